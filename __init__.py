@@ -231,7 +231,7 @@ if TYPE_CHECKING:
     from holdfast.ftm.model.mechanism import Mechanism, MechanismRefused, compose
     from holdfast.ftm.sec.authority import CertificationAuthority as CertificationAuthority  # not in `__all__`
     from holdfast.ftm.votes.voters import NoMajority
-    from holdfast.system.protection import AdaptationUndone
+    from holdfast.system.mechanism_notes import AdaptationUndone
 
 __version__ = "0.1.0"
 
@@ -508,7 +508,7 @@ _LAZY = {
     "MechanismDetached": "holdfast.ftm.events",
     "CannotAdapt": "holdfast.ftm.group.reconfiguration",
     "MechanismChanged": "holdfast.ftm.events",
-    "AdaptationUndone": "holdfast.system.protection",
+    "AdaptationUndone": "holdfast.system.mechanism_notes",
     "MechanismRefused": "holdfast.ftm.model.mechanism",
     "MechanismSettled": "holdfast.ftm.events",
     "NVP": "holdfast.ftm.mechanisms.nvp",

@@ -138,7 +138,7 @@ class Bus:
         return self._actor.ctx.random
 
     def closed(self) -> None:
-        """The program is made."""
+        """Take no more subscriptions and the like, because the program has been made."""
         self._is_open = False
 
     def _registering(self) -> None:

@@ -51,7 +51,7 @@ class LifeAbandoned(Event, frozen=True, eq=False):
 
 
 class DeadLetter(Event, frozen=True, eq=False):
-    """A message nobody handles."""
+    """Nobody handles this message, for the reason that `why` gives."""
 
     message: Any
     why: str
@@ -396,7 +396,7 @@ class EventStream:
         self.missed = 0
 
     def put(self, event: Event) -> None:
-        """Called by the hub."""
+        """Take in an event from the hub; the oldest one gives way if there are too many."""
         if len(self._events) == self._events.maxlen:
             self.missed += 1
         self._events.append(event)
@@ -465,7 +465,7 @@ class EventHub:
         return stream
 
     def remove(self, stream: EventStream) -> None:
-        """Forget a stream."""
+        """Give a stream no more events."""
         if stream in self._streams:
             self._streams.remove(stream)
         self._count()
@@ -475,7 +475,7 @@ class EventHub:
         self._changed(self.has_listeners)
 
     def close(self) -> None:
-        """End every stream."""
+        """End every stream that is open."""
         for stream in list(self._streams):
             stream.close()
 

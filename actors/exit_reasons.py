@@ -72,7 +72,7 @@ class Crash(ExitReason, frozen=True, eq=False):
 
     @property
     def traceback(self) -> str:
-        """The formatted traceback."""
+        """The traceback of the exception, formatted when it is asked for."""
         return self.formatted if self.error is None else format_error(self.error)
 
     def __str__(self) -> str:
@@ -121,8 +121,6 @@ class Hung(ExitReason, frozen=True):
     def __str__(self) -> str:
         return f"hung for {self.seconds:g} s"
 
-
-AnyExit = Normal | Shutdown | Killed | NoProc | Crash | Signal | Exited | OutOfMemory | Hung
 
 NORMAL = Normal()
 SHUTDOWN = Shutdown()

@@ -28,12 +28,11 @@ RUNNER = run_loop.Runner._run.__code__
 """In its frame: the turn that the runner has."""
 
 
-def check_limits(lag: float | None, turns: float | None) -> tuple[float | None, float | None]:
-    """The limits, if each is None or a number > 0. Raises SpecError."""
+def check_limits(lag: float | None, turns: float | None) -> None:
+    """Refuse limits that are neither None nor a number > 0. Raises SpecError."""
     for name, limit in (("watch_lag", lag), ("watch_turns", turns)):
         if limit is not None and not (isinstance(limit, (int, float)) and 0 < limit < float("inf")):
             raise SpecError("ActorSystem", f"{name} must be seconds > 0, not {limit!r}")
-    return lag, turns
 
 
 class LoopWatch:
@@ -62,7 +61,7 @@ class LoopWatch:
             self._thread.start()
 
     def close(self) -> None:
-        """No more of it."""
+        """Stop watching, and wait for the watching thread to end."""
         self._over.set()
         if self._timer is not None:
             self._timer.cancel()

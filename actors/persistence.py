@@ -65,7 +65,7 @@ class NothingKept:
         self._notes: dict[str, bytes] = {}
 
     def knows(self, path: str) -> bool:
-        """Never."""
+        """Return False: nothing is ever recorded."""
         return False
 
     def erase(self, path: str, *, below: bool) -> None:
@@ -79,10 +79,10 @@ class NothingKept:
         raise ControlFailed(path, "roll_back", "nothing was recorded of it in this run")
 
     def blame(self, path: str) -> None:
-        """Nobody is brought back."""
+        """Do nothing: nobody is brought back from records."""
 
     def returned(self, path: str, period: float) -> None:
-        """Nobody is brought back."""
+        """Do nothing: nobody is brought back from records."""
 
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a fact until the node ends."""

@@ -104,7 +104,7 @@ class Listener:
         self._loop.add_reader(self._sock, self._accept)
 
     def stop(self) -> None:
-        """Take nobody any more."""
+        """Accept no more connections from now on."""
         if self._pause is not None:
             self._pause.cancel()
         if self._is_watched:

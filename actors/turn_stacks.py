@@ -43,14 +43,19 @@ def stack_of(work: Coroutine[Any, Any, Any]) -> Iterator[str]:
     """Where a coroutine waits, outermost first, as in a traceback; behind the last one, for what."""
     at: Any = work
     while at is not None:
-        frame: FrameType | None = getattr(at, "cr_frame", None) or getattr(at, "gi_frame", None)
-        code: CodeType | None = getattr(at, "cr_code", None) or getattr(at, "gi_code", None)
-        if code is None:
-            yield f"    waits for {at!r}"
-            return
+        frame: FrameType | None
+        code: CodeType
+        match at:
+            case object(cr_frame=frame, cr_code=code, cr_await=inner):
+                pass
+            case object(gi_frame=frame, gi_code=code, gi_yieldfrom=inner):
+                pass
+            case _:
+                yield f"    waits for {at!r}"
+                return
         if frame is not None:
             yield f'  File "{code.co_filename}", line {frame.f_lineno}, in {code.co_qualname}'
             source = linecache.getline(code.co_filename, frame.f_lineno).strip()
             if source:
                 yield f"    {source}"
-        at = getattr(at, "cr_await", None) or getattr(at, "gi_yieldfrom", None)
+        at = inner

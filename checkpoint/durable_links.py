@@ -24,7 +24,7 @@ Tie = tuple[str, str]
 UNDONE_BY = {"demonitor": "monitor", "unwatch": "watch", "unlink": "link"}
 
 
-class Ties:
+class DurableTies:
     """The monitors and links of one home. There may be several monitors of one actor, but one link."""
 
     def __init__(self, home: Switch) -> None:

@@ -42,10 +42,16 @@ class Called:
         except Exception as error:
             raise self._failed(error) from error
 
-    def _call_for_good(self, method: Callable[P, T], *args: P.args, **named: P.kwargs) -> T:
+    def _write(self, method: Callable[P, T], *args: P.args, **named: P.kwargs) -> T:
+        self._refuse_failed()
+        return self._call(method, *args, **named)
+
+    @contextlib.contextmanager
+    def _for_good(self) -> Generator[None]:
+        """What fails within has failed for good."""
         self._refuse_failed()
         try:
-            return method(*args, **named)
+            yield
         except HoldfastError:
             raise
         except Exception as error:
@@ -71,7 +77,7 @@ class Called:
         try:
             if self.keys:
                 entries = [(self.keys.get(address, address), entry) for address, entry in entries]
-            return self._engine.append(entries)  # not through `_call_for_good`: this is done for every message
+            return self._engine.append(entries)  # not within `_for_good`: this is done for every message
         except HoldfastError:
             raise
         except Exception as error:
@@ -80,12 +86,12 @@ class Called:
 
     def sync(self) -> None:
         """Have everything outlive the machine; a failure is for good."""
-        self._call_for_good(self._engine.sync)
+        with self._for_good():
+            self._engine.sync()
 
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """Keep a snapshot, and forget what it contains."""
-        self._refuse_failed()
-        self._call(self._engine.cut, self._key(address), snapshot, drop, turn=turn, keep=keep)
+        self._write(self._engine.cut, self._key(address), snapshot, drop, turn=turn, keep=keep)
 
     @contextlib.contextmanager
     def together(self) -> Generator[None, None, None]:
@@ -94,15 +100,8 @@ class Called:
         if joint is None:
             yield
             return
-        self._refuse_failed()
-        try:
-            with joint():
-                yield
-        except HoldfastError:
-            raise
-        except Exception as error:
-            self._failure = self._failed(error)
-            raise self._failure from error
+        with self._for_good(), joint():
+            yield
 
     def load(self, address: str, *, older: int = False) -> Saved:
         """Read an address back from the engine."""
@@ -110,15 +109,13 @@ class Called:
 
     def erase(self, address: str) -> None:
         """Have the engine forget an address."""
-        self._refuse_failed()
-        self._call(self._engine.erase, self._key(address))
+        self._write(self._engine.erase, self._key(address))
 
     def keep_blocks(
         self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int
     ) -> None:
         """Have the engine keep blocks of a large snapshot."""
-        self._refuse_failed()
-        self._call(self._engine.keep_blocks, self._key(address), number, blocks, compress)
+        self._write(self._engine.keep_blocks, self._key(address), number, blocks, compress)
 
     def read_blocks(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
         """Read blocks of a large snapshot back."""
@@ -126,8 +123,7 @@ class Called:
 
     def forget_blocks(self, address: str, needed: Collection[int]) -> None:
         """Have the engine remove packs that nothing needs."""
-        self._refuse_failed()
-        self._call(self._engine.forget_blocks, self._key(address), needed)
+        self._write(self._engine.forget_blocks, self._key(address), needed)
 
     def addresses(self) -> list[str]:
         """The addresses of which something is stored."""
@@ -139,8 +135,7 @@ class Called:
 
     def note(self, key: str, value: bytes | None) -> None:
         """Have the engine keep a small fact."""
-        self._refuse_failed()
-        self._call(self._engine.note, key, value)
+        self._write(self._engine.note, key, value)
 
     def noted(self, key: str) -> bytes | None:
         """The small fact of that name, if any."""

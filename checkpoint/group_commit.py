@@ -15,13 +15,12 @@ import contextvars
 import functools
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 from ..actors.errors import HoldfastError
 from ..actors.events import Event, JournalBlocked, JournalGoesOn, JournalStopped
 from .commit_lanes import CommitLanes, Submission
-from .journal import Entry, InHand, Journal, MemoryJournal, Saved, StoreFailed
+from .journal import Entry, InHand, MemoryJournal, Saved, StoreEngine, StoreFailed
 from .method import Durability
 
 if TYPE_CHECKING:
@@ -49,7 +48,7 @@ class Commits:
 
     def __init__(
         self,
-        engine: Journal,
+        engine: StoreEngine,
         loop: asyncio.AbstractEventLoop,
         *,
         durability: Durability = "os",
@@ -75,7 +74,7 @@ class Commits:
     @property
     def in_hand(self) -> InHand | None:
         """Which inputs are in hand, if the engine keeps that."""
-        return getattr(self.engine, "in_hand", None)
+        return self.engine.in_hand
 
     # -- who wants what ---------------------------------------------------------------------------------------------
 
@@ -172,7 +171,7 @@ class Commits:
         try:
             positions = self.engine.append(entries) if entries else []
         except StoreFailed as error:
-            if self._has_failed():
+            if self.engine.has_failed():
                 self._stop(error)
             else:
                 self._block(error)
@@ -204,11 +203,6 @@ class Commits:
                     )
         finally:
             self._is_running = False
-
-    def _has_failed(self) -> bool:
-        """Whether the engine refuses for good."""
-        failed: Callable[[], bool] | None = getattr(self.engine, "has_failed", None)
-        return failed is not None and failed()
 
     def _block(self, error: HoldfastError) -> None:
         """Nothing was written: refuse what can be refused, and try again with the rest."""
@@ -340,12 +334,8 @@ class Commits:
         Raises:
             HoldfastError: it has failed.
         """
-        joint: Callable[[], AbstractContextManager[None]] | None = getattr(self.engine, "together", None)
-        if joint is None:
-            yield
-            return
         try:
-            with joint():
+            with self.engine.together():
                 yield
         except HoldfastError as error:
             self._stop(error)

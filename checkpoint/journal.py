@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Collection, Sequence
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 from ..actors.errors import StoreError
@@ -19,6 +21,7 @@ __all__ = [
     "Primitive",
     "Saved",
     "StaleEpoch",
+    "StoreEngine",
     "StoreFailed",
     "StoreInUse",
 ]
@@ -209,6 +212,23 @@ class Journal(Protocol):
         ...
 
 
+class StoreEngine(Journal, Protocol):
+    """A journal with what only some engines have, and a default for those that have it not."""
+
+    @property
+    def in_hand(self) -> InHand | None:
+        """Which inputs are in hand, if the engine keeps that."""
+        ...
+
+    def has_failed(self) -> bool:
+        """Whether the engine refuses for good."""
+        ...
+
+    def together(self) -> AbstractContextManager[None]:
+        """Have what is written inside stand in the store completely or not at all, if the engine can do that."""
+        ...
+
+
 class InHand(Protocol):
     """Which inputs are in hand, as it outlives the process: what an engine may have as its attribute `in_hand`."""
 
@@ -233,6 +253,7 @@ class MemoryJournal:
     """
 
     __slots__ = ("_last", "_notes", "durable", "epoch")
+    in_hand = None
 
     def __init__(self) -> None:
         self.durable = False
@@ -250,14 +271,22 @@ class MemoryJournal:
         self._last += count
         return list(range(first, first + count))
 
+    def has_failed(self) -> bool:
+        """Return False: nothing is written that could fail."""
+        return False
+
+    def together(self) -> AbstractContextManager[None]:
+        """Do nothing: nothing is written."""
+        return contextlib.nullcontext()
+
     def sync(self) -> None:
-        """Do nothing: nothing survives."""
+        """Do nothing, since nothing survives the process."""
 
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """Do nothing: the switch keeps the snapshot."""
 
     def load(self, address: str, *, older: int = False) -> Saved:
-        """Return an empty `Saved`."""
+        """Return an empty `Saved`, since nothing is stored in memory."""
         return Saved(None, 0, [])
 
     def keep_blocks(

@@ -72,12 +72,12 @@ def demo(
     Exit status 0: nothing lost, nothing doubled, the maps are equal bit by bit. 1: something differs. 2: there is
     nothing to run on.
     """
+    from .demo.demo_runs import DemoPlan
     from .demo.log import LogError, killian_court
     from .demo.main import run_demo
-    from .demo.run import Plan
 
     try:
-        plan = Plan(log or killian_court(), kills, seed, method.value, interval, speed)
+        plan = DemoPlan(log or killian_court(), kills, seed, method.value, interval, speed)
         report = run_demo(plan, Console(), picture=picture, as_json=as_json)
     except (LogError, OSError) as error:
         raise _failed(error, UNUSABLE) from error

@@ -29,9 +29,9 @@ from .wire import (
     REQUEST,
     AnyRequest,
     BadRequest,
-    Control,
+    ControlActor,
+    ControlResponse,
     NotServed,
-    Response,
     Transact,
     Tree,
     Whereis,
@@ -290,11 +290,11 @@ class Endpoint:
             await write(writer, work.result())
         return is_over
 
-    async def _respond(self, request: AnyRequest) -> Response:
+    async def _respond(self, request: AnyRequest) -> ControlResponse:
         try:
             async with asyncio.timeout(LONGEST):
                 value = await self._do(request)
-            return Response(encode_value(value))
+            return ControlResponse(encode_value(value))
         except Exception as error:  # It is the client's to know; a bug in a user's code must not end the endpoint.
             return failure(error)
 
@@ -305,12 +305,12 @@ class Endpoint:
                 return system.tree()
             case Whereis():
                 return system.whereis(request.name).path
-            case Control():
+            case ControlActor():
                 return await self._control(request)
             case Transact():
                 return await self._transact(request)
 
-    async def _control(self, request: Control) -> Any:
+    async def _control(self, request: ControlActor) -> Any:
         system, timeout = self._system, min(request.timeout, LONGEST)
         ref = system.ref(request.path, Actor)
         with trusted_imports(system.node, Needed(request.script, request.args)):
@@ -365,7 +365,7 @@ async def part(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, error
             pass
 
 
-async def write(writer: asyncio.StreamWriter, response: Response) -> None:
+async def write(writer: asyncio.StreamWriter, response: ControlResponse) -> None:
     """Answer. Raises TimeoutError: the client does not take it."""
     try:
         data = frame(response)

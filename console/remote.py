@@ -28,12 +28,13 @@ from .wire import (
     RESPONSE,
     AnyRequest,
     BadRequest,
-    Control,
+    ControlActor,
     Transact,
     Tree,
     Whereis,
     check_user,
     frame,
+    open_arg,
     outcome,
     pack_arg,
     peer_uid,
@@ -181,7 +182,7 @@ class RemoteSystem:
         return RemoteRef(path)
 
     async def get_status(self, ref: RemoteTarget, *, timeout: float = 5.0) -> Status:
-        """How an actor is."""
+        """Get the status of an actor, also while a turn of it waits."""
         status: Status = await self._control("get_status", ref, timeout)
         return status
 
@@ -234,7 +235,7 @@ class RemoteSystem:
         if changes and self._dry_run:
             raise SpecError(verb, "in a dry run no order is given to an actor: put it into a transaction")
         packed = [pack_arg(arg, verb) for arg in args]
-        return await self.call(Control(verb, text_of(ref), packed, timeout, self._script), timeout)
+        return await self.call(ControlActor(verb, text_of(ref), packed, timeout, self._script), timeout)
 
     # -- transactions -------------------------------------------------------------------------------------------------
 
@@ -316,7 +317,7 @@ class RemoteChange:
         self._put("reorder", supervisor, list(ids))
 
     def strategy(self, supervisor: RemoteTarget, strategy: Strategy) -> None:
-        """Restart by another strategy."""
+        """Have a supervisor restart its children by another strategy."""
         self._put("strategy", supervisor, strategy)
 
     def intensity(self, supervisor: RemoteTarget, intensity: int, period: float) -> None:
@@ -328,7 +329,7 @@ class RemoteChange:
         self._put("isolation", target, isolation)
 
     def bind(self, owner: RemoteTarget, port: str, target: RemoteTarget) -> None:
-        """Point a binding elsewhere."""
+        """Have a binding lead to another actor."""
         self._put("bind", owner, port, text_of(target))
 
     def register(self, name: str, target: RemoteTarget) -> None:
@@ -336,7 +337,7 @@ class RemoteChange:
         self._put("register", name, text_of(target))
 
     def unregister(self, name: str) -> None:
-        """Free a name."""
+        """Free a name that an actor has beside its address."""
         self._put("unregister", name)
 
     def suspend(self, target: RemoteTarget) -> None:
@@ -365,7 +366,7 @@ class RemoteChange:
         return f"{text_of(supervisor)}/{name}"
 
     def unbind(self, owner: RemoteTarget, port: str) -> None:
-        """Point a binding nowhere."""
+        """Have a binding lead to nobody."""
         self._put("unbind", owner, port)
 
     def protect(self, target: RemoteTarget, mechanism: Any) -> None:
@@ -405,12 +406,12 @@ class RemoteChange:
         """The steps, in order; in full when the system has answered."""
         if self._steps is not None:
             return self._steps
-        named = [(verb, str(getattr(args[0], "value", ""))) for verb, args in self._operations]
+        named = [(verb, open_arg(args[0])) for verb, args in self._operations]
         return tuple(Step(n, verb, target, f"{verb} {target}") for n, (verb, target) in enumerate(named, 1))
 
     @property
     def difference(self) -> tuple[str, ...]:
-        """How the tree changes."""
+        """How the tree changes, line by line."""
         return self._difference
 
     def describe(self) -> str:
@@ -420,7 +421,7 @@ class RemoteChange:
 
 
 def text_of(target: RemoteTarget) -> str:
-    """A target's address."""
+    """The address of a target, which may be a ref or text."""
     return target.path if isinstance(target, RemoteRef) else target
 
 

@@ -10,7 +10,7 @@ from collections.abc import Generator
 from ..actors.errors import SpecError
 from ..actors.kernel.node import Node
 from ..system.script import find_beside, guarded_imports, load_source, read_source, tell_loaded
-from .wire import AnyArg, Packed
+from .wire import AnyArg, PackedArg
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class Needed:
     def is_used(self, module: str) -> bool:
         """Whether something in it is of this module."""
         name = module.encode()
-        return any(isinstance(arg, Packed) and name in arg.data for arg in self.args)
+        return any(isinstance(arg, PackedArg) and name in arg.data for arg in self.args)
 
 
 @contextlib.contextmanager

@@ -61,23 +61,23 @@ def check_user(uid: int, expected: int) -> None:
 
 
 class Arg(msgspec.Struct, array_like=True, frozen=True, tag_field="kind"):
-    """An argument."""
+    """Base of the arguments of an order that goes over the control endpoint."""
 
 
-class Plain(Arg, tag="plain", array_like=True, frozen=True):
+class PlainArg(Arg, tag="plain", array_like=True, frozen=True):
     """Text, a number, a truth, None, or a list of texts."""
 
     value: str | bool | int | float | list[str] | None
 
 
-class Packed(Arg, tag="packed", array_like=True, frozen=True):
+class PackedArg(Arg, tag="packed", array_like=True, frozen=True):
     """What has to be rebuilt: a child spec or recipe, a function, the recipe of a class, or mechanisms."""
 
     of: Literal["spec", "function", "code", "mechanism"]
     data: bytes
 
 
-AnyArg = Plain | Packed
+AnyArg = PlainArg | PackedArg
 
 
 def pack_arg(value: Any, where: str) -> AnyArg:
@@ -87,23 +87,23 @@ def pack_arg(value: Any, where: str) -> AnyArg:
         SpecError, UnsavableValue: it cannot be sent.
     """
     if isinstance(value, (ChildSpec, Start)):
-        return Packed("spec", pack_data(value, where))
+        return PackedArg("spec", pack_data(value, where))
     if isinstance(value, type) and issubclass(value, Actor):
-        return Packed("code", pack_recipe(Start(value), where))
+        return PackedArg("code", pack_recipe(Start(value), where))
     if is_mechanism(value):
-        return Packed("mechanism", encode_value(pack_mechanism(value), where=where))
+        return PackedArg("mechanism", encode_value(pack_mechanism(value), where=where))
     if callable(value):
-        return Packed("function", encode_value(pack_function(value, where, where)))
+        return PackedArg("function", encode_value(pack_function(value, where, where)))
     plain: Any = list(value) if isinstance(value, (list, tuple)) else value
     is_text = isinstance(plain, list) and all(isinstance(one, str) for one in plain)
     if not is_text and not isinstance(plain, (str, int, float, NoneType)):
         raise SpecError(where, f"{value!r} cannot be sent to the running system")
-    return Plain(plain)
+    return PlainArg(plain)
 
 
 def open_arg(arg: AnyArg) -> Any:
     """The argument again. Imports the modules it needs."""
-    if isinstance(arg, Plain):
+    if isinstance(arg, PlainArg):
         return arg.value
     if arg.of == "spec":
         return unpack_data(arg.data)
@@ -147,21 +147,21 @@ def open_mechanism(data: list[Any]) -> Any:
 # -- requests ---------------------------------------------------------------------------------------------------------
 
 
-class Request(msgspec.Struct, tag_field="ask", forbid_unknown_fields=True, frozen=True):
-    """Base of all requests."""
+class ControlRequest(msgspec.Struct, tag_field="ask", forbid_unknown_fields=True, frozen=True):
+    """Base of all requests to a running system."""
 
 
-class Tree(Request, tag="tree", frozen=True):
+class Tree(ControlRequest, tag="tree", frozen=True):
     """All addresses that live now."""
 
 
-class Whereis(Request, tag="whereis", frozen=True):
+class Whereis(ControlRequest, tag="whereis", frozen=True):
     """The address of the actor with this name."""
 
     name: str
 
 
-class Control(Request, tag="control", frozen=True):
+class ControlActor(ControlRequest, tag="control", frozen=True):
     """An operator's order to one actor."""
 
     verb: Literal[
@@ -181,7 +181,7 @@ class Control(Request, tag="control", frozen=True):
     script: tuple[str, str] | None = None
 
 
-class Transact(Request, tag="transaction", frozen=True):
+class Transact(ControlRequest, tag="transaction", frozen=True):
     """A whole transaction; `script` is the file that its classes may be defined in, and its sha256."""
 
     operations: list[tuple[str, list[AnyArg]]]
@@ -190,11 +190,11 @@ class Transact(Request, tag="transaction", frozen=True):
     script: tuple[str, str] | None = None
 
 
-AnyRequest = Tree | Whereis | Control | Transact
+AnyRequest = Tree | Whereis | ControlActor | Transact
 REQUEST: msgspec.msgpack.Decoder[AnyRequest] = msgspec.msgpack.Decoder(AnyRequest)
 
 
-class Response(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ControlResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The outcome of one request: a value, or an error."""
 
     value: bytes = b""
@@ -203,10 +203,10 @@ class Response(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     text: str = ""
 
 
-RESPONSE: msgspec.msgpack.Decoder[Response] = msgspec.msgpack.Decoder(Response)
+RESPONSE: msgspec.msgpack.Decoder[ControlResponse] = msgspec.msgpack.Decoder(ControlResponse)
 
 
-def frame(value: Request | Response) -> bytes:
+def frame(value: ControlRequest | ControlResponse) -> bytes:
     """Head and body. Raises BadRequest: too large."""
     body = msgspec.msgpack.encode(value)
     if len(body) > LARGEST:
@@ -214,7 +214,7 @@ def frame(value: Request | Response) -> bytes:
     return HEAD.pack(len(body)) + body
 
 
-def failure(error: BaseException) -> Response:
+def failure(error: BaseException) -> ControlResponse:
     """An error as a response; if its arguments cannot be sent it arrives as a RemoteCrash."""
     args = b""
     if isinstance(error, HoldfastError):
@@ -222,10 +222,10 @@ def failure(error: BaseException) -> Response:
             args = encode_value(tuple(error.args))
         except HoldfastError:
             pass  # A refusal with a ref in it, say: its text has to do.
-    return Response(error=type_name(type(error)), args=args, text=error_text(error))
+    return ControlResponse(error=type_name(type(error)), args=args, text=error_text(error))
 
 
-def outcome(response: Response) -> Any:
+def outcome(response: ControlResponse) -> Any:
     """The value in a response.
 
     Raises:

@@ -39,7 +39,7 @@ from .model_server import (
     RollBackModel,
     ValidateModel,
 )
-from .watching import Watch, expecting, property_observers, watch
+from .system_watch import Watch, expecting, property_observers, watch
 
 __all__ = [
     "ChangeModel",

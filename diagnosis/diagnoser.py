@@ -56,7 +56,7 @@ class _Expire(Message):
 
 
 class _Thought(Message):
-    """A diagnosis is made."""
+    """Tells the diagnoser that its thread has made a diagnosis."""
 
     diagnosis: Diagnosis
     explained: Explained
@@ -102,7 +102,7 @@ class DiagnoserActor(Actor):
         self._expiry = float("inf")
 
     async def on_start(self, restored: bool) -> None:
-        """Get the model."""
+        """Ask the model server for the model that is in force."""
         path = f"{self.ctx.path.rpartition('/')[0]}/{SERVER}"
         version = await self.ctx.find(path, ModelServer).ask(GetModel())
         self._engine = await asyncio.to_thread(self._engine_for, version.declaration, version.number)
@@ -241,7 +241,7 @@ class DiagnoserActor(Actor):
         return _Thought(diagnosis, await asyncio.to_thread(self._explain, engine, observed, diagnosis))
 
     def _explain(self, engine: Diagnoser, observed: Observed, diagnosis: Diagnosis) -> Explained:
-        """In a thread."""
+        """Say why a diagnosis was made; this is run in a thread."""
         refused = tuple(self._refused.values())
         if diagnosis.state is not State.FAULTY:
             text = "\n".join(map(str, diagnosis.contradictions)) or _STATES[diagnosis.state]
@@ -275,7 +275,7 @@ class DiagnoserActor(Actor):
         await self.ctx.publish(EXPLANATION, message.explained)
 
     def _rest(self) -> None:
-        """All is thought through."""
+        """Answer those who waited for the diagnosis of all that is known."""
         waiting, self._waiting = self._waiting, []
         for handle in waiting:
             handle.reply(self._newest or Diagnosis(State.BLIND, components=tuple(self._engine.model.components)))

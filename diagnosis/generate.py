@@ -22,7 +22,7 @@ from .messages import DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR
 from .model import Component, Declaration, Expectation, Kind
 from .observers.general import GeneralObserver, Learned
 from .observers.hearing import Heard, listen
-from .observers.node import NodeObserver
+from .observers.node_observer import NodeObserver
 from .observers.observer import Manner, Observer
 from .observers.verdicts import Agreement
 
@@ -77,7 +77,7 @@ async def generate(
     """
     heard: dict[str, set[str]] = {}
     wanted = [topic for topic in dict.fromkeys((*node.topics.names(), *topics)) if topic not in OURS]
-    cell = node.spawn(Start(Listener, (tuple(wanted), heard)))
+    cell = node.spawn(Start(TopicListener, (tuple(wanted), heard)))
     try:
         await asyncio.sleep(seconds)
     finally:
@@ -87,7 +87,7 @@ async def generate(
     return declared(_wiring(node, heard, out))
 
 
-class Listener(Actor):
+class TopicListener(Actor):
     """Notes who publishes on which topics."""
 
     deterministic = False
@@ -96,7 +96,7 @@ class Listener(Actor):
         self._listens_to, self._publishers = topics, heard
 
     def on_start(self, restored: bool) -> None:
-        """Listen."""
+        """Subscribe to the topics that are to be listened to."""
         for topic in self._listens_to:
             listen(self, topic)
 

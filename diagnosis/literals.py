@@ -66,12 +66,12 @@ def ok(topic: str) -> Literal:
 
 
 def running(component: str) -> Literal:
-    """The component runs."""
+    """The literal that a component runs."""
     return Literal("running", (component,))
 
 
 def on(device: str) -> Literal:
-    """The device has power."""
+    """The literal that a device has power."""
     return Literal("on", (device,))
 
 
@@ -81,17 +81,17 @@ def matched(one: str, other: str) -> Literal:
 
 
 def inc(value: str) -> Literal:
-    """The value rises."""
+    """The literal that a value rises."""
     return Literal("inc", (value,))
 
 
 def dec(value: str) -> Literal:
-    """The value falls."""
+    """The literal that a value falls."""
     return Literal("dec", (value,))
 
 
 def const(value: str) -> Literal:
-    """The value stays."""
+    """The literal that a value stays as it is."""
     return Literal("const", (value,))
 
 

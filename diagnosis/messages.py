@@ -107,7 +107,7 @@ class GetExplanation(Message[Explained]):
 
 
 class GetObserved(Message[Observed]):
-    """What is known now."""
+    """Asks for what is observed at the moment."""
 
 
 __all__ = [

@@ -24,13 +24,13 @@ from .model import (
     lint,
     read,
 )
-from .model.history import apply
+from .model.model_history import apply
 
 LOADED: Final = "loaded"
 
 
 class GetModel(Message[Version]):
-    """The version that counts."""
+    """Asks for the version of the model that is in force."""
 
 
 class GetVersions(Message[tuple[Version, ...]]):

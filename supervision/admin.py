@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from ..actors.errors import HoldfastError, SpecError
-from ..actors.kernel.codec import Packed
+from ..actors.kernel.codec import Packable, Packed
 from ..actors.kernel.message import Message, Order, Refusal
 from ..actors.kernel.node import Node
 from ..actors.kernel.ref import ActorRef
@@ -69,7 +69,7 @@ class NoPartitions(Refusal):
 # -- requests -------------------------------------------------------------------------------------------------------
 
 
-class Boxed:
+class Boxed(Packable):
     """A child spec, recipe or plan in a message: as it is in this process, packed when it leaves it."""
 
     __slots__ = ("value",)

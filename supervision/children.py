@@ -45,7 +45,7 @@ class Child:
         return self.state in (UP, RECOVERING)
 
     def info(self, above: str) -> ChildInfo:
-        """As `WhichChildren` tells it."""
+        """Describe the child as `WhichChildren` tells of it."""
         return ChildInfo(self.spec.id, self.state, f"{above}/{self.spec.id}", self.spec.is_supervisor)
 
 
@@ -154,7 +154,7 @@ class StartLimit:
         self._wait(seconds)
 
     def close(self) -> None:
-        """The start is over."""
+        """Count the time no more, because the start is over."""
         if self._timer is not None:
             self._timer.cancel()
         if self._end is not None:

@@ -145,7 +145,7 @@ def _call(make: Callable[..., T], options: dict[str, Any], where: str) -> T:
 
 
 def _named(name: object, where: str) -> Any:
-    """What `package.module:Name` stands for."""
+    """Import the class or function that `package.module:Name` stands for."""
     if not isinstance(name, str) or name.count(":") != 1:
         raise SpecError(where, f"must be a name such as 'package.module:Class', not {name!r}")
     module, _, path = name.partition(":")

@@ -22,11 +22,11 @@ from ..actors.persistence import child_key
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.start_codec import pack_data, unpack_data
 from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
-from .change import check_place, check_subtree
 from .children import STARTING, Child, Row, complete
 from .rules import Rule
 from .spec import NAMELESS, ChildSpec, Flags, Isolation, Plan, Restart, Shutdown, check_spec, child
 from .supervisor import Supervisor
+from .supervisor_changes import check_place, check_subtree
 
 MADE_UP = b""
 """What is noted of a child whose id nobody knows when its supervisor is started again."""

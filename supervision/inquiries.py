@@ -23,7 +23,7 @@ class Inquiries(Actor):
 
     @on(CountChildren, readonly=True)
     def _count_children(self, message: CountChildren) -> ChildCounts:
-        """How many there are."""
+        """Count the children: all, those that run, supervisors and workers."""
         children = self._children.values()
         supervisors = sum(one.spec.is_supervisor for one in children)
         active = sum(one.is_running for one in children)
@@ -31,7 +31,7 @@ class Inquiries(Actor):
 
     @on(GetChildSpec, readonly=True)
     def _get_child_spec(self, message: GetChildSpec) -> Any:
-        """One child's spec."""
+        """Find the spec of one child."""
         spec = self._child(message.id).spec
         return spec if self.ctx.cell.node.ports.uplink is None else Boxed(spec)
 

@@ -63,6 +63,8 @@ def most_below(cell: Cell | None, spec: ChildSpec | None) -> float:
 
 def _limits(cell: Cell | None, spec: ChildSpec | None) -> Iterator[float]:
     """What each child may take: of those in this process as their specs say, elsewhere as far as it is known here."""
+    from .spec import ChildSpec  # It asks here how long a child may take.
+
     living = dict((cell.children or {}) if cell is not None else {})
     known: dict[str, ChildSpec] = {}
     if spec is not None and (cell is None or cell.actor is None):
@@ -71,5 +73,5 @@ def _limits(cell: Cell | None, spec: ChildSpec | None) -> Iterator[float]:
     for name in {**living, **known}:
         if name != "*":
             child = living.get(name)
-            own = child.spec if child is not None and hasattr(child.spec, "shutdown") else None
+            own = child.spec if child is not None and isinstance(child.spec, ChildSpec) else None
             yield most(child, own or known.get(name, template))

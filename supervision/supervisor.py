@@ -30,7 +30,6 @@ from .admin import (
     TerminateChild,
     opened,
 )
-from .change import check_place, new_plan, succession
 from .children import (
     RECOVERING,
     RESTARTING,
@@ -51,6 +50,7 @@ from .errands import Errand, answered
 from .inquiries import Inquiries
 from .intensity import admit_restart, recent_restarts
 from .spec import ChildSpec, Flags, Plan, check_spec
+from .supervisor_changes import check_place, new_plan, succession
 
 DISMISSED = 1000
 """Of the children that were stopped by order and whose specs are gone, so many are remembered, the newest."""

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 from ..actors.errors import SpecError
 from ..actors.kernel.actor import Start
 from ..actors.process.resource_limits import Limits
-from .change import check_subtree
 from .rules import Rule
 from .spec import AutoShutdown, ChildSpec, Flags, Isolation, Restart, Shutdown, Strategy, checked
 from .supervisor import Supervisor
+from .supervisor_changes import check_subtree
 
 
 def supervisor(

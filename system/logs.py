@@ -93,7 +93,7 @@ class LogSink:
                 pass
 
     def close(self) -> None:
-        """Write what still waits."""
+        """Write the events that still wait."""
         for address in list(self._crashes):
             self._release(address)
 

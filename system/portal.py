@@ -9,9 +9,9 @@ from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..actors.errors import ActorStopped, AskTimeout, HoldfastError
+from ..actors.kernel.blocking_handlers import LOOK_AGAIN, wait_on_loop
 from ..actors.kernel.message import Message
 from ..actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
-from ..actors.kernel.threads import LOOK_AGAIN, wait_on_loop
 
 if TYPE_CHECKING:
     from ..actors.kernel.node import Node

@@ -32,7 +32,10 @@ class RecoveryTree:
         self._node, self._homes = node, homes
         self._delay = FIRST_DELAY
         self._born = 0.0
-        homes.on_first = self.begin
+
+    def begin_with_first_home(self) -> None:
+        """Start the supervisor as soon as a recorded actor has a home."""
+        self._homes.on_first = self.begin
 
     def begin(self) -> None:
         """Start the supervisor, unless the system is stopping."""

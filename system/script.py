@@ -33,7 +33,7 @@ class UntrustedFile(HoldfastError, text="{path} is not loaded: {problem}"):
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Source:
+class ScriptSource:
     """A script as it was read: what is checked, hashed and run are the same bytes."""
 
     path: str
@@ -54,11 +54,11 @@ class Source:
 class Script:
     """A script that is loaded."""
 
-    source: Source
+    source: ScriptSource
     reconfigure: Callable[[Any], Awaitable[Any]]
 
 
-def read_source(path: str | os.PathLike[str], uid: int | None = None) -> Source:
+def read_source(path: str | os.PathLike[str], uid: int | None = None) -> ScriptSource:
     """Read a file, if only this user could have written it.
 
     Args:
@@ -83,7 +83,7 @@ def read_source(path: str | os.PathLike[str], uid: int | None = None) -> Source:
         raise SpecError(str(path), error.strerror or str(error)) from error
     if len(data) > LARGEST:
         raise SpecError(str(full), f"a script has at most {LARGEST} bytes")
-    return Source(str(full), data)
+    return ScriptSource(str(full), data)
 
 
 def check_owner(path: str, info: os.stat_result, owners: set[int]) -> None:
@@ -116,7 +116,7 @@ def check_folders(folder: Path, owners: set[int], *, may_share: bool = False) ->
         check_owner(str(one), info, allowed)
 
 
-def find_beside(source: Source) -> None:
+def find_beside(source: ScriptSource) -> None:
     """Let modules be found in the folder of a script too, after all others, so that it can hide none of them."""
     folder = str(Path(source.path).parent)
     if folder not in sys.path:
@@ -176,7 +176,7 @@ def _tell_nobody(path: str, sha256: str) -> None:
     """Who runs a script from the command line sees what it does."""
 
 
-def load_source(source: Source) -> types.ModuleType:
+def load_source(source: ScriptSource) -> types.ModuleType:
     """Run the source as a module, once in a process. What it imports may lie beside it.
 
     Raises:

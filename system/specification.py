@@ -3,7 +3,7 @@
 The program says what it starts below the root, and each such spec has a note here as soon as a transaction has made
 another one of it: of which the change was made, and what has become of it. The next root that starts that very spec
 starts the changed one. If the program has changed, its word is newer. Mechanisms have notes of their own
-(`protection.py`), for they are on trial at first; the specs here are as if those were still to be attached.
+(`mechanism_notes.py`), for they are on trial at first; the specs here are as if those were still to be attached.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from ..actors.errors import HoldfastError, SpecError
 from ..actors.events import Event
 from ..actors.kernel.actor import Start
 from ..actors.process.wire.start_codec import pack_data, unpack_data
-from ..supervision.change import everything
 from ..supervision.children import Child
 from ..supervision.respec import rebuilt
 from ..supervision.spec import ChildSpec
 from ..supervision.supervisor import Supervisor
+from ..supervision.supervisor_changes import everything
 
 if TYPE_CHECKING:
     from ..checkpoint.home.homes import Homes

@@ -23,7 +23,7 @@ from ..actors.kernel.message import Message
 from ..actors.kernel.node import Node, Ports, cell_kind
 from ..actors.kernel.ref import ActorRef, current
 from ..actors.kernel.topics import publish
-from ..actors.loop_watchdog import LoopWatch, check_limits
+from ..actors.loop_watchdog import LoopWatch
 from ..actors.process.process_host import WorkerPlace, in_process, on_frame
 from ..actors.process.worker_pool import Workers
 from ..checkpoint.home.homes import Homes
@@ -34,9 +34,9 @@ from ..checkpoint.places.far_parent import FarParent
 from ..checkpoint.places.life_here import recorded_here
 from ..checkpoint.places.subtree_place import subtree
 from ..checkpoint.protocol import Wanted
-from ..checkpoint.recovery_file import RecoveryFile, load_recovery
+from ..checkpoint.recovery_file import RecoveryFile
 from ..checkpoint.recovery_settings import RecoveryHooks
-from ..checkpoint.stores import check_durability, check_system, open_journal
+from ..checkpoint.store_opening import check_system, open_journal
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.patience import end_within
 from ..supervision.respec import respec
@@ -45,8 +45,9 @@ from ..supervision.supervisor import Supervisor, kill_starting
 from .controls import Controls
 from .live_moves import Moves
 from .logs import LogSink
+from .mechanism_notes import MechanismNotes, check_no_part
+from .options import SystemOptions
 from .portal import ThreadPortal
-from .protection import Protection, check_no_part
 from .recorded import Recorded
 from .recovery import RecoveryTree
 from .script import load_script
@@ -62,8 +63,6 @@ REPLICA = f"{__name__.rpartition('.')[0].rpartition('.')[0]}.ftm.replica"
 """What the processes of replicas import beforehand."""
 PATIENCE = 10.0
 """Seconds after which a table of the recovery file should have found somebody whom it is for."""
-ADMIN_TIMEOUT = 60.0
-"""Seconds an admin call of the system may take that starts and stops nobody."""
 
 LONG = 365 * 86_400.0
 """Seconds `start` and `stop` wait: no limit of their own, the child specs say how long a start or an end may take."""
@@ -114,24 +113,22 @@ class ActorSystem(Recorded, Controls):
         recovery_hooks: RecoveryHooks | None = None,
         recovery: str | os.PathLike[str] | RecoveryFile | None = None,
     ) -> None:
-        if not name or "/" in name:
-            raise SpecError("ActorSystem", f"the name must be text without '/', not {name!r}")
-        self.name = name
-        self._flags = Flags("one_for_one", intensity, period)
-        self._store = store
-        self._durability: Durability | None = check_durability(store, durability)
-        self._takeover = takeover
-        self._preload = tuple(preload)
-        self._log, self._log_payloads = log, log_payloads
+        self._options = SystemOptions(
+            name=name,
+            store=store,
+            durability=durability,
+            flags=Flags("one_for_one", intensity, period),
+            preload=tuple(preload),
+            log=log,
+            log_payloads=log_payloads,
+            seed=seed,
+            takeover=takeover,
+            watch_lag=watch_lag,
+            watch_turns=watch_turns,
+            recovery_hooks=recovery_hooks,
+            recovery=recovery,
+        )
         self._sink: LogSink | None = None
-        self._seed = seed
-        if recovery_hooks is not None and not isinstance(recovery_hooks, RecoveryHooks):
-            raise SpecError(
-                "ActorSystem", f"recovery_hooks must come from recovery_hooks(...), not be {recovery_hooks!r}"
-            )
-        self._recovery_hooks = recovery_hooks
-        self._recovery_file = recovery
-        self._watch_limits = check_limits(watch_lag, watch_turns)
         self._node: Node | None = None
         self._root: Cell | None = None
         self._body: asyncio.Task[Any] | None = None
@@ -141,38 +138,39 @@ class ActorSystem(Recorded, Controls):
         self._transactions = Transactions()
         self._patience: asyncio.TimerHandle | None = None
 
+    @property
+    def name(self) -> str:
+        """The first part of all addresses."""
+        return self._options.name
+
     # -- life -------------------------------------------------------------------------------------------------------
 
     async def __aenter__(self) -> ActorSystem:
         if self._node is not None:
             raise HoldfastError(f"system {self.name!r} was entered already; make a new one")
-        recovery = self._recovery_file
-        file = recovery if isinstance(recovery, RecoveryFile) or recovery is None else load_recovery(recovery)
-        if file is not None:
-            file.check(self.name)
-        node = self._node = Node(self.name, asyncio.get_running_loop(), seed=self._seed)
-        engine = open_journal(self._store, takeover=self._takeover)
+        options = self._options
+        file = options.read_recovery_file()
+        node = self._node = Node(self.name, asyncio.get_running_loop(), seed=options.seed)
+        engine = open_journal(options.store, takeover=options.takeover)
         try:
             check_system(engine, self.name)
-            self._homes = Homes(node, engine, durability=self._durability)
+            self._homes = Homes(node, engine, durability=options.durability, file=file, hooks=options.recovery_hooks)
         except HoldfastError:
             with contextlib.suppress(HoldfastError):  # What it says now is only what follows from that.
                 engine.close()
             raise
-        self._homes.recoveries.hooks = self._recovery_hooks
-        self._recovery = RecoveryTree(node, self._homes)
+        RecoveryTree(node, self._homes).begin_with_first_home()
         self._workers = self._make_pool(node)
         if file is not None:
-            self._homes.file = file
             self._patience = node.loop.call_later(PATIENCE, self._tell_unused)
         self._moves = Moves(node)
-        self._watch = LoopWatch(node, *self._watch_limits)
+        self._watch = LoopWatch(node, options.watch_lag, options.watch_turns)
         self._watch.open()
-        if self._log:
-            self._sink = LogSink(self.name, node.loop, log_payloads=self._log_payloads)
+        if options.log:
+            self._sink = LogSink(self.name, node.loop, log_payloads=options.log_payloads)
             node.events.add_sink(self._sink)
-        self.specifications = Specifications(self._homes, is_kept=self._store is not None)
-        self.mechanism_notes = Protection(self._homes)
+        self.specifications = Specifications(self._homes, is_kept=options.store is not None)
+        self.mechanism_notes = MechanismNotes(self._homes)
         node.connect(
             Ports(
                 host_for=self._host_for,
@@ -184,7 +182,7 @@ class ActorSystem(Recorded, Controls):
         )
         self._body = asyncio.current_task()
         root = self._root = node.root = node.cell_below(None, f"/{self.name}")
-        up = lifecycle.begin(root, Start(Supervisor, (self._flags, ())))
+        up = lifecycle.begin(root, Start(Supervisor, (options.flags, ())))
         if up is not None:
             await up
         root.ended().add_done_callback(self._root_ended)
@@ -247,7 +245,7 @@ class ActorSystem(Recorded, Controls):
 
     def _make_pool(self, node: Node) -> Workers:
         """The processes of this system."""
-        return Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
+        return Workers(node, ENTRY, (*BASE, *self._options.preload), on_frame)
 
     def _complete(self, spec: ChildSpec, path: str) -> ChildSpec:
         """A child spec with what the recovery file and earlier roots say of its address."""

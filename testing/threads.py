@@ -17,7 +17,7 @@ from concurrent.futures import thread as pools
 from types import CodeType
 from typing import Final
 
-from ..actors.kernel.threads import wait_on_loop
+from ..actors.kernel.blocking_handlers import wait_on_loop
 
 FUTEX = {"x86_64": 202, "aarch64": 98}.get(platform.machine(), -1)
 """The number of the system call that waits for a lock."""

@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator, Iterable
 from typing import TYPE_CHECKING, Any, cast
 
 from ..errors import ControlFailed, error_text, portable, type_name
+from ..state_hooks import state_getter, state_setter
 from ..values import UnsavableValue, decode_value, encode_value
 from ..values.classes import slots_of
 
@@ -25,7 +26,7 @@ class Opaque:
 
 def live_state(actor: Actor) -> Any:
     """The state itself: what `get_state()` gives if the class has it, else a dict of the key variables."""
-    get_state = getattr(actor, "get_state", None)
+    get_state = state_getter(actor)
     if get_state is not None:
         return get_state()
     root, names = actor._state_root(), actor.key_variables
@@ -79,8 +80,8 @@ def put_state(actor: Actor, state: Any) -> None:
         ControlFailed: it is no state of this actor. Anything else: the class's own code raised.
     """
     where = actor.ctx.path
-    if hasattr(actor, "get_state"):
-        set_state = getattr(actor, "set_state", None)
+    if state_getter(actor) is not None:
+        set_state = state_setter(actor)
         if set_state is None:
             raise ControlFailed(where, "replace_state", f"{type_name(type(actor))} has get_state but no set_state")
         set_state(state)
@@ -127,8 +128,8 @@ def _changing(actor: Actor, verb: str, *, is_trial: bool) -> Generator[None]:
     ctx = actor.ctx
     ctx.may_replace()
     kind, before = type(actor), dict(vars(actor))
-    hooked = state_to_change(actor) if hasattr(actor, "set_state") else None
-    values = None if hasattr(actor, "get_state") else live_state(actor)
+    hooked = state_to_change(actor) if state_setter(actor) is not None else None
+    values = live_state(actor) if state_getter(actor) is None else None
 
     def put_back() -> None:
         actor.__class__ = kind
@@ -136,8 +137,9 @@ def _changing(actor: Actor, verb: str, *, is_trial: bool) -> Generator[None]:
         vars(actor).update(before)
         if values is not None:
             put_state(actor, values)  # They may be another object's than the actor's.
-        if hooked is not None:
-            actor.set_state(hooked)  # type: ignore[attr-defined]  # it has one, see above
+        set_state = state_setter(actor)
+        if hooked is not None and set_state is not None:
+            set_state(hooked)
 
     try:
         yield

@@ -19,6 +19,7 @@ from ..kernel.actor import Actor, Start
 from ..kernel.envelope import message_in
 from ..kernel.message import message_name
 from ..process.wire.start_codec import pack_recipe, unpack_recipe
+from ..state_hooks import state_migrator
 from ..values import UnsavableValue
 from .live_state import change_state, state_to_show, tried_state
 from .tracing import Statistics, tap_of
@@ -33,7 +34,7 @@ Migrate = Callable[[Any, type[Actor]], Any]
 
 
 class Order:
-    """Base of all orders."""
+    """Base of all orders, which an actor obeys ahead of its messages."""
 
     verb: ClassVar[str]
 
@@ -47,7 +48,7 @@ class Order:
 
     @classmethod
     def unpack(cls, data: dict[str, Any]) -> Order:
-        """The order again."""
+        """Make the order again of the data that it travelled as."""
         return cls()
 
 
@@ -122,7 +123,7 @@ class ReplaceCode(Order):
     def becoming(self, actor: Actor) -> Change:
         """Takes the actor's state, makes the actor one of the new class, and returns the state as that wants it."""
         new = self.start.kind
-        migrate = self.migrate or getattr(new, "migrate", None)
+        migrate = self.migrate or state_migrator(new)
 
         def become(state: Any) -> Any:
             old = type(actor)

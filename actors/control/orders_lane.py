@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from ..process.worker_node import Guest
 
 
-class Ordered(Message[bytes]):
+class OrderAsked(Message[bytes]):
     """Stands for an order in its ask: what comes over a border as the reply is a value, encoded."""
 
 
-ORDERED = Ordered()
+ORDERED = OrderAsked()
 
 
 class OrderAsk(Ask, eq=False):
@@ -34,7 +34,7 @@ class OrderAsk(Ask, eq=False):
     def answer(self, reply: object) -> None:
         """The reply came from another process."""
         try:
-            value = decode_value(reply, imports=False)  # type: ignore[arg-type]  # bytes: it is the reply of `Ordered`
+            value = decode_value(reply, imports=False)  # type: ignore[arg-type]  # bytes: it is the reply of `OrderAsked`
         except HoldfastError as error:
             self.fail(error)
         else:
@@ -75,7 +75,7 @@ class Call(Item):
         return None
 
     def give(self, value: object) -> None:
-        """Answer whoever waits."""
+        """Answer whoever waits for this order."""
         ask = self.ask
         if isinstance(ask, OrderAsk):
             ask.give(value)

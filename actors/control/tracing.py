@@ -91,7 +91,7 @@ class Tap:
         return {"counting": self.counting, "tracing": self._tracing}
 
     def listen(self) -> EventStream:
-        """A new listener."""
+        """Make a stream of what happens at the address from now on."""
         return self.hub.listen()
 
     def _listened_to(self, anybody: bool) -> None:
@@ -106,7 +106,7 @@ class Tap:
         self.hub.close()
 
     def counts(self) -> Statistics:
-        """The counts so far."""
+        """The counts since statistics were switched on."""
         restarts = self.cell.life - self._life
         return Statistics(self._since, self._in, self._out, self._turns, self._seconds, self._longest, restarts)
 
@@ -132,7 +132,7 @@ class Tap:
             self._inner, cell.admit = cell.admit, self._admit
 
     def detach(self) -> None:
-        """Take the tap out."""
+        """Take the tap out of the actor's path, which costs nothing from then on."""
         cell = self.cell
         actor: Any = cell.actor
         if actor is not None and cell.ctx is not None:
@@ -172,12 +172,12 @@ class Tap:
         return self._out
 
     def begun(self, message: object) -> None:
-        """A turn begins."""
+        """Count and tell that a turn begins."""
         self._begin = time.perf_counter()
         self._tell(TurnBegan(self.cell.path, message))
 
     def ended(self, message: object, outcome: str) -> None:
-        """A turn is over."""
+        """Count and tell that a turn is over."""
         seconds = time.perf_counter() - self._begin
         self._turns += 1
         self._seconds += seconds
@@ -254,17 +254,17 @@ class TappedContext:
     __slots__ = ()
 
     def tell(self, cell: Cell, message: Message[Any]) -> None:
-        """As the context's own."""
+        """Count and tell a message that goes out, and send it as the context does."""
         _own(self).tell(cell, message)
         _tap(self).sent(cell.path, message)
 
     async def send(self, cell: Cell, message: Message[Any]) -> None:
-        """As the context's own."""
+        """Count and tell a message that goes out, and send it as the context does."""
         await _own(self).send(cell, message)
         _tap(self).sent(cell.path, message)
 
     def ask(self, cell: Cell, message: Message[Any], timeout: float) -> Any:
-        """As the context's own."""
+        """Count and tell a message that goes out, and ask as the context does."""
         reply = _own(self).ask(cell, message, timeout)
         _tap(self).sent(cell.path, message)
         return reply

@@ -12,9 +12,9 @@ import msgspec
 from ..errors import type_name
 from ..safe_state import SafeStateChange, watch
 from .bindings import Binding
+from .blocking_handlers import in_thread
 from .envelope import Table
 from .message import Message
-from .threads import in_thread
 
 if TYPE_CHECKING:
     from ..exit_reasons import ExitReason
@@ -77,7 +77,7 @@ def on(
         raise TypeError(f"@on({kind.__name__}): a readonly handler writes nothing, so it supersedes nothing")
 
     def mark(handler: Any) -> Any:
-        handler.__handles__ = (*getattr(handler, "__handles__", ()), Handles(kind, readonly, to_thread, supersedes))
+        handler.__handles__ = (*handled_by(handler), Handles(kind, readonly, to_thread, supersedes))
         return handler
 
     return cast("_On[R]", mark)
@@ -89,10 +89,20 @@ def subscribe(topic: str) -> Callable[[F], F]:
         raise ValueError(f"topic {topic!r} must start with '/'")
 
     def mark(handler: F) -> F:
-        cast("Any", handler).__topics__ = (*getattr(handler, "__topics__", ()), topic)
+        cast("Any", handler).__topics__ = (*_topics_of(handler), topic)
         return handler
 
     return mark
+
+
+def handled_by(handler: object) -> tuple[Handles, ...]:
+    """What `@on` has noted on a method; nothing on anything else."""
+    return getattr(handler, "__handles__", ())
+
+
+def _topics_of(handler: object) -> tuple[str, ...]:
+    """What `@subscribe` has noted on a method; nothing on anything else."""
+    return getattr(handler, "__topics__", ())
 
 
 class Actor:
@@ -106,6 +116,8 @@ class Actor:
 
     deterministic: ClassVar[bool] = True
     """False refuses recovery methods that replay messages."""
+    state_access: ClassVar[bool] = True
+    """False refuses mechanisms that save and restore the state."""
     key_variables: ClassVar[tuple[str, ...] | None] = None
     """What a snapshot saves; None saves every instance attribute without a leading underscore."""
     schema_version: ClassVar[int] = 1
@@ -146,16 +158,17 @@ class Actor:
             members.update(vars(one))
         for name in sorted(members):
             handler = members[name]
-            for handles in getattr(handler, "__handles__", ()):
+            marks, subscribed = handled_by(handler), _topics_of(handler)
+            for handles in marks:
                 if not any(vars(one).get(name) is handler for one in cls.__mro__[1:] if issubclass(one, Actor)):
                     _check(cls, name, handler, handles.kind)  # Else it was when the base was made; this is slow.
                 if handles.kind in table:
                     raise TypeError(f"{type_name(cls)} has two handlers for {type_name(handles.kind)}: see {name}")
                 table[handles.kind] = in_thread(handler) if handles.to_thread else handler
                 declared[handles.kind] = handles
-            if getattr(handler, "__topics__", ()) and not getattr(handler, "__handles__", ()):
+            if subscribed and not marks:
                 raise TypeError(f"{type_name(cls)}.{name} has @subscribe without @on: nothing would ever reach it")
-            topics.extend(getattr(handler, "__topics__", ()))
+            topics.extend(subscribed)
         _check_state(cls)
         cls._table, cls._declared, cls._topics = table, declared, tuple(topics)
         cls._bindings = cls._bindings | _declared_bindings(cls)

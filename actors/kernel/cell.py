@@ -48,12 +48,12 @@ class Host(Protocol):
 
     @property
     def place(self) -> Place:
-        """Where its turns run."""
+        """The place where the turns of the actor run."""
         ...
 
     @property
     def parent(self) -> Parent:
-        """Its supervisor."""
+        """The cell of the actor's supervisor."""
         ...
 
     @property
@@ -238,7 +238,7 @@ class Cell(_Hot):
 
     @property
     def path(self) -> str:
-        """The address in full."""
+        """The address in full, from the root down."""
         parent = self.parent
         return self.name if parent is None else f"{parent.path}/{self.name}"
 

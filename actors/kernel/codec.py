@@ -9,8 +9,9 @@ from __future__ import annotations
 import copy
 import functools
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -56,13 +57,17 @@ class Parcel:
         return f"<Parcel {self.name} {len(self.body)} bytes>"
 
 
-class Packable(Protocol):
+class Packable(ABC):
     """A value that makes its own bytes; they come out as `Packed`, which nobody opens by accident."""
 
-    def packed(self) -> bytes: ...
+    __slots__ = ()
+
+    @abstractmethod
+    def packed(self) -> bytes:
+        """The bytes; raises HoldfastError if it cannot be sent."""
 
 
-class Packed:
+class Packed(Packable):
     """A value that came packed. Whoever it is for decides whether its sender may have it opened."""
 
     __slots__ = ("data",)
@@ -71,7 +76,7 @@ class Packed:
         self.data = data
 
     def packed(self) -> bytes:
-        """As it came."""
+        """The bytes as they came."""
         return self.data
 
 
@@ -118,7 +123,7 @@ class Codec:
         return self.encode(same, actor)
 
     def parcel(self, message: Message[Any], actor: str) -> Parcel:
-        """A message, encoded."""
+        """Encode a message, with the name of its type beside the bytes."""
         return Parcel(message_name(type(message)), self.encode(message, actor))
 
     def decode(self, kind: Any, body: Any) -> Any:
@@ -228,9 +233,8 @@ def encode_special(value: Any) -> Any:
     """Refs and arrays as extensions; anything else is refused by name."""
     if isinstance(value, ActorRef):
         return msgspec.msgpack.Ext(REF, value.path.encode())
-    if hasattr(value, "packed"):
-        packable: Packable = value
-        return msgspec.msgpack.Ext(PACKED, packable.packed())
+    if isinstance(value, Packable):
+        return msgspec.msgpack.Ext(PACKED, value.packed())
     numpy = sys.modules.get("numpy")
     if numpy is not None:
         if isinstance(value, numpy.ndarray):

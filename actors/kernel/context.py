@@ -72,7 +72,7 @@ class ActorContext:
 
     @property
     def path(self) -> str:
-        """This actor's address."""
+        """The address of this actor."""
         return self.cell.path
 
     @property
@@ -393,7 +393,7 @@ class ActorContext:
         self.cell.node.topics.subscribe(topic, self.cell)
 
     def unsubscribe(self, topic: str) -> None:
-        """No more of it."""
+        """Receive no more of what is published on a topic."""
         self.cell.node.topics.unsubscribe(topic, self.cell)
 
     def bound(self, port: str) -> ActorRef[Any] | None:
@@ -424,6 +424,11 @@ class ActorContext:
         """Whether an order has to wait (a journaled actor takes none before it has caught up); it comes again then."""
         return False
 
+    @property
+    def named_variables(self) -> tuple[str, ...] | None:
+        """The key variables that a recovery file names for this actor; None if none does."""
+        return None
+
     def may_replace(self) -> None:
         """The state is about to be replaced from outside. Raises ControlFailed if it cannot be now."""
 
@@ -441,7 +446,7 @@ class ActorContext:
         return []
 
     def close(self) -> None:
-        """The life is over."""
+        """Refuse everything from now on, because the life is over."""
         self.closed = True
 
     def create_task(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
@@ -489,7 +494,7 @@ class Stashed(Envelope, eq=False):
 
     @classmethod
     def of(cls, item: Any) -> Stashed:
-        """In place of `item`."""
+        """Make what stands in the stash in place of `item`."""
         return cls(message_in(item), item.sender if isinstance(item, Item) else None)
 
 

@@ -56,7 +56,7 @@ class MailboxHome(Home):
 
 
 class HerePlace(Place):
-    """This very event loop."""
+    """The place of all actors whose turns run in this event loop."""
 
     is_here = True
 
@@ -218,7 +218,7 @@ def open_context(cell: Cell) -> contextvars.Context:
 
 
 class FirstTurn(Item):
-    """Turn 0: `on_start`."""
+    """The first item of each life, turn 0: it calls `on_start`."""
 
     __slots__ = ("restored", "started")
 

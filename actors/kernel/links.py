@@ -197,7 +197,7 @@ class Exit(Item):
 
 
 class Down(Item):
-    """A monitor's notice."""
+    """Tells a monitoring actor that the life it watched is over."""
 
     __slots__ = ("reason", "recovering", "watch")
 

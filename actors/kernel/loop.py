@@ -255,7 +255,7 @@ class RunLoop:
         elif turn.killed or error is not None:
             # What follows is again user code, maybe: it runs on the run queue, not in this runner's name.
             turn.item = turn.item if cell.ctx is None else cell.item  # It may have been forwarded or stashed.
-            mailbox.queue_of(cell).appendleft(TurnEnded(turn, error))
+            mailbox.queue_of(cell).appendleft(TurnRemains(turn, error))
             self.make_ready(cell)
         elif cell.queue:
             self.make_ready(cell)
@@ -341,7 +341,7 @@ def run_turns(cell: Cell, most: int) -> int:
     return count or 1
 
 
-class TurnEnded(Item):
+class TurnRemains(Item):
     """What is left to do after a suspended turn that did not simply succeed."""
 
     __slots__ = ("error", "turn")
@@ -417,7 +417,7 @@ class Runner:
             self._call.set_result(None)
 
     def retire(self) -> None:
-        """End the task."""
+        """End the task of this runner."""
         self.task.cancel()
 
     def _done(self, _: object) -> None:

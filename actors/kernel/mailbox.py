@@ -120,7 +120,7 @@ class Senders:
                 break
 
     def release(self) -> None:
-        """Wake them all."""
+        """Wake all senders that wait for room."""
         waiting, self._waiting = self._waiting, deque()
         for sender in waiting:
             if not sender.done():
@@ -172,7 +172,7 @@ class Bound:
         return self
 
     def put(self, cell: Cell, item: Any) -> None:
-        """Append, counted."""
+        """Append an item to the queue, and count it."""
         self.count += 1
         queue_of(cell).append(item)
         cell.schedule()

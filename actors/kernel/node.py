@@ -18,6 +18,7 @@ from ..events import DeadLetter, Event, EventHub, SupervisorGaveUp
 from ..exit_reasons import KILLED, ExitReason
 from ..persistence import Keeper, NothingKept
 from . import lifecycle
+from .blocking_handlers import Threads
 from .cell import DOWN, GONE, RUNNING, Cell, Host
 from .codec import Codec
 from .deadlines import Deadlines
@@ -25,7 +26,6 @@ from .lifecycle import LOCAL
 from .loop import RunLoop
 from .mailbox import Bound, Bounded, admit_bounded, admit_gone
 from .message import Refusal
-from .threads import Threads
 from .topics import Topics
 
 if TYPE_CHECKING:
@@ -246,8 +246,7 @@ class Node(RunLoop):
         if cell.state is DOWN or cell.state is GONE:
             lifecycle.retire(cell, "its parent has stopped")
             return cell.extra().reason
-        stop = getattr(cell.spec, "stop", None)
-        reason: ExitReason = await (stop(cell) if stop is not None else lifecycle.stop_in_time(cell))
+        reason: ExitReason = await (lifecycle.stop_in_time(cell) if cell.spec is None else cell.spec.stop(cell))
         lifecycle.retire(cell, "its parent has stopped")
         return reason
 
@@ -361,7 +360,7 @@ class Node(RunLoop):
 
 
 def _void() -> None:
-    """Nobody watches."""
+    """Do nothing: this process keeps no time limits by a thread."""
 
 
 def cell_kind(cell: Cell) -> type[Actor] | None:

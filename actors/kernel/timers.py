@@ -116,7 +116,7 @@ class Tick(Item):
 
     @property
     def message(self) -> Message[Any]:
-        """What the timer sends."""
+        """The message that the timer sends."""
         return self.timer.message
 
     @staticmethod

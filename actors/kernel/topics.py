@@ -50,7 +50,7 @@ class Topics:
         return cell in self._cells.get(topic, ())
 
     def names(self) -> list[str]:
-        """Topics that have subscribers."""
+        """The topics that have subscribers."""
         return sorted(self._cells)
 
 

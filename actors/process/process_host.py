@@ -463,7 +463,7 @@ class WorkerPlace(Place):
         connection.send(frames.Command(connection.names.to_wire(cell.path), "stop", {"reason": pack_exit(reason)}))
 
     def kill(self, cell: Cell) -> None:
-        """SIGKILL the process."""
+        """End the actor's process with SIGKILL."""
         worker = self.workers.of(cell)
         if worker is not None:
             worker.kill(KILLED)

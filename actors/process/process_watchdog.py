@@ -19,7 +19,7 @@ LOOKS = 4
 """How often within `hung_after` the watch looks; so often the process beats, too."""
 
 
-class Watched(Protocol):
+class WatchedProcess(Protocol):
     """A process as the watch knows it."""
 
     @property
@@ -30,10 +30,10 @@ class Watched(Protocol):
     def hung(self, seconds: float, /) -> None: ...
 
 
-class Watch:
+class ProcessWatch:
     """Ends a process that hangs or takes more than its limits allow."""
 
-    def __init__(self, worker: Watched, limits: Limits) -> None:
+    def __init__(self, worker: WatchedProcess, limits: Limits) -> None:
         import psutil  # only where something is watched
 
         self.limits = limits
@@ -93,7 +93,7 @@ class Watch:
             del self._timers[:-2]
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stop watching the process from now on."""
         for timer in self._timers:
             timer.cancel()
 

@@ -22,7 +22,7 @@ from .fork.fork_server import ForkServer
 from .fork.forked_process import Forked, has_ended
 from .fork.launch import keep_large_memory, why_not_importable
 from .process_end import ProcessEnd
-from .process_watchdog import LOOKS, Watch, oom_kills
+from .process_watchdog import LOOKS, ProcessWatch, oom_kills
 from .program.stdout import OutputReader
 from .resource_limits import Limits
 from .stand_ins import Inner
@@ -30,7 +30,7 @@ from .wire import frames
 from .wire.connection import Connection
 from .wire.frames import BadFrame
 from .wire.peer import Peer
-from .wire.worker_gate import Gate
+from .wire.worker_gate import WorkerGate
 
 if TYPE_CHECKING:
     from ..kernel.node import Node
@@ -51,7 +51,7 @@ class Worker(Peer):
         self.forked, self.server = forked, server
         self.pid = forked.pid
         self.page = memoryview(forked.page).cast("Q")
-        self.gate = Gate(self)
+        self.gate = WorkerGate(self)
         self.inner = Inner(self.node, self)
         self.cell: Cell | None = None
         self.home = ""  # the address that it was given; an actor that has left may have another one by now
@@ -61,7 +61,7 @@ class Worker(Peer):
         self.end = ProcessEnd(oom_kills())
         self._is_reserved = False  # for an actor that is being moved here, and lives elsewhere so far
         self._grave: asyncio.Future[None] = self.node.loop.create_future()
-        self._watch: Watch | None = None
+        self._watch: ProcessWatch | None = None
         self._outputs: list[OutputReader] = []
         self.movers: dict[int, Callable[[frames.Migrate], None]] = {}  # who hears of which attempt to move an actor
 
@@ -158,7 +158,7 @@ class Worker(Peer):
         self.cell, self._died, self.home = cell, died, cell.path
         self._is_reserved = True
         if limits is not None:
-            self._watch = Watch(self, limits)
+            self._watch = ProcessWatch(self, limits)
 
     def readdress(self, path: str) -> None:
         """Its actor has another address from now on; what is on its way from there still says the old one."""
@@ -221,7 +221,7 @@ class Worker(Peer):
             self.kill(Hung(seconds))
 
     def beat(self) -> None:
-        """Its loop turns."""
+        """Note that the event loop of the process turns."""
         if self._watch is not None:
             self._watch.beat()
 
@@ -541,7 +541,7 @@ class Workers:
             self.node.emit(event)
 
     def processes(self) -> dict[str, int]:
-        """Address to pid."""
+        """The pid of each actor's process, by address."""
         return {cell.path: worker.pid for cell, worker in self.by_cell.items()}
 
     async def close(self) -> None:

@@ -7,8 +7,8 @@ the mark's code is that of the type, and the rest of the list are the value's pa
 The bytes: version, flag; with flag 0 a msgpack tree without marks; with flag 1 the length of the tree (8 bytes, big
 endian), the tree, and the raw buffers that its marks mention, in that order.
 
-`writing.py` lowers and packs, `reading.py` unpacks and makes again. What they both know of the types is in `forms.py`
-(the builtin ones), `classes.py` (those of users) and `arrays.py` (numpy's).
+`value_writer.py` lowers and packs, `value_reader.py` unpacks and makes again. What they both know of the types is in
+`forms.py` (the builtin ones), `classes.py` (those of users) and `arrays.py` (numpy's).
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import hashlib
 from ..errors import DamagedValue, UnsavableValue
 from .budget import LargeInts, TooMany, check_containers
 from .forms import FORMAT, HEAD
-from .reading import Decoder, unpack
-from .writing import pieces, walked_pieces
+from .value_reader import Decoder, unpack
+from .value_writer import pieces, walked_pieces
 
 __all__ = ["DamagedValue", "UnsavableValue", "decode_value", "encode_value", "state_digest", "walked_pieces"]
 

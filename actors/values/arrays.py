@@ -175,7 +175,7 @@ def _make_array(dtype: Any, shape: Any, order: Any, data: memoryview) -> Any:
 
 
 def _size(shape: Any, dtype: Any) -> int:
-    """Bytes of an array."""
+    """The number of bytes of an array of this shape and type."""
     sizes = cast("tuple[int, ...]", shape if type(shape) is tuple else (-1,))
     if min(sizes, default=0) < 0:  # Numpy would take -1 for "as many as there are", and divide by the size of an item.
         raise DamagedValue(f"it has an array of shape {shape}")

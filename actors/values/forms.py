@@ -32,7 +32,7 @@ class Blob:
         self.buffers = buffers  # no memoryviews: as long as one lives, a bytearray cannot grow
 
 
-class Mark(int):
+class HeadMark(int):
     """The code at the head of a list while that list is being read."""
 
 

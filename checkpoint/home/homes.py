@@ -12,10 +12,11 @@ from ...actors.persistence import child_key
 from ..addresses import Addresses, renamed
 from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
-from ..journal import Journal, Saved
+from ..journal import Saved, StoreEngine
 from ..method import Durability, Method, hybrid
 from ..recovery.recoveries import Recoveries
 from ..recovery_file import RecoveryFile
+from ..recovery_settings import RecoveryHooks
 from ..snapshot.rollback import older_snapshot, roll_back
 from ..snapshot.snapshot_groups import Groups
 from ..snapshot.snapshot_schedule import nobody
@@ -39,18 +40,26 @@ ERASING = "erasing"
 class Homes:
     """All recorded addresses of a root, and their journal. A home stays when its actor is stopped."""
 
-    def __init__(self, node: Node, journal: Journal, *, durability: Durability | None = None) -> None:
+    def __init__(
+        self,
+        node: Node,
+        journal: StoreEngine,
+        *,
+        durability: Durability | None = None,
+        file: RecoveryFile | None = None,
+        hooks: RecoveryHooks | None = None,
+    ) -> None:
         self.node = node
         self.journal = Commits(journal, node.loop, durability=durability or "os", emit=node.emit, where=f"/{node.name}")
         self._unkept = Unkept(self.journal)
         self.addresses = Addresses(node, journal, self.find)
         self.quarantine = Quarantine(node, self.journal)
         self._switches: dict[str, Switch] = {}
-        self.recoveries = Recoveries(node)
+        self.recoveries = Recoveries(node, hooks)
         self.on_first: Callable[[], None] | None = None  # there is something to watch over from now on
         self.on_home: Callable[[Switch], None] = nobody  # a home has a life again, or for the first time
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
-        self.file: RecoveryFile | None = None
+        self.file = file
         self._returns: dict[str, list[float]] = {}  # when that came back to an address, on the loop's clock
         self.planted: dict[str, Saved] = {}  # what the next life at an address begins with, whatever is recorded
         unfinished = journal.notes(ERASING).get(ERASING)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from ...actors.process.worker_pool import Worker
 
 
-class Clock:
+class RecoveryClock:
     """The phases of one recovery. (Clocks of loops are too coarse for this.)"""
 
     __slots__ = ("_marks",)
@@ -84,7 +84,7 @@ class JournalHome(RecordedHome):
     def __init__(self, homes: Homes, method: Method, parent: Parent) -> None:
         self.homes, self.method, self.parent = homes, method, parent
         self.switch: Switch | None = None
-        self.clock: Clock | None = None
+        self.clock: RecoveryClock | None = None
         self.recovery: Recovery | None = None  # that of the life which is begun now
         self.page: memoryview | None = None  # of a life in this process: which input it has in hand
 
@@ -124,7 +124,7 @@ class JournalHome(RecordedHome):
         switch = self.switch = self.homes.of(cell, self.method)
         if not self.method.replays:
             forget_turns(switch)
-        self.clock = self.clock or Clock()
+        self.clock = self.clock or RecoveryClock()
         self.clock.mark("isolate")
         return Entered(switch, switch.prepare(), not switch.ledger.is_new)
 
@@ -161,7 +161,7 @@ class JournalHome(RecordedHome):
             return
         if self.page is not None:
             self.page[0] = 0
-        self.clock = Clock()
+        self.clock = RecoveryClock()
         self.clock.mark("noticed", noticed)
         self.clock.mark("detect")
         switch.died(running, ordered=ordered)
@@ -316,7 +316,7 @@ class JournalHome(RecordedHome):
                 node.emit(Recovered(cell.path, cell.life, switch.life.replayed, clock.phases(restore_seconds)))
         self.homes.recoveries.over(cell.path)
 
-    async def _let_at(self, switch: Switch, clock: Clock, restore_seconds: float) -> None:
+    async def _let_at(self, switch: Switch, clock: RecoveryClock, restore_seconds: float) -> None:
         """S4, if anybody has a say in it; else the home has done it.
 
         Raises:

@@ -19,7 +19,7 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, Envelope, Item
 from ...actors.kernel.message import message_name
-from ..durable_links import Ties
+from ..durable_links import DurableTies
 from ..durable_timers import Timers
 from ..inputs import Batch, HomeJournal, Input, Turn
 from ..journal import Saved
@@ -89,7 +89,7 @@ class Switch:
         self.calls = PendingCalls(self)
         self.timers = Timers(self)
         self.topics: dict[str, None] = {}
-        self.ties = Ties(self)
+        self.ties = DurableTies(self)
         self.outputs = Outputs(self)
         self.limit = Limit(self)
         self.replay = PacedReplay(self)
@@ -380,7 +380,7 @@ class Switch:
     def _take(self, turn: int, key: int, outs: list[Out], batch: Batch) -> None:
         """Let new outputs out; drop those that are out already."""
         ledger = self.ledger
-        again = ledger.compare_outputs(turn, key, outs, self._is_rebound)
+        again = ledger.compare_outputs(turn, key, outs, functools.partial(went_elsewhere, self))
         if turn <= ledger.turn:
             self.life.see_again(turn, outs[-1].k if outs else 0)
         for out in outs[:again]:
@@ -388,9 +388,6 @@ class Switch:
                 self.calls.join(turn, key, out)
         for out in outs[again:]:
             self.outputs.execute(turn, key, out, batch)
-
-    def _is_rebound(self, out: Out, digest: int) -> bool:
-        return went_elsewhere(self, out, digest)
 
     def _turn_end(self, end: TurnEnd) -> None:
         ledger = self.ledger

@@ -301,6 +301,10 @@ class RecordedContext(ActorContext):
         self.recorded.stage.postponed.append(call)
         return True
 
+    @property
+    def named_variables(self) -> tuple[str, ...] | None:
+        return self.recorded.method.key_variables
+
     def may_replace(self) -> None:
         problem = self.recorded.may_replace()
         if problem:

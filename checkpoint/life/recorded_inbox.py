@@ -227,17 +227,14 @@ class TakeSnapshot(Item):
         return None
 
 
-class StopRecorded(Item):
+class StopRecorded(lifecycle.Stop):
     """A command: end in good order, with a final snapshot."""
 
-    __slots__ = ("life", "reason")
+    __slots__ = ("life",)
 
     def __init__(self, life: Life, reason: ExitReason) -> None:
-        self.life, self.reason = life, reason
-
-    @property
-    def stops(self) -> ExitReason:  # type: ignore[override]  # others have it as None
-        return self.reason
+        super().__init__(reason)
+        self.life = life
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:

@@ -19,6 +19,7 @@ from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import Message, message_name
+from ...actors.state_hooks import state_getter
 from ..method import Method
 from ..protocol import (
     FAILED,
@@ -125,7 +126,7 @@ class Life:
             check_keys(actor, self.method, first=not restored.has_state)
         except HoldfastError as error:
             self._give_up(str(error), error)
-        self.saving.variables = [] if hasattr(actor, "get_state") else variables(actor)
+        self.saving.variables = variables(actor) if state_getter(actor) is None else []
         if self.method.check_readonly:
             check_readonly(actor, self)
         if restored.has_state:

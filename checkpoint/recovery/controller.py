@@ -9,7 +9,6 @@ from typing import Any
 from ...actors.errors import error_text, type_name
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.actor import on
-from ...actors.kernel.cell import Cell
 from ...actors.kernel.message import Message
 from ...actors.kernel.ref import ActorRef
 from ..recovery_settings import Hook
@@ -120,10 +119,7 @@ class RecoveryController(RecoveryPart):
     def _watch(self, receiver: Receiver) -> None:
         """A receiver that begins a new life meanwhile has to be told again."""
         if not self.ctx.closed:
-            self.ctx.monitor(self._cell_of(receiver).ref)
-
-    def _cell_of(self, receiver: Receiver) -> Cell:
-        return self.ctx.cell.node.cell_at(receiver.path)
+            self.ctx.monitor(self.ctx.cell.node.cell_at(receiver.path).ref)
 
     def on_down(self, source: ActorRef[Any], reason: ExitReason, recovering: bool) -> None:
         """A receiver's life has ended."""

@@ -30,5 +30,5 @@ class MessageHandler(RecoveryPart):
 
     @on(WriteSubmitted)
     def flush(self, message: WriteSubmitted) -> None:
-        """Write what was submitted."""
+        """Write what homes have submitted to the journal."""
         self._homes.journal.come()

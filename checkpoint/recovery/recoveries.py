@@ -68,10 +68,10 @@ class Recovery:
 class Recoveries:
     """All recoveries of a root."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, hooks: RecoveryHooks | None = None) -> None:
         self._node = node
         self.safety = Safety(node)
-        self.hooks: RecoveryHooks | None = None  # those of the system
+        self.hooks = hooks  # those of the system
         self._by_path: dict[str, Recovery] = {}
         self._count = 0
         self._untold: deque[RecoveryPhase] = deque(maxlen=MOST)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 from ...actors.control.live_state import attributes
 from ...actors.errors import HoldfastError, type_name
 from ...actors.kernel.actor import Actor
+from ...actors.state_hooks import state_getter, state_migrator, state_setter
 from ...actors.values import UnsavableValue, decode_value, encode_value
 from ..method import Method
 from .state_image import is_image, read_image
@@ -35,7 +36,7 @@ def state_of(actor: Actor) -> StateForm:
     Raises:
         StateMismatch: a declared key variable is not there. What `get_state` raises.
     """
-    get_state = getattr(actor, "get_state", None)
+    get_state = state_getter(actor)
     if get_state is not None and key_names(actor) is None:
         return StateForm(actor.schema_version, "state", get_state())
     where, root = actor.ctx.path, actor._state_root()
@@ -150,12 +151,11 @@ def put_back(actor: Actor, saved: Any) -> None:
 
 def key_names(actor: Actor) -> tuple[str, ...] | None:
     """The key variables that the recovery file names, or the class; None for all attributes."""
-    life = getattr(actor.ctx, "recorded", None)
-    named: tuple[str, ...] | None = None if life is None else life.method.key_variables
+    named = actor.ctx.named_variables
     if named is not None:
         return named
     # A class with get_state means that, whatever else it says.
-    return None if getattr(actor, "get_state", None) is not None else actor.key_variables
+    return actor.key_variables if state_getter(actor) is None else None
 
 
 def read_path(where: str, root: object, path: str) -> Any:
@@ -214,7 +214,7 @@ def check_saved(actor: Actor, method: Method) -> None:
         UnsavableValue: naming the variable and the type. StateMismatch: a declared key variable is not there or cannot
             be set, or the class lacks what puts its state back.
     """
-    if method.snapshots and key_names(actor) is None and hasattr(actor, "get_state"):
+    if method.snapshots and key_names(actor) is None and state_getter(actor) is not None:
         setter_of(actor)
     save_state(actor)
     where, root = actor.ctx.path, actor._state_root()
@@ -228,12 +228,12 @@ def setter_of(actor: Actor) -> Callable[[Any], object]:
     Raises:
         StateMismatch: there is none, or it is a coroutine function, which would only do it later.
     """
-    set_state = getattr(actor, "set_state", None)
+    set_state = state_setter(actor)
     if set_state is None:
         raise StateMismatch(actor.ctx.path, f"{type_name(type(actor))} has no set_state, which goes with get_state")
     if inspect.iscoroutinefunction(set_state):
         raise StateMismatch(actor.ctx.path, f"{type_name(type(actor))}.set_state is `async def`: it must be plain")
-    return cast("Callable[[Any], object]", set_state)
+    return set_state
 
 
 def migrated(kind: type[Actor], state: Any, version: int, where: str) -> Any:
@@ -246,7 +246,7 @@ def migrated(kind: type[Actor], state: Any, version: int, where: str) -> Any:
     known = f"it has schema version {version}, {type_name(kind)} {kind.schema_version}"
     if not isinstance(version, int) or version > kind.schema_version:
         raise StateMismatch(where, f"{known}: an older class cannot read what a newer one has saved")
-    migrate = getattr(kind, "migrate", None)
+    migrate = state_migrator(kind)
     if migrate is None:
         raise StateMismatch(where, f"{known}, which has no classmethod migrate(state, from_version)")
     if inspect.iscoroutinefunction(migrate):

@@ -115,7 +115,9 @@ class Groups:
         for image in group.images:
             meta = msgspec.msgpack.decode(image.meta, type=Meta)
             meta = msgspec.structs.replace(meta, time=self._homes.node.clock.wall())  # Its timers have stood still.
-            entries: list[Entry] = [tuple(_tuple(part) for part in entry) for entry in image.entries]
+            entries: list[Entry] = [
+                tuple(tuple(part) if isinstance(part, list) else part for part in entry) for entry in image.entries
+            ]
             if journal.durable:
                 old = [position for position, _ in journal.load(image.path).entries]
                 fresh = msgspec.structs.replace(meta, epoch=journal.epoch)
@@ -180,7 +182,3 @@ def _image(home: Switch) -> HomeImage:
         ties=home.ties.saved(),
     )
     return HomeImage(home.path, msgspec.msgpack.encode(meta), [list(entry) for entry in home.ledger.entries()])
-
-
-def _tuple(part: Any) -> Any:
-    return tuple(part) if isinstance(part, list) else part

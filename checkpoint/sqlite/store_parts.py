@@ -318,11 +318,6 @@ def _is_unused(folder: str) -> bool:
     return all(_HALF_MADE.fullmatch(name) or name == f"{NAME}.tmp" for name in _names(folder))
 
 
-def is_half_made(name: str) -> bool:
-    """Whether a file in the folder of snapshots is a database that was never put in place."""
-    return _HALF_MADE.fullmatch(name) is not None
-
-
 def _of_locks(info: os.stat_result) -> str:
     return f"{os.major(info.st_dev):02x}:{os.minor(info.st_dev):02x}:{info.st_ino}"
 

@@ -1,6 +1,6 @@
 """The demo's actors, as a user of holdfast writes them: a reader, a mapper in a process of its own, a planner.
 
-Nothing here knows of crashes, processes or recovery; those are words in the child specs (`tree` in `run.py`).
+Nothing here knows of crashes, processes or recovery; those are words in the child specs (`tree` in `demo_runs.py`).
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import signal
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from .report import Kill
+from .report import MapperKill
 
 LONGEST_DELAY = 0.05  # seconds: so that a kill falls anywhere in a turn, or between turns
 RETRY = 0.005  # seconds: the process of the last kill is not replaced yet
@@ -47,9 +47,9 @@ class Killer:
     """
 
     def __init__(
-        self, moments: list[Moment], find_pid: Callable[[], int | None], on_kill: Callable[[Kill], None]
+        self, moments: list[Moment], find_pid: Callable[[], int | None], on_kill: Callable[[MapperKill], None]
     ) -> None:
-        self.kills: list[Kill] = []
+        self.kills: list[MapperKill] = []
         self._moments, self._find_pid, self._on_kill = list(moments), find_pid, on_kill
         self._open = len(moments)
         self._done = asyncio.Event()
@@ -73,7 +73,7 @@ class Killer:
         if pid is None or killed_before or not _kill(pid):
             asyncio.get_running_loop().call_later(RETRY, self._strike, moment)
             return
-        kill = Kill(pid, moment.scan)
+        kill = MapperKill(pid, moment.scan)
         self.kills.append(kill)
         self._on_kill(kill)
         self._open -= 1

@@ -8,13 +8,13 @@ from pathlib import Path
 from rich.console import Console
 
 from ... import run
+from .demo_runs import DemoPlan, compare
 from .picture import draw, save
-from .report import Outcome, Report
-from .run import Plan, compare
+from .report import DemoReport
 from .show import watcher_for
 
 
-def run_demo(plan: Plan, console: Console, *, picture: Path, as_json: bool) -> Report:
+def run_demo(plan: DemoPlan, console: Console, *, picture: Path, as_json: bool) -> DemoReport:
     """Run the plan and show it: live on a terminal, as lines elsewhere, or as one JSON object.
 
     Raises:
@@ -33,21 +33,17 @@ def run_demo(plan: Plan, console: Console, *, picture: Path, as_json: bool) -> R
     return report
 
 
-def with_picture(report: Report, file: Path) -> Report:
+def with_picture(report: DemoReport, file: Path) -> DemoReport:
     """Draw both maps into a file; if it cannot be written, the report says so and stands."""
     left, right = report.undisturbed, report.disturbed
     titles = "undisturbed", f"{report.method}, killed {len(right.kills)} times: {_verdict(report)}"
     try:
-        save(draw(left.grid, right.grid, titles=titles, path=_common_path(left, right)), file)
+        save(draw(left.grid, right.grid, titles=titles, path=list(left.path if left.path == right.path else ())), file)
     except OSError as error:
         return replace(report, notices=(*report.notices, f"picture  not written: {error}"))
     return replace(report, picture=str(file))
 
 
-def _verdict(report: Report) -> str:
+def _verdict(report: DemoReport) -> str:
     cells = report.differing_cells
     return f"{cells:,} cells differ" if cells else "identical"
-
-
-def _common_path(left: Outcome, right: Outcome) -> list[tuple[float, float]]:
-    return list(left.path if left.path == right.path else ())

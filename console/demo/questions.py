@@ -59,7 +59,7 @@ class Questions:
         return self.sent
 
     def note_answer(self, serial: int) -> None:
-        """Count an answer."""
+        """Count an answer, by the serial number of its question."""
         self.answers[serial] = self.answers.get(serial, 0) + 1
 
     def note_failure(self, serial: int, error: HoldfastError) -> None:

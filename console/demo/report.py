@@ -23,7 +23,7 @@ class Asks:
 
 
 @dataclass(frozen=True)
-class Kill:
+class MapperKill:
     """One SIGKILL: of which process, and after which scan of the log."""
 
     pid: int
@@ -31,7 +31,7 @@ class Kill:
 
 
 @dataclass(frozen=True)
-class Recovery:
+class MapperRecovery:
     """One return of the mapper: seconds by phase, and how many messages were replayed."""
 
     phases: Mapping[str, float]
@@ -39,7 +39,7 @@ class Recovery:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunOutcome:
     """What one run ended with; `problem` is what was wrong with the log."""
 
     grid: OccupancyGrid
@@ -47,8 +47,8 @@ class Outcome:
     gaps: int
     asks: Asks
     seconds: float
-    kills: Sequence[Kill] = ()
-    recoveries: Sequence[Recovery] = ()
+    kills: Sequence[MapperKill] = ()
+    recoveries: Sequence[MapperRecovery] = ()
     failures: Sequence[str] = ()
     path: Sequence[Position] = ()
     problem: str = ""
@@ -56,11 +56,11 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Report:
+class DemoReport:
     """Two runs over the same log, one of them disturbed."""
 
-    undisturbed: Outcome
-    disturbed: Outcome
+    undisturbed: RunOutcome
+    disturbed: RunOutcome
     method: str
     seconds: float
     picture: str = ""
@@ -105,7 +105,7 @@ def judge_asks(sent: int, answers: Mapping[int, int], handled: Mapping[int, int]
     return Asks(sent, sum(bool(answers.get(serial)) for serial in serials), lost, doubled)
 
 
-def recovery_ms(recoveries: Sequence[Recovery]) -> dict[str, float]:
+def recovery_ms(recoveries: Sequence[MapperRecovery]) -> dict[str, float]:
     """Median milliseconds by phase, and of whole recoveries under `total`; empty without a recovery.
 
     >>> recovery_ms([Recovery({"detect": 0.001, "replay": 0.25}, 9), Recovery({"detect": 0.003, "replay": 0.25}, 8)])
@@ -120,7 +120,7 @@ def recovery_ms(recoveries: Sequence[Recovery]) -> dict[str, float]:
     return {phase: round(1000 * seconds, 3) for phase, seconds in medians.items()}
 
 
-def as_json(report: Report) -> dict[str, object]:
+def as_json(report: DemoReport) -> dict[str, object]:
     """The report as one JSON object."""
     run = report.disturbed
     asks = run.asks
@@ -138,12 +138,12 @@ def as_json(report: Report) -> dict[str, object]:
     }
 
 
-def as_lines(report: Report) -> list[str]:
+def as_lines(report: DemoReport) -> list[str]:
     """The report as lines of text."""
     return [*_map_lines(report), *_ask_lines(report.disturbed), *_run_lines(report), *report.notices]
 
 
-def _map_lines(report: Report) -> list[str]:
+def _map_lines(report: DemoReport) -> list[str]:
     run, cells = report.disturbed, report.disturbed.grid.cells.size
     lines = [
         f"scans    {run.scans:,} handled, {report.undisturbed.scans:,} undisturbed, {run.gaps} gaps in their order"
@@ -159,7 +159,7 @@ def _map_lines(report: Report) -> list[str]:
     return lines
 
 
-def _ask_lines(run: Outcome) -> list[str]:
+def _ask_lines(run: RunOutcome) -> list[str]:
     asks = run.asks
     lines = [f"asks     {asks.sent:,} sent, {asks.answered:,} answered, {asks.lost:,} lost, {asks.doubled:,} doubled"]
     if asks.lost > asks.sent - asks.answered:
@@ -169,7 +169,7 @@ def _ask_lines(run: Outcome) -> list[str]:
     return lines
 
 
-def _run_lines(report: Report) -> list[str]:
+def _run_lines(report: DemoReport) -> list[str]:
     run = report.disturbed
     lines = [f"kills    {len(run.kills)} times SIGKILL, method {report.method}"]
     phases = recovery_ms(run.recoveries)

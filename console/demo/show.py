@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 from rich.tree import Tree
 
-from .report import PHASES, Kill, Recovery, Report, as_json, as_lines
+from .report import PHASES, DemoReport, MapperKill, MapperRecovery, as_json, as_lines
 
 REFRESH = 0.1  # seconds between two pictures of the live display
 TENTHS = 10  # plain text: lines of progress in one run
@@ -43,23 +43,23 @@ class Watcher(Protocol):
     def progress(self, now: Progress) -> None:
         """More scans are handled, or more questions answered."""
 
-    def killed(self, kill: Kill) -> None:
+    def killed(self, kill: MapperKill) -> None:
         """The mapper's process got SIGKILL."""
 
-    def recovered(self, recovery: Recovery) -> None:
-        """The mapper is back."""
+    def recovered(self, recovery: MapperRecovery) -> None:
+        """Show that the mapper is back."""
 
     def notice(self, text: str) -> None:
         """Something the user should know, such as a log that is cut off."""
 
-    def finish(self, report: Report) -> None:
-        """Both runs are over."""
+    def finish(self, report: DemoReport) -> None:
+        """Show the verdict when both runs are over."""
 
     def close(self) -> None:
         """Nothing more will come, perhaps because of an error."""
 
 
-class Plain:
+class PlainLines:
     """Lines of text, for a pipe or a file."""
 
     def __init__(self, console: Console) -> None:
@@ -75,16 +75,16 @@ class Plain:
             self._tenth = tenth
             self._print(f"  scan {now.scans:,} of {now.total:,}; {now.answered:,} of {now.sent:,} questions answered")
 
-    def killed(self, kill: Kill) -> None:
+    def killed(self, kill: MapperKill) -> None:
         self._print(f"  SIGKILL to process {kill.pid}, after scan {kill.last_scan:,}")
 
-    def recovered(self, recovery: Recovery) -> None:
+    def recovered(self, recovery: MapperRecovery) -> None:
         self._print(f"  recovered, {recovery.replayed:,} messages replayed: {_milliseconds(recovery.phases)}")
 
     def notice(self, text: str) -> None:
         self._print(f"note: {text}")
 
-    def finish(self, report: Report) -> None:
+    def finish(self, report: DemoReport) -> None:
         self._print("")
         for line in as_lines(report):
             self._print(line)
@@ -108,16 +108,16 @@ class Json:
     def progress(self, now: Progress) -> None:
         pass
 
-    def killed(self, kill: Kill) -> None:
+    def killed(self, kill: MapperKill) -> None:
         pass
 
-    def recovered(self, recovery: Recovery) -> None:
+    def recovered(self, recovery: MapperRecovery) -> None:
         pass
 
     def notice(self, text: str) -> None:
         pass  # The object's "problem" says it.
 
-    def finish(self, report: Report) -> None:
+    def finish(self, report: DemoReport) -> None:
         self._console.print(json.dumps(as_json(report)), markup=False, highlight=False, soft_wrap=True)
 
     def close(self) -> None:
@@ -133,8 +133,8 @@ class Rich:
         self._live = Live(console=console, auto_refresh=False)
         self._live.start()
         self._now = Progress("", 0, 1, 0, 0, 0, None)
-        self._kills: list[Kill] = []
-        self._recoveries: list[Recovery] = []
+        self._kills: list[MapperKill] = []
+        self._recoveries: list[MapperRecovery] = []
         self._shown = 0.0
 
     def begin(self, run: str, total: int) -> None:
@@ -146,19 +146,19 @@ class Rich:
         if monotonic() - self._shown >= REFRESH:
             self._draw()
 
-    def killed(self, kill: Kill) -> None:
+    def killed(self, kill: MapperKill) -> None:
         self._kills.append(kill)
         self._now = replace(self._now, pid=None)
         self._draw()
 
-    def recovered(self, recovery: Recovery) -> None:
+    def recovered(self, recovery: MapperRecovery) -> None:
         self._recoveries.append(recovery)
         self._draw()
 
     def notice(self, text: str) -> None:
         self._console.print(f"note: {text}", style="yellow", markup=False, highlight=False)
 
-    def finish(self, report: Report) -> None:
+    def finish(self, report: DemoReport) -> None:
         self._draw()
         self.close()
         style = "bold green" if report.is_good else "bold red"
@@ -181,7 +181,7 @@ def watcher_for(console: Console, *, as_json_object: bool) -> Watcher:
     """The watcher that suits where the output goes."""
     if as_json_object:
         return Json(console)
-    return Rich(console) if console.is_terminal else Plain(console)
+    return Rich(console) if console.is_terminal else PlainLines(console)
 
 
 def _tree(now: Progress) -> Tree:
@@ -203,7 +203,7 @@ def _bar(now: Progress) -> Table:
     return grid
 
 
-def _table(kills: Sequence[Kill], recoveries: Sequence[Recovery]) -> Table:
+def _table(kills: Sequence[MapperKill], recoveries: Sequence[MapperRecovery]) -> Table:
     """One row a kill; two kills in one recovery share the row of the first, so rows may stay open."""
     table = Table(title="recovery, ms", title_justify="left")
     for heading in ("SIGKILL", "after scan", *PHASES):

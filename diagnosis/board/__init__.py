@@ -2,14 +2,14 @@
 
 `Board` is the client, for a real board and for the simulated one alike; `BoardSimulator` is an actor that is a board,
 with faults to order; `BoardActor` publishes what a board measures as `/board_measurements`. The frames are in
-`frames.py`.
+`board_frames.py`.
 
 Source: Zaman et al. 2013, section IV-A (figure 4).
 """
 
 from .board_actor import TOPIC, BoardActor, BoardFailed, BoardMeasured, GetSpecification, SwitchChannel
+from .board_frames import CHANNELS, BadFrame, ChannelSpecification, Measurements, Reading, Specification
 from .client import Board, BoardError, BoardLost, BoardRefused, BoardSilent, BoardUnreachable
-from .frames import CHANNELS, BadFrame, ChannelSpecification, Measurements, Reading, Specification
 from .simulated_board import Load, SimulatedBoard
 from .simulator_actor import (
     POWER_TOPIC,

@@ -8,8 +8,8 @@ from typing import TypeVar
 
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.message import Message, Refusal
+from .board_frames import Measurements, Specification
 from .client import Board, BoardError
-from .frames import Measurements, Specification
 
 T = TypeVar("T")
 

@@ -13,20 +13,20 @@ from urllib.parse import urlsplit
 from ...actors.errors import HoldfastError
 from ...actors.streams import connect
 from ...supervision.backoff import Backoff
-from .frames import (
+from .board_frames import (
     Answer,
     AskMeasurements,
     AskSpecification,
     BadFrame,
+    BoardDecoder,
     Broadcast,
-    Decoder,
-    Done,
+    DoneFrame,
     Measurements,
-    Refused,
+    RefusedFrame,
     Request,
     SetDefaults,
     Specification,
-    Switch,
+    SwitchFrame,
     encode,
 )
 
@@ -111,7 +111,7 @@ class Board:
         self._watchers: set[asyncio.Future[Measurements]] = set()
 
     async def __aenter__(self) -> Board:
-        """Begin to connect."""
+        """Begin to connect, which goes on in the background."""
         if self._keeper is not None:
             raise RuntimeError("a Board is entered once")
         self._keeper = asyncio.get_running_loop().create_task(self._keep(), name=f"connection to {self.url}")
@@ -148,22 +148,22 @@ class Board:
         return await self._ask(AskSpecification(), Specification)
 
     async def measure(self) -> Measurements:
-        """What it measures now."""
+        """Ask the board what its channels measure now."""
         return await self._ask(AskMeasurements(), Measurements)
 
     async def switch(self, channel: int, on: bool) -> None:
         """Switch a channel, 0 to 9. That it says so does not mean that it is: measure."""
-        await self._ask(Switch(channel, on), Done)
+        await self._ask(SwitchFrame(channel, on), DoneFrame)
 
     async def broadcast(self, interval: float) -> None:
         """Have the measurements told every `interval` seconds, also over new connections; 0: no more."""
         frame = Broadcast(_milliseconds(interval))
-        await self._ask(frame, Done)
+        await self._ask(frame, DoneFrame)
         self._milliseconds = frame.milliseconds
 
     async def set_defaults(self, channels: Iterable[int]) -> None:
         """Which channels are on after the board's own power-up."""
-        await self._ask(SetDefaults(frozenset(channels)), Done)
+        await self._ask(SetDefaults(frozenset(channels)), DoneFrame)
 
     async def measurements(self) -> AsyncIterator[Measurements]:
         """What is broadcast from now on, until the board is closed; who is slow gets the newest only."""
@@ -207,7 +207,7 @@ class Board:
         finally:
             self._waiting.pop(sequence, None)
         match got:
-            case Refused(why):
+            case RefusedFrame(why):
                 raise BoardRefused(self.url, why)
             case _ if isinstance(got, kind):
                 return got
@@ -225,7 +225,7 @@ class Board:
         return self._sequence, answer
 
     async def _keep(self) -> None:
-        """Connect again and again."""
+        """Connect again whenever the connection is lost, with growing delays."""
         attempt = 0
         while True:
             try:
@@ -249,7 +249,7 @@ class Board:
             if self._milliseconds:
                 sequence, answer = self._send(Broadcast(self._milliseconds))
                 answer.add_done_callback(lambda done: self._waiting.pop(sequence, None))
-            decoder = Decoder()
+            decoder = BoardDecoder()
             while data := await self._read(reader):
                 decoder.feed(data)
                 while (taken := decoder.take()) is not None:
@@ -275,7 +275,7 @@ class Board:
         if not isinstance(frame, Answer):
             raise BadFrame(f"{type(frame).__name__} is not for a board to say")
         self._silent = 0
-        if sequence == 0 and isinstance(frame, Refused):
+        if sequence == 0 and isinstance(frame, RefusedFrame):
             raise BadFrame(f"the board ends it: {frame.why}")
         if sequence == 0 and isinstance(frame, Measurements):
             for watcher in self._watchers:

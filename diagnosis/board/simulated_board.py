@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 
 import msgspec
 
-from .frames import CHANNELS, ChannelSpecification, Measurements, Reading, Specification
+from .board_frames import CHANNELS, ChannelSpecification, Measurements, Reading, Specification
 
 RIPPLE = 0.01
 """Share of the current by which a measurement is off, at most."""
@@ -92,7 +92,7 @@ class SimulatedBoard:
             self._put(channel, channel in self._defaults)
 
     def specification(self) -> Specification:
-        """See `Device`."""
+        """Say what the board is, as any `Device` does."""
         channels = tuple(ChannelSpecification(one.name, one.millivolts, one.most_milliamperes) for one in self.loads)
         return Specification(channels, self._defaults)
 
@@ -102,11 +102,11 @@ class SimulatedBoard:
             self._put(channel, on)
 
     def set_defaults(self, channels: frozenset[int]) -> None:
-        """See `Device`."""
+        """Set which channels are on after its own power-up."""
         self._defaults = channels
 
     def measure(self) -> Measurements:
-        """See `Device`."""
+        """Measure all channels, as any `Device` does."""
         uptime = max(0, round((self._clock() - self._began) * 1000))
         return Measurements(uptime, tuple(self._reading(channel) for channel in range(CHANNELS)))
 

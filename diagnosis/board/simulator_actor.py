@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.message import Message, Refusal
-from .frames import CHANNELS
+from .board_frames import CHANNELS
 from .simulated_board import ROBOT, Load, SimulatedBoard
 from .tcp_server import BoardServer
 

@@ -8,20 +8,20 @@ import socket
 from typing import Protocol
 
 from ...actors.streams import Listener
-from .frames import (
+from .board_frames import (
     Answer,
     AskMeasurements,
     AskSpecification,
     BadFrame,
+    BoardDecoder,
     Broadcast,
-    Decoder,
-    Done,
+    DoneFrame,
     Frame,
     Measurements,
-    Refused,
+    RefusedFrame,
     SetDefaults,
     Specification,
-    Switch,
+    SwitchFrame,
     encode,
 )
 
@@ -40,7 +40,7 @@ class Device(Protocol):
     """What the server is in front of. Its channels are those that frames allow."""
 
     def specification(self) -> Specification:
-        """What it is."""
+        """Say what the board is and which channels it has."""
         ...
 
     def measure(self) -> Measurements:
@@ -121,7 +121,7 @@ class BoardServer:
         client = _Client(self, self._device, reader, writer)
         try:
             if len(self._clients) > MOST_CLIENTS:
-                await client.send(0, Refused(f"there are {MOST_CLIENTS} connections already"))
+                await client.send(0, RefusedFrame(f"there are {MOST_CLIENTS} connections already"))
             else:
                 await client.run()
         except (OSError, TimeoutError):
@@ -134,7 +134,7 @@ class BoardServer:
 
 
 class _Client:
-    """One connection."""
+    """One connection of a client, with what is read and written over it."""
 
     def __init__(
         self, server: BoardServer, device: Device, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
@@ -144,7 +144,7 @@ class _Client:
 
     async def run(self) -> None:
         """From its first frame to its end."""
-        decoder, clock = Decoder(), asyncio.get_running_loop().time
+        decoder, clock = BoardDecoder(), asyncio.get_running_loop().time
         ends = clock() + IDLE
         try:
             while True:
@@ -163,7 +163,7 @@ class _Client:
         finally:
             await self._stop_broadcasts()
 
-    async def _next(self, decoder: Decoder) -> bool | None:
+    async def _next(self, decoder: BoardDecoder) -> bool | None:
         """Answer the next frame. None: there is none yet; False: the connection must end."""
         try:
             taken = decoder.take()
@@ -172,7 +172,7 @@ class _Client:
             sequence, frame = taken
             answer = await self._answer(frame)
         except BadFrame as error:
-            await self._reply(error.sequence, Refused(error.why))
+            await self._reply(error.sequence, RefusedFrame(error.why))
             return not error.is_fatal
         await self._reply(sequence, answer)
         return True
@@ -183,19 +183,19 @@ class _Client:
                 return self._device.specification()
             case AskMeasurements():
                 return self._device.measure()
-            case Switch(channel, on):
+            case SwitchFrame(channel, on):
                 self._device.switch(channel, on)
-                return Done()
+                return DoneFrame()
             case SetDefaults(channels):
                 self._device.set_defaults(channels)
-                return Done()
+                return DoneFrame()
             case Broadcast(milliseconds):
                 await self._stop_broadcasts()
                 if milliseconds:
                     self._broadcasts = asyncio.create_task(self._broadcast(milliseconds / 1000))
-                return Done()
+                return DoneFrame()
             case _:
-                return Refused(f"{type(frame).__name__} is for a board to say")
+                return RefusedFrame(f"{type(frame).__name__} is for a board to say")
 
     async def _reply(self, sequence: int, answer: Answer) -> None:
         if self._server.delay:

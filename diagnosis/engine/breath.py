@@ -30,7 +30,7 @@ def beside_a_loop() -> Generator[None]:
 
 
 def breathe() -> None:
-    """Pause for a moment."""
+    """Pause for a moment, so that the event loop's thread has its turn."""
     if _IS_BESIDE.get():
         time.sleep(_PAUSE)
 

@@ -14,12 +14,13 @@ from typing import Final, NamedTuple
 from ..literals import Literal
 from ..model import Model
 from .breath import breathe, breathing
+from .connected import connected
 
 FALSE: Final = 0
 """The atom that never holds: the head of rules without one."""
 
 
-class Step(NamedTuple):
+class RuleStep(NamedTuple):
     """What is left of a rule: while all `needs` work and `body` holds, `head` holds; all in numbers."""
 
     needs: tuple[int, ...]
@@ -28,11 +29,11 @@ class Step(NamedTuple):
     rule: int
 
 
-class Part(NamedTuple):
+class RulePart(NamedTuple):
     """Rules that hang together: `denials` end in a failure, `steps` in an atom that nobody observed."""
 
-    denials: tuple[Step, ...]
-    steps: tuple[Step, ...]
+    denials: tuple[RuleStep, ...]
+    steps: tuple[RuleStep, ...]
 
     @property
     def components(self) -> list[int]:
@@ -43,9 +44,9 @@ class Part(NamedTuple):
 class Cone(NamedTuple):
     """All that matters: components that are surely faulty, and the parts."""
 
-    convicted: tuple[Step, ...]
+    convicted: tuple[RuleStep, ...]
     """One rule that ends in a failure for each component that is surely faulty."""
-    parts: tuple[Part, ...]
+    parts: tuple[RulePart, ...]
 
     @property
     def faulty(self) -> frozenset[int]:
@@ -64,7 +65,7 @@ class Index:
         self.atoms: tuple[Literal | None, ...] = (None, *model.vocabulary)
         self.atom = {atom: number for number, atom in enumerate(self.atoms)}
         self.steps = tuple(
-            Step(
+            RuleStep(
                 tuple(self.number[name] for name in rule.needs),
                 tuple(self.atom[model.vocabulary.check(atom)] for atom in rule.body),
                 FALSE if rule.head is None else self.atom[model.vocabulary.check(rule.head)],
@@ -72,12 +73,12 @@ class Index:
             )
             for number, rule in enumerate(model.rules)
         )
-        makers: list[list[Step]] = [[] for _ in self.atoms]
+        makers: list[list[RuleStep]] = [[] for _ in self.atoms]
         for step in self.steps:
             makers[step.head].append(step)
         self.makers = tuple(map(tuple, makers))
         """By atom, the rules that conclude it."""
-        users: list[list[Step]] = [[] for _ in self.atoms]
+        users: list[list[RuleStep]] = [[] for _ in self.atoms]
         for step in self.steps:
             for atom in step.body:
                 users[atom].append(step)
@@ -106,7 +107,7 @@ def cone_of(index: Index, positive: frozenset[int], negative: frozenset[int]) ->
     The observations must not contradict the model by themselves (see `contradiction`).
     """
     failures = negative | {FALSE}
-    convicted: dict[int, Step] = {}
+    convicted: dict[int, RuleStep] = {}
     for failure in sorted(failures):
         for step in index.makers[failure]:
             if len(step.needs) == 1 and positive.issuperset(step.body):
@@ -116,11 +117,13 @@ def cone_of(index: Index, positive: frozenset[int], negative: frozenset[int]) ->
     return Cone(tuple(convicted.values()), tuple(parts_of(kept, failures)))
 
 
-def _backwards(index: Index, positive: frozenset[int], negative: frozenset[int], faulty: dict[int, Step]) -> list[Step]:
+def _backwards(
+    index: Index, positive: frozenset[int], negative: frozenset[int], faulty: dict[int, RuleStep]
+) -> list[RuleStep]:
     """The rules that lead to a failure, without what is known."""
     todo = [FALSE, *negative]
     met = set(todo)
-    found: list[Step] = []
+    found: list[RuleStep] = []
     for atom in breathing(todo):  # it grows
         for step in index.makers[atom]:
             if faulty and any(component in faulty for component in step.needs):
@@ -130,7 +133,7 @@ def _backwards(index: Index, positive: frozenset[int], negative: frozenset[int],
                     continue
                 body = tuple(needed for needed in step.body if needed not in positive)
                 if len(body) != len(step.body):
-                    step = Step(step.needs, body, step.head, step.rule)
+                    step = RuleStep(step.needs, body, step.head, step.rule)
                 for needed in body:
                     if needed not in met:
                         met.add(needed)
@@ -139,7 +142,7 @@ def _backwards(index: Index, positive: frozenset[int], negative: frozenset[int],
     return found
 
 
-def _grounded(steps: list[Step]) -> list[Step]:
+def _grounded(steps: list[RuleStep]) -> list[RuleStep]:
     """Without rules that wait for an atom which nothing can make hold."""
     waiting: dict[int, list[int]] = {}
     missing = [len(step.body) for step in steps]
@@ -161,14 +164,14 @@ def _grounded(steps: list[Step]) -> list[Step]:
     return [step for step, count in zip(steps, missing, strict=True) if not count]
 
 
-def _reaching(steps: list[Step], failures: frozenset[int]) -> list[Step]:
+def _reaching(steps: list[RuleStep], failures: frozenset[int]) -> list[RuleStep]:
     """Without rules that lead to no failure any more."""
-    makers: dict[int, list[Step]] = {}
+    makers: dict[int, list[RuleStep]] = {}
     for step in steps:
         makers.setdefault(step.head, []).append(step)
     todo = sorted(failures)
     met = set(todo)
-    kept: list[Step] = []
+    kept: list[RuleStep] = []
     for atom in breathing(todo):  # it grows
         for step in makers.get(atom, ()):
             kept.append(step)
@@ -179,35 +182,25 @@ def _reaching(steps: list[Step], failures: frozenset[int]) -> list[Step]:
     return kept
 
 
-def parts_of(steps: list[Step], failures: frozenset[int]) -> Iterator[Part]:
-    """Group what hangs together by a component or by an atom that nobody observed (union-find)."""
-    parent = list(range(len(steps)))
+def parts_of(steps: list[RuleStep], failures: frozenset[int]) -> Iterator[RulePart]:
+    """Group what hangs together by a component or by an atom that nobody observed."""
 
-    def root(number: int) -> int:
-        while parent[number] != number:
-            parent[number] = number = parent[parent[number]]
-        return number
+    def keys_of(step: RuleStep) -> Iterator[int]:
+        yield from (~component for component in step.needs)  # Atoms are >= 0.
+        yield from step.body
+        if step.head not in failures:
+            yield step.head
 
-    by_component: dict[int, int] = {}
-    by_atom: dict[int, int] = {}
-    for number, step in enumerate(breathing(steps)):
-        for component in step.needs:
-            parent[root(number)] = root(by_component.setdefault(component, number))
-        for atom in step.body if step.head in failures else (*step.body, step.head):
-            parent[root(number)] = root(by_atom.setdefault(atom, number))
-    groups: dict[int, list[Step]] = {}
-    for number, step in enumerate(breathing(steps)):
-        groups.setdefault(root(number), []).append(step)
-    for group in groups.values():
+    for group in connected(steps, keys_of):
         denials = tuple(step for step in group if step.head in failures)
-        yield Part(denials, tuple(step for step in group if step.head not in failures))
+        yield RulePart(denials, tuple(step for step in group if step.head not in failures))
 
 
 def contradiction(index: Index, positive: frozenset[int], negative: frozenset[int]) -> tuple[Literal, ...]:
     """Observations that contradict the model whoever is faulty, without one that could be left out; () if none do."""
     if not index.unconditional:
         return ()
-    why: dict[int, Step] = {}
+    why: dict[int, RuleStep] = {}
     known = set(positive)
     grown = True
     while grown:
@@ -222,7 +215,7 @@ def contradiction(index: Index, positive: frozenset[int], negative: frozenset[in
     return () if torn is None else _reasons(index, positive, torn, why)
 
 
-def _reasons(index: Index, positive: frozenset[int], torn: int, why: dict[int, Step]) -> tuple[Literal, ...]:
+def _reasons(index: Index, positive: frozenset[int], torn: int, why: dict[int, RuleStep]) -> tuple[Literal, ...]:
     """The observations a conclusion rests on, and the one it contradicts."""
     needed: set[int] = set()
     todo = [torn]

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import msgspec
 
 from ..literals import Literal
-from .cone import Index, Step, cone_of
+from .cone import Index, RuleStep, cone_of
 
 
 class Conflict(msgspec.Struct, frozen=True):
@@ -62,7 +62,7 @@ def explain(index: Index, positive: frozenset[int], negative: frozenset[int]) ->
     cone = cone_of(index, positive, negative)
     conflicts = [_conflict(index, {step.needs[0]}, [step], step.head, positive) for step in cone.convicted]
     for part in cone.parts:
-        makers: dict[int, list[Step]] = {}
+        makers: dict[int, list[RuleStep]] = {}
         for step in part.steps:
             makers.setdefault(step.head, []).append(step)
         found = (_minimal(denial, part.denials, makers) for denial in part.denials)
@@ -75,8 +75,8 @@ def explain(index: Index, positive: frozenset[int], negative: frozenset[int]) ->
 
 
 def _minimal(
-    denial: Step, denials: tuple[Step, ...], makers: dict[int, list[Step]]
-) -> tuple[Step, set[int], list[Step]]:
+    denial: RuleStep, denials: tuple[RuleStep, ...], makers: dict[int, list[RuleStep]]
+) -> tuple[RuleStep, set[int], list[RuleStep]]:
     """A minimal conflict that begins with a denial: the denial it ends with, its components, and the rules used."""
     used = _derivation([denial], makers, None)
     assert used is not None  # the cone holds only rules that can apply
@@ -89,15 +89,19 @@ def _minimal(
     return used[0], needs, used
 
 
-def _any_derivation(denials: tuple[Step, ...], makers: dict[int, list[Step]], allowed: set[int]) -> list[Step] | None:
+def _any_derivation(
+    denials: tuple[RuleStep, ...], makers: dict[int, list[RuleStep]], allowed: set[int]
+) -> list[RuleStep] | None:
     found = (_derivation([denial], makers, allowed) for denial in denials if allowed.issuperset(denial.needs))
     return next((used for used in found if used is not None), None)
 
 
-def _derivation(steps: list[Step], makers: dict[int, list[Step]], allowed: set[int] | None) -> list[Step] | None:
+def _derivation(
+    steps: list[RuleStep], makers: dict[int, list[RuleStep]], allowed: set[int] | None
+) -> list[RuleStep] | None:
     """The steps, with rules of `allowed` components for each atom they wait for; None if there are none."""
     order = _order(steps, makers)
-    chosen: dict[int, Step] = {}
+    chosen: dict[int, RuleStep] = {}
     for atom in order:
         for maker in makers[atom]:
             is_allowed = allowed is None or allowed.issuperset(maker.needs)
@@ -116,7 +120,7 @@ def _derivation(steps: list[Step], makers: dict[int, list[Step]], allowed: set[i
     return used
 
 
-def _order(steps: list[Step], makers: dict[int, list[Step]]) -> list[int]:
+def _order(steps: list[RuleStep], makers: dict[int, list[RuleStep]]) -> list[int]:
     """The atoms that `steps` rest on, each after those it is made from (the model has no circles)."""
     order: list[int] = []
     met: set[int] = set()
@@ -133,7 +137,7 @@ def _order(steps: list[Step], makers: dict[int, list[Step]]) -> list[int]:
     return order[:-1]  # without the failure itself
 
 
-def _conflict(index: Index, needs: set[int], used: list[Step], head: int, positive: frozenset[int]) -> Conflict:
+def _conflict(index: Index, needs: set[int], used: list[RuleStep], head: int, positive: frozenset[int]) -> Conflict:
     given = {atom for step in used for atom in index.steps[step.rule].body if atom in positive}
     failed = index.atoms[head]
     return Conflict(

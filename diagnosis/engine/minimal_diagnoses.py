@@ -17,12 +17,12 @@ from ..literals import Literal
 from ..model import Declaration, Model, System
 from ..observations import Contradiction, Observed
 from .breath import beside_a_loop, breathe, breathing
-from .cone import Cone, Index, Part, cone_of, contradiction
+from .cone import Cone, Index, RulePart, cone_of, contradiction
 from .explain import Explanation, explain
 from .probe import Probe, probes
 from .rank import Ranked, Ranking, merged, products
 from .result import Candidate, Diagnosis, State
-from .solve import Budget, Solved, solve
+from .solve import SearchBudget, Solved, solve
 
 PARTS_KEPT: Final = 256
 """Parts whose diagnoses are remembered."""
@@ -52,13 +52,13 @@ class Diagnoser:
             raise ValueError(f"limit {limit} and seconds {seconds} must be greater than 0")
         self.limit, self.seconds = limit, seconds
         self._lock = threading.Lock()
-        self._parts: OrderedDict[Part, list[Solved]] = OrderedDict()
+        self._parts: OrderedDict[RulePart, list[Solved]] = OrderedDict()
         self._model = model if isinstance(model, Model) else Model(model)
         self._index = Index(self._model)
 
     @property
     def model(self) -> Model:
-        """The model that counts."""
+        """The model that diagnoses are made by."""
         return self._model
 
     def use(self, model: Model) -> None:
@@ -77,7 +77,7 @@ class Diagnoser:
         """
         if not isinstance(observations, Observed):
             observations = tuple(observations)  # it may be read only here
-        budget = Budget(self.seconds if seconds is None else seconds)
+        budget = SearchBudget(self.seconds if seconds is None else seconds)
         work = asyncio.ensure_future(asyncio.to_thread(self._beside, observations, frozenset(repaired), budget))
         try:
             return await asyncio.shield(work)
@@ -99,7 +99,7 @@ class Diagnoser:
         Raises:
             BadLiteral: an observation has a name that the model does not declare.
         """
-        budget = Budget(self.seconds if seconds is None else seconds)
+        budget = SearchBudget(self.seconds if seconds is None else seconds)
         return self._diagnose(observations, frozenset(repaired), budget)
 
     def observed(self, observations: Observations) -> Observed:
@@ -141,11 +141,11 @@ class Diagnoser:
         seen = index.numbers(tuple(can_be_seen)) if can_be_seen is not None else None
         return probes(index, positive, negative, diagnosis.candidates, seen, costs or {})
 
-    def _beside(self, observations: Observations, repaired: frozenset[str], budget: Budget) -> Diagnosis:
+    def _beside(self, observations: Observations, repaired: frozenset[str], budget: SearchBudget) -> Diagnosis:
         with beside_a_loop():
             return self._diagnose(observations, repaired, budget)
 
-    def _diagnose(self, observations: Observations, repaired: frozenset[str], budget: Budget) -> Diagnosis:
+    def _diagnose(self, observations: Observations, repaired: frozenset[str], budget: SearchBudget) -> Diagnosis:
         began = time.perf_counter()
         with self._lock, contextlib.closing(budget):
             observed = self.observed(observations)
@@ -172,7 +172,7 @@ class Diagnoser:
         return Diagnosis(State.CONTRADICTORY, contradictions=tuple(torn)) if torn else None
 
     def _solved(
-        self, positive: frozenset[int], negative: frozenset[int], repaired: frozenset[str], budget: Budget
+        self, positive: frozenset[int], negative: frozenset[int], repaired: frozenset[str], budget: SearchBudget
     ) -> Diagnosis:
         cone = cone_of(self._index, positive, negative)
         if not cone.convicted and not cone.parts:
@@ -200,7 +200,7 @@ class Diagnoser:
         rows = (products([singles[member] for member in members]) for members in solved.sets)
         return merged(rows, self.limit)
 
-    def _part(self, part: Part, budget: Budget) -> list[Solved]:
+    def _part(self, part: RulePart, budget: SearchBudget) -> list[Solved]:
         known = self._parts.get(part)
         if known is not None:
             self._parts.move_to_end(part)

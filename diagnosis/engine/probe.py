@@ -13,7 +13,7 @@ from typing import Final
 import msgspec
 
 from ..literals import Literal
-from .cone import FALSE, Index, Step
+from .cone import FALSE, Index, RuleStep
 from .result import Candidate
 
 CANDIDATES: Final = 16
@@ -127,7 +127,7 @@ class _World:
             stack.pop()
         return known[wanted]
 
-    def _unknown(self, step: Step, known: dict[int, bool], supposed: int | None) -> list[int]:
+    def _unknown(self, step: RuleStep, known: dict[int, bool], supposed: int | None) -> list[int]:
         given = (self._positive, self._negative)
         return [n for n in step.body if n != supposed and n not in known and not any(n in one for one in given)]
 

@@ -11,13 +11,13 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from .breath import breathe, breathing
-from .cone import Part, Step, parts_of
+from .cone import RulePart, RuleStep, parts_of
 
 
 class Reduced(NamedTuple):
     """A part in which each component stands for all of its class."""
 
-    part: Part
+    part: RulePart
     classes: dict[int, tuple[int, ...]]
 
 
@@ -25,9 +25,9 @@ Need = tuple[frozenset[int], frozenset[int]]
 """Components and atoms."""
 
 
-def reduce(part: Part) -> Iterator[Reduced]:
+def reduce(part: RulePart) -> Iterator[Reduced]:
     """The parts that are left of a part, with the same minimal diagnoses once classes are written out."""
-    makers: dict[int, list[Step]] = {}
+    makers: dict[int, list[RuleStep]] = {}
     for step in part.steps:
         makers.setdefault(step.head, []).append(step)
     needs = _unfold(part, {atom: made[0] for atom, made in makers.items() if len(made) == 1})
@@ -37,9 +37,9 @@ def reduce(part: Part) -> Iterator[Reduced]:
         yield _classed(left)
 
 
-def _unfold(part: Part, sources: dict[int, Step]) -> dict[Step, Need]:
+def _unfold(part: RulePart, sources: dict[int, RuleStep]) -> dict[RuleStep, Need]:
     """For each rule what it needs, once atoms with one source are replaced (the model has no circles)."""
-    needs: dict[Step, Need] = {}
+    needs: dict[RuleStep, Need] = {}
     for first in (*part.denials, *part.steps):
         stack = [first]
         while stack:
@@ -63,13 +63,13 @@ def _unfold(part: Part, sources: dict[int, Step]) -> dict[Step, Need]:
     return needs
 
 
-def _step(need: Need, step: Step) -> Step:
-    return Step(tuple(sorted(need[0])), tuple(sorted(need[1])), step.head, step.rule)
+def _step(need: Need, step: RuleStep) -> RuleStep:
+    return RuleStep(tuple(sorted(need[0])), tuple(sorted(need[1])), step.head, step.rule)
 
 
-def _without_supersets(steps: list[Step], failures: frozenset[int]) -> list[Step]:
+def _without_supersets(steps: list[RuleStep], failures: frozenset[int]) -> list[RuleStep]:
     """Without conflicts that contain another one."""
-    kept: list[Step] = []
+    kept: list[RuleStep] = []
     by_member: dict[int, list[frozenset[int]]] = {}
     for step in breathing(sorted(steps, key=lambda step: len(step.needs)), 64):
         if step.head in failures and not step.body:
@@ -81,7 +81,7 @@ def _without_supersets(steps: list[Step], failures: frozenset[int]) -> list[Step
     return kept
 
 
-def _classed(part: Part) -> Reduced:
+def _classed(part: RulePart) -> Reduced:
     """Components that are needed by the same rules become one."""
     rules = (*part.denials, *part.steps)
     occurs: dict[int, list[int]] = {}
@@ -96,4 +96,4 @@ def _classed(part: Part) -> Reduced:
         tuple(step._replace(needs=tuple(one for one in step.needs if one in members)) for step in some)
         for some in (part.denials, part.steps)
     )
-    return Reduced(Part(denials, steps), members)
+    return Reduced(RulePart(denials, steps), members)

@@ -14,7 +14,7 @@ Plain: TypeAlias = dict[str, Any]
 
 
 class State(enum.Enum):
-    """How the system looks."""
+    """How the system looks by a diagnosis."""
 
     HEALTHY = "healthy"
     FAULTY = "faulty"

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 import clingo
 from clingo.backend import HeuristicType
 
-from .cone import Part
+from .cone import RulePart
 from .reduce import reduce
 
 _MINIMAL: Final = ("--heuristic=Domain", "--enum-mode=domRec", "--warn=none", "0")
@@ -27,7 +27,7 @@ _SHORT: Final = 5000
 """Conflicts of clingo, not of ours, that a short search may take: some tens of milliseconds."""
 
 
-class Budget:
+class SearchBudget:
     """How long, and whether still, to go on. `cancel` may be called from another thread.
 
     Searches run in the calling thread: to have clingo run them in one of its own costs more than most searches. Short
@@ -57,7 +57,7 @@ class Budget:
                 self._control.interrupt()
 
     def close(self) -> None:
-        """No more searches."""
+        """Begin no more searches, and keep no more time."""
         self.cancel()
         if self._timer is not None:
             self._timer.cancel()
@@ -106,7 +106,7 @@ class Solved(NamedTuple):
         return sum(math.prod(len(self.classes[member]) for member in members) for members in self.sets)
 
 
-def solve(part: Part, limit: int, budget: Budget) -> list[Solved]:
+def solve(part: RulePart, limit: int, budget: SearchBudget) -> list[Solved]:
     """The minimal diagnoses of a part: the unions of one set of each of what it falls into.
 
     Of each at most `limit` are searched for, before classes are written out.
@@ -114,7 +114,7 @@ def solve(part: Part, limit: int, budget: Budget) -> list[Solved]:
     return [_solve(left, limit, budget)._replace(classes=classes) for left, classes in reduce(part)]
 
 
-def _solve(part: Part, limit: int, budget: Budget) -> Solved:
+def _solve(part: RulePart, limit: int, budget: SearchBudget) -> Solved:
     """The minimal diagnoses of a part, at most `limit` of them.
 
     If there are more, the smallest of all are among those returned, as far as time and `limit` allow.
@@ -132,14 +132,14 @@ def _solve(part: Part, limit: int, budget: Budget) -> Solved:
     return Solved(sets, {}, by_count=True, by_time=smallest.by_time)
 
 
-def _only_conflict(part: Part) -> list[int] | None:
+def _only_conflict(part: RulePart) -> list[int] | None:
     """If just one rule leads to each atom and to the failure: its components, each of which alone explains it."""
     if len(part.denials) != 1 or len({step.head for step in part.steps}) != len(part.steps):
         return None
     return part.components
 
 
-def _search(part: Part, options: Sequence[str], limit: int, budget: Budget) -> Solved:
+def _search(part: RulePart, options: Sequence[str], limit: int, budget: SearchBudget) -> Solved:
     """A short search, and if it is not short a long one from the beginning."""
     found, is_done = _searched(part, (*options, f"--solve-limit={_SHORT}"), limit, budget, is_short=True)
     if not is_done and budget.left:
@@ -147,7 +147,9 @@ def _search(part: Part, options: Sequence[str], limit: int, budget: Budget) -> S
     return found
 
 
-def _searched(part: Part, options: Sequence[str], limit: int, budget: Budget, *, is_short: bool) -> tuple[Solved, bool]:
+def _searched(
+    part: RulePart, options: Sequence[str], limit: int, budget: SearchBudget, *, is_short: bool
+) -> tuple[Solved, bool]:
     """What was found, and whether that is all that was asked for."""
     control = clingo.Control(list(options))
     is_optimising = _OPTIMISING in options
@@ -169,7 +171,7 @@ def _searched(part: Part, options: Sequence[str], limit: int, budget: Budget, *,
     return Solved(sets, {}, by_count=is_more, by_time=not is_done), is_done
 
 
-def _build(control: clingo.Control, part: Part, *, is_optimising: bool) -> dict[clingo.Symbol, int]:
+def _build(control: clingo.Control, part: RulePart, *, is_optimising: bool) -> dict[clingo.Symbol, int]:
     """Write the program; the only atoms with names are those of components, true for faulty."""
     components: dict[clingo.Symbol, int] = {}
     faulty: dict[int, int] = {}

@@ -4,7 +4,8 @@ from .check import Model, ModelError
 from .clauses import Rule
 from .declaration import Clause, Component, Declaration, Expectation, Kind, Relation, Spelling, System, Value
 from .file import load, read
-from .history import (
+from .lint import Finding, Flaw, lint
+from .model_history import (
     Add,
     Change,
     Declare,
@@ -18,7 +19,6 @@ from .history import (
     Replace,
     Version,
 )
-from .lint import Finding, Flaw, lint
 
 __all__ = [
     "Add",

@@ -17,7 +17,7 @@ from .declaration import Component, Declaration, Kind, System, settle_kinds
 _NAME: Final = re.compile(r"[^\s(),]+\Z")
 
 
-class Problem(msgspec.Struct, frozen=True):
+class ModelProblem(msgspec.Struct, frozen=True):
     """Something wrong with a declaration, and where."""
 
     where: str
@@ -79,15 +79,19 @@ class Model:
         return frozenset(atoms)
 
 
-def _names(declared: Declaration) -> Iterator[Problem]:
+def _names(declared: Declaration) -> Iterator[ModelProblem]:
     """Names that cannot be, are taken, or lead nowhere."""
     first: dict[str, Component] = {}
     for component in declared.components:
         if not _NAME.match(component.name):
-            yield Problem(component.where, f"{component.name!r} is no name: no spaces, brackets and commas, please")
+            yield ModelProblem(
+                component.where, f"{component.name!r} is no name: no spaces, brackets and commas, please"
+            )
         elif component.name in first:
             before = first[component.name].where
-            yield Problem(component.where, f"{component.name} is declared twice{f', also at {before}' * bool(before)}")
+            yield ModelProblem(
+                component.where, f"{component.name} is declared twice{f', also at {before}' * bool(before)}"
+            )
         first.setdefault(component.name, component)
     for component in declared.components:
         yield from _of_component(component, first)
@@ -95,72 +99,74 @@ def _names(declared: Declaration) -> Iterator[Problem]:
         for name, _ in (relation.one, relation.other):
             yield from _software(name, first, relation.where)
         if relation.one[1] == relation.other[1]:
-            yield Problem(relation.where, f"{relation.one[1]} is related to itself")
+            yield ModelProblem(relation.where, f"{relation.one[1]} is related to itself")
         yield from _bad_words(relation.where, (relation.one[1], relation.other[1]))
     for expectation in declared.expectations:
         if not expectation.of:
-            yield Problem(expectation.where, f"{expectation.atom} is expected of no component")
+            yield ModelProblem(expectation.where, f"{expectation.atom} is expected of no component")
         for name in expectation.of:
             if name not in first:
-                yield Problem(expectation.where, f"{expectation.atom} is expected of {_unknown(name, first)}")
+                yield ModelProblem(expectation.where, f"{expectation.atom} is expected of {_unknown(name, first)}")
     topics = {topic for component in declared.components for topic in component.out}
     for value in declared.values:
         yield from _bad_words(value.where, (value.name,))
         if value.topic not in topics and f"ok({value.topic})" not in declared.propositions:
-            yield Problem(value.where, f"value {value.name} is in {_unknown(value.topic, topics, 'topic')}")
+            yield ModelProblem(value.where, f"value {value.name} is in {_unknown(value.topic, topics, 'topic')}")
 
 
-def _of_component(component: Component, known: dict[str, Component]) -> Iterator[Problem]:
+def _of_component(component: Component, known: dict[str, Component]) -> Iterator[ModelProblem]:
     name, where = component.name, component.where
     if not 0 < component.prior < 1:
-        yield Problem(where, f"prior of {name} is {component.prior:g}; it must be between 0 and 1, without these")
+        yield ModelProblem(where, f"prior of {name} is {component.prior:g}; it must be between 0 and 1, without these")
     if component.kind.is_hardware and (component.out or component.on):
-        yield Problem(where, f"{name} is a device: it publishes nothing and drives nothing; its driver does")
+        yield ModelProblem(where, f"{name} is a device: it publishes nothing and drives nothing; its driver does")
     if component.kind is Kind.NODE and component.on:
-        yield Problem(where, f"{name} drives {', '.join(component.on)}: declare it as a driver")
+        yield ModelProblem(where, f"{name} drives {', '.join(component.on)}: declare it as a driver")
     for device in component.on:
         if device not in known:
-            yield Problem(where, f"{name} drives {_unknown(device, known)}")
+            yield ModelProblem(where, f"{name} drives {_unknown(device, known)}")
         elif not known[device].kind.is_hardware:
-            yield Problem(where, f"{name} drives {device}, which is no device")
+            yield ModelProblem(where, f"{name} drives {device}, which is no device")
     yield from _bad_words(
         where, [*component.out, *(topic for made_from in component.out.values() for topic in made_from)]
     )
 
 
-def _bad_words(where: str, words: Iterable[str]) -> Iterator[Problem]:
+def _bad_words(where: str, words: Iterable[str]) -> Iterator[ModelProblem]:
     for word in words:
         if not _NAME.match(word):
-            yield Problem(where, f"{word!r} is no name: no spaces, brackets and commas, please")
+            yield ModelProblem(where, f"{word!r} is no name: no spaces, brackets and commas, please")
 
 
-def _software(name: str, known: dict[str, Component], where: str) -> Iterator[Problem]:
+def _software(name: str, known: dict[str, Component], where: str) -> Iterator[ModelProblem]:
     if name not in known:
-        yield Problem(where, f"a value is related of {_unknown(name, known)}")
+        yield ModelProblem(where, f"a value is related of {_unknown(name, known)}")
     elif known[name].kind.is_hardware:
-        yield Problem(where, f"a value of {name} is related, but a device publishes none: name its driver")
+        yield ModelProblem(where, f"a value of {name} is related, but a device publishes none: name its driver")
 
 
-def _rules(declared: Declaration, problems: list[Problem]) -> Iterator[Rule]:
+def _rules(declared: Declaration, problems: list[ModelProblem]) -> Iterator[Rule]:
     """All rules; what cannot be one is added to `problems`."""
     known = {component.name for component in declared.components}
     try:
         yield from rules_of(declared)
     except (BadClause, BadLiteral) as error:
-        problems.append(Problem(declared.where, str(error)))
+        problems.append(ModelProblem(declared.where, str(error)))
     for clause in declared.clauses:
         try:
             rule = read_clause(clause, declared.spelling)
         except BadClause as error:
-            problems.append(Problem(clause.where, f"clause {clause.text!r}: {error}"))
+            problems.append(ModelProblem(clause.where, f"clause {clause.text!r}: {error}"))
             continue
         if rule is not None:
             unknown = [name for name in rule.needs if name not in known]
-            problems += (Problem(clause.where, f"clause {clause.text!r}: {_unknown(name, known)}") for name in unknown)
+            problems += (
+                ModelProblem(clause.where, f"clause {clause.text!r}: {_unknown(name, known)}") for name in unknown
+            )
             yield rule
 
 
-def _inputs(declared: Declaration) -> Iterator[Problem]:
+def _inputs(declared: Declaration) -> Iterator[ModelProblem]:
     """Topics that are needed and published by nobody: most often a slip of the pen."""
     known = {f"ok({topic})" for component in declared.components for topic in component.out}
     known |= set(declared.propositions) | {expectation.atom for expectation in declared.expectations}
@@ -170,20 +176,20 @@ def _inputs(declared: Declaration) -> Iterator[Problem]:
                 if f"ok({wanted})" not in known:
                     topics = [atom[3:-1] for atom in known if atom.startswith("ok(")]
                     what = f"{topic} of {component.name} is made from {_unknown(wanted, topics, 'topic')}"
-                    yield Problem(component.where, f"{what}; if it comes from outside, declare it as external")
+                    yield ModelProblem(component.where, f"{what}; if it comes from outside, declare it as external")
 
 
-def _arities(rules: list[Rule], declared: Declaration) -> Iterator[Problem]:
+def _arities(rules: list[Rule], declared: Declaration) -> Iterator[ModelProblem]:
     """Predicates with another number of arguments than elsewhere, and written clauses with atoms nobody declared."""
     arities = dict(ARITIES)
     for text in declared.propositions:
         try:
             atom = parse(text)
         except BadLiteral as error:
-            yield Problem(declared.where, str(error))
+            yield ModelProblem(declared.where, str(error))
         else:
             if not atom.positive:
-                yield Problem(declared.where, f"{text!r}: a proposition is declared without its negation")
+                yield ModelProblem(declared.where, f"{text!r}: a proposition is declared without its negation")
             yield from _arity(atom, arities, declared.where)
     for rule in rules:
         for atom in (*rule.body, *([rule.head] if rule.head else [])):
@@ -195,16 +201,16 @@ def _arities(rules: list[Rule], declared: Declaration) -> Iterator[Problem]:
             try:
                 vocabulary.check(atom)
             except BadLiteral as error:
-                yield Problem(rule.where, f"{error} (clause {rule}); declare it as a proposition")
+                yield ModelProblem(rule.where, f"{error} (clause {rule}); declare it as a proposition")
 
 
-def _arity(atom: Literal, arities: dict[str, int], where: str) -> Iterator[Problem]:
+def _arity(atom: Literal, arities: dict[str, int], where: str) -> Iterator[ModelProblem]:
     wanted = arities.setdefault(atom.name, len(atom.args))
     if wanted != len(atom.args):
-        yield Problem(where, f"{atom}: {atom.name} takes {wanted} argument{'s' * (wanted != 1)}")
+        yield ModelProblem(where, f"{atom}: {atom.name} takes {wanted} argument{'s' * (wanted != 1)}")
 
 
-def _cycles(rules: list[Rule]) -> Iterator[Problem]:
+def _cycles(rules: list[Rule]) -> Iterator[ModelProblem]:
     """One circle of atoms that hold because of each other: a fault in it would go unexplained."""
     needed: dict[Literal, dict[Literal, str]] = {}
     for rule in rules:
@@ -216,7 +222,7 @@ def _cycles(rules: list[Rule]) -> Iterator[Problem]:
         if circle:
             way = " <- ".join(map(str, circle))
             where = needed[circle[0]][circle[1]]
-            yield Problem(where, f"circle: {way}; leave out the input that matters least")
+            yield ModelProblem(where, f"circle: {way}; leave out the input that matters least")
             return
 
 

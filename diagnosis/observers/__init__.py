@@ -8,7 +8,7 @@ from .diagnostic import Check, DiagnosticObserver
 from .general import GeneralObserver, Learned
 from .hardware import Channel, HardwareObserver
 from .multiple import ConditionedObserver, TriggeredObserver
-from .node import NodeObserver
+from .node_observer import NodeObserver
 from .observer import Look, Manner, Observer
 from .property import Bound, Property, PropertyObserver
 from .qualitative import QualitativeObserver, trend

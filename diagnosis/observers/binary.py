@@ -60,7 +60,7 @@ class BinaryQualitativeObserver(Observer):
             line.clear()
 
     def look(self) -> None:
-        """Compare."""
+        """Say whether the two trends are alike."""
         self.verdict(self._atom, self._are_alike())
 
     def _are_alike(self) -> bool | None:

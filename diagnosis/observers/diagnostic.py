@@ -36,7 +36,7 @@ class _Checked:
         self.afresh()
 
     def afresh(self) -> None:
-        """Begin anew."""
+        """Forget what was filtered so far, so that the filter begins anew."""
         self.filter = self._new_filter() if self._new_filter is not None else None
 
 

@@ -74,11 +74,11 @@ class GeneralObserver(Observer):
             self._times = deque(self._times, maxlen=most)
 
     def hear(self, topic: str, message: Any) -> None:
-        """Note when."""
+        """Note when a message came on a topic."""
         self._times.append(self.now)
 
     def look(self) -> None:
-        """Count."""
+        """Count the messages within the window, and say whether the rate is right."""
         now = self.now
         while self._times and self._times[0] <= now - self._window:
             self._times.popleft()

@@ -43,7 +43,7 @@ class HardwareObserver(Observer):
         self._time = float("-inf")
 
     def hear(self, topic: str, message: Any) -> None:
-        """All channels were measured."""
+        """Judge what the board has measured of all its channels."""
         if not isinstance(message, BoardMeasured):
             return
         self._time = self.now

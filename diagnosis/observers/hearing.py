@@ -33,7 +33,7 @@ class Ear(Actor):
         self._topic, self._to = topic, to
 
     def on_start(self, restored: bool) -> None:
-        """Listen."""
+        """Subscribe to the topic that it hears."""
         self.ctx.subscribe(self._topic)
 
     @on(Message)

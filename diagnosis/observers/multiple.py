@@ -123,12 +123,12 @@ class ConditionedObserver(Observer):
             self._since = self.now
 
     def afresh(self) -> None:
-        """The time begins anew."""
+        """Count the time in which messages are due from now on."""
         if self._since is not None:
             self._since, self._last = self.now, float("-inf")
 
     def look(self) -> None:
-        """Whether something is overdue."""
+        """Say whether a message is overdue."""
         if self._since is None:
             return
         if self._last >= self._since and self.now - self._last <= self._within:

@@ -23,7 +23,7 @@ from ...actors.process.process_host import WorkerPlace
 from ...actors.process.wire.peer import OutsideHost
 from ..literals import Literal
 from ..messages import Grace
-from .node import at_root
+from .node_observer import at_root
 from .observer import Manner, Observer, atom_of
 from .regression import Regression
 from .verdicts import Filter, Limits
@@ -122,7 +122,7 @@ class PropertyObserver(Observer):
         self._lives.clear()
 
     async def look(self) -> None:
-        """Measure it all."""
+        """Measure all properties, and say which are within their bounds."""
         late = self.age % self.manner.every
         self._late = late if self.manner.every - late > EARLY else 0.0
         values = await self._measure()

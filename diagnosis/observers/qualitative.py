@@ -68,7 +68,7 @@ class QualitativeObserver(Observer):
         self._filter = filter() if filter is not None else None
 
     def hear(self, topic: str, message: Any) -> None:
-        """One sample."""
+        """Take in one sample of the value."""
         value = self._read(message)
         if value is not None:
             self._line.add(self.now, value if self._filter is None else self._filter(value))
@@ -79,7 +79,7 @@ class QualitativeObserver(Observer):
         self._filter = self._new_filter() if self._new_filter is not None else None
 
     def look(self) -> None:
-        """The trend now."""
+        """Say which trend the value has now."""
         self._line.forget(self.now)
         fit = self._line.fit() if self._line.is_full else None
         said = None if fit is None else trend(self._value, fit, self._slope, self._significance)

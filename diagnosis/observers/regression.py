@@ -73,7 +73,7 @@ class Regression:
             self._slide()
 
     def clear(self) -> None:
-        """Begin anew."""
+        """Forget all samples of the value."""
         self._samples.clear()
         self._is_full = False
         self._recentre()

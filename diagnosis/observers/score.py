@@ -41,11 +41,11 @@ class ScoreObserver(Observer):
         self.afresh()
 
     def afresh(self) -> None:
-        """An average begins anew."""
+        """Forget the scores, so that the average begins anew."""
         self._average, self._count = Smooth(self._weight), 0
 
     def hear(self, topic: str, message: Any) -> None:
-        """One more."""
+        """Score one more message of the topic."""
         score = self._score(message)
         if score is None:
             return

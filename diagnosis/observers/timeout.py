@@ -37,7 +37,7 @@ class TimeoutObserver(Observer):
             self.verdict(self._atom, True)
 
     def afresh(self) -> None:
-        """The time begins anew."""
+        """Count the time of silence from now on."""
         self._last, self._since = None, self.now
 
     def look(self) -> None:

@@ -56,7 +56,7 @@ class Debounce(Generic[T]):
         return self.settled
 
     def clear(self) -> None:
-        """Begin anew."""
+        """Forget the samples that were counted so far."""
         self._votes.clear()
         self.settled = None
 

@@ -7,8 +7,8 @@ diagnosis by `repair_problem`, or read from PDDL. `find_plan` asks a `Planner` i
 from .answers import Budget, Outcome, Plan, Planner, Step, TimedOut, Unsolvable
 from .finding import find_plan
 from .language import Domain, PlanningError, Problem
+from .pddl_reader import read_domain, read_problem, with_actions
 from .plan_check import InvalidPlan, Simulator, check_plan
-from .reading import read_domain, read_problem, with_actions
 from .repair import repair_domain, repair_problem
 from .stable import ClingoPlanner
 

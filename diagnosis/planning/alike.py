@@ -11,16 +11,17 @@ from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
 from ..engine.breath import breathing
+from ..engine.connected import connected
 from .grounding import GroundAction
 from .language import Atom, Literal, Problem
-from .relevance import together
+from .relevance import atoms
 
 Numbered: TypeAlias = tuple[int, bool]
 """A literal, by the number of its atom within a part."""
 
 
 @dataclasses.dataclass(slots=True)
-class Part:
+class ActionGroup:
     """Actions that hang together, in order, and their atoms as they are numbered."""
 
     actions: Sequence[GroundAction]
@@ -38,13 +39,13 @@ class OneOfEach:
 
     def __init__(self, problem: Problem, actions: Sequence[GroundAction]) -> None:
         self._problem = problem
-        parts = [_numbered(some) for some in together(actions)]
+        parts = [_numbered(some) for some in connected(actions, atoms)]
         owner = {atom: part for part, _ in parts for atom in part.atoms}
         fixed: list[Literal] = []
         for goal in problem.goals:
             part = owner.get(goal.atom)
             (fixed if part is None else part.goals).append(goal)
-        kinds: dict[object, list[Part]] = {}
+        kinds: dict[object, list[ActionGroup]] = {}
         for part, form in breathing(parts):
             if part.goals:
                 state = tuple([atom in problem.init for atom in part.atoms])
@@ -75,7 +76,7 @@ class OneOfEach:
         return tuple(goal for goal in self._problem.goals if goal in found)
 
 
-def _numbered(actions: Sequence[GroundAction]) -> tuple[Part, object]:
+def _numbered(actions: Sequence[GroundAction]) -> tuple[ActionGroup, object]:
     """A part, and its form: equal only for parts that are alike."""
     numbers: dict[Atom, int] = {}
 
@@ -93,4 +94,4 @@ def _numbered(actions: Sequence[GroundAction]) -> tuple[Part, object]:
             for action in actions
         ]
     )
-    return Part(actions, numbers, []), form
+    return ActionGroup(actions, numbers, []), form

@@ -27,7 +27,7 @@ from .language import (
     Problem,
     Same,
 )
-from .world import Binding, World, fill, statics
+from .static_facts import Binding, StaticFacts, fill, statics
 
 Term: TypeAlias = frozenset[Literal]
 """A conjunction."""
@@ -90,7 +90,7 @@ class Grounder:
             if known is not None:
                 self._kept.move_to_end(key)
                 return known
-        actions = ground(World.of(problem), budget)
+        actions = ground(StaticFacts.of(problem), budget)
         with self._lock:
             self._kept[key] = actions
             while len(self._kept) > KEPT:
@@ -98,7 +98,7 @@ class Grounder:
         return actions
 
 
-def ground(world: World, budget: Budget) -> tuple[GroundAction, ...]:
+def ground(world: StaticFacts, budget: Budget) -> tuple[GroundAction, ...]:
     """All ground actions of a world, in the order of names. Raises PlanningError if they are too many, OutOfTime."""
     actions: list[GroundAction] = []
     for action in world.domain.actions:
@@ -109,7 +109,7 @@ def ground(world: World, budget: Budget) -> tuple[GroundAction, ...]:
     return tuple(actions)
 
 
-def _ground_action(world: World, action: Action, budget: Budget) -> Iterator[GroundAction]:
+def _ground_action(world: StaticFacts, action: Action, budget: Budget) -> Iterator[GroundAction]:
     conditions = Conditions(world, f"action {action.name}")
     for bound in breathing(world.bindings(action.parameters, world.guards(action.precondition), {}), 64):
         budget.check()
@@ -121,7 +121,9 @@ def _ground_action(world: World, action: Action, budget: Budget) -> Iterator[Gro
                 yield GroundAction(step, needs, effects, action.cost)
 
 
-def _effects(world: World, conditions: Conditions, effects: Iterable[Effect], bound: Binding) -> Iterator[GroundEffect]:
+def _effects(
+    world: StaticFacts, conditions: Conditions, effects: Iterable[Effect], bound: Binding
+) -> Iterator[GroundEffect]:
     made: dict[tuple[Term, Literal], None] = {}
     for effect in effects:
         for inner in world.places(effect, bound):
@@ -137,7 +139,7 @@ def _effects(world: World, conditions: Conditions, effects: Iterable[Effect], bo
 class Conditions:
     """Makes ground conjunctions of formulas; what is static is decided here and now."""
 
-    def __init__(self, world: World, where: str) -> None:
+    def __init__(self, world: StaticFacts, where: str) -> None:
         self._world, self._where = world, where
 
     def terms(self, formula: Formula, bound: Binding, value: bool = True) -> list[Term]:

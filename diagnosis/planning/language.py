@@ -39,7 +39,7 @@ class Variable(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Fact:
-    """The atom is true."""
+    """The formula that an atom is true."""
 
     atom: Atom
 
@@ -54,14 +54,14 @@ class Same:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Not:
-    """The formula is false."""
+    """The formula that another one is false."""
 
     of: Formula
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class And:
-    """All are true."""
+    """The formula that all parts are true."""
 
     of: tuple[Formula, ...] = ()
 

@@ -22,7 +22,7 @@ from .language import (
     Problem,
     Same,
 )
-from .world import Binding, World, fill
+from .static_facts import Binding, StaticFacts, fill
 
 TRUE: Final = And()
 """The condition of an effect that has none."""
@@ -42,7 +42,7 @@ class Simulator:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.state = set(problem.init)
-        self._world = World.of(problem)
+        self._world = StaticFacts.of(problem)
         self._actions = {action.name: action for action in problem.domain.actions}
         self._bound: dict[Step, tuple[Action, Binding]] = {}
 

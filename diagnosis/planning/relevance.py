@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
-from ..engine.breath import breathing
+from ..engine.connected import connected
 from .answers import Budget, OutOfTime, Unsolvable
 from .grounding import GroundAction, changing_part, holds
 from .language import Atom, Literal, Problem
@@ -223,34 +223,13 @@ def prove_unsolvable(task: Task, budget: Budget) -> Proof | None:
 
 def parts(task: Task) -> list[tuple[Sequence[GroundAction], tuple[Literal, ...]]]:
     """The actions and goals that share no atom with the others."""
-    made = together([one.action for one in task.useful])
+    made = connected([one.action for one in task.useful], atoms)
     owner = {atom: number for number, actions in enumerate(made) for action in actions for atom in atoms(action)}
     goals: dict[int, list[Literal]] = {}
     for goal in task.goals:
         if goal.atom in owner:
             goals.setdefault(owner[goal.atom], []).append(goal)
     return [(made[number], tuple(wanted)) for number, wanted in goals.items()]
-
-
-def together(actions: Sequence[GroundAction]) -> list[list[GroundAction]]:
-    """The actions in groups that share no atom (union-find), in order."""
-    parent = list(range(len(actions)))
-
-    def root(number: int) -> int:
-        while parent[number] != number:
-            parent[number] = number = parent[parent[number]]
-        return number
-
-    owner: dict[Atom, int] = {}
-    for number, action in enumerate(breathing(actions)):
-        for atom in atoms(action):
-            first = owner.setdefault(atom, number)
-            if first != number:
-                parent[root(number)] = root(first)
-    groups: dict[int, list[GroundAction]] = {}
-    for number, action in enumerate(actions):
-        groups.setdefault(root(number), []).append(action)
-    return list(groups.values())
 
 
 def atoms(action: GroundAction) -> set[Atom]:

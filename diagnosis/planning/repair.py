@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable, Mapping
 from importlib.resources import files
 
 from .language import Atom, Domain, Literal, PlanningError, Problem
-from .reading import read_domain, with_actions
+from .pddl_reader import read_domain, with_actions
 
 
 @functools.cache

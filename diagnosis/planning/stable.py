@@ -57,7 +57,7 @@ class ClingoPlanner:
         self._grounder = Grounder()
 
     def solve(self, problem: Problem, budget: Budget) -> Outcome:
-        """See `Planner.solve`."""
+        """Solve a problem within a budget, as any `Planner` does."""
         try:
             actions = self._grounder.ground(problem, budget)
             small = OneOfEach(problem, actions)

@@ -13,8 +13,8 @@ from .answers import Budget, Outcome, OutOfTime, Plan, Step, TimedOut, Unsolvabl
 from .grounding import GroundAction, Grounder, changing_part
 from .language import Atom, PlanningError, Problem
 from .ordering import stages
+from .pddl_writer import Names, write_domain, write_problem
 from .relevance import hopeless, task_of
-from .writing import Names, write_domain, write_problem
 
 
 class UnifiedPlanner:

@@ -4,10 +4,41 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import NamedTuple
 
 from ...supervision.arbiter import covers
 from ..literals import Literal
 from ..planning import Step
+
+
+class Verifying(NamedTuple):
+    """A plan was carried out at `since`, and the symptoms have until `ends` to go."""
+
+    touched: frozenset[str]
+    since: float
+    ends: float
+
+
+class Finishing(NamedTuple):
+    """The diagnosis finds nothing bad any more; the symptoms have until `ends` to be seen to have gone."""
+
+    ends: float
+
+
+class Unclear(NamedTuple):
+    """It is not known what there is to repair; at `ends` the case is given up."""
+
+    why: str
+    ends: float
+
+
+class HeldByMode(NamedTuple):
+    """In this mode nothing can be done: it has to change, or the fault has to go."""
+
+    mode: str
+
+
+Phase = Verifying | Finishing | Unclear | HeldByMode
 
 
 @dataclasses.dataclass(slots=True)
@@ -15,9 +46,11 @@ class Case:
     """What was seen and done so far.
 
     Attributes:
+        phase: what the case waits for; None: the next round can begin.
         tried: plans that were carried out for each candidate.
         hopeless: candidates for which there is no plan, each with the reason.
-        has_told: something was given up, and that was said.
+        blamed: whom the present plan is for.
+        midway: whom it has begun to act on.
     """
 
     number: int
@@ -29,15 +62,40 @@ class Case:
     hopeless: dict[tuple[str, ...], str] = dataclasses.field(default_factory=dict[tuple[str, ...], str])
     rounds: int = 0
     failures: list[str] = dataclasses.field(default_factory=list[str])
-    has_told: bool = False
+    phase: Phase | None = None
+    blamed: frozenset[str] = frozenset()
+    midway: set[str] = dataclasses.field(default_factory=set[str])
+
+    @property
+    def reason(self) -> str:
+        """Why the present plan is carried out, in words."""
+        return f"diagnosed: {', '.join(sorted(self.blamed))}"
+
+    def enter(self, phase: Phase | None, now: float) -> None:
+        """Go on in another phase. The time in which a mode forbade everything does not count."""
+        if isinstance(self.phase, HeldByMode):
+            self.began = now
+        self.phase = phase
+
+    def begin_plan(self, bad: tuple[str, ...]) -> None:
+        """A plan for a candidate is carried out from now on."""
+        self.rounds += 1
+        self.tried[bad] = self.tried.get(bad, 0) + 1
+        self.blamed, self.midway = frozenset(bad), set()
+
+    def take_back_plan(self, bad: tuple[str, ...]) -> None:
+        """Nothing of the plan was tried, so it does not count."""
+        self.rounds -= 1
+        self.tried[bad] -= 1
 
     def add_symptoms(self, symptoms: Iterable[Literal]) -> None:
-        """More was seen."""
+        """Add symptoms that were seen meanwhile."""
         self.symptoms = tuple(dict.fromkeys((*self.symptoms, *symptoms)))
 
     def count(self, step: Step) -> None:
         """A step is carried out."""
         self.actions.append(step)
+        self.midway.update(step.args[:1])
         for name in step.args[:1]:
             self.tries[name] = self.tries.get(name, 0) + 1
 

@@ -8,7 +8,9 @@ engine's rank. So a diagnosis that did not help is not taken again before the ot
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Collection, Mapping
+from typing import NamedTuple
 
 from ..engine import Candidate, Diagnosis, State
 from ..literals import Literal
@@ -21,14 +23,28 @@ from .ledger import Ledger
 from .policy import Policy
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Situation:
-    """What repair knows at one moment."""
+class CaseView(NamedTuple):
+    """What repair knows at one moment of a case.
+
+    Attributes:
+        diagnosed: when the diagnosis came.
+        settles: until when no plan is made.
+        bad: the candidate to act on.
+        given_up: components that are beyond repair.
+        was_planned_dry: a plan was told of that is not carried out.
+        is_unsure: something that depends on whom the case has touched is not seen to hold yet.
+    """
 
     diagnosis: Diagnosis
     observed: Observed
     mode: str
     now: float
+    diagnosed: float = -math.inf
+    settles: float = -math.inf
+    bad: tuple[str, ...] | None = None
+    given_up: Collection[str] = ()
+    was_planned_dry: bool = False
+    is_unsure: bool = False
 
 
 def choose(
@@ -68,7 +84,7 @@ def problem_for(
     repertoire: Repertoire,
     policy: Policy,
     ledger: Ledger,
-    situation: Situation,
+    at: CaseView,
     bad: Collection[str],
     alone: Collection[str],
 ) -> Problem:
@@ -77,7 +93,7 @@ def problem_for(
     hardware = [name for name, kind in kinds.items() if kind is Kind.SWITCHABLE]
     nodes = [name for name, kind in kinds.items() if not kind.is_hardware]
     drives = {name: [one for one in model.components[name].on if one in set(hardware)] for name in nodes}
-    off = {literal.args[0] for literal in situation.observed.negative if literal.name in ("on", "running")}
+    off = {literal.args[0] for literal in at.observed.negative if literal.name in ("on", "running")}
     blamed = [name for name in bad if name in kinds]
     touchable = [name for name in kinds if name not in alone]
     problem = repair_problem(
@@ -93,9 +109,7 @@ def problem_for(
         restart_drivers=policy.restart_drivers,
         facts=repertoire.allowed(
             touchable,
-            lambda action, name: (
-                policy.may(action.name, situation.mode) and ledger.is_left(action, name, situation.now)
-            ),
+            lambda action, name: policy.may(action.name, at.mode) and ledger.is_left(action, name, at.now),
         ),
     )
     # Who is left alone is neither good nor bad: nobody can rely on it, and nobody is to mend it.

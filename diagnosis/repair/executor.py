@@ -38,7 +38,7 @@ class Result:
     why: str = ""
 
 
-class World(Protocol):
+class RepairWorld(Protocol):
     """What an executor sees and tells; the repairer is it."""
 
     def now(self) -> float:
@@ -62,11 +62,11 @@ class World(Protocol):
         ...
 
     async def began(self, step: Step, epoch: int) -> None:
-        """A step begins."""
+        """Note and tell that a step begins."""
         ...
 
     async def ended(self, result: Result) -> None:
-        """A step has ended."""
+        """Note and tell that a step has ended."""
         ...
 
 
@@ -85,7 +85,7 @@ class Executor:
 
     def __init__(
         self,
-        world: World,
+        world: RepairWorld,
         arbiter: Arbiter,
         *,
         address: Callable[[Step], str],

@@ -126,7 +126,7 @@ class RetryRepair(Order[None]):
 
 
 class RepairStatus(Message):
-    """How repair stands."""
+    """Tells how repair stands: mode, cases, and whom it has given up."""
 
     mode: str
     is_repairing: bool
@@ -135,7 +135,7 @@ class RepairStatus(Message):
 
 
 class GetRepairStatus(Message[RepairStatus]):
-    """How does it stand?"""
+    """Asks how repair stands at the moment."""
 
 
 __all__ = [

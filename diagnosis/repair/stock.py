@@ -266,23 +266,10 @@ async def _command(act: Act, *names: str, command: Sequence[str]) -> None:
 # -- fault-tolerance mechanisms -------------------------------------------------------------------------------------
 
 
-class Change(Protocol):
-    """What a transaction collects, as far as these actions need it."""
-
-    def attach(self, target: str, mechanism: Any) -> None:
-        """Protect an actor."""
-
-    def compose(self, target: str, mechanism: Any, *, outside: bool = False) -> None:
-        """Nest one more mechanism."""
-
-    def transition(self, target: str, mechanism: Any) -> None:
-        """Put a mechanism in the place of another."""
-
-
 class Transaction(Protocol):
     """`system.transaction`: the system gives it, since repair knows nothing of mechanisms."""
 
-    def __call__(self, *, timeout: float) -> AbstractAsyncContextManager[Change]:
+    def __call__(self, *, timeout: float) -> AbstractAsyncContextManager[object]:
         """Collect what is to be done in the block; at its end it is done, or undone."""
         ...
 
@@ -338,7 +325,7 @@ def _word(mechanism: Any) -> str:
     """A mechanism in the name of an action."""
     if isinstance(mechanism, (tuple, list)):
         return "_".join(map(_word, mechanism))
-    name = mechanism if isinstance(mechanism, str) else getattr(mechanism, "name", "")
+    name = mechanism if isinstance(mechanism, str) else str(mechanism.name)
     return name if name.isidentifier() else "mechanism"
 
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import msgspec
 
-from ...actors.values.writing import HEAD_ALONE
+from ...actors.values.value_writer import HEAD_ALONE
 
 MANY: Final = 64
 """Entries from which on a variable is encoded in groups."""

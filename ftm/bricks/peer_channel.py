@@ -154,7 +154,7 @@ class Answered:
             handle.reply(self._outcome)
 
     def set(self, outcome: bytes | Refusal) -> None:
-        """It is handled."""
+        """Note the outcome of a request, which is handled."""
         self._outcome = outcome
         waiting, self._waiting = self._waiting, []
         for handle in waiting:

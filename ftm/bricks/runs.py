@@ -26,7 +26,7 @@ from ...supervision.spec import child
 from ..replica.protected_actor import Server
 from ..replica.replica_life import ServerLife
 from ..votes.canonical import canonical, end_form
-from ..votes.voters import Agreed, AnyVoter, Undecided, _decide
+from ..votes.voters import Agreed, AnyVoter, Undecided, decide_by
 from .brick_messages import Done, Request, State, Work
 from .bricks import After, Before
 
@@ -138,7 +138,7 @@ def vote(voter: AnyVoter, runs: Sequence[Run | None], *, with_state: bool = True
     first = runs[0]
     if first is not None and all(row == rows[0] for row in rows):
         return Agreed(first, 0, tuple(range(len(runs))))
-    decided = _decide(voter, runs, lambda run: form(run, with_state=with_state))
+    decided = decide_by(voter, runs, lambda run: form(run, with_state=with_state))
     if isinstance(decided, Agreed) and decided.choice is None:
         return Undecided("no run has come to what is in the middle")
     return decided

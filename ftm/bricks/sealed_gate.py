@@ -14,7 +14,7 @@ from .bricks import FOREVER, Brick
 from .sealed_frames import Agree, Greet, Opened, Refused, Sealed
 
 
-class Gate(Brick):
+class SealedGate(Brick):
     """Passes frames to the brick that opens them, and takes what was in them; what came plain is not admitted."""
 
     handlers: ClassVar[dict[type[Message[Any]], str]] = {}

@@ -62,13 +62,13 @@ class Helping(Remembering):
         self._kept: State | None = None
 
     async def on_stop(self, reason: object) -> None:
-        """The shadow goes too."""
+        """Stop the shadow together with its brick."""
         shadow, self._shadow = self._shadow, None
         if shadow is not None:
             await shadow.close()
 
     async def from_peer(self, message: Message[Any]) -> Any:
-        """Compute for it."""
+        """Compute a request for the other replica."""
         if isinstance(message, Settled):
             self.settled(message)
             return None

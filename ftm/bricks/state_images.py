@@ -43,7 +43,7 @@ class Piece(msgspec.Struct, array_like=True):
 
     @property
     def key(self) -> Key:
-        """Which piece it is."""
+        """The name of the piece among the pieces of its state."""
         return self.name, self.number
 
 
@@ -145,7 +145,7 @@ def image_from(data: bytes) -> Image:
 
 
 def _piece(key: Key, view: memoryview, before: Piece | None) -> Piece:
-    """A buffer in blocks."""
+    """Cut a buffer into blocks, with a checksum for each."""
     parts = [view[begin : begin + BLOCK] for begin in range(0, len(view), BLOCK)]
     if before is None:
         return Piece(*key, list(map(bytes, parts)), list(map(zlib.crc32, parts)))

@@ -20,7 +20,7 @@ from ...checkpoint.snapshot.key_variables import save_state
 from .brick_messages import CannotJoin, ConfigMismatch, Done, Logged, StaleEpoch, State, Strayed
 from .bricks import FOREVER, Abandon, Brick, Flush
 from .replica_orders import Export, Exported, Join, Peer
-from .sealed_gate import Gate
+from .sealed_gate import SealedGate
 from .standing import PeerLost
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class GoneAstray(Message):
     """To the RequestProtocol of a follower, from its After: tell the leader."""
 
 
-class Transfer(Gate):
+class Transfer(SealedGate):
     """The part of a RequestProtocol that speaks with that of the other replica."""
 
     peer_messages = (Take, Astray)

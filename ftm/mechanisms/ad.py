@@ -32,13 +32,13 @@ class Assisting(Helping):
     """Before of both replicas: computes for the other one; has the assertions asked at the end of each turn."""
 
     def on_start(self, restored: bool) -> None:
-        """From now on."""
+        """Have the assertions asked at the end of each turn from now on."""
         assert isinstance(self.mechanism, AD)
         self._inspector = Inspector(self.mechanism.assertions)
         self._standing.server.hooks.append(self._inspector)
 
     async def on_stop(self, reason: object) -> None:
-        """No longer."""
+        """Have the assertions asked no longer."""
         self._standing.server.hooks.remove(self._inspector)
         await super().on_stop(reason)
 

@@ -46,7 +46,7 @@ class Forward(Message[None]):
     looks: bool = False
 
 
-class Heard(Message[None]):
+class AskOutcome(Message[None]):
     """The outcome of an ask that the actor has made on the leader."""
 
     outcome: Outcome
@@ -135,7 +135,7 @@ class Handling(Before):
     peer_messages = (Forward,)
 
     async def from_peer(self, message: Message[Any]) -> None:
-        """Take a batch."""
+        """Take a batch of requests from the leader."""
         assert isinstance(message, Forward)
         standing = self._standing
         await standing.following.until_ready()
@@ -151,17 +151,17 @@ class Handling(Before):
 class Computing(Proceed, Sender):
     """Proceed of both: what the actor hears on the leader, it hears on the follower."""
 
-    peer_messages = (Heard,)
+    peer_messages = (AskOutcome,)
     answers_later = True  # What has to wait for the leader's state must not hold up the order that brings it.
 
     async def heard(self, outcome: Outcome) -> None:
         """Pass on what the leader's turn has heard."""
         if self.leads and self._standing.other.path is not None:
-            self._standing.other.forwarded.append(self.send_peer(Heard(outcome)))
+            self._standing.other.forwarded.append(self.send_peer(AskOutcome(outcome)))
 
     async def from_peer(self, message: Message[Any]) -> None:
         """The leader's turn has heard this."""
-        assert isinstance(message, Heard)
+        assert isinstance(message, AskOutcome)
         await self._standing.following.until_ready()
         self._standing.server.inward(message.outcome)
 

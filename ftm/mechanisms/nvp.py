@@ -23,11 +23,11 @@ from ...actors.kernel.actor import Actor
 from ..alarms import Masked
 from ..bricks.brick_messages import Request, State
 from ..bricks.runs import Deciding, Remembering, Run, Shadow, turns_of, vote
-from ..model.declaration import Cost
 from ..model.mechanism import Mechanism, Role
+from ..model.mechanism_declaration import Cost
 from ..votes.assertions import names_of
 from ..votes.versions import version
-from ..votes.voters import AnyVoter, Custom, Majority, Median, NoMajority, Undecided
+from ..votes.voters import AnyVoter, Custom, Majority, Median, NoMajority, Undecided, Voter
 from .rb import protected_class
 
 MAJORITY = Majority()
@@ -46,7 +46,7 @@ class Versions(Deciding):
         ]
 
     async def on_stop(self, reason: object) -> None:
-        """They go too."""
+        """Stop the shadows of the other versions too."""
         for shadow in self._others:
             await shadow.close()
 
@@ -91,7 +91,7 @@ class NVP(Mechanism):
     cpu: ClassVar[str] = "high"
     units: ClassVar[int] = 1
     layer: ClassVar[str] = "repetition"
-    cost: ClassVar[Cost] = Cost(runs=3, latency=3, total=3)
+    cost: ClassVar[Cost | None] = Cost(runs=3, latency=3, total=3)
     roles: ClassVar[dict[str, Role]] = {"single": Role(before=Remembering, after=Versions)}
 
     versions: Any = ()
@@ -121,7 +121,8 @@ def voter_of(value: Any) -> Any:
         made: Any = msgspec.convert(value, AnyVoter) if isinstance(value, dict) else value
     except msgspec.ValidationError as error:
         raise ValueError(f"{value!r} is no voter: {error}") from error
-    if isinstance(made, type) or not hasattr(made, "vote"):
+    is_voter = isinstance(made, Voter) and not isinstance(made, type)
+    if not is_voter:
         known = "Exact(), Majority(), Tolerance(...), Median() or custom(function) of holdfast.ftm.votes.voters"
         raise ValueError(f"a voter is one such as {known}, not {made!r}")
     return made

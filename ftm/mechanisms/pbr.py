@@ -103,7 +103,7 @@ class StateUpdate(After):
     peer_messages = (Checkpoint,)
 
     async def from_peer(self, message: Message[Any]) -> int:
-        """Take a checkpoint."""
+        """Take a checkpoint from the primary."""
         assert isinstance(message, Checkpoint)
         standing = self._standing
         await standing.following.until_ready()

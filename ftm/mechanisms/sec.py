@@ -70,17 +70,17 @@ class Opening(Before):
 
     @on(Greet)
     def greet(self, message: Greet) -> ReplyHandle[bytes]:
-        """Somebody begins a hand-shake."""
+        """Answer the greeting with which somebody begins a hand-shake."""
         return self._later(self._link.greet(message.hello))
 
     @on(Agree)
     def agree(self, message: Agree) -> ReplyHandle[None]:
-        """Its end."""
+        """Complete a hand-shake, from which on there is a session."""
         return self._later(self._link.agree(message.hello, message.finish))
 
     @on(Sealed)
     def sealed(self, message: Sealed) -> ReplyHandle[bytes]:
-        """A frame."""
+        """Open a sealed frame, and pass on what is in it."""
         return self._later(self._link.take(message.frame, self._do))
 
     @property
@@ -274,10 +274,10 @@ class SEC(Mechanism):
         enrols: Callable[[], list[str]] | None = None,
     ) -> SecuredLink:
         """This participant's end of its links."""
-        from ..sec.identity import End
+        from ..sec.identity import LinkEnd
         from ..sec.link import Link
 
-        return Link(End(node, address, path, self, epoch, enrols))
+        return Link(LinkEnd(node, address, path, self, epoch, enrols))
 
 
 __all__ = ["SEC", "LinkLost", "Opening", "Sealing"]

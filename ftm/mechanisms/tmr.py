@@ -28,8 +28,8 @@ from ..bricks.brick_messages import Done, NotFollowing, Request, StaleEpoch, Sta
 from ..bricks.runs import Deciding, Digests, Run, turns_of, vote
 from ..bricks.shadow_runs import NEEDS_STATE, Compute, Computed, Helping, Settled
 from ..bricks.standing import PeerLost
-from ..model.declaration import Cost
 from ..model.mechanism import Mechanism, Role
+from ..model.mechanism_declaration import Cost
 from ..votes.voters import Majority, Median, NoMajority, Undecided
 from .nvp import voter_of
 
@@ -187,7 +187,7 @@ class TMR(Mechanism):
     units: ClassVar[int] = 3
     layer: ClassVar[str] = "replication"
     keeps_members: ClassVar[bool] = True
-    cost: ClassVar[Cost] = Cost(latency=2, total=3, requests=4, recovery=0.02)
+    cost: ClassVar[Cost | None] = Cost(latency=2, total=3, requests=4, recovery=0.02)
     roles: ClassVar[dict[str, Role]] = {
         "leader": Role(before=Computing, after=Voting),
         "follower": Role(before=Computing, computes=False),

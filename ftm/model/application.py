@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 
 from ...actors.errors import UnsavableValue, type_name
+from ...actors.kernel.actor import Actor
 from ...actors.values import encode_value
 
 
@@ -42,7 +43,7 @@ class Application(msgspec.Struct, frozen=True):
     turn_seconds: float = 0.0
 
     @classmethod
-    def of(cls, kind: type, *, sample: Any = None, **known: Any) -> Application:
+    def of(cls, kind: type[Actor], *, sample: Any = None, **known: Any) -> Application:
         """What a class says of itself.
 
         Determinism is its `deterministic`. Its state can be had unless it says `state_access = False`: by
@@ -60,8 +61,8 @@ class Application(msgspec.Struct, frozen=True):
             why, size = _encoded_size(sample)
         said: dict[str, Any] = {
             "name": type_name(kind),
-            "version": str(getattr(kind, "version", None) or getattr(kind, "schema_version", 1)),
-            "is_deterministic": bool(getattr(kind, "deterministic", True)),
+            "version": str(getattr(kind, "version", None) or kind.schema_version),
+            "is_deterministic": kind.deterministic,
             "has_state_access": not why,
             "why_no_state": why,
             "has_delta": _has(kind, "get_delta", "apply_delta"),
@@ -92,8 +93,8 @@ class Application(msgspec.Struct, frozen=True):
                 raise ValueError(f"unknown need {need!r}")
 
 
-def _no_state(kind: type) -> str:
-    if not getattr(kind, "state_access", True):
+def _no_state(kind: type[Actor]) -> str:
+    if not kind.state_access:
         return f"{type_name(kind)} says state_access = False"
     getters = [name for name in ("get_state", "set_state") if _has(kind, name)]
     if len(getters) == 1:
@@ -111,7 +112,7 @@ def _encoded_size(sample: Any) -> tuple[str, int]:
         state: Any = sample.get_state()
     else:
         attributes: dict[str, Any] = vars(sample)
-        keys = getattr(kind, "key_variables", None)
+        keys = kind.key_variables
         if keys is None:
             keys = [key for key in attributes if not key.startswith("_") and key != "ctx"]
         state = {key: attributes[key] for key in keys if key in attributes}

@@ -19,7 +19,7 @@ from itertools import product
 import msgspec
 
 from .application import Application
-from .declaration import FAULTS, LAYERS, LEVELS, NEEDS, Cost, Entry, Mechanisms
+from .mechanism_declaration import FAULTS, LAYERS, LEVELS, NEEDS, Cost, Entry, Mechanisms
 
 
 class Faults(msgspec.Struct, frozen=True):
@@ -118,7 +118,7 @@ class Selection(msgspec.Struct, frozen=True):
 
     @property
     def best(self) -> Choice | None:
-        """The cheapest valid choice."""
+        """The cheapest of the valid choices."""
         return self.valid[0] if self.valid else None
 
     def explain(self) -> str:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from ...actors.errors import type_name
 from ...actors.kernel.message import message_name
-from .declaration import BadDeclaration, Entry
 from .mechanism import Description, Mechanism, MechanismRefused, Part, Role, compose, find, load, load_module
+from .mechanism_declaration import BadDeclaration, Entry
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
@@ -69,7 +69,7 @@ def check_stack(layers: tuple[Mechanism, ...], kind: type[Actor] | None, where: 
             why = f"it wants {one.replicas} replicas, and {others[0].name} outside of it {others[0].replicas}"
             raise MechanismRefused(one.name, why)
         above = one
-        inside: frozenset[str] = getattr(one, "over", frozenset())
+        inside = one.over
         here = {other.layer for other in layers[layers.index(one) + 1 :]}
         if inside and not inside & here:
             raise MechanismRefused(one.name, f"a mechanism of the layer {', '.join(sorted(inside))} must stand inside")
@@ -114,7 +114,7 @@ def describe(layers: Any) -> list[Description] | None:
 
 
 def names_of(layers: Any) -> str:
-    """Layers in words."""
+    """The names of layers, outermost first, as one text."""
     return " + ".join(type_name(type(layer)).rpartition(".")[2] for layer in compose(layers))
 
 

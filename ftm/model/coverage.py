@@ -10,7 +10,7 @@ import msgspec
 
 from .application import Application
 from .change_model import Choice, Faults, Resources, label, select
-from .declaration import FAULTS, NEEDS, Entry, Mechanisms
+from .mechanism_declaration import FAULTS, NEEDS, Entry, Mechanisms
 
 
 def built_in_mechanisms() -> Mechanisms:

@@ -22,7 +22,9 @@ import msgspec
 from ...actors.errors import HoldfastError, type_name
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.message import message_name
+from ...actors.process.wire.start_codec import Described
 from .detection import Detection
+from .mechanism_declaration import MechanismDeclaration
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node
@@ -83,7 +85,7 @@ class Description(msgspec.Struct, array_like=True, frozen=True):
 
 
 @dataclasses.dataclass(frozen=True)
-class Mechanism:
+class Mechanism(MechanismDeclaration, Described):
     """Base of all mechanisms. Derive a frozen dataclass, and set the class attributes."""
 
     revived_by: ClassVar[str] = f"{__name__}:revive"
@@ -133,7 +135,7 @@ class Mechanism:
         return dataclasses.replace(role, **other) if other else role
 
     def role_name(self, *, leads: bool) -> str:
-        """How that is called."""
+        """The name of the role of a replica that leads, or does not."""
         names = list(self.roles) or ["single"]
         return names[0] if leads else names[-1]
 
@@ -164,7 +166,7 @@ class Mechanism:
         return new
 
     def describe(self) -> Description:
-        """For another process."""
+        """Describe the mechanism for another process."""
         code = code_of(type(self))
         settings = {field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self) if field.init}
         bricks = tuple((*key, code_of(kind)) for key, kind in sorted(self.exchanged.items(), key=lambda pair: pair[0]))
@@ -210,7 +212,7 @@ def _plain(value: Any) -> Any:
 
 def has_state_access(kind: type[Actor]) -> bool:
     """Whether an actor's state can be saved, as far as its class says."""
-    return bool(getattr(kind, "state_access", True))
+    return kind.state_access
 
 
 def detection_in(layers: Iterable[Mechanism]) -> Detection | None:

@@ -28,7 +28,7 @@ from ..model.change_model import (
     resource_price,
     select,
 )
-from ..model.declaration import Entry, Mechanisms
+from ..model.mechanism_declaration import Entry, Mechanisms
 
 ADAPT, HOLD, NONE, STAY = "adapt", "hold", "none", "stay"
 """Decisions: change; a change is wanted and held back; nothing is valid; all is well."""

@@ -20,6 +20,7 @@ import msgspec
 import psutil
 
 from ...actors.events import Event, EventHub, EventStream
+from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.message import Message, Order
 from ...actors.kernel.node import cell_kind
@@ -75,7 +76,7 @@ class Adapt(Order[None]):
     is_urgent: bool = False
 
 
-class Look(Message):
+class MonitorLook(Message):
     """Look at what there is, and decide. It tells itself."""
 
 
@@ -139,7 +140,7 @@ class Monitored(msgspec.Struct, frozen=True):
 
 
 class Report(Message[Monitored]):
-    """What do you know?"""
+    """Asks the engine for what it knows."""
 
 
 class CarryOut(Message):
@@ -252,7 +253,7 @@ class Watch:
         if event.address.startswith(f"{self.address}/ftm/"):  # Replicas that are lost are told at the address itself.
             return None
         reason = getattr(event, "reason", None)
-        if getattr(reason, "is_clean", False):  # A process that ended because it was to is no fault.
+        if isinstance(reason, ExitReason) and reason.is_clean:  # A process that ended because it was to is no fault.
             return None
         if isinstance(reason, str) and reason in HARMLESS:
             return None
@@ -275,7 +276,7 @@ class MonitoringEngine(Actor):
             self._withdraw("the monitoring engine was restarted")
         if watch.running is not None:
             self._tried(Tried(watch.running.number, "the monitoring engine was restarted meanwhile"))
-        self.ctx.every(watch.judge.settings.interval, Look())
+        self.ctx.every(watch.judge.settings.interval, MonitorLook())
 
     def _now(self) -> float:
         return self.ctx.cell.node.loop.time()
@@ -285,8 +286,8 @@ class MonitoringEngine(Actor):
 
     # -- seeing -----------------------------------------------------------------------------------------------------
 
-    @on(Look)
-    def _look(self, message: Look) -> None:
+    @on(MonitorLook)
+    def _look(self, message: MonitorLook) -> None:
         watch = self._watch
         for kind in watch.take_signs():
             self._sign(kind, 1)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import SpecError
 from ...actors.kernel.node import cell_kind
+from ...supervision.spec import ChildSpec
 from ..model.application import Application
 from ..model.composition import layers_of
 from ..model.mechanism import compose
@@ -53,7 +54,7 @@ def watch_of(
     """
     cell = ref._cell
     kind, spec = cell_kind(cell), cell.spec
-    if kind is None or not hasattr(spec, "mechanism"):
+    if kind is None or not isinstance(spec, ChildSpec):
         raise SpecError(ref.path, "it is not supervised, so no mechanism could be given to it")
     made: dict[str, Mechanism] = {}
     for one in mechanisms:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+from ...actors.state_hooks import state_getter
 from ...actors.values import decode_value, state_digest
 from ...checkpoint.life.recorded_inbox import Fed
 from ...checkpoint.protocol import Feed, Snapshot, pieces
@@ -30,7 +31,7 @@ def point_of(life: ServerLife, data: Image, deltas: list[bytes]) -> State:
 
 def names_of_state(actor: Any) -> set[str] | None:
     """Find the variables of an actor whose state consists of all of them; None if it says itself what its state is."""
-    if getattr(actor, "get_state", None) is None and key_names(actor) is None:
+    if state_getter(actor) is None and key_names(actor) is None:
         return set(variables(actor))
     return None
 

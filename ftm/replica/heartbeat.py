@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .protected_actor import Server
 
 
-class Tick(Message):
+class HeartbeatDue(Message):
     """It is time for a heartbeat."""
 
 
@@ -45,20 +45,20 @@ class Heart(Actor):
         """Beat at once, then regularly."""
         if self._interval > 0:
             self._take_pace()
-            self._timer = self.ctx.every(self._interval, Tick())
-            self._beat(Tick())
+            self._timer = self.ctx.every(self._interval, HeartbeatDue())
+            self._beat(HeartbeatDue())
 
     def _take_pace(self) -> None:
         said = detection_in(self._standing.layers)
         self._interval, self._longest = self._usual if said is None else (said.interval, said.watch_turns or 0.0)
 
-    @on(Tick)
-    def _beat(self, message: Tick) -> None:
+    @on(HeartbeatDue)
+    def _beat(self, message: HeartbeatDue) -> None:
         standing, before = self._standing, self._interval
         self._take_pace()
         if self._interval != before:  # A change of mechanism has said so.
             self._timer.cancel()
-            self._timer = self.ctx.every(self._interval, Tick())
+            self._timer = self.ctx.every(self._interval, HeartbeatDue())
         try:
             self.detector.tell(Beat(self._name, standing.epoch))
             if self._longest:

@@ -22,6 +22,7 @@ from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import message_name
+from ...actors.state_hooks import gives_deltas
 from ...actors.values import encode_value
 from ...checkpoint.life.recorded_inbox import Fed, GoLive, StopRecorded
 from ...checkpoint.method import Method
@@ -155,7 +156,7 @@ class Server(lifecycle.HerePlace):
         cell.table = table = kind._table
         state = self.state
         state.has_access = has_state_access(kind)
-        state.has_deltas = state.has_access and hasattr(kind, "get_delta") and hasattr(kind, "apply_delta")
+        state.has_deltas = state.has_access and gives_deltas(kind)
         state.waiting = frozenset(
             message_name(one) for one in kind._declared if inspect.iscoroutinefunction(table[one])
         )
@@ -200,7 +201,7 @@ class Server(lifecycle.HerePlace):
 
     @property
     def turn(self) -> int:
-        """The last turn."""
+        """The number of the last turn."""
         return self.points.turn if self.life is None else self.life.turn
 
     @property

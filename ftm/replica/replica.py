@@ -36,7 +36,7 @@ from ..bricks.sealed_frames import Opened, Refused
 from ..bricks.standing import Standing
 from ..bricks.state_transfer import Assume, Play
 from ..model.mechanism import Description, Mechanism, MechanismRefused, detection_in, revive
-from .heartbeat import Heart, Tick
+from .heartbeat import Heart, HeartbeatDue
 from .protected_actor import Server
 from .state_manager import StateManager
 
@@ -61,7 +61,7 @@ SETTLED_WITHIN = 6.0
 """Seconds after which a brick that is not needed any more is ended, whatever is still in its mailbox."""
 
 
-class Place(NamedTuple):
+class PlacedBrick(NamedTuple):
     """A brick in the graph: its class, and the mechanism whose it is (None: it passes through)."""
 
     kind: type[Brick]
@@ -86,32 +86,32 @@ def nested(layers: tuple[Mechanism, ...]) -> tuple[Mechanism, ...]:
     return (*kept[:at], *moved, *kept[at:])
 
 
-def weave(layers: tuple[Mechanism, ...], *, leads: bool) -> dict[str, Place]:
+def weave(layers: tuple[Mechanism, ...], *, leads: bool) -> dict[str, PlacedBrick]:
     """The bricks of a composition, by slot, outermost layer first.
 
     Raises:
         MechanismRefused: a mechanism stands in it twice, or two want to compute.
     """
-    places: dict[str, Place] = {PROTOCOL: Place(RequestProtocol, None, PROTOCOL)}
+    places: dict[str, PlacedBrick] = {PROTOCOL: PlacedBrick(RequestProtocol, None, PROTOCOL)}
     proceed: tuple[type[Proceed], Mechanism | None] = (Proceed, None)
     for index, one in enumerate(layers):
         role, prefix = one.role(leads=leads), f"{one.name}." if index else ""
         if f"{one.name}.before" in places:
             raise MechanismRefused(one.name, "it stands in the composition twice")
         if index:
-            places[f"{one.name}.protocol"] = Place(InnerProtocol, None, f"{prefix}protocol")
+            places[f"{one.name}.protocol"] = PlacedBrick(InnerProtocol, None, f"{prefix}protocol")
             if one.secures:
                 raise MechanismRefused(one.name, "it secures the links: it stands outermost, and once")
         for part, kind in PARTS.items():
             check_brick(one, part, getattr(role, part) or kind)
         before, after = role.before or Before, role.after or After
-        places[f"{one.name}.before"] = Place(before, one if role.before else None, f"{prefix}before")
-        places[f"{one.name}.after"] = Place(after, one if role.after else None, f"{prefix}after")
+        places[f"{one.name}.before"] = PlacedBrick(before, one if role.before else None, f"{prefix}before")
+        places[f"{one.name}.after"] = PlacedBrick(after, one if role.after else None, f"{prefix}after")
         if role.proceed is not None and role.proceed is not Proceed:
             if proceed[0] is not Proceed:
                 raise MechanismRefused(one.name, f"{proceed[1] and proceed[1].name} wants a Proceed of its own too")
             proceed = role.proceed, one
-    places["proceed"] = Place(proceed[0], proceed[1], "proceed")
+    places["proceed"] = PlacedBrick(proceed[0], proceed[1], "proceed")
     return places
 
 
@@ -138,7 +138,7 @@ class Woven:
 
     config: int
     layers: tuple[Mechanism, ...]
-    places: dict[str, Place]
+    places: dict[str, PlacedBrick]
     names: dict[str, str]  # slot to child
     new: list[str]
 
@@ -259,7 +259,7 @@ class Replica(Supervisor):
             raise
         return woven
 
-    def _known(self, slot: str, place: Place, free: dict[str, str]) -> str | None:
+    def _known(self, slot: str, place: PlacedBrick, free: dict[str, str]) -> str | None:
         """A brick that is there and does just this."""
         old = self._woven
         before = old.places.get(slot)
@@ -362,7 +362,7 @@ class Replica(Supervisor):
         self._bind_all(woven)
         self._pass_on(held)
         if BEAT in self._children and detection_in(old.layers) != detection_in(woven.layers):
-            self._cell(BEAT).ref.tell(Tick())  # Now: the next beat as it was may be later than is waited for.
+            self._cell(BEAT).ref.tell(HeartbeatDue())  # Now: the next beat as it was may be later than is waited for.
         if behind:
             self._obey(EndBricks(left), None)
         else:

@@ -26,7 +26,7 @@ from .sec_errors import EnrolmentRefused, NoCertificate, Rejected
 
 
 class GetRoot(Message[bytes]):
-    """The authority's own certificate."""
+    """Asks for the authority's own certificate."""
 
 
 class Enrol(Order[bytes]):

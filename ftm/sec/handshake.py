@@ -26,7 +26,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from .certificates import Peer, Trust
 from .keys import Secret, SigningKey, is_signed
 from .sec_errors import CLOSED, FORGED, MALFORMED, REVOKED, STALE_EPOCH, STALE_LIFE, VERSION, WRONG_PEER, Rejected
-from .session import SUITES, Limits, Session, expand
+from .session import SUITES, Session, SessionLimits, expand
 
 T = TypeVar("T")
 
@@ -95,7 +95,7 @@ class Participant(Secret):
         incarnation: int,
         epoch: int = 0,
         suites: tuple[str, ...] = tuple(SUITES),
-        limits: Limits | None = None,
+        limits: SessionLimits | None = None,
         wall: Callable[[], float] = time.time,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -106,7 +106,7 @@ class Participant(Secret):
         self._key, self._suites, self._wall, self._clock = key, suites, wall, clock
         self.certificate, self.trust, self.name = certificate, trust, me.name
         self.incarnation, self.epoch = incarnation, epoch
-        self.limits = Limits() if limits is None else limits
+        self.limits = SessionLimits() if limits is None else limits
         self.rejected: Counter[str] = Counter()
         self._lives: dict[str, int] = {}  # by peer: the highest incarnation that has proved itself
         self._epochs: dict[str, int] = {}
@@ -194,7 +194,7 @@ class Participant(Secret):
 
     @property
     def sessions(self) -> tuple[Session, ...]:
-        """Those that are open."""
+        """The sessions that are open."""
         return tuple(session for session in self._sessions.values() if session.is_open)
 
     def raise_epoch(self, epoch: int) -> None:
@@ -210,7 +210,7 @@ class Participant(Secret):
         return is_newer
 
     def close(self) -> None:
-        """End all sessions."""
+        """End all sessions, and agree on no more."""
         self._close(CLOSED, lambda session: True)
 
     def _close(self, reason: str, is_over: Callable[[Session], bool]) -> None:

@@ -20,7 +20,7 @@ from .certificates import MOST_NAME, Trust, about, make_request, public_of
 from .handshake import Participant
 from .keys import Secret, SigningKey, raw_public, read_own, write_own
 from .sec_errors import UNTRUSTED, EnrolmentRefused, NoCertificate, Rejected, UnsafeKeyFile
-from .session import Limits
+from .session import SessionLimits
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node
@@ -48,7 +48,7 @@ def root_file(folder: str, authority: str) -> Path:
     return Path(folder) / f"{hashlib.sha256(authority.encode()).hexdigest()[:32]}.root"
 
 
-class End(NamedTuple):
+class LinkEnd(NamedTuple):
     """Whose end of secured links it is."""
 
     node: Node
@@ -68,7 +68,7 @@ class End(NamedTuple):
 class Identity(Secret):
     """One participant. Its key and certificate are got when they are needed, and renewed in time."""
 
-    def __init__(self, end: End) -> None:
+    def __init__(self, end: LinkEnd) -> None:
         self.mechanism, self.path = end.mechanism, end.path
         self._node, self._address, self._epoch, self._enrols = end.node, end.address, end.epoch, end.enrols
         self.rejected: Counter[str] = Counter()
@@ -111,7 +111,7 @@ class Identity(Secret):
             self._check_root(root)
         key = SigningKey.from_file(key_file(settings.folder, self.path))
         certificate = await self._authority(GetCertificate(certified(self.path)))
-        limits = Limits(settings.rotate_messages, settings.rotate_seconds, lifetime=settings.lifetime)
+        limits = SessionLimits(settings.rotate_messages, settings.rotate_seconds, lifetime=settings.lifetime)
         life = time.monotonic_ns() if old is None else old.incarnation
         trust = Trust(root, needs_list=True)  # Who cannot know whether somebody was revoked believes nobody.
         trust.take_list(await self._authority(GetRevocations()), time.time())

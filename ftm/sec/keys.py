@@ -78,7 +78,7 @@ class SigningKey(Secret):
 
     @property
     def private(self) -> Ed25519PrivateKey:
-        """For building certificates."""
+        """The private key, for building certificates."""
         return self._private
 
     @property

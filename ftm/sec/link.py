@@ -35,7 +35,7 @@ from ..bricks.sealed_frames import (
 from .authority import AwaitRevocations
 from .certificates import HEARTBEAT
 from .handshake import Participant, Response
-from .identity import End, Identity, certified, root_file
+from .identity import Identity, LinkEnd, certified, root_file
 from .keys import Secret
 from .sec_errors import (
     CLOSED,
@@ -95,7 +95,7 @@ class Partner(Secret):
 class Link(Identity):
     """One end of secured links."""
 
-    def __init__(self, end: End) -> None:
+    def __init__(self, end: LinkEnd) -> None:
         super().__init__(end)
         self._proxy = certified(f"{end.address}/ftm/proxy")
         self._replicas = frozenset(certified(f"{end.address}/ftm/r{number}") for number in range(1, MOST_REPLICAS + 1))

@@ -50,7 +50,7 @@ SUITES: Final[dict[str, type[AESGCM] | type[ChaCha20Poly1305]]] = {
 }
 
 
-class Limits(msgspec.Struct, frozen=True):
+class SessionLimits(msgspec.Struct, frozen=True):
     """When keys are exchanged, and when a session ends.
 
     Args:
@@ -118,7 +118,7 @@ class Window:
         return REPLAYED if self._bits >> behind & 1 else ""
 
     def put(self, number: int) -> None:
-        """A number was here."""
+        """Note that the frame of this number has come."""
         ahead = number - self.newest
         if ahead > 0:
             # A number far ahead must not make a number of that many bits.
@@ -159,7 +159,7 @@ class Session(Secret):
         incarnation: int,
         clock: Callable[[], float],
         lifetime: float,
-        limits: Limits,
+        limits: SessionLimits,
         rejected: Counter[str],
     ) -> None:
         now = clock()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ...actors.errors import type_name
-from ...actors.kernel.actor import Actor
+from ...actors.kernel.actor import Actor, handled_by
 from ..model.mechanism import MechanismRefused, has_state_access
 from .assertions import imported
 
@@ -32,7 +32,7 @@ def version(kind: type[Actor], name: str, mechanism: str) -> type[Actor]:
 
 
 def _with_handler(kind: type[Actor], handler: Any, name: str, mechanism: str) -> type[Any]:
-    handled = [one.kind for one in getattr(handler, "__handles__", ())]
+    handled = [one.kind for one in handled_by(handler)]
     if not handled:
         raise MechanismRefused(mechanism, f"{name} is neither an actor class nor a handler (@on)")
     body: dict[str, Any] = {}
@@ -45,5 +45,5 @@ def _with_handler(kind: type[Actor], handler: Any, name: str, mechanism: str) ->
 
 
 def _handles(kind: type[Actor], key: str) -> list[Any]:
-    marks = getattr(getattr(kind, key, None), "__handles__", ())
+    marks = handled_by(getattr(kind, key, None))
     return [one.kind for one in marks]

@@ -17,13 +17,12 @@ import statistics
 from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from itertools import combinations
-from typing import Any, Final, Generic, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, Final, Generic, Protocol, TypeVar, runtime_checkable
 
 import msgspec
 
 from ...actors.errors import HoldfastError
-from ...checkpoint.protocol import Answer, TurnEnd
-from .canonical import ABSENT, answer_form, canonical, close, end_form
+from .canonical import ABSENT, canonical, close
 
 T = TypeVar("T")
 Groups = tuple[tuple[int, ...], ...]
@@ -52,7 +51,7 @@ class Agreed(msgspec.Struct, Generic[T], frozen=True):
 
     @property
     def is_unanimous(self) -> bool:
-        """Whether nobody dissents."""
+        """Whether no ballot says anything else."""
         return not self.dissenting
 
 
@@ -213,7 +212,7 @@ def decide(voter: Voter, ballots: Sequence[T]) -> Agreed[T] | Undecided:
     >>> decide(Tolerance(abs=0.1), [0.3, 0.1 + 0.2, 9.0]).agreeing
     (0, 1)
     """
-    decided = _decide(voter, [_Ballot(ballot) for ballot in ballots], lambda ballot: canonical(ballot.value))
+    decided = decide_by(voter, [_Ballot(ballot) for ballot in ballots], lambda ballot: canonical(ballot.value))
     if isinstance(decided, Undecided):
         return decided
     if decided.choice is not None:
@@ -222,43 +221,6 @@ def decide(voter: Voter, ballots: Sequence[T]) -> Agreed[T] | Undecided:
         return Agreed(_plain(decided.value), None, decided.agreeing, decided.dissenting)
     except TypeError as error:
         return Undecided(str(error))
-
-
-def vote_answers(voter: Voter, answers: Sequence[Answer | None], kind: Any = None) -> Agreed[Answer] | Undecided:
-    """Vote on encoded answers (None: absent). What is taken is the answer as it was encoded.
-
-    Args:
-        voter: what decides.
-        answers: one per run. A refusal or an error is an answer like a reply; of a crash, class and text count.
-        kind: the type of the reply; only needed if there are sets in it, whose order says nothing.
-    """
-    if _is_plain_case(voter, answers):
-        return Agreed(cast("Answer", answers[0]), 0, tuple(range(len(answers))))
-    decided = _decide(voter, answers, lambda answer: answer_form(answer, kind))
-    if isinstance(decided, Undecided) or decided.choice is not None:
-        return decided
-    try:
-        _, outcome, name, made = cast("tuple[str, str, str, object]", decided.value)
-        answer = Answer(outcome, name, msgspec.msgpack.encode(_plain(made)))
-    except (TypeError, ValueError) as error:
-        return Undecided(str(error))
-    return Agreed(answer, None, decided.agreeing, decided.dissenting)
-
-
-def vote_ends(voter: Voter, ends: Sequence[TurnEnd | None], *, with_state: bool = True) -> Agreed[TurnEnd] | Undecided:
-    """Vote on how turns ended (None: absent): outcome, outputs in program order, answer, and the state's digest.
-
-    Args:
-        voter: what decides; not one that makes an answer of several (`Median` does where no end is in the middle).
-        ends: one per run.
-        with_state: whether states must be the same to the bit. Not together with a tolerance: digests have none.
-    """
-    if _is_plain_case(voter, ends):
-        return Agreed(cast("TurnEnd", ends[0]), 0, tuple(range(len(ends))))
-    decided = _decide(voter, ends, lambda end: end_form(end, with_state=with_state))
-    if isinstance(decided, Undecided) or decided.choice is not None:
-        return decided
-    return Undecided("no turn has ended with what is in the middle")
 
 
 class _Ballot:
@@ -270,17 +232,8 @@ class _Ballot:
         self.value = value
 
 
-def _is_plain_case(voter: Voter, ballots: Sequence[object]) -> bool:
-    """All are there and equal to the byte: nothing has to be decoded. A user's voter may find even that wrong."""
-    if not isinstance(voter, Exact | Majority | Tolerance) or not 0 < len(ballots) <= MOST_BALLOTS:
-        return False
-    first = ballots[0]
-    need = 0 if isinstance(voter, Exact) else voter.need
-    return first is not None and need <= len(ballots) and all(ballot == first for ballot in ballots)
-
-
-def _decide(voter: Voter, ballots: Sequence[Any], form: Callable[[Any], object]) -> Agreed[Any] | Undecided:
-    """None is an absent ballot. An answer that was made is in canonical form."""
+def decide_by(voter: Voter, ballots: Sequence[Any], form: Callable[[Any], object]) -> Agreed[Any] | Undecided:
+    """Vote on ballots by their canonical `form`; None is an absent one. An answer that was made is in that form."""
     if not 0 < len(ballots) <= MOST_BALLOTS:
         return Undecided(f"{len(ballots)} ballots: between 1 and {MOST_BALLOTS} can be compared")
     try:

@@ -17,7 +17,7 @@ from ...actors.kernel.context import ActorContext
 from ...actors.kernel.links import link
 from ...actors.kernel.ref import ActorRef
 from ..spec import Shutdown
-from .jobs import Work
+from .jobs import BeginJob
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -68,7 +68,7 @@ class Job(Generic[R]):
 
     @property
     def is_done(self) -> bool:
-        """Whether it is over."""
+        """Whether the job is over."""
         return self._future.done()
 
     async def outcome(self, timeout: float | None = None) -> Ok[None, R] | Failed[None] | None:
@@ -87,7 +87,7 @@ class Job(Generic[R]):
         self._end(self._shutdown)
 
     def kill(self) -> None:
-        """End it at once."""
+        """End the job at once, in whatever state it is."""
         self._end("brutal_kill")
 
     async def stop(self, shutdown: Shutdown | None = None) -> Ok[None, R] | Failed[None]:
@@ -179,7 +179,7 @@ async def _result(cell: Cell) -> Any:
 
     Raises whatever it failed with; AskFailed if it was ended.
     """
-    reply = cell.ref.ask(Work(), FOREVER)
+    reply = cell.ref.ask(BeginJob(), FOREVER)
     reply.add_done_callback(seen)
     if cell.state is not DOWN:  # Else its process is coming up: if that fails, so does the ask.
         gone = cell.ended()

@@ -60,7 +60,7 @@ class _Window:
         self.wake()
 
     def wake(self, _: object = None) -> None:
-        """Something has happened."""
+        """Wake whoever waits for the next outcome."""
         if self._woken is not None and not self._woken.done():
             self._woken.set_result(None)
 
@@ -131,7 +131,7 @@ class _Source:
         return self._pulling
 
     def close(self) -> None:
-        """No more of it."""
+        """Take nothing more from the source."""
         if self._pulling is not None:
             self._pulling.cancel()
 

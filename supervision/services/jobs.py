@@ -18,17 +18,17 @@ from ...actors.errors import AskFailed, HoldfastError, remote_crash
 from ...actors.exit_reasons import KILLED, ExitReason, Shutdown, crash
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Actor, on
+from ...actors.kernel.blocking_handlers import ThreadContext, is_async
 from ...actors.kernel.cell import DOWN
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message, Refusal
 from ...actors.kernel.ref import current
-from ...actors.kernel.threads import ThreadContext, is_async
 from ..children import Child, StartLimit
 from ..dynamic import DynamicSupervisor
 from ..spec import ChildSpec
 
 
-class Work(Message[Any]):
+class BeginJob(Message[Any]):
     """Begin; the reply, which comes at the end, is what the function returned."""
 
 
@@ -39,7 +39,7 @@ class JobActor(Actor):
         label: what the job is called; its supervisor adds a number.
         function: what is called; packed by name if the job is to live in another process.
         args: its arguments.
-        is_awaited: it begins with `Work`, and answers that; else with its start.
+        is_awaited: it begins with `BeginJob`, and answers that; else with its start.
         is_coded: it lives in another process than whoever started it.
     """
 
@@ -57,9 +57,9 @@ class JobActor(Actor):
         if not self._is_awaited:
             self._work = self.ctx.create_task(self._run())
 
-    @on(Work)
-    def _begin(self, message: Work) -> ReplyHandle[Any]:
-        """Begin."""
+    @on(BeginJob)
+    def _begin(self, message: BeginJob) -> ReplyHandle[Any]:
+        """Begin the job, and answer when it is over."""
         self._handle = self.ctx.reply_handle()
         self._work = self.ctx.create_task(self._run())
         return self._handle

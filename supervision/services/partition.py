@@ -129,7 +129,7 @@ class PartitionSupervisor(Supervisor):
 
     @on(StartChild)
     def _start_child(self, message: StartChild) -> Any:
-        """Partitions are all alike."""
+        """Refuse, because all partitions are alike."""
         raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
 
     @on(RemoveChild)
@@ -140,7 +140,7 @@ class PartitionSupervisor(Supervisor):
 
     @on(DeleteChild)
     def _delete_child(self, message: DeleteChild) -> Any:
-        """Partitions are all alike."""
+        """Refuse, because all partitions are alike."""
         self._child(message.id)
         raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
 

@@ -125,7 +125,7 @@ class PoolSupervisor(Supervisor):
 
     @on(PoolInfo, readonly=True)
     def _info(self, message: PoolInfo) -> PoolStatus:
-        """How it is."""
+        """Tell how many workers there are, are up and leave, and how many messages wait."""
         up = sum(one.is_running and one.cell is not None and one.cell.host.is_up(one.cell) for one in self._crew)
         router = self._children.get(ROUTER)
         cell = None if router is None else router.cell
@@ -185,7 +185,7 @@ class PoolSupervisor(Supervisor):
 
     @on(StartChild)
     def _start_child(self, message: StartChild) -> Any:
-        """Workers are all alike."""
+        """Refuse, because all workers are alike."""
         raise NotSupported("the children of a pool are its workers: use ResizePool")
 
     @on(RemoveChild)
@@ -196,7 +196,7 @@ class PoolSupervisor(Supervisor):
 
     @on(DeleteChild)
     def _delete_child(self, message: DeleteChild) -> Any:
-        """Workers are all alike."""
+        """Refuse, because all workers are alike."""
         self._child(message.id)
         raise NotSupported("the children of a pool are its workers: use ResizePool")
 
@@ -277,7 +277,7 @@ def _worker_in(where: str, worker: Any, isolation: Isolation | None) -> ChildSpe
 
 
 class HasNode(Protocol):
-    """An actor system."""
+    """What has a node: an actor system."""
 
     @property
     def node(self) -> Node: ...

@@ -23,12 +23,12 @@ from ...actors.kernel.actor import Actor, on, start
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.message import Message, Refusal
 from ...actors.process.fork.launch import outside_environment
-from ...actors.process.program.external_program import Kept, ProgramFailed
+from ...actors.process.program.external_program import KeptProgram, ProgramFailed
 from ...actors.process.resource_limits import Limits
 from ..backoff import Backoff
 from ..rules import Rule
 from ..spec import ChildSpec, Restart, Shutdown, child
-from .readiness import Ready, Sign, by_name, reached
+from .readiness import ReadySign, Sign, by_name, reached
 
 Stop: TypeAlias = int | Sequence[str] | Callable[[int], Awaitable[object] | object]
 """How a program is asked to end: a signal, a command, or a function that is given its pid."""
@@ -69,11 +69,11 @@ class InputRefused(Refusal):
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Order:
+class ProgramPlan:
     """What a program is and how it is started and stopped. Made by `program`."""
 
     command: tuple[str, ...]
-    ready: Ready | None
+    ready: ReadySign | None
     ready_timeout: float
     stop: Any
     shutdown: Shutdown
@@ -88,9 +88,9 @@ class Program(Actor):
 
     deterministic = False
 
-    def __init__(self, order: Order) -> None:
+    def __init__(self, order: ProgramPlan) -> None:
         self._order = order
-        self._kept: Kept | None = None
+        self._kept: KeptProgram | None = None
         self._is_up = False
         self._lines: deque[str] = deque(maxlen=LINES)
         self._parts: dict[str, str] = {}  # of lines that have no end yet, by stream
@@ -106,7 +106,7 @@ class Program(Actor):
         if left := [ended for ended, address in remains.items() if address == own]:
             await asyncio.wait(left)  # The last life was killed: its program must be gone before the next one begins.
         order = self._order
-        if isinstance(before, Kept) and not before.ended.done():
+        if isinstance(before, KeptProgram) and not before.ended.done():
             why = f"that of an earlier life still runs, and cannot be ended from here ({before.denied.result()})"
             raise ProgramFailed(order.command[0], why)
         self._sign = None if order.ready is None else Sign(order.ready)
@@ -121,9 +121,11 @@ class Program(Actor):
         if kept.ended.done():  # At once: nobody was there yet to be told.
             self.ctx.stop(kept.ended.result())
 
-    def _keep(self, command: Sequence[str], more: Mapping[str, str] | None = None, *, stdin: bool = False) -> Kept:
+    def _keep(
+        self, command: Sequence[str], more: Mapping[str, str] | None = None, *, stdin: bool = False
+    ) -> KeptProgram:
         order = self._order
-        kept = Kept(
+        kept = KeptProgram(
             self.ctx.cell.node,
             command,
             env={**_environment(order.env), **(more or {})},
@@ -142,7 +144,7 @@ class Program(Actor):
         why = f"it cannot be ended from here, and runs on until somebody else ends it ({denied.result()})"
         self.ctx.cell.node.emit(HookFailed(self.ctx.path, "stop", exit_reasons.crash(ProgramFailed(program, why))))
 
-    async def _until_ready(self, kept: Kept, sign: Sign) -> None:
+    async def _until_ready(self, kept: KeptProgram, sign: Sign) -> None:
         """Wait for the sign.
 
         Raises:
@@ -192,7 +194,7 @@ class Program(Actor):
             self._sign.line(whole)
 
     def _last(self) -> list[str]:
-        """What it said last."""
+        """The last words that the program has written."""
         return [*self._lines, *(text for text in self._parts.values() if text)][-LINES:]
 
     def _started(self, started: asyncio.Future[int]) -> None:
@@ -211,7 +213,7 @@ class Program(Actor):
 
     @on(ProgramInfo, readonly=True)
     def info(self, message: ProgramInfo) -> ProgramStatus:
-        """How it is."""
+        """Tell how the program is."""
         kept = self._kept
         return ProgramStatus(-1 if kept is None else kept.pid, self._now() - self._since, self._last())
 
@@ -248,7 +250,7 @@ class Program(Actor):
             kept.kill()
         await kept.wait_killed()
 
-    async def _asked(self, kept: Kept, patience: float | None) -> bool:
+    async def _asked(self, kept: KeptProgram, patience: float | None) -> bool:
         """Ask the program to end; whether it did so in time."""
         try:
             async with asyncio.timeout(patience):
@@ -262,7 +264,7 @@ class Program(Actor):
             self.ctx.cell.node.emit(HookFailed(self.ctx.path, "stop", exit_reasons.crash(error)))
         return kept.ended.done()
 
-    async def _ask(self, kept: Kept) -> None:
+    async def _ask(self, kept: KeptProgram) -> None:
         way = self._order.stop
         if isinstance(way, int):
             kept.signal(way)
@@ -296,12 +298,12 @@ class Program(Actor):
 class _Leash:
     """Ends with the life that owns a program, also if that is killed and no hook runs: then the program is too."""
 
-    def __init__(self, cell: Cell, kept: Kept) -> None:
+    def __init__(self, cell: Cell, kept: KeptProgram) -> None:
         self._cell, self._kept = cell, kept
         cell.extra().belongings.timers.add(self)
 
     def cancel(self) -> None:
-        """The life is over."""
+        """End the program, because the life that owns it is over."""
         cell, kept = self._cell, self._kept
         cell.extra().belongings.timers.discard(self)
         if kept.ended.done():
@@ -369,9 +371,9 @@ def program(
     directory = _directory_in(where, cwd)
     if isinstance(ready, Path) and directory is not None:
         ready = Path(directory, ready)
-    order = Order(
+    order = ProgramPlan(
         words,
-        None if ready is None else Ready.of(where, ready),
+        None if ready is None else ReadySign.of(where, ready),
         float(ready_timeout),
         _stop_in(where, stop),
         shutdown,

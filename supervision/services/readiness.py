@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from ...actors.errors import SpecError
-from ...actors.kernel.threads import Threads, is_async
+from ...actors.kernel.blocking_handlers import Threads, is_async
 from ...actors.streams import Address, connect
 
 FIRST_LOOK, LAST_LOOK = 0.01, 0.2
@@ -27,14 +27,14 @@ Kind = Literal["line", "path", "port", "seconds", "call"]
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Ready:
+class ReadySign:
     """One kind of sign, as plain data where it can be."""
 
     kind: Kind
     value: Any
 
     @classmethod
-    def of(cls, where: str, ready: object) -> Ready:
+    def of(cls, where: str, ready: object) -> ReadySign:
         """What a user gave.
 
         Raises:
@@ -110,7 +110,7 @@ def _found(module: str, name: str) -> Any:
 class Sign:
     """The wait for one sign; made before the program is started, so that what was there before is no sign."""
 
-    def __init__(self, ready: Ready) -> None:
+    def __init__(self, ready: ReadySign) -> None:
         self.ready = ready
         self.seen = asyncio.Event()  # a line with the pattern has come
         self._pattern = re.compile(*ready.value) if ready.kind == "line" else None

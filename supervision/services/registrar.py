@@ -44,7 +44,7 @@ class NotUnique(Refusal):
     order: str
 
 
-class Row(msgspec.Struct, frozen=True, array_like=True):
+class RegistryRow(msgspec.Struct, frozen=True, array_like=True):
     """An entry as it travels."""
 
     number: int
@@ -61,7 +61,7 @@ class Register(Message[None]):
     life: int
 
 
-class Find(Message[list[Row]]):
+class Find(Message[list[RegistryRow]]):
     """The entries of a key, of a holder, of both, or all."""
 
     key: bytes | None = None
@@ -72,14 +72,14 @@ class Count(Message[int]):
     """How many entries there are."""
 
 
-class Drop(Message[int]):
+class DropEntries(Message[int]):
     """Give up the sender's entries for a key: those numbered, or all. The reply is how many these were."""
 
     key: bytes
     numbers: list[int] | None = None
 
 
-class Replace(Message[bool]):
+class ReplaceValue(Message[bool]):
     """Put another value into an entry of the sender's; False if it is gone."""
 
     key: bytes
@@ -116,7 +116,7 @@ class GetMeta(Message[list[Any]]):
 
 
 class DeleteMeta(Message[None]):
-    """Forget such a value."""
+    """Forgets a value that belongs to the registry as a whole."""
 
     name: str
 
@@ -140,7 +140,7 @@ class KeyFreed(Message[None]):
 
 
 @dataclasses.dataclass(slots=True, eq=False)
-class Entry:
+class HeldKey:
     """One key, held by one life of an actor."""
 
     number: int
@@ -149,9 +149,9 @@ class Entry:
     life: int
     value: Any
 
-    def row(self) -> Row:
-        """As it travels."""
-        return Row(self.number, self.key, self.holder.ref, self.value)
+    def row(self) -> RegistryRow:
+        """Make the row in which the entry travels."""
+        return RegistryRow(self.number, self.key, self.holder.ref, self.value)
 
 
 @dataclasses.dataclass(slots=True, eq=False)
@@ -170,7 +170,7 @@ class Holdings:
     """What one actor holds, in the order in which it came to it."""
 
     monitor: Monitor
-    entries: dict[Entry, None] = dataclasses.field(default_factory=dict[Entry, None])
+    entries: dict[HeldKey, None] = dataclasses.field(default_factory=dict[HeldKey, None])
     claims: dict[Claim, None] = dataclasses.field(default_factory=dict[Claim, None])
 
 
@@ -180,7 +180,7 @@ class Book:
 
     meta: dict[str, Any]
     number: int = 0
-    keys: dict[bytes, dict[Entry, None]] = dataclasses.field(default_factory=dict[bytes, dict[Entry, None]])
+    keys: dict[bytes, dict[HeldKey, None]] = dataclasses.field(default_factory=dict[bytes, dict[HeldKey, None]])
     locks: dict[bytes, deque[Claim]] = dataclasses.field(default_factory=dict[bytes, deque[Claim]])
     holders: dict[Cell, Holdings] = dataclasses.field(default_factory=dict[Cell, Holdings])
 
@@ -232,13 +232,13 @@ class RegistryActor(Actor):
                 else:
                     raise KeyTaken(entry.holder.ref)
         self._book.number += 1
-        entry = Entry(self._book.number, message.key, holder, message.life, message.value)
+        entry = HeldKey(self._book.number, message.key, holder, message.life, message.value)
         self._book.keys.setdefault(message.key, {})[entry] = None
         self._holdings(holder).entries[entry] = None
         self._tell_listeners(KeyRegistered(self.ctx.ref, key_of(entry.key), holder.ref, entry.value))
 
     @on(Find, readonly=True)
-    def _find(self, message: Find) -> list[Row]:
+    def _find(self, message: Find) -> list[RegistryRow]:
         """Entries in the order in which they came, without those of the dead."""
         book = self._book
         if message.holder is not None:
@@ -257,8 +257,8 @@ class RegistryActor(Actor):
         """All entries of the living."""
         return sum(is_living(entry.holder, entry.life) for entries in self._book.keys.values() for entry in entries)
 
-    @on(Drop)
-    def _drop(self, message: Drop) -> int:
+    @on(DropEntries)
+    def _drop(self, message: DropEntries) -> int:
         """Only one's own; what is not there is no error."""
         holdings = self._book.holders.get(self._sender())
         mine = [entry for entry in (holdings.entries if holdings is not None else ()) if entry.key == message.key]
@@ -268,9 +268,9 @@ class RegistryActor(Actor):
             self._remove(entry, ended=False)
         return len(mine)
 
-    @on(Replace)
-    def _replace(self, message: Replace) -> bool:
-        """Only one's own."""
+    @on(ReplaceValue)
+    def _replace(self, message: ReplaceValue) -> bool:
+        """Put another value into an entry, if it is the sender's own."""
         if not self._is_unique:
             raise NotUnique("update_value")
         holder = self._sender()
@@ -280,7 +280,7 @@ class RegistryActor(Actor):
                 return True
         return False
 
-    def _remove(self, entry: Entry, *, ended: bool) -> None:
+    def _remove(self, entry: HeldKey, *, ended: bool) -> None:
         entries = self._book.keys[entry.key]
         del entries[entry]
         if not entries:
@@ -293,7 +293,7 @@ class RegistryActor(Actor):
 
     @on(Lock)
     def _lock(self, message: Lock) -> ReplyHandle[Any] | None:
-        """First come, first served."""
+        """Queue for the lock of a key; whoever has asked first gets it."""
         item = self.ctx.item
         handle = self.ctx.reply_handle()
         sender = item.sender if isinstance(item, Ask) else None

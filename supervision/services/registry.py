@@ -23,7 +23,7 @@ from ..spec import ChildSpec, Restart, Shutdown
 from .registrar import (
     Count,
     DeleteMeta,
-    Drop,
+    DropEntries,
     Find,
     GetMeta,
     Keys,
@@ -33,8 +33,8 @@ from .registrar import (
     PutMeta,
     Register,
     RegistryActor,
-    Replace,
-    Row,
+    RegistryRow,
+    ReplaceValue,
     Unlock,
     key_of,
 )
@@ -137,14 +137,14 @@ class Registry(Generic[K, V]):
 
     async def unregister(self, key: K) -> int:
         """Give up all one's entries for a key; returns how many there were. Others' stay as they are."""
-        return await self._ask(Drop(pack_key(key)))
+        return await self._ask(DropEntries(pack_key(key)))
 
     async def unregister_match(self, key: K, test: Callable[[V], bool]) -> int:
         """Give up those of one's entries for a key whose value passes the test; returns how many."""
         packed = pack_key(key)
         rows = await self._ask(Find(packed, _own_ref()))
         numbers = [row.number for row in rows if test(row.value)]
-        return await self._ask(Drop(packed, numbers)) if numbers else 0
+        return await self._ask(DropEntries(packed, numbers)) if numbers else 0
 
     async def update_value(self, key: K, change: Callable[[V], V]) -> tuple[V, V] | None:
         """Put `change(value)` in the place of the value of one's unique key.
@@ -161,7 +161,7 @@ class Registry(Generic[K, V]):
             return None
         old: V = rows[0].value
         new = change(old)
-        return (new, old) if await self._ask(Replace(packed, rows[0].number, new)) else None
+        return (new, old) if await self._ask(ReplaceValue(packed, rows[0].number, new)) else None
 
     # -- anybody's entries ------------------------------------------------------------------------------------------
 
@@ -260,13 +260,13 @@ class Registry(Generic[K, V]):
         return found[0] if found else default
 
     async def delete_meta(self, name: str) -> None:
-        """Forget such a value."""
+        """Forget a value that belongs to the registry as a whole."""
         await self._ask(DeleteMeta(name))
 
     async def _ask(self, message: Message[T]) -> T:
         return await self.ref.ask(message, self.timeout)
 
-    def _entries(self, rows: list[Row]) -> list[RegistryEntry[K, V]]:
+    def _entries(self, rows: list[RegistryRow]) -> list[RegistryEntry[K, V]]:
         return [RegistryEntry(cast("K", key_of(row.key)), row.holder, cast("V", row.value)) for row in rows]
 
 

@@ -12,7 +12,7 @@ from ...actors.kernel import mailbox
 from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.context import Stashed
-from ...actors.kernel.envelope import Ask, Envelope, Table, chain_of, message_in
+from ...actors.kernel.envelope import AnyTable, Ask, Envelope, Table, chain_of, message_in
 from ...actors.kernel.message import Message, Refusal
 from ..admin import NotSupported
 from ..children import STOPPED, Child
@@ -205,17 +205,7 @@ class Router(Actor):
         mailbox.resume(cell, mailbox.BY_ITSELF)
 
 
-class AnyMessage(Table):
-    """The table of a router whose workers' class is not known here: it decides itself what is unknown."""
-
-    def __contains__(self, kind: object) -> bool:
-        return True
-
-    def knows(self, kind: type) -> bool:
-        return True
-
-
-Router._table = AnyMessage()
+Router._table = AnyTable()  # The workers' class is not known here: they decide themselves what is unknown.
 
 
 @functools.cache

@@ -243,7 +243,10 @@ class Tasks:
             raise SpecError("stream", f"max_concurrency must be a whole number >= 1, not {max_concurrency!r}")
         if on_timeout not in get_args(OnTimeout):
             raise SpecError("stream", f"on_timeout must be one of {', '.join(get_args(OnTimeout))}, not {on_timeout!r}")
-        begin = functools.partial(self._begin_with, function, linked, isolation, shutdown)
+
+        def begin(item: Any) -> Job[Any]:
+            return self._begin(function, (item,), linked, isolation, shutdown)
+
         return stream_of(begin, items, most, ordered, timeout, on_timeout)
 
     async def outcomes(
@@ -269,11 +272,6 @@ class Tasks:
         return [cast("ActorRef[Actor]", node.cell_at(info.path).ref) for info in await self.ref.ask(WhichChildren())]
 
     # -- how --------------------------------------------------------------------------------------------------------
-
-    def _begin_with(
-        self, function: Callable[..., Any], linked: bool, isolation: Isolation, shutdown: Shutdown, item: Any
-    ) -> Job[Any]:
-        return self._begin(function, (item,), linked, isolation, shutdown)
 
     def _begin(
         self,

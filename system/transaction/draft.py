@@ -19,7 +19,7 @@ from ...supervision.dynamic import DynamicSupervisor
 from ...supervision.services.partition import PartitionSupervisor
 from ...supervision.spec import ChildSpec, Flags
 from ...supervision.supervisor import Supervisor
-from ..protection import part_of
+from ..mechanism_notes import part_of
 from ..recovery import RecoverySupervisor
 from .lasting import recipe_flags, recipe_specs
 from .operation import wrong

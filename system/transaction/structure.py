@@ -20,10 +20,10 @@ from ...supervision.admin import (
     RemoveChild,
     StartChild,
 )
-from ...supervision.change import check_subtree
 from ...supervision.dynamic import check_dynamic
 from ...supervision.spec import NAMELESS, ChildSpec, Flags, Plan, check_spec, child
 from ...supervision.supervisor import Supervisor
+from ...supervision.supervisor_changes import check_subtree
 from .arrangement import planned_spec
 from .draft import START_TIMEOUT, Draft, Place, Target, check_awake, is_elsewhere
 from .lasting import recipe_specs

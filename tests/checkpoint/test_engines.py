@@ -12,7 +12,7 @@ import pytest
 import holdfast as hf
 from holdfast.checkpoint.journal import Journal, MemoryJournal
 from holdfast.checkpoint.sqlite import SqliteJournal
-from holdfast.checkpoint.stores import open_journal
+from holdfast.checkpoint.store_opening import open_journal
 from holdfast.testing.schedules.disk import SimulatedDisk, SimulatedJournal
 from holdfast.testing.stores import conformance
 from tests.checkpoint.one_file import OneFile

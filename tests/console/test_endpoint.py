@@ -23,10 +23,10 @@ from holdfast.console.wire import (
     LARGEST,
     RESPONSE,
     BadRequest,
-    Control,
-    Packed,
-    Plain,
-    Request,
+    ControlActor,
+    ControlRequest,
+    PackedArg,
+    PlainArg,
     Transact,
     Tree,
     WrongUser,
@@ -187,17 +187,17 @@ BAD = {
 @pytest.mark.parametrize(
     ("request_", "problem"),
     [
-        (Transact([("step", [Plain("x")])], dry_run=False, timeout=1.0), "there is no operation 'step'"),
+        (Transact([("step", [PlainArg("x")])], dry_run=False, timeout=1.0), "there is no operation 'step'"),
         (Transact([("compose", [])], dry_run=False, timeout=1.0), "compose lacks outside"),
-        (Transact([("update", [Plain("/app/left")])], dry_run=False, timeout=1.0), "update lacks role"),
+        (Transact([("update", [PlainArg("/app/left")])], dry_run=False, timeout=1.0), "update lacks role"),
         (
-            Control("replace_state", "/app/left", [Packed("function", encode_value("os:system"))], 1.0),
+            ControlActor("replace_state", "/app/left", [PackedArg("function", encode_value("os:system"))], 1.0),
             "is no function: a name, its arguments",
         ),
     ],
 )
 async def test_a_request_that_cannot_be_read_is_answered(
-    system: hf.ActorSystem, path: Path, request_: Request, problem: str
+    system: hf.ActorSystem, path: Path, request_: ControlRequest, problem: str
 ) -> None:
     reader, writer = await asyncio.open_unix_connection(path)
     writer.write(frame(request_))
@@ -287,7 +287,7 @@ async def test_a_path_that_somebody_is_about_to_take_is_left_alone(system: hf.Ac
 
 
 def test_every_request_is_typed() -> None:
-    assert all(kind.__struct_config__.forbid_unknown_fields for kind in Request.__subclasses__())
+    assert all(kind.__struct_config__.forbid_unknown_fields for kind in ControlRequest.__subclasses__())
 
 
 # -- what a script can do ---------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.console.demo.killer import LONGEST_DELAY, Killer, Moment, schedule
-from holdfast.console.demo.report import Kill
+from holdfast.console.demo.report import MapperKill
 
 
 @given(st.integers(0, 50), st.integers(1, 5000), st.integers())
@@ -42,14 +42,14 @@ class Processes:
 async def test_each_process_is_killed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     processes = Processes(11, 11, None, 13, 12)
     monkeypatch.setattr("os.kill", processes.kill)
-    told: list[Kill] = []
+    told: list[MapperKill] = []
     killer = Killer([Moment(5, 0.0), Moment(6, 0.0)], processes.find, told.append)
     killer.saw(4)
     assert not processes.signals
     killer.saw(9)
     await killer.finish()
     assert processes.signals == [(11, signal.SIGKILL), (12, signal.SIGKILL)]
-    assert killer.kills == told == [Kill(11, 5), Kill(12, 6)]
+    assert killer.kills == told == [MapperKill(11, 5), MapperKill(12, 6)]
 
 
 async def test_no_kills_are_done_at_once() -> None:

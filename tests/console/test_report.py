@@ -8,10 +8,10 @@ import numpy as np
 from holdfast.console.demo.grid import Geometry, OccupancyGrid
 from holdfast.console.demo.report import (
     Asks,
-    Kill,
-    Outcome,
-    Recovery,
-    Report,
+    DemoReport,
+    MapperKill,
+    MapperRecovery,
+    RunOutcome,
     as_json,
     as_lines,
     judge_asks,
@@ -19,11 +19,13 @@ from holdfast.console.demo.report import (
 )
 
 PLACE = Geometry(1.0, 0.0, 0.0, 4, 3)
-GOOD = Outcome(OccupancyGrid(PLACE), scans=9, gaps=0, asks=Asks(5, 5, 0, 0), seconds=1.0)
-REPORT = Report(GOOD, replace(GOOD, kills=[Kill(42, 3)], recoveries=[Recovery({"detect": 0.002}, 7)]), "hybrid", 2.5)
+GOOD = RunOutcome(OccupancyGrid(PLACE), scans=9, gaps=0, asks=Asks(5, 5, 0, 0), seconds=1.0)
+REPORT = DemoReport(
+    GOOD, replace(GOOD, kills=[MapperKill(42, 3)], recoveries=[MapperRecovery({"detect": 0.002}, 7)]), "hybrid", 2.5
+)
 
 
-def changed(**fields: object) -> Report:
+def changed(**fields: object) -> DemoReport:
     return replace(REPORT, disturbed=replace(REPORT.disturbed, **fields))  # type: ignore[arg-type]
 
 
@@ -70,7 +72,7 @@ def test_a_bad_line_is_a_fault_and_a_cut_off_one_is_none() -> None:
 def test_recovery_is_summed_up_by_phase() -> None:
     assert recovery_ms([]) == {}
     several = [(0.001, 0.1), (0.002, 0.3), (0.009, 0.2)]
-    recoveries = [Recovery({"detect": detect, "replay": replay}, 1) for detect, replay in several]
+    recoveries = [MapperRecovery({"detect": detect, "replay": replay}, 1) for detect, replay in several]
     assert recovery_ms(recoveries) == {"detect": 2.0, "replay": 200.0, "total": 209.0}
 
 

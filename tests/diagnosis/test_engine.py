@@ -7,8 +7,8 @@ import threading
 import pytest
 
 from holdfast.diagnosis.engine import Diagnoser, State, minimal_diagnoses
-from holdfast.diagnosis.engine.cone import Index, Part, cone_of
-from holdfast.diagnosis.engine.solve import Budget, Solved, solve
+from holdfast.diagnosis.engine.cone import Index, RulePart, cone_of
+from holdfast.diagnosis.engine.solve import SearchBudget, Solved, solve
 from holdfast.diagnosis.literals import BadLiteral, Vocabulary, ok, parse, running
 from holdfast.diagnosis.model import History, Model, Put, System
 from holdfast.diagnosis.observations import Observation, ObservationSet
@@ -134,7 +134,7 @@ def test_what_interrupts_before_a_search_begins_is_not_lost() -> None:
     system, symptoms = ladder(90)
     index = Index(Model(system))
     (part,) = cone_of(index, frozenset(), index.numbers([*map(parse, symptoms_of(symptoms))])).parts
-    budget = Budget(600.0)
+    budget = SearchBudget(600.0)
     budget.cancel()
     (solved,) = solve(part, 10**9, budget)
     assert (solved.sets, solved.by_time) == ([], True)
@@ -146,9 +146,9 @@ def symptoms_of(texts: list[str]) -> list[str]:
 
 
 def test_only_parts_that_changed_are_solved_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    solved: list[Part] = []
+    solved: list[RulePart] = []
 
-    def spy(part: Part, limit: int, budget: Budget) -> list[Solved]:
+    def spy(part: RulePart, limit: int, budget: SearchBudget) -> list[Solved]:
         solved.append(part)
         return solve(part, limit, budget)
 

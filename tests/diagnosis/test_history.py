@@ -25,7 +25,7 @@ from holdfast.diagnosis.model import (
     System,
     Value,
 )
-from holdfast.diagnosis.model.history import KEPT
+from holdfast.diagnosis.model.model_history import KEPT
 
 
 @pytest.fixture

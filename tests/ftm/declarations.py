@@ -1,23 +1,9 @@
 """Declarations of eight mechanisms, as their files have them; bricks are not needed to select."""
 
-from typing import ClassVar
-
-from holdfast.ftm.model.declaration import Cost
+from holdfast.ftm.model.mechanism_declaration import Cost, MechanismDeclaration
 
 
-class Declared:
-    """Base of the declarations below."""
-
-    name: ClassVar[str] = ""
-    replicas: ClassVar[int] = 1
-    units: ClassVar[int] = 1
-    tolerates: ClassVar[frozenset[str]] = frozenset()
-    needs: ClassVar[frozenset[str]] = frozenset()
-    bandwidth: ClassVar[str] = "nil"
-    cpu: ClassVar[str] = "low"
-
-
-class PBR(Declared):
+class PBR(MechanismDeclaration):
     name = "pbr"
     replicas = units = 2
     tolerates = frozenset({"crash"})
@@ -26,7 +12,7 @@ class PBR(Declared):
     cost = Cost(states=1, requests=1, recovery=0.02)
 
 
-class LFR(Declared):
+class LFR(MechanismDeclaration):
     name = "lfr"
     replicas = units = 2
     tolerates = frozenset({"crash"})
@@ -36,14 +22,14 @@ class LFR(Declared):
     cost = Cost(total=2, requests=1, recovery=0.01)
 
 
-class TR(Declared):
+class TR(MechanismDeclaration):
     name = "tr"
     tolerates = frozenset({"transient_value"})
     needs = frozenset({"determinism", "state_access"})
     cpu = "high"
 
 
-class AD(Declared):
+class AD(MechanismDeclaration):
     name = "a&d"
     replicas = units = 2
     tolerates = frozenset({"transient_value", "permanent_value"})
@@ -51,20 +37,20 @@ class AD(Declared):
     over = frozenset({"replication"})
 
 
-class SEC(Declared):
+class SEC(MechanismDeclaration):
     name = "sec"
     tolerates = frozenset({"eavesdropping", "forgery", "replay"})
     needs = frozenset({"certificates"})
 
 
-class RB(Declared):
+class RB(MechanismDeclaration):
     name = "rb"
     layer = "repetition"
     tolerates = frozenset({"development", "transient_value"})
     needs = frozenset({"versions", "assertions", "state_access"})
 
 
-class NVP(Declared):
+class NVP(MechanismDeclaration):
     name = "nvp"
     layer = "repetition"
     units = 3
@@ -74,7 +60,7 @@ class NVP(Declared):
     cost = Cost(runs=1, latency=1, total=3, requests=2)
 
 
-class TMR(Declared):
+class TMR(MechanismDeclaration):
     name = "tmr"
     replicas = units = 3
     tolerates = frozenset({"crash", "transient_value", "permanent_value"})

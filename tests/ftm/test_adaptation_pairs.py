@@ -15,8 +15,8 @@ import holdfast as hf
 from holdfast.console.endpoint import control_endpoint
 from holdfast.ftm.group.reconfiguration import STEPS
 from holdfast.ftm.model.change_model import nesting_problems
-from holdfast.ftm.model.declaration import LAYERS
 from holdfast.ftm.model.mechanism import BUILT_IN, Mechanism, code_of, find
+from holdfast.ftm.model.mechanism_declaration import LAYERS
 from holdfast.ftm.sec.authority import CertificationAuthority
 from tests.ftm.accounts import Counter, Load, Tags
 from tests.ftm.test_adaptation import stack, transition

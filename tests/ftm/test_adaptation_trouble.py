@@ -19,7 +19,7 @@ from holdfast.ftm.group.replicas import Replicas
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
-from holdfast.system.protection import UNDER_WAY, AdaptationUndone, Protection
+from holdfast.system.mechanism_notes import UNDER_WAY, AdaptationUndone, MechanismNotes
 from holdfast.system.transaction.change import Change
 from tests.ftm.accounts import Add, Counter, Load, Tags
 from tests.ftm.test_adaptation import protected, stack, transition
@@ -199,7 +199,7 @@ async def test_a_root_that_died_in_the_middle_says_so(tmp_path: Path) -> None:
         assert system.homes.notes(UNDER_WAY) == {}
         system.mechanism_notes.begun("/app/alice", "compose")
         with system.events() as stream:
-            Protection(system.homes)
+            MechanismNotes(system.homes)
             (event,) = [one for one in stream.take() if isinstance(one, AdaptationUndone)]
         assert (event.address, event.step) == ("/app/alice", "compose")
 

@@ -23,8 +23,8 @@ import holdfast.ftm
 from holdfast.console.endpoint import control_endpoint
 from holdfast.ftm.model.change_model import label
 from holdfast.ftm.model.coverage import coverage, selection_table
-from holdfast.ftm.model.declaration import FAULTS, NEEDS
 from holdfast.ftm.model.mechanism import BUILT_IN, MechanismRefused, find, load
+from holdfast.ftm.model.mechanism_declaration import FAULTS, NEEDS
 from holdfast.ftm.sec import sec_errors as sec_errors
 from tests.ftm.accounts import Add, Closed, Counter, Load, Tags
 
@@ -162,7 +162,7 @@ async def test_the_script_of_the_example_is_applied_from_another_process(
 def modules() -> list[Any]:
     """All of holdfast.ftm, and what keeps mechanisms over a restart of the root."""
     names = [one.name for one in pkgutil.walk_packages(holdfast.ftm.__path__, "holdfast.ftm.")]
-    return [importlib.import_module(name) for name in [*names, "holdfast.system.protection"]]
+    return [importlib.import_module(name) for name in [*names, "holdfast.system.mechanism_notes"]]
 
 
 def defined(base: type) -> set[str]:

@@ -24,8 +24,8 @@ from holdfast.ftm.model.change_model import (
     select,
 )
 from holdfast.ftm.model.coverage import coverage, selection_table, selection_text
-from holdfast.ftm.model.declaration import FAULTS, LAYERS, BadDeclaration, Cost, Entry
-from tests.ftm.declarations import AD, EIGHT, LFR, NVP, PBR, RB, SEC, TMR, TR, Declared
+from holdfast.ftm.model.mechanism_declaration import FAULTS, LAYERS, BadDeclaration, Cost, Entry, MechanismDeclaration
+from tests.ftm.declarations import AD, EIGHT, LFR, NVP, PBR, RB, SEC, TMR, TR
 
 GOOD = Application("Account")
 PLENTY = Resources(units=6, certificates=True)
@@ -254,7 +254,7 @@ def test_more_resources_never_make_it_dearer(
 
 
 @pytest.mark.parametrize("layers", [(), (PBR,), (PBR, TR), (LFR, TR), (AD, PBR), (SEC, PBR, TR), (SEC, AD, LFR, RB)])
-def test_these_are_nested_rightly(layers: tuple[type[Declared], ...]) -> None:
+def test_these_are_nested_rightly(layers: tuple[type[MechanismDeclaration], ...]) -> None:
     """A64-A66."""
     assert nesting_problems(layers) == ()
 
@@ -274,13 +274,15 @@ def test_these_are_nested_rightly(layers: tuple[type[Declared], ...]) -> None:
         ((AD, TMR), "a&d keeps 2 replicas, and tmr 3"),
     ],
 )
-def test_these_are_not(layers: tuple[type[Declared], ...], why: str) -> None:
+def test_these_are_not(layers: tuple[type[MechanismDeclaration], ...], why: str) -> None:
     """T42."""
     assert any(why in problem for problem in nesting_problems(layers))
 
 
 @given(st.lists(st.sampled_from(EIGHT), max_size=4))
-def test_an_order_is_right_exactly_when_no_layer_stands_outside_an_outer_one(layers: list[type[Declared]]) -> None:
+def test_an_order_is_right_exactly_when_no_layer_stands_outside_an_outer_one(
+    layers: list[type[MechanismDeclaration]],
+) -> None:
     ranks = [LAYERS.index(Entry.of(layer).layer) for layer in layers]
     needs_duplex = [at for at, layer in enumerate(layers) if layer is AD]
     is_right = all(a < b for a, b in itertools.pairwise(ranks)) and all(
@@ -328,7 +330,7 @@ def test_an_instance_declares_like_its_class() -> None:
     ],
 )
 def test_a_declaration_of_what_there_is_not_is_refused(changes: dict[str, Any], why: str) -> None:
-    kind = type("Wrong", (Declared,), {"name": "wrong", **changes})
+    kind = type("Wrong", (MechanismDeclaration,), {"name": "wrong", **changes})
     with pytest.raises(BadDeclaration, match=why):
         Entry.of(kind)
 

@@ -22,7 +22,7 @@ from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tmr import TMR, Computing, Voting
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.ftm.model.mechanism import Mechanism, Role
-from holdfast.system.protection import AdaptationUndone
+from holdfast.system.mechanism_notes import AdaptationUndone
 from tests.ftm import probation_root
 from tests.ftm.accounts import Add, Counter, Load, Tags
 from tests.ftm.bad_bricks import Wrong

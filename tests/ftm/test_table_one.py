@@ -12,8 +12,8 @@ from holdfast.ftm.model.application import Application
 from holdfast.ftm.model.change_model import Faults, Resources, choice_of, nesting_problems, select
 from holdfast.ftm.model.composition import check_stack
 from holdfast.ftm.model.coverage import coverage
-from holdfast.ftm.model.declaration import FAULTS
 from holdfast.ftm.model.mechanism import BUILT_IN, MechanismRefused, find
+from holdfast.ftm.model.mechanism_declaration import FAULTS
 from tests.ftm.accounts import Counter
 from tests.ftm.versions import SETTINGS
 

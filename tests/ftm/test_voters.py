@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import holdfast as hf
 from holdfast.actors.kernel.codec import encode_special
 from holdfast.checkpoint.protocol import CRASH, OK, REFUSAL, REPLY, Answer, Out, TurnEnd
-from holdfast.ftm.votes.canonical import ABSENT, canonical
+from holdfast.ftm.votes.canonical import ABSENT, answer_form, canonical, end_form
 from holdfast.ftm.votes.voters import (
     Agreed,
     AnyVoter,
@@ -32,8 +32,7 @@ from holdfast.ftm.votes.voters import (
     Voter,
     custom,
     decide,
-    vote_answers,
-    vote_ends,
+    decide_by,
 )
 
 NAN = math.nan
@@ -369,6 +368,14 @@ def test_voters_travel_as_settings(voter: AnyVoter) -> None:
 # -- what is encoded ------------------------------------------------------------------------------------------------
 
 
+def vote_answers(voter: AnyVoter, answers: Sequence[Answer | None], kind: Any = None) -> Any:
+    return decide_by(voter, answers, lambda answer: answer_form(answer, kind))
+
+
+def vote_ends(voter: AnyVoter, ends: list[TurnEnd], *, with_state: bool = True) -> Any:
+    return decide_by(voter, ends, lambda one: end_form(one, with_state=with_state))
+
+
 def test_encoded_answers_are_compared_by_what_they_mean() -> None:
     answers = [reply({"a": 1, "b": [2.0]}), reply({"b": [2], "a": 1}), reply({"a": 2})]
     decided = vote_answers(Majority(), answers)
@@ -411,13 +418,6 @@ def test_bytes_that_are_no_payload_are_compared_as_bytes() -> None:
     assert won(vote_answers(Majority(), wrong)) == (0, 1)
 
 
-def test_a_median_of_answers_is_encoded_again() -> None:
-    decided = vote_answers(Median(), [reply([1, 5]), reply([2, 9]), reply([3, 1])])
-    assert isinstance(decided, Agreed)
-    assert msgspec.msgpack.decode(decided.value.body) == [2, 5]
-    assert decided.choice is None
-
-
 def test_ends_differ_by_outputs_status_answer_and_state() -> None:
     out = Out(1, "tell", "/app/b", "app:Add", msgspec.msgpack.encode([1.0]))
     other = Out(1, "tell", "/app/b", "app:Add", msgspec.msgpack.encode([2.0]))
@@ -434,7 +434,6 @@ def test_ends_differ_by_outputs_status_answer_and_state() -> None:
         assert won(vote_ends(Majority(), [wrong, good, good])) == (1, 2)
     assert won(vote_ends(Exact(), [good, end(1.0, out, state=6)], with_state=False)) == (0, 1)
     assert won(vote_ends(Tolerance(abs=1), [good, end(1, other, state=5)])) == (0, 1)
-    assert isinstance(vote_ends(Median(), [end([1, 5]), end([2, 9]), end([3, 1])]), Undecided)
 
 
 def test_a_tolerance_is_none_for_counts_of_turns_and_outputs() -> None:
@@ -443,17 +442,6 @@ def test_a_tolerance_is_none_for_counts_of_turns_and_outputs() -> None:
     assert isinstance(vote_ends(wide, [end(1, one), end(1, other)]), Undecided)
     assert isinstance(vote_ends(wide, [end(1, state=1), end(1, state=2)]), Undecided)
     assert won(vote_ends(wide, [end(1, one), end(50, one)])) == (0, 1)
-
-
-@given(st.lists(st.sampled_from([b"\x01", b"\x02", b"\xc1", None]), min_size=1, max_size=5))
-def test_the_quick_way_and_the_slow_way_decide_alike(bodies: list[bytes | None]) -> None:
-    answers = [None if body is None else Answer(REPLY, "", body) for body in bodies]
-    for voter in (Exact(), Majority(), Tolerance()):
-        quick = vote_answers(voter, answers)
-        slow = decide(voter, [ABSENT if body is None else body for body in bodies])
-        assert isinstance(quick, Agreed) == isinstance(slow, Agreed)
-        if isinstance(quick, Agreed) and isinstance(slow, Agreed):
-            assert (quick.agreeing, quick.dissenting) == (slow.agreeing, slow.dissenting)
 
 
 def test_no_majority_is_an_error_with_a_class_that_crosses_processes() -> None:

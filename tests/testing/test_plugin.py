@@ -164,7 +164,7 @@ async def test_two(actor_systems):
     counter = one.spawn(hf.start(Counter), "counter")
     assert await counter.ask(Add(1)) == 1
     assert (one.tree(), other.tree()) == (["/one", "/one/counter"], ["/other"])
-    assert (one._flags.intensity, other._flags.intensity) == (7, 9)
+    assert (one._options.flags.intensity, other._options.flags.intensity) == (7, 9)
     running.extend([one, other])
 
 def test_ended():

@@ -30,7 +30,7 @@ OWNER_VARIABLE = "HOLDFAST_PROCESS"  # number of the actor process, set in it an
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 
 
-class Kind(IntEnum):
+class PacketKind(IntEnum):
     """What a packet says; (number, value) in brackets, then the text."""
 
     CONFIG = 1  # to the server, first and once: text = Config as JSON
@@ -129,7 +129,7 @@ def hand_over(control: socket.socket, config: Config) -> None:
     except BaseException as error:
         why = f"{type(error).__name__}: {error}".encode(errors="replace")
         with contextlib.suppress(ConnectionError):  # nobody is left to be told
-            control.send(HEADER.pack(Kind.BROKEN, 0, 0) + why)
+            control.send(HEADER.pack(PacketKind.BROKEN, 0, 0) + why)
         return
     zygote.Zygote(control, config, parent_fd).run()
 

@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 
 from ...errors import ProcessUnavailable
 from ...streams import check_can_watch
-from .boot import HEADER, Kind, receive
+from .boot import HEADER, PacketKind, receive
 from .child_processes import signal_by
 from .forked_process import SOCKET_BYTES, Forked, ForkLedger, ForkRequest, fail, has_ended
 from .launch import check_can_start, exec_server, server_config
@@ -119,7 +119,7 @@ class ForkServer:
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SOCKET_BYTES)
         with theirs:
             config = json.dumps(server_config(self._entry, self._preload)._asdict())
-            ours.send(HEADER.pack(Kind.CONFIG, 0, 0) + config.encode())
+            ours.send(HEADER.pack(PacketKind.CONFIG, 0, 0) + config.encode())
             self._process = exec_server(theirs.fileno())
         try:
             self._pidfd = os.pidfd_open(self._process.pid)
@@ -235,7 +235,7 @@ class ForkServer:
         if self._control is None:
             raise ProcessUnavailable("the fork server does not run")
         self._loading += 1
-        self._post(HEADER.pack(Kind.PRELOAD, 0, 0) + module_or_path.encode())
+        self._post(HEADER.pack(PacketKind.PRELOAD, 0, 0) + module_or_path.encode())
 
     # --- the control socket
 
@@ -293,7 +293,7 @@ class ForkServer:
                 self._loop.remove_reader(self._control.fileno())
                 return
             kind, number, value = HEADER.unpack_from(data)
-            self._on_packet(Kind(kind), number, value, data[HEADER.size :].decode(), fds)
+            self._on_packet(PacketKind(kind), number, value, data[HEADER.size :].decode(), fds)
 
     def _pause_reading(self, error: OSError | MemoryError) -> None:
         """Nothing can be taken from the socket now; what is in it stays there. At once it would be as bad."""
@@ -312,24 +312,24 @@ class ForkServer:
         except OSError as error:
             self._pause_reading(error)
 
-    def _on_packet(self, kind: Kind, number: int, value: int, text: str, fds: list[int]) -> None:
+    def _on_packet(self, kind: PacketKind, number: int, value: int, text: str, fds: list[int]) -> None:
         match kind:
-            case Kind.FORKED:
+            case PacketKind.FORKED:
                 self._forks.forked(number, value, fds)
-            case Kind.EXITED:
+            case PacketKind.EXITED:
                 if not self._forks.exited(number, value):
                     self._report(number, value)
-            case Kind.REFUSED:
+            case PacketKind.REFUSED:
                 self._forks.refused(number, text)
-            case Kind.READY if not self._ready.done():
+            case PacketKind.READY if not self._ready.done():
                 self.threads = value
                 self._ready.set_result(None)
-            case Kind.BROKEN if not self._ready.done():
+            case PacketKind.BROKEN if not self._ready.done():
                 self._ready.set_exception(ProcessUnavailable(f"the fork server cannot import {self._entry}: {text}"))
-            case Kind.PROBLEM:
+            case PacketKind.PROBLEM:
                 name, why = json.loads(text)
                 self.preload_errors[name] = why
-            case Kind.LOADED:
+            case PacketKind.LOADED:
                 self._loading -= 1
             case _:
                 pass

@@ -14,7 +14,7 @@ from typing import Any
 
 from ...errors import ProcessUnavailable
 from ...shared_memory import keep_size, unnamed
-from .boot import HEADER, PAGE_BYTES, Kind
+from .boot import HEADER, PAGE_BYTES, PacketKind
 from .child_processes import signal_by
 
 SOCKET_BYTES = 2 * 1024 * 1024
@@ -105,7 +105,7 @@ class ForkRequest:
     def send(self, control: socket.socket) -> None:
         """Ask the server; raises BlockingIOError if it must be tried again."""
         if self._child_fds:  # otherwise nobody waits any more
-            socket.send_fds(control, [HEADER.pack(Kind.FORK, self.number, 0)], self._child_fds)
+            socket.send_fds(control, [HEADER.pack(PacketKind.FORK, self.number, 0)], self._child_fds)
             self._close_child_fds()
 
     def _close_child_fds(self) -> None:

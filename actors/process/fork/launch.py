@@ -67,7 +67,7 @@ def check_can_start() -> None:
 
 
 def server_command(control_fd: int) -> list[str]:
-    """What to exec."""
+    """The command that becomes the fork server."""
     # Our own flags (-O changes what `assert` means), and -P: the file's directory is no place to import from.
     flags: list[str] = subprocess._args_from_interpreter_flags()  # type: ignore[attr-defined]
     return [sys.executable, *flags, "-P", os.path.abspath(boot.__file__), str(control_fd)]

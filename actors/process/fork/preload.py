@@ -16,7 +16,7 @@ MAIN_NAME = "__mp_main__"  # the name scripts already know from multiprocessing
 
 
 def find_entry(entry: str) -> Callable[[socket.socket, int], int | None]:
-    """Import "module:function"."""
+    """Import the function that "module:function" names."""
     module, _, function = entry.partition(":")
     found: Callable[[socket.socket, int], int | None] = getattr(importlib.import_module(module), function)
     return found

@@ -27,7 +27,16 @@ import types
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, NoReturn
 
-from .boot import HEADER, OWNER_VARIABLE, PR_SET_CHILD_SUBREAPER, PR_SET_PDEATHSIG, Config, Kind, bind_prctl, receive
+from .boot import (
+    HEADER,
+    OWNER_VARIABLE,
+    PR_SET_CHILD_SUBREAPER,
+    PR_SET_PDEATHSIG,
+    Config,
+    PacketKind,
+    bind_prctl,
+    receive,
+)
 from .child_processes import ProcessTable, send_signal
 from .preload import attempt, find_entry, load, load_main
 
@@ -82,7 +91,7 @@ class Zygote:
             self._entry = find_entry(config.entry)
             gc.enable()
         except BaseException as error:
-            self._send(Kind.BROKEN, text=f"{type(error).__name__}: {error}")
+            self._send(PacketKind.BROKEN, text=f"{type(error).__name__}: {error}")
             return False
         if config.main:
             self._load("__main__", lambda: load_main(config.main, config.main_is_path))
@@ -91,12 +100,12 @@ class Zygote:
         self._prctl(PR_SET_CHILD_SUBREAPER, 1)
         self._settle()
         self._prctl(PR_SET_PDEATHSIG, 0)  # from here on the end of the parent is an orderly one: descendants go first
-        self._send(Kind.READY, value=len(os.listdir("/proc/self/task")))
+        self._send(PacketKind.READY, value=len(os.listdir("/proc/self/task")))
         return True
 
     def _load(self, name: str, load_it: Callable[[], None]) -> None:
         if problem := attempt(load_it):
-            self._send(Kind.PROBLEM, text=json.dumps([name, problem[:8000]]))
+            self._send(PacketKind.PROBLEM, text=json.dumps([name, problem[:8000]]))
 
     def _settle(self) -> None:
         """After importing: take the signals, freeze the heap, note the processes that belong to modules."""
@@ -151,16 +160,16 @@ class Zygote:
         if not data:
             return False
         kind, number, _ = HEADER.unpack_from(data)
-        if kind == Kind.FORK:
+        if kind == PacketKind.FORK:
             self._fork(number, fds)
-        elif kind == Kind.PRELOAD:
+        elif kind == PacketKind.PRELOAD:
             name = data[HEADER.size :].decode()
             self._load(name, lambda: load(name))
             self._settle()
-            self._send(Kind.LOADED)
+            self._send(PacketKind.LOADED)
         return True
 
-    def _send(self, kind: Kind, number: int = 0, value: int = 0, text: str = "", fds: Sequence[int] = ()) -> None:
+    def _send(self, kind: PacketKind, number: int = 0, value: int = 0, text: str = "", fds: Sequence[int] = ()) -> None:
         # A parent that does not read holds us up, which is right; one that is gone is noticed by the loop.
         with contextlib.suppress(ConnectionError):
             socket.send_fds(self._control, [HEADER.pack(kind, number, value), text.encode(errors="replace")], fds)
@@ -193,13 +202,13 @@ class Zygote:
             send_signal(pid, signal.SIGKILL)
             self._refuse(number, (), f"pidfd_open: {error.strerror}")
             return
-        self._send(Kind.FORKED, number, pid, fds=(pidfd,))
+        self._send(PacketKind.FORKED, number, pid, fds=(pidfd,))
         os.close(pidfd)
 
     def _refuse(self, number: int, fds: Sequence[int], why: str) -> None:
         for fd in fds:
             os.close(fd)
-        self._send(Kind.REFUSED, number, text=why)
+        self._send(PacketKind.REFUSED, number, text=why)
 
     # deaths
 
@@ -212,7 +221,7 @@ class Zygote:
             # First the descendants, then the report: who starts the actor anew must not find its port still taken.
             self._kill_strays()
             for pid, status in ours:
-                self._send(Kind.EXITED, pid, status)
+                self._send(PacketKind.EXITED, pid, status)
 
     def _reap(self) -> list[tuple[int, int]]:
         """Take the wait status of all that have died."""

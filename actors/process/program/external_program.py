@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from ...errors import ActorStopped, HoldfastError, ProcessUnavailable
 from ...exit_reasons import NORMAL, Exited, ExitReason, Hung, OutOfMemory, Signal
 from ...streams import check_can_watch
-from ..process_watchdog import Watch, oom_kills
+from ..process_watchdog import ProcessWatch, oom_kills
 from ..resource_limits import Limits
 from . import reaper
 from .stdin import InputWriter
@@ -34,7 +34,7 @@ class ProgramFailed(HoldfastError, text="{program}: {reason}"):
     reason: str
 
 
-class Kept:
+class KeptProgram:
     """One program: its start, its output, its end.
 
     Attributes:
@@ -78,7 +78,7 @@ class Kept:
         self._status: int | None = None
         self._open = 0  # outputs that have not been handed on to their ends
         self._oom_before = oom_kills()
-        self._watch: Watch | None = None
+        self._watch: ProcessWatch | None = None
         self.input: InputWriter | None = None
         order = {"command": list(command), "env": dict(env), "cwd": cwd, "limits": _own_limits(limits)}
         try:
@@ -194,7 +194,7 @@ class Kept:
             import psutil
 
             with contextlib.suppress(psutil.Error):  # It may have ended already.
-                self._watch = Watch(self, limits)
+                self._watch = ProcessWatch(self, limits)
         if not self.started.done():
             self.started.set_result(pid)
 
@@ -246,7 +246,7 @@ class Kept:
         return Exited(code) if code else NORMAL
 
     def hung(self, seconds: float) -> None:
-        """Programs have no heartbeat."""
+        """Kill the program; this never happens, since programs have no heartbeat."""
         self.kill(Hung(seconds))
 
 

@@ -49,7 +49,7 @@ def prctl(option: int, argument: int) -> None:
         raise OSError(number, f"prctl({option}): {os.strerror(number)}")
 
 
-class Keeper:
+class Reaper:
     """The loop of the keeper: signals from the owner, deaths from the kernel."""
 
     def __init__(self, control: int, owner: int, order: dict[str, Any]) -> None:
@@ -237,7 +237,7 @@ def main() -> None:
     os.set_inheritable(control, False)
     with open(order_fd, "rb") as file:
         order = marshal.load(file)
-    Keeper(control, owner, order).run()
+    Reaper(control, owner, order).run()
 
 
 if __name__ == "__main__":

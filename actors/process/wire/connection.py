@@ -114,7 +114,7 @@ class Connection(asyncio.BufferedProtocol):
         if encoder.large:
             parts = encoder.spliced(data)
             size = sum(map(len, parts))
-        if size > SMALL_BYTES and (size > MAX_FRAME or not self._may_send_large(type(frame))):
+        if size > SMALL_BYTES and (size > MAX_FRAME or type(frame) not in (_FROM_ROOT if self._guarded else _CARRIERS)):
             payload = payload_of(frame)
             self.names.withdraw(frame)
             raise BadMessage(actor, type_name(type(payload)), too_large(payload, size))
@@ -128,9 +128,6 @@ class Connection(asyncio.BufferedProtocol):
         if not self._flushing:
             self._flushing = True
             self._loop.call_soon(self.flush)
-
-    def _may_send_large(self, kind: type[Frame]) -> bool:
-        return kind in (_FROM_ROOT if self._guarded else _CARRIERS)
 
     def tell(self, to: int, name: int, message: Any, number: int, actor: str) -> None:
         """Queue a plain message; those of one type to one address go out as one frame.

@@ -31,7 +31,7 @@ class BadFrame(HoldfastError, text="malformed frame: {problem}"):
 
 
 class Frame(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
-    """Base of all frames."""
+    """Base of all frames between the root and its workers."""
 
 
 class Tell(Frame, tag=1):
@@ -118,7 +118,7 @@ class Publish(Frame, tag=9):
 
 
 class Beat(Frame, tag=10):
-    """The sender's loop turns."""
+    """Says that the event loop of the sender still turns."""
 
 
 class Note(Frame, tag=11):

@@ -61,7 +61,7 @@ class NameTable:
                 self._given.pop(value, None)
 
     def forget_given(self) -> None:
-        """Give all names anew."""
+        """Give all names to the other side anew, for it knows none of them."""
         self._given.clear()
         self.kinds.clear()
         self.is_full = False

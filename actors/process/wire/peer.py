@@ -90,7 +90,8 @@ class Peer:
         self.pending[key] = ask
         ask.started = number or True  # From here on only the page of its process knows, if that counts it.
         if len(self.pending) > 4096 and key % 1024 == 0:
-            self._forget_done()
+            # Asks that expired are dropped: their replies, if any come, are late.
+            self.pending = {key: ask for key, ask in self.pending.items() if not ask.is_done}
 
     def offer(self, path: str, message: Any, sender: Cell | None) -> asyncio.Future[None]:
         """Send a message to `path`; the future ends when it is accepted there.
@@ -143,12 +144,8 @@ class Peer:
             self.kinds_out[kind] = name
         return name, message
 
-    def _forget_done(self) -> None:
-        """Drop asks that expired: their replies, if any come, are late."""
-        self.pending = {key: ask for key, ask in self.pending.items() if not ask.is_done}
-
     def join(self, connection: Connection) -> None:
-        """Speak over this connection."""
+        """Speak with the other side over this connection."""
         self.connection, self.kinds_out = connection, connection.names.kinds
 
     def on_forget(self, frame: frames.Forget) -> None:
@@ -217,7 +214,7 @@ class Peer:
         return None if name is None else self.node.cell_at(self.connection.names.from_wire(name))
 
     def on_tell(self, cell: Cell, frame: frames.Tell, page: memoryview | None) -> None:
-        """Take in a message."""
+        """Take in a tell from the other side."""
         try:
             message = self._message_in(cell, frame)
         except HoldfastError as error:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import sys
-from typing import Any, TypeVar
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, TypeVar
 
 from ...errors import SpecError, type_name
 from ...kernel.actor import Actor, Start
@@ -13,6 +14,17 @@ from ...kernel.message import message_name
 from ...values import decode_value, encode_value
 
 T = TypeVar("T")
+
+
+class Described(ABC):
+    """A value that travels in a recipe as its description, in plain data."""
+
+    revived_by: ClassVar[str]
+    """The function, as "module:function", that makes the value of its description again."""
+
+    @abstractmethod
+    def describe(self) -> Any:
+        """Describe the value, in plain data."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -33,8 +45,8 @@ class _PackedData:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class _Described:
-    """An object that describes itself: what makes it again, and from what."""
+class _Description:
+    """A value that describes itself: what makes it again, and from what."""
 
     by: str
     description: Any
@@ -91,9 +103,8 @@ def _lower(value: Any, where: str) -> Any:
         return type(value)(_lower(inner, where) for inner in value)
     if type(value) is dict:
         return {key: _lower(inner, where) for key, inner in value.items()}
-    by = getattr(type(value), "revived_by", None)
-    if by is not None:
-        return _Described(by, value.describe())
+    if isinstance(value, Described):
+        return _Description(value.revived_by, value.describe())
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
         if any(isinstance(inner, Start) for inner in fields.values()):
@@ -111,11 +122,11 @@ def _raise_up(value: Any, *, imports: bool = True) -> Any:
         if not imports and loaded(value.kind, Actor) is None:
             raise SpecError("recipe", f"{value.kind} is no actor class that is loaded here")
         return Start(_find(value.kind, Actor), up(value.args), up(value.kwargs))
-    if not imports and isinstance(value, (_PackedData, _Described)):
+    if not imports and isinstance(value, (_PackedData, _Description)):
         raise SpecError("recipe", "another process names what is to be made of its words: nothing is")
     if isinstance(value, _PackedData):
         return _find(value.kind, object)(**up(value.fields))
-    if isinstance(value, _Described):
+    if isinstance(value, _Description):
         return _named(value.by)(value.description)
     if type(value) in (list, tuple):
         return type(value)(up(inner) for inner in value)
@@ -144,7 +155,7 @@ def _find(name: str, base: type) -> type[Any]:
 
 
 def _named(name: str) -> Any:
-    """What has this name."""
+    """Find the class or function that has this name."""
     module_name, _, path = name.partition(":")
     try:
         found: Any = sys.modules.get(module_name) or importlib.import_module(module_name)

@@ -40,7 +40,7 @@ MOST_LIVES: Final = 2**53
 """No address has had so many lives."""
 
 
-class Gate:
+class WorkerGate:
     """The gate of one actor process."""
 
     def __init__(self, worker: Worker) -> None:
@@ -308,29 +308,29 @@ def text(frame: frames.Command, key: str) -> str:
     return value
 
 
-def _home(gate: Gate, to: str, frame: frames.Command) -> None:
+def _home(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     """It speaks of its own actor."""
     if to != gate.home:
         raise BadFrame(f"{frame.verb!r} of {to}, and the process is that of {gate.home}")
 
 
-def _knows(gate: Gate, to: str, frame: frames.Command) -> None:
+def _knows(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     """It has heard of its actor's new address."""
     _home(gate, to, frame)
     gate.heard()
 
 
-def _own(gate: Gate, to: str, frame: frames.Command) -> None:
+def _own(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     """It speaks of one of its actors."""
     gate.require_own(to, repr(frame.verb))
 
 
-def _topic(gate: Gate, to: str, frame: frames.Command) -> None:
+def _topic(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     _own(gate, to, frame)
     text(frame, "topic")
 
 
-def _below(gate: Gate, to: str, frame: frames.Command) -> None:
+def _below(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     """It speaks of an address below its own."""
     _home(gate, to, frame)
     path = gate.require_own(frame.data.get("path"), repr(frame.verb))
@@ -338,7 +338,7 @@ def _below(gate: Gate, to: str, frame: frames.Command) -> None:
         raise BadFrame(f"{frame.verb!r} of {path!r}, which is no address below {to}")
 
 
-def _born(gate: Gate, to: str, frame: frames.Command) -> None:
+def _born(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     _below(gate, to, frame)
     text(frame, "kind")
     gate.claims(frame.data.get("bindings", {}))
@@ -349,12 +349,12 @@ def _born(gate: Gate, to: str, frame: frames.Command) -> None:
         raise BadFrame(f"a life with the number {life!r}")
 
 
-def _gone(gate: Gate, to: str, frame: frames.Command) -> None:
+def _gone(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     _below(gate, to, frame)
     unpack_exit(frame.data.get("reason"))
 
 
-def _keep(gate: Gate, to: str, frame: frames.Command) -> None:
+def _keep(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     _home(gate, to, frame)
     gate.require_own(frame.data.get("path"), "what is kept")
     text(frame, "what")
@@ -365,17 +365,17 @@ def _keep(gate: Gate, to: str, frame: frames.Command) -> None:
         raise BadFrame(f"an answer under {frame.data['answer']!r}")
 
 
-def _order(gate: Gate, to: str, frame: frames.Command) -> None:
+def _order(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     """An order to a life."""
     gate.require_granted(to, repr(frame.verb))
     if frame.verb == "stop":
         unpack_exit(frame.data.get("reason"))
 
 
-def _tie(key: str, *, both: bool) -> Callable[[Gate, str, frames.Command], None]:
+def _tie(key: str, *, both: bool) -> Callable[[WorkerGate, str, frames.Command], None]:
     """One end of a link or watch is its own; `both`: whichever."""
 
-    def rule(gate: Gate, to: str, frame: frames.Command) -> None:
+    def rule(gate: WorkerGate, to: str, frame: frames.Command) -> None:
         other = text(frame, key)
         if not (both and gate.owns(to)):
             gate.require_own(other, repr(frame.verb))
@@ -385,27 +385,27 @@ def _tie(key: str, *, both: bool) -> Callable[[Gate, str, frames.Command], None]
     return rule
 
 
-Rule = Callable[[Gate, Any], None]
+Rule = Callable[[WorkerGate, Any], None]
 
 RULES: Final[dict[type[frames.Frame], Rule]] = {
-    frames.Tell: Gate.send,
-    frames.Offer: Gate.send,
-    frames.Ask: Gate.ask,
-    frames.Publish: Gate.publish,
-    frames.Reply: Gate.outcome,
-    frames.Failure: Gate.outcome,
-    frames.Launched: Gate.outcome,
-    frames.Beat: Gate.outcome,
-    frames.Moved: Gate.outcome,
-    frames.Ended: Gate.ended,
-    frames.Note: Gate.note,
-    frames.Record: Gate.of_own,
-    frames.Migrate: Gate.of_own,
-    frames.Command: Gate.command,
+    frames.Tell: WorkerGate.send,
+    frames.Offer: WorkerGate.send,
+    frames.Ask: WorkerGate.ask,
+    frames.Publish: WorkerGate.publish,
+    frames.Reply: WorkerGate.outcome,
+    frames.Failure: WorkerGate.outcome,
+    frames.Launched: WorkerGate.outcome,
+    frames.Beat: WorkerGate.outcome,
+    frames.Moved: WorkerGate.outcome,
+    frames.Ended: WorkerGate.ended,
+    frames.Note: WorkerGate.note,
+    frames.Record: WorkerGate.of_own,
+    frames.Migrate: WorkerGate.of_own,
+    frames.Command: WorkerGate.command,
 }
 """What has no row (`Launch`, `Run`) only the root sends. `Forget` is the connection's own."""
 
-COMMANDS: Final[dict[str, Callable[[Gate, str, frames.Command], None]]] = {
+COMMANDS: Final[dict[str, Callable[[WorkerGate, str, frames.Command], None]]] = {
     "readdressed": _knows,
     "subscribe": _topic,
     "unsubscribe": _topic,

@@ -37,7 +37,15 @@ from holdfast.diagnosis.board import (
     WrongCurrent,
 )
 from holdfast.diagnosis.board import tcp_server as board_server
-from holdfast.diagnosis.board.frames import HEAD, AskMeasurements, Decoder, Frame, Refused, Switch, encode
+from holdfast.diagnosis.board.board_frames import (
+    HEAD,
+    AskMeasurements,
+    BoardDecoder,
+    Frame,
+    RefusedFrame,
+    SwitchFrame,
+    encode,
+)
 from holdfast.testing import probe
 
 BASE, PC = 0, 1
@@ -274,7 +282,7 @@ async def spoken_to(simulator: hf.ActorRef[BoardSimulator], *pieces: bytes) -> t
             for piece in pieces:
                 writer.write(piece)
                 await writer.drain()
-            decoder, heard = Decoder(), list[tuple[int, Frame]]()
+            decoder, heard = BoardDecoder(), list[tuple[int, Frame]]()
             while data := await reader.read(4096):
                 decoder.feed(data)
                 while (taken := decoder.take()) is not None:
@@ -288,13 +296,15 @@ async def spoken_to(simulator: hf.ActorRef[BoardSimulator], *pieces: bytes) -> t
 
 
 async def test_a_bad_frame_is_refused_and_the_connection_lives(simulator: hf.ActorRef[BoardSimulator]) -> None:
-    wrong = bytearray(encode(5, Switch(9, True)))
+    wrong = bytearray(encode(5, SwitchFrame(9, True)))
     wrong[HEAD.size] = 10
     wrong[-4:] = crc32(wrong[:-4]).to_bytes(4, "big")
-    heard, is_over = await spoken_to(simulator, bytes(wrong), encode(6, Refused("no")), encode(99, AskMeasurements()))
+    heard, is_over = await spoken_to(
+        simulator, bytes(wrong), encode(6, RefusedFrame("no")), encode(99, AskMeasurements())
+    )
     assert not is_over
-    assert heard[0] == (5, Refused("there is no channel 10: they are 0 to 9"))
-    assert heard[1] == (6, Refused("Refused is for a board to say"))
+    assert heard[0] == (5, RefusedFrame("there is no channel 10: they are 0 to 9"))
+    assert heard[1] == (6, RefusedFrame("RefusedFrame is for a board to say"))
     assert isinstance(heard[2][1], Measurements)
 
 
@@ -303,7 +313,7 @@ async def test_noise_is_refused_and_ends_only_its_own_connection(simulator: hf.A
         await board.measure()
         heard, is_over = await spoken_to(simulator, b"GET / HTTP/1.1\r\n\r\n")
         assert is_over
-        assert heard == [(0, Refused("it does not begin as one"))]
+        assert heard == [(0, RefusedFrame("it does not begin as one"))]
         await board.measure()
 
 
@@ -320,7 +330,7 @@ async def test_too_many_clients_are_told_so(
     monkeypatch.setattr(board_server, "MOST_CLIENTS", 1)
     async with await client(simulator) as board:
         await board.measure()
-        assert await spoken_to(simulator) == ([(0, Refused("there are 1 connections already"))], True)
+        assert await spoken_to(simulator) == ([(0, RefusedFrame("there are 1 connections already"))], True)
         await board.measure()
 
 

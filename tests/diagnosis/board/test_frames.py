@@ -7,20 +7,20 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from holdfast.diagnosis.board import BadFrame, ChannelSpecification, Measurements, Reading, Specification
-from holdfast.diagnosis.board.frames import (
+from holdfast.diagnosis.board.board_frames import (
     CHANNELS,
     HEAD,
     LARGEST,
     TAIL,
     AskMeasurements,
     AskSpecification,
+    BoardDecoder,
     Broadcast,
-    Decoder,
-    Done,
+    DoneFrame,
     Frame,
-    Refused,
+    RefusedFrame,
     SetDefaults,
-    Switch,
+    SwitchFrame,
     encode,
 )
 
@@ -31,11 +31,11 @@ names = st.text(max_size=8)
 frames: st.SearchStrategy[Frame] = st.one_of(
     st.builds(AskSpecification),
     st.builds(AskMeasurements),
-    st.builds(Done),
-    st.builds(Switch, numbers, st.booleans()),
+    st.builds(DoneFrame),
+    st.builds(SwitchFrame, numbers, st.booleans()),
     st.builds(Broadcast, st.one_of(st.just(0), st.integers(10, 3_600_000))),
     st.builds(SetDefaults, masks),
-    st.builds(Refused, st.text(max_size=50)),
+    st.builds(RefusedFrame, st.text(max_size=50)),
     st.builds(
         Specification,
         st.tuples(*[st.builds(ChannelSpecification, names, unsigned, unsigned)] * CHANNELS),
@@ -50,7 +50,7 @@ frames: st.SearchStrategy[Frame] = st.one_of(
 said = st.lists(st.tuples(st.integers(0, 0xFFFF), frames), max_size=5)
 
 
-def heard(decoder: Decoder) -> list[tuple[int, Frame]]:
+def heard(decoder: BoardDecoder) -> list[tuple[int, Frame]]:
     found: list[tuple[int, Frame]] = []
     while (taken := decoder.take()) is not None:
         found.append(taken)
@@ -60,7 +60,7 @@ def heard(decoder: Decoder) -> list[tuple[int, Frame]]:
 @given(said, st.lists(st.integers(1, 200)))
 def test_what_is_said_is_heard_however_it_is_cut(what: list[tuple[int, Frame]], sizes: list[int]) -> None:
     stream = b"".join(encode(sequence, frame) for sequence, frame in what)
-    decoder, found = Decoder(), list[tuple[int, Frame]]()
+    decoder, found = BoardDecoder(), list[tuple[int, Frame]]()
     for size in [*sizes, len(stream) + 1]:
         piece, stream = stream[:size], stream[size:]
         decoder.feed(piece)
@@ -74,7 +74,7 @@ def test_one_flipped_bit_is_noticed(what: list[tuple[int, Frame]], data: st.Data
     stream = bytearray(b"".join(encode(sequence, frame) for sequence, frame in what))
     bit = data.draw(st.integers(0, len(stream) * 8 - 1))
     stream[bit // 8] ^= 1 << bit % 8
-    decoder, found = Decoder(), list[tuple[int, Frame]]()
+    decoder, found = BoardDecoder(), list[tuple[int, Frame]]()
     decoder.feed(bytes(stream))
     try:
         found += heard(decoder)
@@ -87,7 +87,7 @@ def test_one_flipped_bit_is_noticed(what: list[tuple[int, Frame]], data: st.Data
 
 @given(st.binary(max_size=300))
 def test_noise_is_refused_or_waited_out(noise: bytes) -> None:
-    decoder, found, refused = Decoder(), list[tuple[int, Frame]](), False
+    decoder, found, refused = BoardDecoder(), list[tuple[int, Frame]](), False
     decoder.feed(noise)
     try:
         found = heard(decoder)
@@ -110,8 +110,8 @@ def whole(kind: int, body: bytes, sequence: int = 7) -> bytes:
 @example(kind=3, body=b"\x0a\x01")
 @example(kind=5, body=b"\x04\0")
 def test_a_whole_frame_is_heard_exactly_or_refused_and_the_next_one_is_heard(kind: int, body: bytes) -> None:
-    decoder = Decoder()
-    decoder.feed(whole(kind, body) + encode(8, Done()))
+    decoder = BoardDecoder()
+    decoder.feed(whole(kind, body) + encode(8, DoneFrame()))
     taken, refused = None, None
     try:
         taken = decoder.take()
@@ -120,7 +120,7 @@ def test_a_whole_frame_is_heard_exactly_or_refused_and_the_next_one_is_heard(kin
     assert (taken is None) is not (refused is None)
     assert refused is None or (refused.sequence, refused.is_fatal) == (7, False)
     assert taken is None or encode(*taken) == whole(kind, body)
-    assert decoder.take() == (8, Done())
+    assert decoder.take() == (8, DoneFrame())
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_a_whole_frame_is_heard_exactly_or_refused_and_the_next_one_is_heard(kin
         (whole(0x7F, b""), "no kind 0x7f", False),
         (whole(3, bytes([10, 1])), "no channel 10", False),
         (whole(3, bytes([1, 2])), "not 2", False),
-        (whole(3, bytes([1])), "Switch", False),
+        (whole(3, bytes([1])), "SwitchFrame", False),
         (whole(1, b"x"), "holds more", False),
         (whole(4, bytes([0, 0, 0, 9])), "not 9", False),
         (whole(5, bytes([0b100, 0])), "no channel 10", False),
@@ -141,7 +141,7 @@ def test_a_whole_frame_is_heard_exactly_or_refused_and_the_next_one_is_heard(kin
     ],
 )
 def test_a_bad_frame_is_refused_with_the_reason(data: bytes, why: str, is_fatal: bool) -> None:
-    decoder = Decoder()
+    decoder = BoardDecoder()
     decoder.feed(data)
     with pytest.raises(BadFrame) as raised:
         decoder.take()
@@ -152,8 +152,8 @@ def test_a_bad_frame_is_refused_with_the_reason(data: bytes, why: str, is_fatal:
 @pytest.mark.parametrize(
     "frame",
     [
-        Switch(10, True),
-        Switch(-1, True),
+        SwitchFrame(10, True),
+        SwitchFrame(-1, True),
         Broadcast(9),
         Broadcast(3_600_001),
         SetDefaults(frozenset({10})),

@@ -21,7 +21,7 @@ from holdfast.diagnosis.planning import (
     read_problem,
 )
 from holdfast.diagnosis.planning.language import Action, And, Atom, Effect, Fact, Formula, Literal, Not, Or
-from holdfast.diagnosis.planning.writing import Names, write_domain, write_problem
+from holdfast.diagnosis.planning.pddl_writer import Names, write_domain, write_problem
 
 ATOMS = [(f"p{i}",) for i in range(4)]
 

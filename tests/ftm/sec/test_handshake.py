@@ -12,7 +12,7 @@ from holdfast.ftm.sec.certificates import Trust
 from holdfast.ftm.sec.handshake import AnswerBody, Hello, Participant, Signed
 from holdfast.ftm.sec.keys import SigningKey
 from holdfast.ftm.sec.sec_errors import Rejected
-from holdfast.ftm.sec.session import Limits
+from holdfast.ftm.sec.session import SessionLimits
 from tests.ftm.sec.parties import Office, meet
 
 
@@ -290,7 +290,7 @@ def test_they_agree_on_the_best_cipher_that_both_have(office: Office) -> None:
 
 
 def test_all_sessions_can_be_closed(office: Office) -> None:
-    one, other = office.party("a", limits=Limits(window=5)), office.party("b")
+    one, other = office.party("a", limits=SessionLimits(window=5)), office.party("b")
     mine, _ = meet(one, other)
     one.close()
     assert reason(lambda: mine.seal(b"x")) == "closed"

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from holdfast.ftm.sec import session as sessions
 from holdfast.ftm.sec.sec_errors import Rejected
-from holdfast.ftm.sec.session import HEAD, LEAP, TAG_BYTES, Limits, Session, Window
+from holdfast.ftm.sec.session import HEAD, LEAP, TAG_BYTES, Session, SessionLimits, Window
 from tests.ftm.sec.parties import Office, meet
 
 SUITES = ["aes-256-gcm", "chacha20-poly1305"]
@@ -24,7 +24,7 @@ def reason(work: Callable[[], object]) -> str:
 
 def pair(suite: str = SUITES[0], **limits: Any) -> tuple[Office, Session, Session]:
     office = Office()
-    given_limits = Limits(**limits)
+    given_limits = SessionLimits(**limits)
     one = office.party("a", suites=(suite,), limits=given_limits)
     other = office.party("b", suites=(suite,), limits=given_limits)
     return office, *meet(one, other)
@@ -252,7 +252,7 @@ def test_a_forked_process_does_not_seal_with_its_parents_numbers(monkeypatch: py
 @pytest.mark.parametrize("wrong", [{"messages": 0}, {"seconds": 0}, {"grace": -1}, {"lifetime": 0}, {"window": 0}])
 def test_limits_that_are_none_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="must be"):
-        Limits(**wrong)
+        SessionLimits(**wrong)
 
 
 @settings(max_examples=40)

@@ -26,8 +26,8 @@ from .forms import (
     STRUCT,
     TUPLES,
     TYPES,
+    HeadMark,
     Make,
-    Mark,
     pairs,
 )
 
@@ -38,7 +38,7 @@ def _make_tuples(rows: list[Any]) -> list[Any]:
     return [*map(tuple, rows)]
 
 
-_MARKS: Final = {code: Mark(code) for code in range(1, 64)}
+_MARKS: Final = {code: HeadMark(code) for code in range(1, 64)}
 unpack: Final = cast(
     "Callable[..., Any]", partial(msgpack.unpackb, strict_map_key=False, unicode_errors="surrogatepass")
 )
@@ -102,7 +102,7 @@ class Decoder:
         return _MARKS[code]
 
     def on_list(self, parts: list[Any]) -> Any:
-        if not parts or type(parts[0]) is not Mark:
+        if not parts or type(parts[0]) is not HeadMark:
             return parts
         self.open_marks -= 1
         return self.make[parts.pop(0)](parts)

@@ -106,7 +106,7 @@ class _Encoder:
         return lowered
 
     def number(self, key: int) -> int:
-        """Of what is shared."""
+        """Give a number to an object that stands at several places."""
         self.has_marks = True
         self.numbers[key] = number = len(self.numbers)
         return number

@@ -165,7 +165,7 @@ class ThreadContext:
             setattr(self._ctx, name, value)
 
     def tell(self, cell: Cell, message: Message[Any]) -> None:
-        """A ref's tell."""
+        """Send a tell from the worker thread, through the event loop."""
         self._on_loop(self._ctx.tell, cell, message)
 
     def send(self, cell: Cell, message: Message[Any]) -> Any:

@@ -38,13 +38,13 @@ class Relate(msgspec.Struct, frozen=True, tag=True):
 
 
 class Expect(msgspec.Struct, frozen=True, tag=True):
-    """Add an expectation."""
+    """Adds an expectation to the model."""
 
     expectation: Expectation
 
 
 class Add(msgspec.Struct, frozen=True, tag=True):
-    """Add a written clause."""
+    """Adds a clause to the model, as it is written."""
 
     clause: Clause
 
@@ -56,13 +56,13 @@ class Drop(msgspec.Struct, frozen=True, tag=True):
 
 
 class Declare(msgspec.Struct, frozen=True, tag=True):
-    """Add propositions."""
+    """Adds propositions that clauses may use."""
 
     propositions: tuple[str, ...]
 
 
 class Replace(msgspec.Struct, frozen=True, tag=True):
-    """Replace the whole model."""
+    """Puts another model in the place of the whole model."""
 
     declaration: Declaration
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Final, Protocol
+from typing import ClassVar, Final
 
 import msgspec
 
@@ -51,22 +51,26 @@ class Cost(msgspec.Struct, frozen=True):
     recovery: float = 0.0
 
 
-class Declaration(Protocol):
-    """What is read of a mechanism, a class or an instance of one. Only `name`, `tolerates` and `needs` must be there.
+class MechanismDeclaration:
+    """What is read of a mechanism, a class or an instance of one. A declaration has `name`, `tolerates` and `needs`.
 
-    `replicas`, `units`: how many it takes, 1 if nothing is said. `layer`: one of `LAYERS`, if it cannot be told from
+    `replicas`, `units`: how many it takes. `layer`: one of `LAYERS`, if it cannot be told from
     its needs and replicas. `over`: layers of which one must stand inside (A&D stands over a duplex). `bandwidth` (nil,
     low, high) and `cpu` (low, high): the words of Table I. `cost`: the numbers beside, made of the words if absent.
     `least_energy`: the part of the battery below which it is not to be used.
     """
 
-    name: ClassVar[str]
-    tolerates: ClassVar[frozenset[str]]
-    needs: ClassVar[frozenset[str]]
-
-
-Mechanisms = Sequence[Any]
-"""Declarations: classes of mechanisms or instances of them."""
+    name: ClassVar[str] = ""
+    tolerates: ClassVar[frozenset[str]] = frozenset()
+    needs: ClassVar[frozenset[str]] = frozenset()
+    replicas: ClassVar[int] = 1
+    units: ClassVar[int] = 1
+    layer: ClassVar[str] = ""
+    over: ClassVar[frozenset[str]] = frozenset()
+    bandwidth: ClassVar[str] = "nil"
+    cpu: ClassVar[str] = "low"
+    cost: ClassVar[Cost | None] = None
+    least_energy: ClassVar[float] = 0.0
 
 
 class BadDeclaration(ValueError):
@@ -89,7 +93,7 @@ class Entry(msgspec.Struct, frozen=True):
     least_energy: float = 0.0
 
     @classmethod
-    def of(cls, mechanism: Any) -> Entry:
+    def of(cls, mechanism: MechanismDeclaration | type[MechanismDeclaration] | Entry) -> Entry:
         """Read a declaration.
 
         Raises:
@@ -97,12 +101,10 @@ class Entry(msgspec.Struct, frozen=True):
         """
         if isinstance(mechanism, Entry):
             return mechanism
-        name = str(getattr(mechanism, "name", "") or getattr(mechanism, "__name__", ""))
+        name, replicas = mechanism.name, mechanism.replicas
         tolerates, needs = frozenset(mechanism.tolerates), frozenset(mechanism.needs)
-        replicas = int(getattr(mechanism, "replicas", 1))
-        bandwidth, cpu = getattr(mechanism, "bandwidth", "nil"), getattr(mechanism, "cpu", "low")
-        layer = getattr(mechanism, "layer", "") or _layer(tolerates, needs, replicas)
-        over = frozenset(getattr(mechanism, "over", ()))
+        bandwidth, cpu, over = mechanism.bandwidth, mechanism.cpu, frozenset(mechanism.over)
+        layer = mechanism.layer or _layer(tolerates, needs, replicas)
         for what, given, known in (
             ("faults", tolerates, FAULTS),
             ("needs", needs, NEEDS),
@@ -114,10 +116,14 @@ class Entry(msgspec.Struct, frozen=True):
                 raise BadDeclaration(
                     f"{name}: unknown {what} {', '.join(map(str, unknown))}; known: {', '.join(known)}"
                 )
-        units = int(getattr(mechanism, "units", replicas))
-        cost = getattr(mechanism, "cost", None) or _cost(layer, bandwidth, cpu, replicas)
-        least = float(getattr(mechanism, "least_energy", 0.0))
-        return cls(name, layer, tolerates, needs, units, replicas, bandwidth, cpu, cost, over, least)
+        cost = mechanism.cost or _cost(layer, bandwidth, cpu, replicas)
+        return cls(
+            name, layer, tolerates, needs, mechanism.units, replicas, bandwidth, cpu, cost, over, mechanism.least_energy
+        )
+
+
+Mechanisms = Sequence[MechanismDeclaration | type[MechanismDeclaration] | Entry]
+"""Declarations: classes of mechanisms or instances of them, or what was read of them."""
 
 
 def _layer(tolerates: frozenset[str], needs: frozenset[str], replicas: int) -> str:

@@ -26,12 +26,12 @@ LimitsOf = Mapping[str, Mapping[Property, Limits]]
 """What is good, for each property of some components."""
 
 
-class Host(Protocol):
-    """What is watched: an `ActorSystem`."""
+class WatchedSystem(Protocol):
+    """The system that is watched: an `ActorSystem`."""
 
     @property
     def node(self) -> Node:
-        """Its own process."""
+        """The node of the process in which diagnosis itself lives."""
         ...
 
     async def start(self, spec: ChildSpec) -> ActorRef[Any]:
@@ -60,7 +60,7 @@ class Watch:
         return self._node.find_ref(f"{self.tree.path}/{DIAGNOSER}", DiagnoserActor)
 
     async def diagnosis(self) -> Diagnosis:
-        """What is wrong now."""
+        """The present diagnosis of the system."""
         return await self.diagnoser.ask(GetDiagnosis())
 
     async def why(self) -> Explained:
@@ -68,12 +68,12 @@ class Watch:
         return await self.diagnoser.ask(GetExplanation())
 
     async def observed(self) -> Observed:
-        """What is known now."""
+        """What is observed of the system at the moment."""
         return await self.diagnoser.ask(GetObserved())
 
 
 async def watch(
-    system: Host,
+    system: WatchedSystem,
     model: Declaration | System | None = None,
     observers: Iterable[ChildSpec] = (),
     *,

@@ -15,11 +15,11 @@ import msgspec
 from ..actors.errors import SpecError
 from ..actors.events import Event
 from ..supervision.respec import rebuilt, spec_below
+from ..supervision.spec import ChildSpec
 
 if TYPE_CHECKING:
     from ..actors.kernel.cell import Cell
     from ..checkpoint.home.homes import Homes
-    from ..supervision.spec import ChildSpec
 
 KEPT = "mechanisms"
 """The note with what there is."""
@@ -37,7 +37,7 @@ def check_no_part(cell: Cell) -> None:
     """Whether an actor is not what a mechanism has below the address that it protects. Raises SpecError."""
     above = cell.parent
     while above is not None:
-        if getattr(above.spec, "mechanism", None) is not None:
+        if isinstance(above.spec, ChildSpec) and above.spec.mechanism is not None:
             raise SpecError(cell.path, part_of(above.path))
         above = above.parent
 
@@ -48,7 +48,7 @@ class AdaptationUndone(Event, frozen=True, eq=False):
     step: str
 
 
-class Protection:
+class MechanismNotes:
     """What the mechanisms of addresses have become; `completing` gives them to the specs of this root."""
 
     def __init__(self, homes: Homes) -> None:
@@ -133,7 +133,7 @@ class Protection:
             self.flush()
 
     def flush(self) -> None:
-        """Keep what there is."""
+        """Write what has changed to the store."""
         if self._is_dirty:
             self._is_dirty = False
             self._homes.note(KEPT, msgspec.msgpack.encode(self._kept) if self._kept else None)

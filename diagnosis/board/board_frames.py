@@ -47,14 +47,14 @@ class BadFrame(HoldfastError, text="bad frame: {why}"):
 
 
 class AskSpecification(msgspec.Struct, frozen=True):
-    """What are you?"""
+    """Asks the board what it is and which channels it has."""
 
 
 class AskMeasurements(msgspec.Struct, frozen=True):
     """What do you measure now?"""
 
 
-class Switch(msgspec.Struct, frozen=True):
+class SwitchFrame(msgspec.Struct, frozen=True):
     """Switch a channel, 0 to 9, on or off."""
 
     channel: int
@@ -89,7 +89,7 @@ class Specification(msgspec.Struct, frozen=True):
 
 
 class Reading(msgspec.Struct, frozen=True):
-    """One channel now."""
+    """What one channel measures at the moment."""
 
     on: bool
     milliamperes: int
@@ -103,35 +103,35 @@ class Measurements(msgspec.Struct, frozen=True):
     channels: tuple[Reading, ...]
 
 
-class Done(msgspec.Struct, frozen=True):
+class DoneFrame(msgspec.Struct, frozen=True):
     """The request was carried out."""
 
 
-class Refused(msgspec.Struct, frozen=True):
+class RefusedFrame(msgspec.Struct, frozen=True):
     """The request was not carried out."""
 
     why: str
 
 
-Request: TypeAlias = AskSpecification | AskMeasurements | Switch | Broadcast | SetDefaults
-Answer: TypeAlias = Specification | Measurements | Done | Refused
+Request: TypeAlias = AskSpecification | AskMeasurements | SwitchFrame | Broadcast | SetDefaults
+Answer: TypeAlias = Specification | Measurements | DoneFrame | RefusedFrame
 Frame: TypeAlias = Request | Answer
 
 KINDS: Final[dict[int, type[Frame]]] = {
     0x01: AskSpecification,
     0x02: AskMeasurements,
-    0x03: Switch,
+    0x03: SwitchFrame,
     0x04: Broadcast,
     0x05: SetDefaults,
     0x81: Specification,
     0x82: Measurements,
-    0x83: Done,
-    0x84: Refused,
+    0x83: DoneFrame,
+    0x84: RefusedFrame,
 }
 EMPTY: Final[dict[type[Frame], Frame]] = {
     AskSpecification: AskSpecification(),
     AskMeasurements: AskMeasurements(),
-    Done: Done(),
+    DoneFrame: DoneFrame(),
 }
 NUMBERS: Final = {kind: number for number, kind in KINDS.items()}
 
@@ -159,7 +159,7 @@ def encode(sequence: int, frame: Frame) -> bytes:
     return head + body + TAIL.pack(zlib.crc32(head + body))
 
 
-class Decoder:
+class BoardDecoder:
     """Frames from a stream of bytes, however it is cut; it never keeps more than one frame and what came with it."""
 
     def __init__(self) -> None:
@@ -217,9 +217,9 @@ def _decoded(number: int, sequence: int, body: bytes) -> Frame:
 
 def _body(frame: Frame) -> bytes:
     match frame:
-        case AskSpecification() | AskMeasurements() | Done():
+        case AskSpecification() | AskMeasurements() | DoneFrame():
             return b""
-        case Switch(channel, on):
+        case SwitchFrame(channel, on):
             return _SWITCH.pack(_channel(channel), on)
         case Broadcast(milliseconds):
             if milliseconds and not FASTEST <= milliseconds <= SLOWEST:
@@ -240,15 +240,15 @@ def _body(frame: Frame) -> bytes:
             _ten(channels)
             readings = (_READING.pack(one.on, one.milliamperes, one.millivolts) for one in channels)
             return _UPTIME.pack(uptime) + b"".join(readings)
-        case Refused(why):
+        case RefusedFrame(why):
             return why.encode()[:LONGEST_REASON].decode(errors="ignore").encode()
 
 
 def _frame(kind: type[Frame], body: bytes) -> Frame:
     """The frame of a body. What the body holds besides is found by coding the frame again."""
-    if kind is Switch:
+    if kind is SwitchFrame:
         channel, on = _SWITCH.unpack(body)
-        return Switch(_channel(channel), _flag(on))
+        return SwitchFrame(_channel(channel), _flag(on))
     if kind is Broadcast:
         return Broadcast(*_MILLISECONDS.unpack(body))
     if kind is SetDefaults:
@@ -260,8 +260,8 @@ def _frame(kind: type[Frame], body: bytes) -> Frame:
         channels = tuple(Reading(_flag(on), milliamperes, millivolts) for on, milliamperes, millivolts in readings)
         _ten(channels)
         return Measurements(_UPTIME.unpack_from(body)[0], channels)
-    if kind is Refused:
-        return Refused(body.decode())
+    if kind is RefusedFrame:
+        return RefusedFrame(body.decode())
     return EMPTY[kind]
 
 

@@ -15,7 +15,7 @@ def fill(atom: Atom, bound: Binding) -> Atom:
     return (atom[0], *[bound.get(name, name) for name in atom[1:]])
 
 
-class World:
+class StaticFacts:
     """Objects by type, and static facts by what they say of whom."""
 
     def __init__(self, domain: Domain, objects: Mapping[str, str], statics: frozenset[Atom]) -> None:
@@ -34,7 +34,7 @@ class World:
                 self._facts.setdefault((atom[0], place, name), []).append(atom)
 
     @classmethod
-    def of(cls, problem: Problem) -> World:
+    def of(cls, problem: Problem) -> StaticFacts:
         """The world of a problem."""
         return cls(problem.domain, problem.everything(), statics(problem))
 

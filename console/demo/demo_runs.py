@@ -28,7 +28,7 @@ from .killer import Killer, schedule
 from .log import Survey, survey
 from .planner import Position
 from .questions import PATIENCE, Questions
-from .report import Kill, Outcome, Recovery, Report, judge_asks
+from .report import DemoReport, MapperKill, MapperRecovery, RunOutcome, judge_asks
 from .show import Progress, Watcher
 
 Method = Literal["hybrid", "fresh"]
@@ -39,7 +39,7 @@ LAST_EVENTS = 2.0  # seconds to wait for the report of a recovery that is alread
 
 
 @dataclass(frozen=True)
-class Plan:
+class DemoPlan:
     """What to do. `speed` is a multiple of the recording's pace, 0 for as fast as it goes; `interval` in seconds."""
 
     log: Path
@@ -60,7 +60,7 @@ def tree(geometry: Geometry, recovery: object, kills: int) -> ChildSpec:
     )
 
 
-def recovery_of(plan: Plan) -> object:
+def recovery_of(plan: DemoPlan) -> object:
     """The recovery method that the plan names."""
     match plan.method:
         case "hybrid":
@@ -69,7 +69,7 @@ def recovery_of(plan: Plan) -> object:
             return fresh()
 
 
-async def compare(plan: Plan, watcher: Watcher) -> Report:
+async def compare(plan: DemoPlan, watcher: Watcher) -> DemoReport:
     """Run both, and report.
 
     Raises:
@@ -79,21 +79,21 @@ async def compare(plan: Plan, watcher: Watcher) -> Report:
     found = survey(plan.log)
     if found.problem is not None:
         watcher.notice(f"{found.problem}; the {found.scans:,} scans before are used")
-    undisturbed = await Run(plan, found, watcher, "undisturbed", kills=0).drive()
-    disturbed = await Run(plan, found, watcher, f"{plan.method}, {plan.kills} kills", kills=plan.kills).drive()
-    return Report(undisturbed, disturbed, plan.method, monotonic() - began)
+    undisturbed = await DemoRun(plan, found, watcher, "undisturbed", kills=0).drive()
+    disturbed = await DemoRun(plan, found, watcher, f"{plan.method}, {plan.kills} kills", kills=plan.kills).drive()
+    return DemoReport(undisturbed, disturbed, plan.method, monotonic() - began)
 
 
-class Run:
+class DemoRun:
     """One system from its start to its end: it reads the log, asks, kills, and collects what it holds at the end."""
 
-    def __init__(self, plan: Plan, found: Survey, watcher: Watcher, name: str, *, kills: int) -> None:
+    def __init__(self, plan: DemoPlan, found: Survey, watcher: Watcher, name: str, *, kills: int) -> None:
         self._plan, self._found, self._watcher, self._name = plan, found, watcher, name
         self._moments = schedule(kills, found.scans, plan.seed)
-        self._recoveries: list[Recovery] = []
+        self._recoveries: list[MapperRecovery] = []
         self._heard = asyncio.Event()
 
-    async def drive(self) -> Outcome:
+    async def drive(self) -> RunOutcome:
         """Start the system, let the log run through it, stop it."""
         self._watcher.begin(self._name, self._found.scans)
         found = self._found
@@ -107,7 +107,7 @@ class Run:
             finally:
                 await _cancel(events)
 
-    async def _inside(self, system: ActorSystem) -> Outcome:
+    async def _inside(self, system: ActorSystem) -> RunOutcome:
         mapper = system.ref(MAPPER, Mapper)
         planner = system.ref(PLANNER, Planner)
         began = monotonic()
@@ -177,7 +177,7 @@ class Run:
         with system.events() as events:
             async for event in events:
                 if isinstance(event, Recovered) and event.address == MAPPER:
-                    recovery = Recovery(event.phases, event.replayed)
+                    recovery = MapperRecovery(event.phases, event.replayed)
                     self._recoveries.append(recovery)
                     self._heard.set()
                     self._watcher.recovered(recovery)
@@ -196,12 +196,12 @@ class Run:
         self,
         state: MapperState,
         questions: Questions,
-        kills: list[Kill],
+        kills: list[MapperKill],
         read: LogRead,
         path: list[Position],
         seconds: float,
-    ) -> Outcome:
-        return Outcome(
+    ) -> RunOutcome:
+        return RunOutcome(
             grid=as_grid(state.whole),
             scans=state.scans,
             gaps=state.gaps,

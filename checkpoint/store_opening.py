@@ -7,11 +7,11 @@ from typing import get_args
 
 from ..actors.errors import SpecError
 from .engine_calls import Called
-from .journal import Journal, MemoryJournal
+from .journal import Journal, MemoryJournal, StoreEngine
 from .method import Durability
 
 
-def open_journal(store: str | Journal | None, *, takeover: bool = False) -> Journal:
+def open_journal(store: str | Journal | None, *, takeover: bool = False) -> StoreEngine:
     """The journal that `store` names: None or "memory", or "sqlite:PATH"; or the open engine that it is.
 
     Raises:
@@ -51,7 +51,7 @@ PARTS = (
 """What an engine has."""
 
 
-def check_durability(store: str | Journal | None, durability: Durability | None) -> Durability | None:
+def check_durability(store: str | Journal | None, durability: Durability | None) -> None:
     """Refuse what cannot be kept.
 
     Raises:
@@ -67,4 +67,3 @@ def check_durability(store: str | Journal | None, durability: Durability | None)
     lasts = store is not None and store != "memory" and (isinstance(store, str) or store.durable)
     if durability in ("os", "fsync") and not lasts:
         raise SpecError("ActorSystem", f"durability={durability!r} needs a store: store='sqlite:PATH'")
-    return durability

@@ -1,0 +1,59 @@
+"""What a program asks of its system, checked before anything of it is begun."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+
+from ..actors.errors import SpecError
+from ..actors.loop_watchdog import check_limits
+from ..checkpoint.journal import Journal
+from ..checkpoint.method import Durability
+from ..checkpoint.recovery_file import RecoveryFile, load_recovery
+from ..checkpoint.recovery_settings import RecoveryHooks
+from ..checkpoint.store_opening import check_durability
+from ..supervision.spec import Flags
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
+class SystemOptions:
+    """The arguments of an `ActorSystem`, whose docstring says what each of them means.
+
+    Raises:
+        SpecError: the system has no name, or something else than what it takes.
+    """
+
+    name: str
+    store: str | Journal | None
+    durability: Durability | None
+    flags: Flags
+    preload: tuple[str, ...]
+    log: bool
+    log_payloads: bool
+    seed: int | None
+    takeover: bool
+    watch_lag: float | None
+    watch_turns: float | None
+    recovery_hooks: RecoveryHooks | None
+    recovery: str | os.PathLike[str] | RecoveryFile | None
+
+    def __post_init__(self) -> None:
+        if not self.name or "/" in self.name:
+            raise SpecError("ActorSystem", f"the name must be text without '/', not {self.name!r}")
+        check_durability(self.store, self.durability)
+        hooks = self.recovery_hooks
+        if hooks is not None and not isinstance(hooks, RecoveryHooks):
+            raise SpecError("ActorSystem", f"recovery_hooks must come from recovery_hooks(...), not be {hooks!r}")
+        check_limits(self.watch_lag, self.watch_turns)
+
+    def read_recovery_file(self) -> RecoveryFile | None:
+        """The recovery file, read now if only its path was given.
+
+        Raises:
+            SpecError: it cannot be used, or is another system's.
+        """
+        given = self.recovery
+        file = given if isinstance(given, RecoveryFile) or given is None else load_recovery(given)
+        if file is not None:
+            file.check(self.name)
+        return file
