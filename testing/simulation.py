@@ -49,8 +49,9 @@ from .schedules.choices import (
     repeated,
     size,
 )
-from .schedules.control import Control, ControlledLoop, Root, inside
+from .schedules.control import Control, ControlledLoop
 from .schedules.disk import PATH, Latency, NoRootToKill, SimulatedDisk
+from .schedules.places import Root, inside
 from .schedules.processes import SimulatedWorkers
 from .schedules.shrinking import shrink
 from .schedules.strategies import DEPTH, Strategy, mixed, strategy

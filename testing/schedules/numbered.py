@@ -17,7 +17,9 @@ T = TypeVar("T")
 class NumberedFuture(asyncio.Future[T]):
     """A future of a simulated run."""
 
-    number = 0
+    __slots__ = ("number",)
+
+    number: int
 
     def __hash__(self) -> int:
         return self.number
@@ -26,7 +28,7 @@ class NumberedFuture(asyncio.Future[T]):
 class NumberedTask(asyncio.Task[T]):
     """A task of a simulated run."""
 
-    number = 0
+    __slots__ = ("number",)
 
     def __init__(self, number: int, *args: Any, **options: Any) -> None:
         self.number = number  # First: the task is put into a set while it is made.
