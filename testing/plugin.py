@@ -132,10 +132,16 @@ def _loop_factory(name: str) -> Callable[[], asyncio.AbstractEventLoop]:
     return asyncio.new_event_loop
 
 
+WANTED = pytest.StashKey["Wanted"]()
+
+
 def _wanted(item: pytest.Item) -> Wanted:
+    """What the test expects, which is read once."""
     from .wanted import Wanted
 
-    return Wanted(item, EXPECTABLE)
+    if WANTED not in item.stash:
+        item.stash[WANTED] = Wanted(item, EXPECTABLE)
+    return item.stash[WANTED]
 
 
 @pytest.hookimpl(wrapper=True)

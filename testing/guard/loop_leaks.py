@@ -109,11 +109,13 @@ class LoopLeaks:
 
     async def tasks(self) -> list[str]:
         """Tasks that are not ours and still run after a few turns of the loop."""
+        left = self._new_tasks()
         for _ in range(TASK_GRACE):
-            if not self._new_tasks():
+            if not left:
                 break
             await asyncio.sleep(0)
-        return [repr(task) for task in self._new_tasks()]
+            left = self._new_tasks()
+        return [repr(task) for task in left]
 
     def _new_tasks(self) -> set[asyncio.Task[object]]:
         return asyncio.all_tasks() - self._tasks - {asyncio.current_task()}
