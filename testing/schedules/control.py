@@ -13,32 +13,30 @@ import asyncio
 import concurrent.futures
 import itertools
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable
 from contextvars import Context
 from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple
 
 from ...actors.kernel import loop as run_loop
-from ...actors.kernel.cell import NEXT_URGENT, Cell
-from ...actors.kernel.envelope import Ask
-from ...actors.kernel.message import Message, message_of
+from ...actors.kernel.cell import Cell
 from ...actors.kernel.node import Node
-from ...checkpoint.life.recorded_inbox import Fed
-from ..clock import VirtualClockLoop
+from ..clock import TICKS, VirtualClockLoop
 from ..swaps import Swaps
 from .disk import simulated
 from .due import Due, Option
+from .footprints import Footprints
+from .livelock import Rounds
 from .numbered import NumberedFuture, NumberedTask
 from .places import Place, inside, is_dead, never, no_more
-from .strategies import ALL, Explored, Footprint
+from .strategies import Explored
 
 if TYPE_CHECKING:
-    from .choices import Choices
+    from .choices import Choices, Keys
+    from .turn_log import TurnLog
 
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
-TICKS: Final = 30_000
-"""Ticks of the loop at one moment of virtual time: as many as it makes in some seconds."""
 MOST_TURNS: Final = 64
 """Turns after which the loop has a look at files and threads, if no callback of its own wants to run."""
 MOST: Final = run_loop.MOST
@@ -62,7 +60,7 @@ class DrawnCells(deque[Cell]):
         elif len(self) == 1:
             cell = super().popleft()
         else:
-            cell = control.at(self, control.choices.turn(len(self), self._keys))
+            cell = control.at(self, control.choose(len(self), self._keys))
             self.remove(cell)
         control.takes_turn(cell, self)
         return cell
@@ -79,11 +77,11 @@ class ControlledLoop(VirtualClockLoop):
     thread run.
     """
 
-    def __init__(self) -> None:
-        super().__init__(ticks=TICKS)
+    def __init__(self, *, ticks: int = TICKS) -> None:
+        self.control: Control | None = None
+        super().__init__(ticks=ticks)
         self.due = Due()
         self._ready: Any = self.due
-        self.control: Control | None = None
         self._own_thread = threading.get_ident()
         self._numbers = itertools.count()  # of its tasks and futures
         self._sent: deque[asyncio.Handle] = deque()  # by threads
@@ -103,6 +101,15 @@ class ControlledLoop(VirtualClockLoop):
     def rests(self, rest: asyncio.Future[None]) -> None:
         """Have a future done when nothing else can happen at this moment, if it is not done before."""
         self._resting.append(rest)
+
+    def forget_ticks(self) -> None:
+        super().forget_ticks()
+        if self.control is not None:
+            self.control.begin_moment()
+
+    def has_too_many_ticks(self, ticks: int) -> bool:
+        """As every virtual loop; when steps are chosen, a tick is a round of all that waited when it began."""
+        return super().has_too_many_ticks(ticks) if self.control is None else self.control.goes_on_for_ever(ticks)
 
     def hears_at_once(self) -> bool:
         return self.control is None
@@ -240,37 +247,43 @@ def _do(done: asyncio.Future[T], work: Callable[[], T]) -> None:
 
 
 class Control:
-    """Has the choices of one run carried out, and notes the turns.
+    """Has the choices of one run carried out, from here to `remove`.
 
-    Attributes:
-        trace: (address, what was handled) of each turn, in the order in which they began.
+    Args:
+        choices: what decides.
+        log: notes the turns.
+        node: of the root.
+        loop: whose steps are chosen.
+        on_node: called with each node whose turns are chosen.
     """
 
-    def __init__(self, choices: Choices, trace: list[tuple[str, str]]) -> None:
-        self.choices, self.trace = choices, trace
+    def __init__(
+        self,
+        choices: Choices,
+        log: TurnLog,
+        node: Node,
+        loop: ControlledLoop,
+        *,
+        on_node: Callable[[Node], None] = lambda node: None,
+    ) -> None:
+        self.choices = choices
+        self.choose: Callable[[int, Keys], int] = choices.turn  # which of so many goes on
+        self._rounds: Rounds | None = None  # counted only at a moment that goes on for long
+        self._moment = 0  # how many turns there had been when it began
         self.next_cell: Cell | None = None
         self._next: Option | None = None
+        self._log, self._note = log, log.note
+        self._loop, self._due, self._on_node = loop, loop.due, on_node
         self._now = 0.0
-        self._has_stepped = False
         self._turns = 0  # since a callback was called
         self._last: Cell | None = None
         self._in_a_row = 0  # turns of that one
-        self._names: dict[type, str] = {}
-        self._swaps = Swaps()
-        self._node: Node | None = None
         self._nodes: dict[object, DrawnCells] = {}
-        self._draining: deque[Cell] = deque()
-        self.on_node: Callable[[Node], None] = lambda node: None
-        self._due = Due()
-        self._moments: list[tuple[int, asyncio.Future[None]]] = []  # after so many turns of the run
-        self._before: dict[Cell, tuple[Any, ...]] = {}
-        self._touched: set[Hashable] = set()
-
-    def install(self, node: Node, loop: ControlledLoop) -> None:
-        """From here on every step is chosen."""
-        self._node, self._due, self._loop = node, loop.due, loop
-        if isinstance(self.choices, Explored):
-            self.choices.control = self
+        self._drained: DrawnCells | None = None  # where a turn was begun, after which nothing has been chosen yet
+        self._footprints: Footprints | None = None
+        if isinstance(choices, Explored):
+            self._footprints = choices.footprints = Footprints(node, loop)
+        self._swaps = Swaps()
         self._swaps.put(run_loop, "clock", self._clock)
         for name in ("MOST", "STRIDE"):
             self._swaps.put(run_loop, name, 1)
@@ -283,7 +296,7 @@ class Control:
         self._swaps.put(node, "ready", cells)
         for name in ("most", "stride"):
             self._swaps.put(node, name, 1)  # One turn, and a look at the clock, which is where the next step is chosen.
-        self.on_node(node)
+        self._on_node(node)
 
     def drop(self, node: Node) -> None:
         """Nothing of this node has a turn any more."""
@@ -293,17 +306,10 @@ class Control:
         if self.next_cell is not None and self.next_cell.node is node:
             self.next_cell = None
 
-    def moment(self, turns: int) -> asyncio.Future[None]:
-        """A future that is done after so many turns, or when nothing else can happen."""
-        moment: asyncio.Future[None] = self._loop.create_future()
-        self._moments.append((len(self.trace) + turns, moment))
-        self._loop.rests(moment)
-        return moment
-
     def remove(self) -> None:
         """Let the rest of the run be as in production."""
-        if self._node is not None:
-            self._loop.control = self._due.chooser = None
+        self._loop.control = self._due.chooser = None
+        self._loop.forget_ticks()  # All that were counted till now were others.
         self._swaps.undo()
         for node, cells in self._nodes.items():
             ready: deque[Cell] = node.ready  # type: ignore[attr-defined]
@@ -311,53 +317,56 @@ class Control:
                 ready.clear()
                 ready.extend(cells)
 
-    def goes_on(self, ready: deque[Cell]) -> bool:
+    # -- who is ready -------------------------------------------------------------------------------------------------
+
+    def _goes_on(self, ready: deque[Cell]) -> bool:
         """Whether the actor that had the last turn has another one first, as in production."""
         return ready[-1] is self._last and self._in_a_row < MOST
 
     def at(self, ready: deque[Cell], index: int) -> Cell:
         """The one at this place in the order of production."""
-        return ready[index - self.goes_on(ready)]  # The last one is the first.
+        return ready[index - self._goes_on(ready)]  # The last one is the first.
 
     def in_order(self, ready: deque[Cell]) -> list[Cell]:
         """Who is ready, in the order in which production would let them run."""
-        return [ready[-1], *itertools.islice(ready, len(ready) - 1)] if self.goes_on(ready) else [*ready]
+        return [ready[-1], *itertools.islice(ready, len(ready) - 1)] if self._goes_on(ready) else [*ready]
+
+    def _keys(self, options: list[Option]) -> list[Hashable]:
+        """Who goes on with each of these callbacks: with that of a node, each actor that is ready there."""
+        keys: list[Hashable] = []
+        for key, _, _ in options:
+            cells = self._nodes.get(key)
+            keys += self.in_order(cells) if cells else [key]
+        return keys
+
+    def _waiting(self) -> dict[Hashable, int]:
+        """Who could go on, and how much is before each."""
+        found = Counter[Hashable](key for key, handle, _ in self._due.options if not handle.cancelled())
+        for node, cells in self._nodes.items():
+            found.pop(node, None)
+            found.update({cell: len(cell.queue or (None,)) for cell in cells})
+        begun = self._last  # It is in no run queue, and what it handles now waits no more.
+        if self._drained is not None and begun is not None and begun.queue and len(begun.queue) > 1:
+            found[begun] = len(begun.queue) - 1
+        return found
 
     # -- steps --------------------------------------------------------------------------------------------------------
 
     def takes_turn(self, cell: Cell, ready: DrawnCells) -> None:
         """The cell has the next turn; `ready` are those of the same node."""
-        self._has_stepped, self._draining = True, ready
-        if self._moments:
-            self._tell_moments()
+        self._drained = ready
         self._turns += 1
         self._in_a_row = self._in_a_row + 1 if cell is self._last else 1
         self._last = cell
-        queue = cell.queue
-        if queue:
-            item = queue[0]
-            message: Any = item.message if type(item) is Ask else item
-            name = self._names.get(type(message))
-            if name is None:
-                name = told(cell, item)
-                if isinstance(message, Message):
-                    self._names[type(message)] = name
-            self.trace.append((cell.path, name))
-        if self._before:
-            self._touched.add(cell.path)
-
-    def _tell_moments(self) -> None:
-        for number, moment in self._moments:
-            if number <= len(self.trace) and not moment.done():
-                moment.set_result(None)
-        self._moments = [one for one in self._moments if not one[1].done()]
+        if self._rounds is not None:
+            self._rounds.step(cell)
+        self._note(cell)
+        if self._footprints is not None:
+            self._footprints.touch(cell)
 
     def _clock(self) -> float:
         """The run loop's measure of its slices: asked before the first turn and after each."""
-        if not self._has_stepped:
-            return self._now
-        self._has_stepped = False
-        ready = self._draining
+        ready, self._drained = self._drained, None
         if not ready:
             return self._now
         if not self._due.options:
@@ -372,7 +381,7 @@ class Control:
         elif total == 1:
             chosen = 0
         else:
-            chosen = self.choices.turn(total, lambda: [*self.in_order(ready), *(option[0] for option in others)])
+            chosen = self.choose(total, lambda: [*self.in_order(ready), *(option[0] for option in others)])
         if chosen < count:
             self.next_cell = self.at(ready, chosen)
         else:
@@ -387,8 +396,8 @@ class Control:
             chosen = self._chosen(due)
         if self.next_cell is None:
             self._turns = 0
-            if self._before:
-                self._touched |= ALL
+            if self._footprints is not None:
+                self._footprints.touch(None)
         return chosen
 
     def _chosen(self, due: Due) -> Option:
@@ -401,7 +410,7 @@ class Control:
             if type(key := option[0]) is Node and (cells := nodes.get(key)):
                 drained.append((place, cells))
                 count += len(cells) - 1
-        index = 0 if count == 1 else self.choices.turn(count, lambda: self._keys(options))
+        index = 0 if count == 1 else self.choose(count, lambda: self._keys(options))
         for place, cells in drained:
             if index < place:
                 break
@@ -411,54 +420,25 @@ class Control:
             index -= len(cells) - 1
         return options[index]
 
-    def _keys(self, options: list[Option]) -> list[Hashable]:
-        keys: list[Hashable] = []
-        for key, _, _ in options:
-            cells = self._nodes.get(key)
-            keys += self.in_order(cells) if cells else [key]
-        return keys
+    def called(self, option: Option) -> None:
+        """A callback is called; if it is that of a node, its turns tell more."""
+        if self._rounds is not None and type(option[0]) is not Node:
+            self._rounds.step(option[0])
 
-    # -- what a step touches ------------------------------------------------------------------------------------------
+    # -- the moment ---------------------------------------------------------------------------------------------------
 
-    def begin_footprint(self) -> None:
-        """A step begins: note how everything is."""
-        self._before = self._state()
-        self._touched = set()
-        self._begun = self._outside()
+    def begin_moment(self) -> None:
+        """Virtual time has passed."""
+        self._rounds, self._moment, self._due.is_told = None, self._log.turns, False
+        self.choose = self.choices.turn
 
-    def footprint(self) -> Footprint:
-        """The actors that the steps since then have touched; ALL if anything else may have changed."""
-        if self._outside() != self._begun or "all" in self._touched:
-            return ALL
-        after = self._state()
-        if after.keys() != self._before.keys():
-            return ALL
-        changed = {cell.path for cell, state in after.items() if state != self._before[cell]}
-        return frozenset(self._touched | changed)
+    def goes_on_for_ever(self, ticks: int) -> bool:
+        """Whether it seems that virtual time will never pass, after so many ticks of the loop at this moment."""
+        if self._rounds is None and (ticks > (most := self._loop.most_ticks) or self._log.turns - self._moment > most):
+            self._rounds, self._due.is_told = Rounds(most, self._waiting), True
+            self.choose = self._choose_in_round
+        return self._rounds is not None and self._rounds.are_too_many
 
-    def _outside(self) -> tuple[int, int]:
-        return len(self._due), self._loop.scheduled_timers()
-
-    def _state(self) -> dict[Cell, tuple[Any, ...]]:
-        assert self._node is not None
-        found: dict[Cell, tuple[Any, ...]] = {}
-        cells = [self._node.root] if self._node.root is not None else []
-        for cell in cells:  # It grows meanwhile.
-            more = cell.more
-            urgent = len(more.urgent or ()) if more is not None else 0
-            queue = cell.queue
-            found[cell] = (len(queue) if queue is not None else -1, cell.state, cell.life, urgent)
-            cells += (cell.children or {}).values()
-        return found
-
-
-def told(cell: Cell, item: Any) -> str:
-    """What a turn handles, in a word or two."""
-    if item is NEXT_URGENT:
-        commands = cell.more.urgent if cell.more is not None else None
-        item = commands[0] if commands else item
-    elif isinstance(item, Fed):
-        feed = item.feed
-        return feed.name.rpartition(":")[2] or feed.kind
-    message = message_of(item)
-    return type(item if message is None else message).__name__
+    def _choose_in_round(self, count: int, keys: Keys) -> int:
+        assert self._rounds is not None
+        return self._rounds.first(keys()) if self._rounds.is_late else self.choices.turn(count, keys)

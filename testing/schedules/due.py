@@ -27,18 +27,24 @@ class Chooser(Protocol):
         """One of those that are due."""
         ...
 
+    def called(self, option: Option) -> None:
+        """A callback was taken, and is called now."""
+        ...
+
 
 class Due:
     """Stands in for the queue of an asyncio loop: who takes the next callback gets the one that was chosen.
 
     Attributes:
         chooser: who chooses; None: they come in order.
+        is_told: whether it hears of each callback that is called.
         has_dead: whether places have died. What is scheduled for them later must not run either.
         options: all that are due, in order.
     """
 
     def __init__(self) -> None:
         self.chooser: Chooser | None = None
+        self.is_told = False
         self.has_dead = False
         self.options: list[Option] = []
         self._ordered = 0  # so many of them have a place that matters
@@ -72,6 +78,8 @@ class Due:
                 if option is chosen:
                     del options[index]
                     break
+        if self.is_told and chooser is not None:
+            chooser.called(chosen)
         self._ordered -= chosen[2]
         return chosen[1]
 

@@ -18,6 +18,9 @@ class Last:
     def choose_callback(self, due: Due) -> Option:
         return due.next_options()[-1]
 
+    def called(self, option: Option) -> None:
+        """It does not matter."""
+
 
 def test_callbacks_keep_their_order_and_come_before_steps_behind_them() -> None:
     called: list[str] = []
