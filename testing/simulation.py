@@ -119,6 +119,7 @@ class Simulation:
 
     def enter(self, loop: asyncio.AbstractEventLoop) -> None:
         """From here to `remove` the world is the seed's."""
+        assert isinstance(loop, ControlledLoop)
         world = self._surroundings.enter_context(World(self.seed, loop))
         self._surroundings.callback(lambda: setattr(self, "escaped", tuple(world.escaped)))
 

@@ -85,6 +85,7 @@ class ControlledLoop(VirtualClockLoop):
         self._own_thread = threading.get_ident()
         self._numbers = itertools.count()  # of its tasks and futures
         self._sent: deque[asyncio.Handle] = deque()  # by threads
+        self._work: dict[asyncio.Future[Any], int] = {}  # of anyio's threads, by when it was given
         self._resting: list[asyncio.Future[None]] = []
         self._dead: list[Any] = []  # tasks: kept, since what is collected is closed, which runs its code
         self.sync_seconds: Callable[[], float] = float  # that a sync of a simulated store takes: none
@@ -118,10 +119,22 @@ class ControlledLoop(VirtualClockLoop):
         sent: Any = self._sent
         return sum(_given(handle._args) >= 0 for handle in sent)
 
+    def number_work(self, future: asyncio.Future[Any]) -> None:
+        """A thread of anyio is given work, the result of which this future is for."""
+        self._work[future] = next(self._numbers)
+
+    def _given(self, args: Any) -> int:
+        """When the work was given whose result a callback with these arguments brings; -1: it brings none."""
+        match args:
+            case (asyncio.Future() as future, _, _) if future in self._work:
+                return self._work.pop(future)
+            case _:
+                return _given(args)
+
     def at_rest(self) -> bool:
         sent: Any = self._sent
         self._sent = deque()
-        for handle in sorted(sent, key=lambda handle: _given(handle._args)):
+        for handle in sorted(sent, key=lambda handle: self._given(handle._args)):
             self.due.append(handle)
         if sent:
             return True

@@ -271,7 +271,7 @@ def test_a_server_is_told() -> None:
 
     with pytest.warns(EscapesSimulation) as told:
         run_schedule(serves, Production(0), OWN, {})
-    assert any("a file or socket is read (asyncio." in str(one.message) for one in told)
+    assert any("a socket is read (asyncio." in str(one.message) for one in told)
 
 
 def test_what_a_thread_brings_comes_when_nothing_else_can_happen() -> None:
