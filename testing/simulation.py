@@ -22,10 +22,11 @@ import tempfile
 import warnings
 from collections.abc import Callable, Coroutine, Iterable
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 from unittest import SkipTest
 
-from ..actors.errors import AskFailed, SpecError
+from ..actors.errors import AskFailed, HoldfastError, SpecError
 from ..actors.kernel.cell import GONE
 from ..actors.kernel.mailbox import admit_gone
 from ..actors.kernel.node import Node
@@ -397,8 +398,12 @@ class Settings:
 
         @functools.wraps(test)
         def run(*args: Any, **fixtures: Any) -> None:
+            __tracebackhide__ = True
             given = signature.bind(*args, **fixtures).arguments  # By name: ours may stand in front of them.
-            self._run_all(functools.partial(test, **given), own)
+            try:
+                self._run_all(functools.partial(test, **given), own)
+            except BaseException as error:
+                raise error.with_traceback(_of_the_test(error))
 
         run.__signature__ = signature  # type: ignore[attr-defined]  # what pytest looks for fixtures in
         del run.__wrapped__  # else pytest-asyncio and checkers see the async function
@@ -690,6 +695,18 @@ def _kind(error: BaseException) -> tuple[object, ...]:
     return type(error), *last
 
 
+def _of_the_test(error: BaseException) -> TracebackType | None:
+    """The traceback from the test's own frame on, without those that lead there; whole if it is not in there."""
+    trace = error.__traceback__
+    while trace is not None:
+        file = trace.tb_frame.f_code.co_filename
+        if not file.startswith((_LIBRARY, _ASYNCIO)) or f"{os.sep}tests{os.sep}" in file:
+            return trace
+        trace = trace.tb_next
+    return None if isinstance(error, HoldfastError) else error.__traceback__
+
+
+_ASYNCIO = str(Path(asyncio.__file__).parent)
 _LIBRARY = str(Path(__file__).resolve().parents[1])
 
 
