@@ -403,7 +403,7 @@ class Settings:
             try:
                 self._run_all(functools.partial(test, **given), own)
             except BaseException as error:
-                raise error.with_traceback(_of_the_test(error))
+                raise error.with_traceback(_of_the_test(error))  # noqa: B904  # It is the same error.
 
         run.__signature__ = signature  # type: ignore[attr-defined]  # what pytest looks for fixtures in
         del run.__wrapped__  # else pytest-asyncio and checkers see the async function
