@@ -181,14 +181,16 @@ def _guard_in_loop_of_test(request: pytest.FixtureRequest) -> Guard:
     Raises:
         pytest.fail.Exception: the test does not run in a loop of pytest-asyncio.
     """
+    marker = request.node.get_closest_marker("asyncio")
     if "anyio_backend" in request.fixturenames or request.node.get_closest_marker("anyio") is not None:
+        if marker is None or request.node.get_closest_marker("anyio") is not None:
+            why = "runs this test in another one: mark it with @pytest.mark.asyncio instead of @pytest.mark.anyio"
+        else:
+            why = "takes the async fixtures of all async tests to another one: set anyio_mode = strict"
         pytest.fail(
-            "the fixtures of holdfast run in the loop of pytest-asyncio, and anyio's plugin runs this test in another "
-            "one: mark it with @pytest.mark.asyncio instead of @pytest.mark.anyio",
-            pytrace=False,
+            f"the fixtures of holdfast run in the loop of pytest-asyncio, and anyio's plugin {why}", pytrace=False
         )
     scope = None
-    marker = request.node.get_closest_marker("asyncio")
     if marker is not None:
         scope = marker.kwargs.get("loop_scope") or marker.kwargs.get("scope")
     if scope is None and request.config.pluginmanager.has_plugin("asyncio"):
