@@ -35,6 +35,8 @@ LOOK_AGAIN = 0.002
 """Real seconds between two looks at the threads at work."""
 TICKS = 10_000
 """Ticks of the loop at one moment of virtual time; a run queue that is never empty makes them in about 5 s."""
+COUNTED = 16
+"""Ticks between two looks at how many there are."""
 JUMPS = 500_000
 """Jumps of the clock in one run of the loop."""
 PIDFD = "anon_inode:[pidfd]"
@@ -86,27 +88,31 @@ class _JumpingSelector(selectors.DefaultSelector):
         self.now = start
         self.jobs = 0  # work of executors whose results will wake the loop
         self.ticks, self.jumps = 0, 0
-        self._most_ticks, self._most_jumps = ticks, jumps
+        self.most_ticks, self._most_jumps = ticks, jumps
         self._loop = loop
         self._threads = Threads()
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        is_busy = timeout is not None and timeout <= 0
+        if is_busy and len(self.get_map()) == WAKE_UP_SOCKETS and not self._loop.hears_at_once():
+            self._tick()
+            return []
         ready = super().select(0)
-        if ready or (timeout is not None and timeout <= 0):
+        if ready or is_busy:
             self._tick()
             return ready
         ready = self._select_after_threads()
         if not ready and self._loop.at_rest():
             self._tick()
             return ready
-        self.ticks = 0
+        self._loop.forget_ticks()
         return ready or self._jump()
 
     def _tick(self) -> None:
         self.ticks += 1
-        if self.ticks > self._most_ticks:
-            self.ticks = 0
-            self._loop.stands_still(f"{self._most_ticks} ticks of the loop at virtual time {self.now:g} s")
+        if self.ticks % COUNTED == 0 and self._loop.has_too_many_ticks(self.ticks):
+            self._loop.forget_ticks()
+            self._loop.stands_still(f"{self.most_ticks} ticks of the loop at virtual time {self.now:g} s")
 
     def _select_after_threads(self) -> list[tuple[selectors.SelectorKey, int]]:
         """What is ready once no thread is at work, or as soon as one of them wakes the loop."""
@@ -167,6 +173,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     _ready: deque[asyncio.Handle]  # asyncio's own
     _scheduled: list[asyncio.TimerHandle]
+    _debug: bool
+    _closed: bool
 
     def __init__(self, start: float = 0.0, *, ticks: int = TICKS, jumps: int = JUMPS) -> None:
         self._virtual = _JumpingSelector(self, start, ticks, jumps)
@@ -187,12 +195,30 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     def run_forever(self) -> None:
         """As every loop; each run may take so many ticks and jumps."""
-        self._virtual.ticks = self._virtual.jumps = 0
+        self._virtual.jumps = 0
+        self.forget_ticks()
         super().run_forever()
 
     async def rest(self) -> None:
         """Let everything that is due have a turn."""
         await asyncio.sleep(0)
+
+    @property
+    def most_ticks(self) -> int:
+        """How many ticks at one moment are not too many."""
+        return self._virtual.most_ticks
+
+    def forget_ticks(self) -> None:
+        """Ticks are counted from here on."""
+        self._virtual.ticks = 0
+
+    def has_too_many_ticks(self, ticks: int) -> bool:
+        """Whether so many ticks at one moment are too many."""
+        return ticks > self.most_ticks
+
+    def hears_at_once(self) -> bool:
+        """Whether a thread that wakes the loop is heard while other things are due."""
+        return True
 
     def held_back(self) -> int:
         """How many results of executors are held back until nothing else can happen."""

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import importlib
 import types
-from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Generator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -24,14 +25,25 @@ if TYPE_CHECKING:
     ActorSystems = Callable[..., Awaitable[GuardedSystem]]
 
 
-def async_fixture(function: Callable[..., Any], *, name: str, loop_scope: str) -> Any:
-    """A fixture by pytest-asyncio. The plugin is loaded wherever holdfast is installed; only its fixtures need that."""
-    # Each a function of its own: pytest-asyncio keeps the scope at the function.
-    own = types.FunctionType(function.__code__, function.__globals__, name, None, function.__closure__)
+LOOP_SCOPES = ("function", "class", "module", "package", "session")
+Makers = dict[str, Callable[..., Any]]
+"""What makes a fixture, by the scope of the loop in which it does so."""
+
+
+def async_fixture(function: Callable[..., Any], *, name: str) -> tuple[Any, Makers]:
+    """A fixture by pytest-asyncio, which makes it in the loop of a function, and what makes it in other loops.
+
+    The plugin is loaded wherever holdfast is installed; only its fixtures need pytest-asyncio.
+    """
     try:
-        return importlib.import_module("pytest_asyncio").fixture(own, name=name, loop_scope=loop_scope)
+        fixture = importlib.import_module("pytest_asyncio").fixture
     except ImportError:
-        return pytest.fixture(_missing, name=name)
+        return pytest.fixture(_missing, name=name), {}
+    made: dict[str, Any] = {}
+    for scope in LOOP_SCOPES:  # Each a function of its own: pytest-asyncio keeps the scope at the function.
+        own = types.FunctionType(function.__code__, function.__globals__, name, None, function.__closure__)
+        made[scope] = own, fixture(own, name=name, loop_scope=scope)
+    return made["function"][1], {scope: own for scope, (own, _) in made.items()}
 
 
 def _missing() -> None:
@@ -40,7 +52,6 @@ def _missing() -> None:
 
 
 EXPECTABLE = ("dead_letters", "crashes", "leaks", "sends", "replies", "types", "exceptions")
-LOOP_SCOPES = ("function", "class", "module", "package", "session")
 LOOPS = ("uvloop", "asyncio")
 PROFILES = ("ci", "nightly")
 
@@ -132,10 +143,16 @@ def _loop_factory(name: str) -> Callable[[], asyncio.AbstractEventLoop]:
     return asyncio.new_event_loop
 
 
+WANTED = pytest.StashKey["Wanted"]()
+
+
 def _wanted(item: pytest.Item) -> Wanted:
+    """What the test expects, which is read once."""
     from .wanted import Wanted
 
-    return Wanted(item, EXPECTABLE)
+    if WANTED not in item.stash:
+        item.stash[WANTED] = Wanted(item, EXPECTABLE)
+    return item.stash[WANTED]
 
 
 @pytest.hookimpl(wrapper=True)
@@ -150,69 +167,95 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, Any, Any]
         running.reset(token)
 
 
-async def guard_of_the_test(request: pytest.FixtureRequest) -> AsyncIterator[Guard]:
-    """The systems of one test, and the look at what they leave, in the loop of the test."""
-    from .guarded import Guard, GuardedSystem
+GUARD = pytest.StashKey["Guard"]()
+
+
+@contextlib.asynccontextmanager
+async def _guarded(item: pytest.Item) -> AsyncGenerator[Guard]:
+    """The guard of a test, which looks at what is left when the fixture ends that was the first to ask for it."""
+    from .guarded import Guard
+
+    if GUARD in item.stash:
+        yield item.stash[GUARD]
+        return
+    wanted = _wanted(item)
+    guard = item.stash[GUARD] = Guard(allowed=wanted.leaks, exceptions=not wanted.exceptions)
+    try:
+        yield guard
+    finally:
+        del item.stash[GUARD]
+        await guard.close()
+
+
+async def system_of_the_test(request: pytest.FixtureRequest) -> AsyncIterator[GuardedSystem]:
+    """A running system of the test's own, on the test's loop; it ends with the test."""
+    from .guarded import GuardedSystem
 
     wanted = _wanted(request.node)
-    guard = Guard(allowed=wanted.leaks, exceptions=not wanted.exceptions)
-    if "actor_system" in request.node.fixturenames:  # Started here, it needs no fixture of its own: these take time.
-        wanted.tell(await guard.start(GuardedSystem(**wanted.options)))
-    yield guard
-    await guard.close()
+    async with _guarded(request.node) as guard:
+        system = await guard.start(GuardedSystem(**wanted.options))
+        wanted.tell(system)
+        yield system
 
 
-# A fixture of pytest-asyncio runs in the loop of one scope, and a test says by its marker which one it runs in.
-for _scope in LOOP_SCOPES:
-    globals()[f"holdfast_guard_{_scope}"] = async_fixture(
-        guard_of_the_test, name=f"holdfast_guard_{_scope}", loop_scope=_scope
-    )
+async def systems_of_the_test(request: pytest.FixtureRequest) -> AsyncIterator[ActorSystems]:
+    """Start a system: `system = await actor_systems("name", store=...)`, as often as the test likes."""
+    from .guarded import GuardedSystem
+
+    wanted = _wanted(request.node)
+    async with _guarded(request.node) as guard:
+
+        async def start(name: str = "app", **options: Any) -> GuardedSystem:
+            system = await guard.start(GuardedSystem(name, **{**wanted.options, **options}))
+            wanted.tell(system)
+            return system
+
+        yield start
 
 
-def _guard_in_loop_of_test(request: pytest.FixtureRequest) -> Guard:
-    """The guard that runs in the same loop as the test.
+actor_system, _makers = async_fixture(system_of_the_test, name="actor_system")
+actor_systems, _more_makers = async_fixture(systems_of_the_test, name="actor_systems")
+MAKERS = {makers["function"]: makers for makers in (_makers, _more_makers) if makers}
+"""The same by what pytest knows each fixture by."""
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_fixture_setup(
+    fixturedef: pytest.FixtureDef[Any], request: pytest.FixtureRequest
+) -> Generator[None, object, object]:
+    """Have the systems of a test made in its loop: a fixture of pytest-asyncio has one scope, and so has a test."""
+    makers, function = MAKERS.get(fixturedef.func), fixturedef.func
+    if makers is None:
+        return (yield)
+    put: Any = fixturedef  # as pytest-asyncio does, which exchanges the function, too
+    put.func = makers[_loop_scope_of(request)]
+    try:
+        return (yield)
+    finally:
+        put.func = function
+
+
+def _loop_scope_of(request: pytest.FixtureRequest) -> str:
+    """The scope of the loop that the test runs in.
 
     Raises:
         pytest.fail.Exception: the test does not run in a loop of pytest-asyncio.
     """
+    marker = request.node.get_closest_marker("asyncio")
     if "anyio_backend" in request.fixturenames or request.node.get_closest_marker("anyio") is not None:
+        if marker is None or request.node.get_closest_marker("anyio") is not None:
+            why = "runs this test in another one: mark it with @pytest.mark.asyncio instead of @pytest.mark.anyio"
+        else:
+            why = "takes the async fixtures of all async tests to another one: set anyio_mode = strict"
         pytest.fail(
-            "the fixtures of holdfast run in the loop of pytest-asyncio, and anyio's plugin runs this test in another "
-            "one: mark it with @pytest.mark.asyncio instead of @pytest.mark.anyio",
-            pytrace=False,
+            f"the fixtures of holdfast run in the loop of pytest-asyncio, and anyio's plugin {why}", pytrace=False
         )
     scope = None
-    marker = request.node.get_closest_marker("asyncio")
     if marker is not None:
         scope = marker.kwargs.get("loop_scope") or marker.kwargs.get("scope")
     if scope is None and request.config.pluginmanager.has_plugin("asyncio"):
         scope = request.config.getini("asyncio_default_test_loop_scope")
-    guard: Guard = request.getfixturevalue(f"holdfast_guard_{scope or 'function'}")
-    return guard
-
-
-@pytest.fixture
-def actor_systems(request: pytest.FixtureRequest) -> ActorSystems:
-    """Start a system: `system = await actor_systems("name", store=...)`, as often as the test likes."""
-    from .guarded import GuardedSystem
-
-    guard, wanted = _guard_in_loop_of_test(request), _wanted(request.node)
-
-    async def start(name: str = "app", **options: Any) -> GuardedSystem:
-        system = await guard.start(GuardedSystem(name, **{**wanted.options, **options}))
-        wanted.tell(system)
-        return system
-
-    return start
-
-
-@pytest.fixture
-def actor_system(request: pytest.FixtureRequest) -> GuardedSystem:
-    """A running system of the test's own, on the test's loop; it ends with the test."""
-    system = _guard_in_loop_of_test(request).first
-    if system is None:
-        pytest.fail("actor_system is to be a parameter of the test or of its fixtures", pytrace=False)
-    return system
+    return scope or "function"
 
 
 @pytest.fixture

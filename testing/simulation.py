@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import functools
 import inspect
 import math
@@ -21,15 +22,17 @@ import tempfile
 import warnings
 from collections.abc import Callable, Coroutine, Iterable
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 from unittest import SkipTest
 
-from ..actors.errors import AskFailed, SpecError
+from ..actors.errors import AskFailed, HoldfastError, SpecError
 from ..actors.kernel.cell import GONE
 from ..actors.kernel.mailbox import admit_gone
 from ..actors.kernel.node import Node
 from ..actors.kernel.ref import ActorRef, current
 from .barrier import waiter_of
+from .clock import TICKS
 from .faults import Faults
 from .guard.leaks import Leaks
 from .guard.loop_leaks import LoopLeaks
@@ -49,11 +52,14 @@ from .schedules.choices import (
     repeated,
     size,
 )
-from .schedules.control import Control, ControlledLoop, Root, inside
+from .schedules.control import Control, ControlledLoop
 from .schedules.disk import PATH, Latency, NoRootToKill, SimulatedDisk
+from .schedules.places import Root, inside
 from .schedules.processes import SimulatedWorkers
 from .schedules.shrinking import shrink
-from .schedules.strategies import DEPTH, Strategy, mixed, strategy
+from .schedules.strategies import DEPTH, mixed
+from .schedules.strategies import strategy as strategy_of
+from .schedules.turn_log import TurnLog
 from .schedules.world import EPOCH, World
 from .swaps import Swaps
 from .turns import Tracer, watch_turns
@@ -106,13 +112,15 @@ class Simulation:
         self.trace: list[tuple[str, str]] = []
         self.faults = Faults(choices.seed, choices)
         self.escaped: tuple[str, ...] = ()
-        self._control = Control(choices, self.trace)
+        self._control: Control | None = None  # There is none before the system has been started.
+        self._log = TurnLog(self.trace)
         self._swaps = Swaps()
         self._ends: list[Callable[[], None]] = []
         self._surroundings = contextlib.ExitStack()
 
     def enter(self, loop: asyncio.AbstractEventLoop) -> None:
         """From here to `remove` the world is the seed's."""
+        assert isinstance(loop, ControlledLoop)
         world = self._surroundings.enter_context(World(self.seed, loop))
         self._surroundings.callback(lambda: setattr(self, "escaped", tuple(world.escaped)))
 
@@ -135,10 +143,13 @@ class Simulation:
 
         self._make, self._test, self._looks = make, asyncio.current_task(), looks
         loop.sync_seconds = Latency(self.choices, "syncs", self._sync)
-        if recorder is not None:
-            self._control.on_node = lambda node: self._ends.append(watch_turns(node, recorder))
+
+        def watch(node: Node) -> None:
+            if recorder is not None:
+                self._ends.append(watch_turns(node, recorder))
+
         root = await self._start()
-        self._control.install(root.node, loop)
+        self._control = Control(self.choices, self._log, root.node, loop, on_node=watch)
         return root.system
 
     async def _start(self) -> Root:
@@ -187,7 +198,12 @@ class Simulation:
             raise ValueError(f"moment takes one turn or more, not {turns!r}")
         number = self.choices.draw(MOMENT, turns + 1, self._draw.randint(0, turns))
         if number:
-            await self._control.moment(number)
+            loop = asyncio.get_running_loop()
+            assert isinstance(loop, ControlledLoop)
+            moment: asyncio.Future[None] = loop.create_future()
+            self._log.await_turns(number, moment)
+            loop.rests(moment)
+            await moment
 
     async def crash_root(self, *, power: bool = False) -> GuardedSystem:
         """SIGKILL for the process in which the system lives, at this very moment; then it is started again.
@@ -221,6 +237,7 @@ class Simulation:
             self.disk.cut_power(self.choices)
         root = await self._start()
         root.system.succeed(before.system)
+        assert self._control is not None
         self._control.add(root.node)
         return root.system
 
@@ -242,7 +259,8 @@ class Simulation:
 
     def remove(self) -> None:
         """Leave the system as it was."""
-        self._control.remove()
+        if self._control is not None:
+            self._control.remove()
         self._swaps.undo()
         self.stop_recording()
         self._surroundings.close()
@@ -319,6 +337,91 @@ def _is_called_by(task: asyncio.Task[Any], system: GuardedSystem, node: Node) ->
     return False
 
 
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What is said of a simulated test beside the test itself: as the arguments of `simulate`, which are refused here.
+
+    Raises:
+        SpecError, ValueError: one of them is wrong.
+    """
+
+    seeds: int = 1
+    seed: int | None = None
+    replay: str | None = None
+    strategy: str = "mixed"
+    depth: int = DEPTH
+    latency: float | Seconds = 0.0
+    sync: float | Seconds = 0.0
+    ticks: int = TICKS
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.seeds < 1:
+            raise ValueError(f"simulate takes one seed or more, not seeds={self.seeds}")
+        if self.ticks < 1:
+            raise ValueError(f"simulate takes one tick or more, not ticks={self.ticks}")
+        strategy_of(self.strategy, self.depth)
+        _seconds("latency", self.latency)
+        _seconds("sync", self.sync)
+        if self.replay is not None:
+            from_text(self.replay)
+
+    def said(self, wanted: Wanted, seeds: int | None = None) -> range | str:
+        """The seeds to try, or the schedule to repeat. The command line and the environment have the last word."""
+        file: str | None = wanted.option("replay")
+        if file:
+            return Path(file).read_text(encoding="utf-8").strip()
+        if self.replay is not None:
+            return self.replay
+        chosen = wanted.option("seed")
+        said = os.environ.get(SEED, "") if chosen is None else str(chosen)
+        try:
+            seed = int(said) if said else self.seed
+        except ValueError:
+            raise SpecError("simulate", f"{SEED} must be a number, not {said!r}") from None
+        if seed is not None:
+            return range(seed, seed + 1)
+        count = seeds or self.seeds
+        return range(int(wanted.option("seeds") or count * (NIGHTLY if wanted.option("profile") == "nightly" else 1)))
+
+    def decorate(self, test: Test) -> Callable[..., None]:
+        """What pytest calls in place of the test.
+
+        Raises:
+            TypeError: it is no `async def`.
+        """
+        if not inspect.iscoroutinefunction(test):
+            raise TypeError(f"@simulate takes an `async def` test, not {test!r}")
+        wanted = inspect.signature(test).parameters
+        own = {name for name in ("system", "faults", "simulation") if name in wanted}
+        signature = inspect.Signature([parameter for name, parameter in wanted.items() if name not in own])
+
+        @functools.wraps(test)
+        def run(*args: Any, **fixtures: Any) -> None:
+            __tracebackhide__ = True
+            given = signature.bind(*args, **fixtures).arguments  # By name: ours may stand in front of them.
+            try:
+                self._run_all(functools.partial(test, **given), own)
+            except BaseException as error:
+                raise error.with_traceback(_of_the_test(error))  # noqa: B904  # It is the same error.
+
+        run.__signature__ = signature  # type: ignore[attr-defined]  # what pytest looks for fixtures in
+        del run.__wrapped__  # else pytest-asyncio and checkers see the async function
+        return run
+
+    def _run_all(self, test: Test, own: set[str]) -> None:
+        leaks = Leaks(running.get().leaks)
+        try:
+            if running.get().option("real"):
+                run_real(test, own, self.options, self.said(running.get(), REAL_RUNS))
+            else:
+                Search(test, own, self).run()
+        finally:
+            leaks.close()
+        if left := leaks.outside():
+            raise UnexpectedEnd(tuple(left))
+
+
 def simulate(
     test: Test | None = None,
     *,
@@ -329,6 +432,7 @@ def simulate(
     depth: int = DEPTH,
     latency: float | Seconds = 0.0,
     sync: float | Seconds = 0.0,
+    ticks: int = TICKS,
     **options: Any,
 ) -> Any:
     """Run an async test under many schedules, each on a virtual clock with a system of its own.
@@ -351,56 +455,16 @@ def simulate(
         depth: of PCT: how many events have to come in one order for the bug to show.
         latency: seconds that what an actor's process and the root write to each other takes; (least, longest): drawn.
         sync: seconds that a sync of the simulated store takes; (least, longest): drawn.
+        ticks: at one moment of virtual time, after which the run is taken to go on there for ever (`NotIdle`). In a
+            tick everything that waited at its beginning has its turn: a burst takes as many as it is deep.
         options: for ActorSystem. `store="simulated"`: a store in memory, which outlives the root (`crash_root`).
 
     Raises:
         whatever the test raises, with a note that shows the run and says how to repeat it. NotRepeatable: two runs with
         the same choices differ. SpecError, ValueError, TypeError: the arguments are wrong.
     """
-    if test is None:
-        return functools.partial(
-            simulate,
-            seeds=seeds,
-            seed=seed,
-            replay=replay,
-            strategy=strategy,
-            depth=depth,
-            latency=latency,
-            sync=sync,
-            **options,
-        )
-    late, syncs = _seconds("latency", latency), _seconds("sync", sync)
-    if seeds < 1:
-        raise ValueError(f"simulate takes one seed or more, not seeds={seeds}")
-    if not inspect.iscoroutinefunction(test):
-        raise TypeError(f"@simulate takes an `async def` test, not {test!r}")
-    search_of(strategy, depth)  # Refused where it stands.
-    if replay is not None:
-        from_text(replay)
-    wanted = inspect.signature(test).parameters
-    own = {name for name in ("system", "faults", "simulation") if name in wanted}
-
-    signature = inspect.Signature([parameter for name, parameter in wanted.items() if name not in own])
-
-    @functools.wraps(test)
-    def run(*args: Any, **fixtures: Any) -> None:
-        given = signature.bind(*args, **fixtures).arguments  # By name: ours may stand in front of them.
-        leaks, called = Leaks(running.get().leaks), functools.partial(test, **given)
-        try:
-            if running.get().option("real"):
-                run_real(called, own, options, _said(running.get(), REAL_RUNS, seed))
-            else:
-                search = Search(called, own, options, search_of(strategy, depth), strategy, late, syncs)
-                search.run(seeds, seed, replay)
-        finally:
-            leaks.close()
-        left = leaks.outside()
-        if left:
-            raise UnexpectedEnd(tuple(left))
-
-    run.__signature__ = signature  # type: ignore[attr-defined]  # what pytest looks for fixtures in
-    del run.__wrapped__  # else pytest-asyncio and checkers see the async function
-    return run
+    settings = Settings(seeds, seed, replay, strategy, depth, latency, sync, ticks, options)
+    return settings.decorate if test is None else settings.decorate(test)
 
 
 def _seconds(name: str, given: float | Seconds) -> Seconds:
@@ -410,63 +474,46 @@ def _seconds(name: str, given: float | Seconds) -> Seconds:
     return seconds
 
 
-search_of = strategy
-"""The strategy of that name: `simulate` has a parameter that is called so, too."""
-
-
 class Search:
     """The runs of one test, one schedule after the other, until one fails.
 
     Args:
         test: what is run; `own` are those of its parameters that come from here.
-        options: of its systems.
-        strategy: what gives the schedules.
-        named: its name.
-        latency, sync: as `simulate` says.
+        settings: the strategy, the options of its systems, and so on.
 
     Attributes:
         runs: how many schedules have been tried.
         is_complete: whether there is no other schedule.
     """
 
-    def __init__(
-        self,
-        test: Test,
-        own: Iterable[str],
-        options: dict[str, Any],
-        strategy: Strategy,
-        named: str = "mixed",
-        latency: Seconds = (0.0, 0.0),
-        sync: Seconds = (0.0, 0.0),
-    ) -> None:
-        self._latency, self._sync = latency, sync
+    def __init__(self, test: Test, own: Iterable[str], settings: Settings) -> None:
         self.runs = 0
         self.is_complete = False
-        self._test, self._own, self._options = test, set(own), options
-        self._strategy, self._named = strategy, named
+        self._test, self._own, self._settings = test, set(own), settings
+        self._strategy, self._named = strategy_of(settings.strategy, settings.depth), settings.strategy
         self._wanted = running.get()
         self._failures = self._wanted.failures()
 
-    def run(self, seeds: int, seed: int | None = None, replay: str | None = None) -> None:
+    def run(self) -> None:
         """Try the schedules that are asked for; those that have failed the last time come first.
 
         Raises:
             as `simulate`.
         """
-        said = _said(self._wanted, seeds, seed, replay)
+        said = self._settings.said(self._wanted)
         if isinstance(said, str):
             number, taken = from_text(said)
             self._try(repeated(number, taken))
             self._forget(said)
             return
-        if seed is None and self._failures is not None and len(said) > 1:
+        if self._settings.seed is None and self._failures is not None and len(said) > 1:
             for text in self._failures.texts():
                 number, taken = from_text(text)
                 self._try(repeated(number, taken))
                 self._failures.drop(text)
         for number in said:
             if self._named == "pct" and len(said) == 1 and number:
-                self._learn(self._run(search_of("pct").choices(0) or Choices(0)))
+                self._learn(self._run(strategy_of("pct").choices(0) or Choices(0)))
             choices = self._strategy.choices(number)
             if choices is None:
                 self.is_complete = True
@@ -488,9 +535,17 @@ class Search:
             self._failures.drop(text)
 
     def _run(self, choices: Choices, recorder: Recorder | None = None, *, looks: bool = True) -> Simulation:
-        late, syncs = self._latency, self._sync
+        said = self._settings
         return run_schedule(
-            self._test, choices, self._own, self._options, recorder, looks=looks, latency=late, sync=syncs
+            self._test,
+            choices,
+            self._own,
+            said.options,
+            recorder,
+            looks=looks,
+            latency=_seconds("latency", said.latency),
+            sync=_seconds("sync", said.sync),
+            ticks=said.ticks,
         )
 
     def _try(self, choices: Choices, *, looks: bool = True) -> Simulation:
@@ -622,26 +677,6 @@ def _head(seed: int, text: str | None, is_of_seed: bool) -> str:
     return f"seed={seed}: repeat it with {', or '.join(parts)}"
 
 
-def _said(wanted: Wanted, seeds: int, seed: int | None, replay: str | None = None) -> range | str:
-    """The seeds to try, or the schedule to repeat."""
-    file: str | None = wanted.option("replay")
-    if file:
-        return Path(file).read_text(encoding="utf-8").strip()
-    if replay is not None:
-        return replay
-    chosen = wanted.option("seed")
-    said = os.environ.get(SEED, "") if chosen is None else str(chosen)
-    if said:
-        try:
-            seed = int(said)
-        except ValueError:
-            raise SpecError("simulate", f"{SEED} must be a number, not {said!r}") from None
-    if seed is not None:
-        return range(seed, seed + 1)
-    count = wanted.option("seeds") or seeds * (NIGHTLY if wanted.option("profile") == "nightly" else 1)
-    return range(int(count))
-
-
 def _is_failure(error: BaseException) -> bool:
     """Whether it is the outcome of a run, and not the wish to end the test."""
     pytest = sys.modules.get("pytest")
@@ -660,6 +695,18 @@ def _kind(error: BaseException) -> tuple[object, ...]:
     return type(error), *last
 
 
+def _of_the_test(error: BaseException) -> TracebackType | None:
+    """The traceback from the test's own frame on, without those that lead there; whole if it is not in there."""
+    trace = error.__traceback__
+    while trace is not None:
+        file = trace.tb_frame.f_code.co_filename
+        if not file.startswith((_LIBRARY, _ASYNCIO)) or f"{os.sep}tests{os.sep}" in file:
+            return trace
+        trace = trace.tb_next
+    return None if isinstance(error, HoldfastError) else error.__traceback__
+
+
+_ASYNCIO = str(Path(asyncio.__file__).parent)
 _LIBRARY = str(Path(__file__).resolve().parents[1])
 
 
@@ -700,12 +747,13 @@ def run_schedule(
     looks: bool = True,
     latency: Seconds = (0.0, 0.0),
     sync: Seconds = (0.0, 0.0),
+    ticks: int = TICKS,
 ) -> Simulation:
     """One run under one schedule. Returns what happened.
 
     Args:
         recorder: draws up what happens.
-        latency, sync: as `simulate` says.
+        latency, sync, ticks: as `simulate` says.
         looks: whether each message is looked at, as `GuardedSystem` does: that takes most of the time of a run.
 
     Raises:
@@ -713,7 +761,7 @@ def run_schedule(
     """
     simulation = Simulation(choices, latency, sync)
     try:
-        with asyncio.Runner(loop_factory=ControlledLoop) as runner:
+        with asyncio.Runner(loop_factory=functools.partial(ControlledLoop, ticks=ticks)) as runner:
             runner.run(_run(test, simulation, own, options, recorder, looks))
     except BaseException as error:
         error.__simulation__ = simulation  # type: ignore[attr-defined]

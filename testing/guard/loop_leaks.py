@@ -13,7 +13,7 @@ TASK_GRACE = 10
 """Turns of the loop that a cancelled task may take to end."""
 LIBRARY = __name__.partition(".")[0] + "."
 MANY = 1000
-"""Timers that are noted before those that are over are forgotten."""
+"""Timers, and futures, that are noted before those that are over are forgotten."""
 
 
 class LoopLeaks:
@@ -32,7 +32,7 @@ class LoopLeaks:
         self._swaps = Swaps()
         self._timers: list[tuple[asyncio.Handle, float, Any]] = []  # with when they are due, and what they call
         self._most = MANY
-        self._futures: weakref.WeakSet[asyncio.Future[Any]] = weakref.WeakSet()
+        self._futures: list[weakref.ref[asyncio.Future[Any]]] = []
         self._lost: list[tuple[str, BaseException]] = []
         self._loop: Any = None
         try:
@@ -44,8 +44,8 @@ class LoopLeaks:
         self._handler = self._loop.get_exception_handler()
         for name, time in (("call_at", lambda: 0.0), ("call_later", self._loop.time)):
             self._swaps.put(self._loop, name, self._noting_timers(getattr(self._loop, name), time))
-        for name in ("create_future", "create_task"):
-            self._swaps.put(self._loop, name, self._noting_futures(getattr(self._loop, name)))
+        self._swaps.put(self._loop, "create_future", self._noting_futures(self._loop.create_future))
+        self._swaps.put(self._loop, "create_task", self._noting_tasks(self._loop.create_task))
         self._swaps.put(self._loop, "call_exception_handler", self._noting(self._loop.call_exception_handler))
 
     def _noting_timers(self, call: Any, origin: Callable[[], float]) -> Any:
@@ -62,11 +62,24 @@ class LoopLeaks:
         return noted
 
     def _noting_futures(self, make: Any) -> Any:
-        add = self._futures.add
+        futures, ref = self._futures, weakref.ref  # A WeakSet takes ten times as long.
+        most = MANY
 
-        def noted(*args: Any, **options: Any) -> Any:
-            made = make(*args, **options)
-            add(made)
+        def noted() -> Any:
+            nonlocal most
+            futures.append(ref(made := make()))
+            if len(futures) > most:
+                futures[:] = [one for one in futures if one() is not None]
+                most = max(MANY, 2 * len(futures))
+            return made
+
+        return noted
+
+    def _noting_tasks(self, make: Any) -> Any:
+        futures = self._futures
+
+        def noted(coro: Any, **options: Any) -> Any:
+            futures.append(weakref.ref(made := make(coro, **options)))
             return made
 
         return noted
@@ -96,11 +109,13 @@ class LoopLeaks:
 
     async def tasks(self) -> list[str]:
         """Tasks that are not ours and still run after a few turns of the loop."""
+        left = self._new_tasks()
         for _ in range(TASK_GRACE):
-            if not self._new_tasks():
+            if not left:
                 break
             await asyncio.sleep(0)
-        return [repr(task) for task in self._new_tasks()]
+            left = self._new_tasks()
+        return [repr(task) for task in left]
 
     def _new_tasks(self) -> set[asyncio.Task[object]]:
         return asyncio.all_tasks() - self._tasks - {asyncio.current_task()}
@@ -126,9 +141,10 @@ class LoopLeaks:
         found: dict[int, str] = {}
         for message, error in self._lost:
             found[id(error)] = f"{_text(error)} ({message})"
-        for future in list(self._futures):
-            failure = _unseen(future)
-            if failure is None or id(failure) in found:
+        for noted in self._futures:
+            future = noted()
+            failure = None if future is None else _unseen(future)
+            if future is None or failure is None or id(failure) in found:
                 continue
             asked = (asks or {}).get(future)
             what = repr(future) if asked is None else f"the ask of {asked[1]!r} to {asked[0]}"

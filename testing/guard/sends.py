@@ -9,8 +9,10 @@ and compared when a turn of one of the two is over, and at the end.
 from __future__ import annotations
 
 import asyncio
+import functools
 import weakref
 from collections import defaultdict, deque
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -89,9 +91,9 @@ class SendChecks(TurnWatcher):
         Raises:
             BadMessage: a field has another type than it declares.
         """
-        if not isinstance(message, Message) or is_of_library(message):
-            return
         kind = type(message)
+        if not isinstance(message, Message) or is_of_library(kind):
+            return
         if not self.are_types_expected and (problem := wrong_field(message)) is not None:
             raise BadMessage(cell.path, type_name(kind), problem)
         if is_fixed(kind):
@@ -162,7 +164,7 @@ class SendChecks(TurnWatcher):
             return
         ctx = current.get(None)
         giver: Cell = ask.to if ctx is None else ctx.cell
-        if giver.actor is None or not may_change(reply) or is_of_library(ask.message):
+        if giver.actor is None or not may_change(reply) or is_of_library(type(ask.message)):
             return
         body = self._images.of(reply)
         if body is None or id(reply) in self._kept:
@@ -279,9 +281,12 @@ class SendChecks(TurnWatcher):
         self._near.clear()
 
 
-def is_of_library(message: object) -> bool:
-    """Whether it is one of the runtime's own orders: these are no business of the test's."""
-    return type(message).__module__.startswith(LIBRARY)
+def _is_of_library(kind: type) -> bool:
+    """Whether messages of this class are the runtime's own orders: these are no business of the test's."""
+    return kind.__module__.startswith(LIBRARY)
+
+
+is_of_library: Callable[[type], bool] = functools.cache(_is_of_library)
 
 
 def _listed(head: str, lines: list[str]) -> str:

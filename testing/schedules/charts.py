@@ -11,7 +11,7 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import message_of
 from ..turns import Substitute, TurnWatcher
-from .control import told
+from .turn_log import told
 
 SHOWN = 40
 """Turns that the text shows, the last ones."""

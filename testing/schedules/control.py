@@ -13,90 +13,35 @@ import asyncio
 import concurrent.futures
 import itertools
 import threading
-import weakref
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable
-from contextvars import Context, ContextVar
+from contextvars import Context
 from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple
 
 from ...actors.kernel import loop as run_loop
-from ...actors.kernel.cell import NEXT_URGENT, Cell
-from ...actors.kernel.message import Message, message_of
+from ...actors.kernel.cell import Cell
 from ...actors.kernel.node import Node
-from ...checkpoint.life.recorded_inbox import Fed
-from ..clock import VirtualClockLoop
+from ..clock import TICKS, VirtualClockLoop
 from ..swaps import Swaps
 from .disk import simulated
+from .due import Due, Option
+from .footprints import Footprints
+from .livelock import Rounds
 from .numbered import NumberedFuture, NumberedTask
-from .strategies import ALL, Explored, Footprint
+from .places import Place, inside, is_dead, never, no_more
+from .strategies import Explored
 
 if TYPE_CHECKING:
-    from ..guarded import GuardedSystem
-    from .choices import Choices
+    from .choices import Choices, Keys
+    from .turn_log import TurnLog
 
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
-LOOP: Final = "the loop"
-"""All callbacks that are no steps of tasks: they keep their order."""
-TICKS: Final = 30_000
-"""Ticks of the loop at one moment of virtual time: as many as it makes in some seconds."""
 MOST_TURNS: Final = 64
 """Turns after which the loop has a look at files and threads, if no callback of its own wants to run."""
 MOST: Final = run_loop.MOST
 LONGEST: Final = 1024
 """Turns after which a callback has to be called, whatever the schedule says."""
-
-
-class Place:
-    """Where code of a simulated run runs: the root, or a process. Of a dead one nothing runs any more.
-
-    Attributes:
-        node: whose actors are there, once it has begun.
-        tasks: that were created there.
-        lane: what keeps its callbacks in order.
-        is_dead: whether it was killed, or has ended.
-    """
-
-    node: Node
-
-    def __init__(self) -> None:
-        self.tasks: weakref.WeakSet[asyncio.Task[Any]] = weakref.WeakSet()
-        self.lane: Hashable = self
-        self.is_dead = False
-
-
-class Root(Place):
-    """The process in which a system of the run lives. The test lives there, too, and outlives it.
-
-    Attributes:
-        is_up: whether its system has been started.
-    """
-
-    def __init__(self, system: GuardedSystem) -> None:
-        super().__init__()
-        self.system, self.is_up = system, False
-        self.lane = LOOP
-
-
-inside: ContextVar[Place | None] = ContextVar("holdfast simulated place", default=None)
-"""The place whose code runs; None: the test's."""
-
-
-class DrawnHandles(deque[asyncio.Handle]):
-    """The callbacks of a loop that are due. The next one to be called is chosen."""
-
-    control: Control | None = None
-    has_dead = False
-    """Whether places have died. What is scheduled for them later must not run either."""
-
-    def popleft(self) -> asyncio.Handle:
-        if self.has_dead:
-            for handle in self:
-                if is_dead(handle):
-                    handle.cancel()
-        if self.control is None or len(self) == 1:
-            return super().popleft()
-        return self.control.pick_handle(self)
 
 
 class DrawnCells(deque[Cell]):
@@ -115,11 +60,8 @@ class DrawnCells(deque[Cell]):
         elif len(self) == 1:
             cell = super().popleft()
         else:
-            index = control.choices.turn(len(self), self._keys)
-            if control.goes_on(self):
-                index -= 1  # The last one is the first.
-            cell = self[index]
-            del self[index]
+            cell = control.at(self, control.choose(len(self), self._keys))
+            self.remove(cell)
         control.takes_turn(cell, self)
         return cell
 
@@ -135,20 +77,22 @@ class ControlledLoop(VirtualClockLoop):
     thread run.
     """
 
-    def __init__(self) -> None:
-        super().__init__(ticks=TICKS)
-        self.due = DrawnHandles()
-        self._ready = self.due
+    def __init__(self, *, ticks: int = TICKS) -> None:
+        self.control: Control | None = None
+        super().__init__(ticks=ticks)
+        self.due = Due()
+        self._ready: Any = self.due
         self._own_thread = threading.get_ident()
         self._numbers = itertools.count()  # of its tasks and futures
         self._sent: deque[asyncio.Handle] = deque()  # by threads
+        self._work: dict[asyncio.Future[Any], int] = {}  # of anyio's threads, by when it was given
         self._resting: list[asyncio.Future[None]] = []
         self._dead: list[Any] = []  # tasks: kept, since what is collected is closed, which runs its code
         self.sync_seconds: Callable[[], float] = float  # that a sync of a simulated store takes: none
 
     async def rest(self) -> None:
         """Wait until nothing else can happen at this moment: one tick more is not enough where others come first."""
-        if self.due.control is None:
+        if self.control is None:
             await super().rest()
             return
         rest: asyncio.Future[None] = self.create_future()
@@ -159,14 +103,39 @@ class ControlledLoop(VirtualClockLoop):
         """Have a future done when nothing else can happen at this moment, if it is not done before."""
         self._resting.append(rest)
 
+    def forget_ticks(self) -> None:
+        super().forget_ticks()
+        if self.control is not None:
+            self.control.begin_moment()
+
+    def has_too_many_ticks(self, ticks: int) -> bool:
+        """As every virtual loop; when steps are chosen, a tick is a round of all that waited when it began."""
+        return super().has_too_many_ticks(ticks) if self.control is None else self.control.goes_on_for_ever(ticks)
+
+    def hears_at_once(self) -> bool:
+        return self.control is None
+
     def held_back(self) -> int:
         sent: Any = self._sent
         return sum(_given(handle._args) >= 0 for handle in sent)
 
+    def number_work(self, future: asyncio.Future[Any]) -> None:
+        """A thread of anyio is given work, the result of which this future is for."""
+        self._work[future] = next(self._numbers)
+
+    def _given(self, args: Any) -> int:
+        """When the work was given whose result a callback with these arguments brings; -1: it brings none."""
+        match args:
+            case (asyncio.Future() as future, _, _) if future in self._work:
+                return self._work.pop(future)
+            case _:
+                return _given(args)
+
     def at_rest(self) -> bool:
         sent: Any = self._sent
         self._sent = deque()
-        self.due.extend(sorted(sent, key=lambda handle: _given(handle._args)))
+        for handle in sorted(sent, key=lambda handle: self._given(handle._args)):
+            self.due.append(handle)
         if sent:
             return True
         resting, self._resting = self._resting, []
@@ -174,6 +143,16 @@ class ControlledLoop(VirtualClockLoop):
             if not rest.done():
                 rest.set_result(None)
         return bool(resting)
+
+    def call_soon(
+        self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
+    ) -> asyncio.Handle:
+        """As every loop, in half of the time."""
+        if self._debug or self._closed:
+            return super().call_soon(callback, *args, context=context)
+        handle = asyncio.Handle(callback, args, self, context)
+        self.due.append(handle)
+        return handle
 
     def call_soon_threadsafe(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
@@ -183,7 +162,7 @@ class ControlledLoop(VirtualClockLoop):
         So does the result of work that a thread has done before the loop could ask to be told of it.
         """
         is_own = threading.get_ident() == self._own_thread and _given(args) < 0
-        if is_own or self.due.control is None:
+        if is_own or self.control is None:
             return super().call_soon_threadsafe(callback, *args, context=context)
         handle = asyncio.Handle(callback, args, self, context)
         self._sent.append(handle)
@@ -226,8 +205,8 @@ class ControlledLoop(VirtualClockLoop):
 
     def add(self, place: Place) -> None:
         """A place begins to run in this loop."""
-        if self.due.control is not None:
-            self.due.control.add(place.node)
+        if self.control is not None:
+            self.control.add(place.node)
 
     def drop(self, place: Place) -> None:
         """Nothing of this place runs any more."""
@@ -242,10 +221,10 @@ class ControlledLoop(VirtualClockLoop):
             asyncio._unregister_task(task)  # Nobody waits for it, and it cleans nothing up.
             task._log_destroy_pending = False
         self._dead += tasks
-        node.wake = _never  # type: ignore[method-assign]
-        node.idle_again = _no_more  # type: ignore[method-assign]
-        if self.due.control is not None:
-            self.due.control.drop(node)
+        node.wake = never  # type: ignore[method-assign]
+        node.idle_again = no_more  # type: ignore[method-assign]
+        if self.control is not None:
+            self.control.drop(node)
 
     def close(self) -> None:
         """As every loop. What was left of killed processes is collected now: Python runs the `finally` of each then."""
@@ -260,17 +239,6 @@ class ControlledLoop(VirtualClockLoop):
     def scheduled_timers(self) -> int:
         """How many timers there are."""
         return len(self._scheduled)
-
-
-def is_dead(handle: Any) -> bool:
-    """Whether a callback belongs to a place that is dead."""
-    if handle._cancelled:
-        return False
-    place = handle._context.get(inside)
-    if place is not None:
-        return bool(place.is_dead)
-    owner = getattr(handle._callback, "__self__", None)  # Who is called for, by the test, may be dead as well.
-    return isinstance(owner, Node) and owner.wake is _never
 
 
 def _given(args: Any) -> int:
@@ -291,52 +259,49 @@ def _do(done: asyncio.Future[T], work: Callable[[], T]) -> None:
         done.set_exception(error)
 
 
-def _never() -> None:
-    """In place of the wake-up of a dead node."""
-
-
-def _no_more(runner: object) -> bool:
-    """A dead node needs no runner again."""
-    return False
-
-
 class Control:
-    """Has the choices of one run carried out, and notes the turns.
+    """Has the choices of one run carried out, from here to `remove`.
 
-    Attributes:
-        trace: (address, what was handled) of each turn, in the order in which they began.
+    Args:
+        choices: what decides.
+        log: notes the turns.
+        node: of the root.
+        loop: whose steps are chosen.
+        on_node: called with each node whose turns are chosen.
     """
 
-    def __init__(self, choices: Choices, trace: list[tuple[str, str]]) -> None:
-        self.choices, self.trace = choices, trace
+    def __init__(
+        self,
+        choices: Choices,
+        log: TurnLog,
+        node: Node,
+        loop: ControlledLoop,
+        *,
+        on_node: Callable[[Node], None] = lambda node: None,
+    ) -> None:
+        self.choices = choices
+        self.choose: Callable[[int, Keys], int] = choices.turn  # which of so many goes on
+        self._rounds: Rounds | None = None  # counted only at a moment that goes on for long
+        self._moment = 0  # how many turns there had been when it began
         self.next_cell: Cell | None = None
-        self._next_handle: asyncio.Handle | None = None
+        self._next: Option | None = None
+        self._log, self._note = log, log.note
+        self._loop, self._due, self._on_node = loop, loop.due, on_node
         self._now = 0.0
-        self._has_stepped = False
         self._turns = 0  # since a callback was called
         self._last: Cell | None = None
         self._in_a_row = 0  # turns of that one
-        self._names: dict[type, str] = {}
-        self._swaps = Swaps()
-        self._node: Node | None = None
         self._nodes: dict[object, DrawnCells] = {}
-        self._draining: deque[Cell] = deque()
-        self.on_node: Callable[[Node], None] = lambda node: None
-        self._host = DrawnHandles()
-        self._moments: list[tuple[int, asyncio.Future[None]]] = []  # after so many turns of the run
-        self._before: dict[Cell, tuple[Any, ...]] = {}
-        self._touched: set[Hashable] = set()
-
-    def install(self, node: Node, loop: ControlledLoop) -> None:
-        """From here on every step is chosen."""
-        self._node, self._host, self._loop = node, loop.due, loop
-        if isinstance(self.choices, Explored):
-            self.choices.control = self
+        self._drained: DrawnCells | None = None  # where a turn was begun, after which nothing has been chosen yet
+        self._footprints: Footprints | None = None
+        if isinstance(choices, Explored):
+            self._footprints = choices.footprints = Footprints(node, loop)
+        self._swaps = Swaps()
         self._swaps.put(run_loop, "clock", self._clock)
         for name in ("MOST", "STRIDE"):
             self._swaps.put(run_loop, name, 1)
         self.add(node)
-        loop.due.control = self
+        loop.control = loop.due.chooser = self
 
     def add(self, node: Node) -> None:
         """The turns of this node are chosen, too: the root's, or that of a process."""
@@ -344,7 +309,7 @@ class Control:
         self._swaps.put(node, "ready", cells)
         for name in ("most", "stride"):
             self._swaps.put(node, name, 1)  # One turn, and a look at the clock, which is where the next step is chosen.
-        self.on_node(node)
+        self._on_node(node)
 
     def drop(self, node: Node) -> None:
         """Nothing of this node has a turn any more."""
@@ -354,16 +319,10 @@ class Control:
         if self.next_cell is not None and self.next_cell.node is node:
             self.next_cell = None
 
-    def moment(self, turns: int) -> asyncio.Future[None]:
-        """A future that is done after so many turns, or when nothing else can happen."""
-        moment: asyncio.Future[None] = self._loop.create_future()
-        self._moments.append((len(self.trace) + turns, moment))
-        self._loop.rests(moment)
-        return moment
-
     def remove(self) -> None:
         """Let the rest of the run be as in production."""
-        self._host.control = None
+        self._loop.control = self._due.chooser = None
+        self._loop.forget_ticks()  # All that were counted till now were others.
         self._swaps.undo()
         for node, cells in self._nodes.items():
             ready: deque[Cell] = node.ready  # type: ignore[attr-defined]
@@ -371,172 +330,128 @@ class Control:
                 ready.clear()
                 ready.extend(cells)
 
-    def goes_on(self, ready: deque[Cell]) -> bool:
+    # -- who is ready -------------------------------------------------------------------------------------------------
+
+    def _goes_on(self, ready: deque[Cell]) -> bool:
         """Whether the actor that had the last turn has another one first, as in production."""
         return ready[-1] is self._last and self._in_a_row < MOST
 
+    def at(self, ready: deque[Cell], index: int) -> Cell:
+        """The one at this place in the order of production."""
+        return ready[index - self._goes_on(ready)]  # The last one is the first.
+
     def in_order(self, ready: deque[Cell]) -> list[Cell]:
         """Who is ready, in the order in which production would let them run."""
-        return [ready[-1], *itertools.islice(ready, len(ready) - 1)] if self.goes_on(ready) else [*ready]
+        return [ready[-1], *itertools.islice(ready, len(ready) - 1)] if self._goes_on(ready) else [*ready]
+
+    def _keys(self, options: list[Option]) -> list[Hashable]:
+        """Who goes on with each of these callbacks: with that of a node, each actor that is ready there."""
+        keys: list[Hashable] = []
+        for key, _, _ in options:
+            cells = self._nodes.get(key)
+            keys += self.in_order(cells) if cells else [key]
+        return keys
+
+    def _waiting(self) -> dict[Hashable, int]:
+        """Who could go on, and how much is before each."""
+        found = Counter[Hashable](key for key, handle, _ in self._due.options if not handle.cancelled())
+        for node, cells in self._nodes.items():
+            found.pop(node, None)
+            found.update({cell: len(cell.queue or (None,)) for cell in cells})
+        begun = self._last  # It is in no run queue, and what it handles now waits no more.
+        if self._drained is not None and begun is not None and begun.queue and len(begun.queue) > 1:
+            found[begun] = len(begun.queue) - 1
+        return found
 
     # -- steps --------------------------------------------------------------------------------------------------------
 
     def takes_turn(self, cell: Cell, ready: DrawnCells) -> None:
         """The cell has the next turn; `ready` are those of the same node."""
-        self._has_stepped, self._draining = True, ready
-        if self._moments:
-            self._tell_moments()
+        self._drained = ready
         self._turns += 1
         self._in_a_row = self._in_a_row + 1 if cell is self._last else 1
         self._last = cell
-        queue = cell.queue
-        if queue:
-            item = queue[0]
-            kind = type(item)
-            name = self._names.get(kind)
-            if name is None:
-                name = told(cell, item)
-                if issubclass(kind, Message):
-                    self._names[kind] = name
-            self.trace.append((cell.path, name))
-        if self._before:
-            self._touched.add(cell.path)
-
-    def _tell_moments(self) -> None:
-        for number, moment in self._moments:
-            if number <= len(self.trace) and not moment.done():
-                moment.set_result(None)
-        self._moments = [one for one in self._moments if not one[1].done()]
+        if self._rounds is not None:
+            self._rounds.step(cell)
+        self._note(cell)
+        if self._footprints is not None:
+            self._footprints.touch(cell)
 
     def _clock(self) -> float:
         """The run loop's measure of its slices: asked before the first turn and after each."""
-        if not self._has_stepped:
-            return self._now
-        self._has_stepped = False
-        ready = self._draining
+        ready, self._drained = self._drained, None
         if not ready:
             return self._now
-        if not self._host:
+        if not self._due.options:
             if self._turns % MOST_TURNS == 0:
                 self._now += 1.0
             return self._now
-        others = self._others(self._host)
+        others = self._due.next_options()
         count = len(ready)
-        cells = self.in_order(ready)
-        chosen = count if self._turns >= LONGEST else self._chosen(count + len(others), cells, others)
-        if chosen < count:
-            self.next_cell = cells[chosen]
+        total = count + len(others)
+        if self._turns >= LONGEST:
+            chosen = count
+        elif total == 1:
+            chosen = 0
         else:
-            self._next_handle = others[chosen - count][1]
+            chosen = self.choose(total, lambda: [*self.in_order(ready), *(option[0] for option in others)])
+        if chosen < count:
+            self.next_cell = self.at(ready, chosen)
+        else:
+            self._next = others[chosen - count]
             self._now += 1.0  # The slice is over.
         return self._now
 
-    def _chosen(self, count: int, cells: list[Cell], others: list[tuple[Hashable, asyncio.Handle]]) -> int:
-        if count == 1:
-            return 0
-        return self.choices.turn(count, lambda: [*cells, *(key for key, _ in others)])
-
-    def pick_handle(self, due: DrawnHandles) -> asyncio.Handle:
-        """Take the callback that is called next from those that are due."""
-        handle, self._next_handle = self._next_handle, None
-        if handle is None or handle not in due:
-            handle = self._choose_handle(due)
-        due.remove(handle)
+    def choose_callback(self, due: Due) -> Option:
+        """The callback that is called next; if it is that of a node, a cell of it is chosen, too."""
+        chosen, self._next = self._next, None
+        if chosen is None or chosen not in due.options:
+            chosen = self._chosen(due)
         if self.next_cell is None:
             self._turns = 0
-            if self._before:
-                self._touched |= ALL
-        return handle
+            if self._footprints is not None:
+                self._footprints.touch(None)
+        return chosen
 
-    def _choose_handle(self, due: DrawnHandles) -> asyncio.Handle:
-        options: list[tuple[Hashable, asyncio.Handle]] = []
-        for key, handle in self._others(due):
-            cells = self._nodes.get(key)
-            if cells:
-                options += [(cell, handle) for cell in self.in_order(cells)]
-            else:
-                options.append((key, handle))
+    def _chosen(self, due: Due) -> Option:
+        options = due.next_options()
         if not options:  # All are cancelled.
-            return due[0]
-        index = 0 if len(options) == 1 else self.choices.turn(len(options), lambda: [key for key, _ in options])
-        key, handle = options[index]
-        if isinstance(key, Cell):
-            self.next_cell = key
-        return handle
+            return due.options[0]
+        count, nodes = len(options), self._nodes
+        drained: list[tuple[int, DrawnCells]] = []  # where the callback of a node stands, and who is ready there
+        for place, option in enumerate(options):
+            if type(key := option[0]) is Node and (cells := nodes.get(key)):
+                drained.append((place, cells))
+                count += len(cells) - 1
+        index = 0 if count == 1 else self.choose(count, lambda: self._keys(options))
+        for place, cells in drained:
+            if index < place:
+                break
+            if index < place + len(cells):
+                self.next_cell = self.at(cells, index - place)
+                return options[place]
+            index -= len(cells) - 1
+        return options[index]
 
-    def _others(self, due: DrawnHandles) -> list[tuple[Hashable, asyncio.Handle]]:
-        """What may be called next, with whose step it is."""
-        found: list[tuple[Hashable, asyncio.Handle]] = []
-        tasks: set[Hashable] = set()
-        nodes = self._nodes
-        loops: set[Hashable] = set()
-        handle: Any
-        for handle in due:
-            if handle._cancelled:
-                continue
-            owner = getattr(handle._callback, "__self__", None)
-            if type(owner) is Node and owner in nodes:
-                found.append((owner, handle))
-            elif isinstance(owner, asyncio.Task):
-                # A step that is in the queue behind a callback comes after it, in production too.
-                if owner not in tasks and not (loops and self._lane(handle) in loops):
-                    found.append((owner, handle))
-                tasks.add(owner)
-            elif type(handle) is asyncio.TimerHandle:
-                found.append((handle, handle))
-            else:
-                key = self._lane(handle)
-                if key not in loops:
-                    loops.add(key)
-                    found.append((key, handle))
-        return found
+    def called(self, option: Option) -> None:
+        """A callback is called; if it is that of a node, its turns tell more."""
+        if self._rounds is not None and type(option[0]) is not Node:
+            self._rounds.step(option[0])
 
-    def _lane(self, handle: Any) -> Hashable:
-        """What keeps a callback in order: the loop of the process in which it runs."""
-        place = None if len(self._nodes) == 1 else handle._context.get(inside)
-        return LOOP if place is None else place.lane
+    # -- the moment ---------------------------------------------------------------------------------------------------
 
-    # -- what a step touches ------------------------------------------------------------------------------------------
+    def begin_moment(self) -> None:
+        """Virtual time has passed."""
+        self._rounds, self._moment, self._due.is_told = None, self._log.turns, False
+        self.choose = self.choices.turn
 
-    def begin_footprint(self) -> None:
-        """A step begins: note how everything is."""
-        self._before = self._state()
-        self._touched = set()
-        self._begun = self._outside()
+    def goes_on_for_ever(self, ticks: int) -> bool:
+        """Whether it seems that virtual time will never pass, after so many ticks of the loop at this moment."""
+        if self._rounds is None and (ticks > (most := self._loop.most_ticks) or self._log.turns - self._moment > most):
+            self._rounds, self._due.is_told = Rounds(most, self._waiting), True
+            self.choose = self._choose_in_round
+        return self._rounds is not None and self._rounds.are_too_many
 
-    def footprint(self) -> Footprint:
-        """The actors that the steps since then have touched; ALL if anything else may have changed."""
-        if self._outside() != self._begun or "all" in self._touched:
-            return ALL
-        after = self._state()
-        if after.keys() != self._before.keys():
-            return ALL
-        changed = {cell.path for cell, state in after.items() if state != self._before[cell]}
-        return frozenset(self._touched | changed)
-
-    def _outside(self) -> tuple[int, int]:
-        return len(self._host), self._loop.scheduled_timers()
-
-    def _state(self) -> dict[Cell, tuple[Any, ...]]:
-        assert self._node is not None
-        found: dict[Cell, tuple[Any, ...]] = {}
-        cells = [self._node.root] if self._node.root is not None else []
-        for cell in cells:  # It grows meanwhile.
-            more = cell.more
-            urgent = len(more.urgent or ()) if more is not None else 0
-            queue = cell.queue
-            found[cell] = (len(queue) if queue is not None else -1, cell.state, cell.life, urgent)
-            cells += (cell.children or {}).values()
-        return found
-
-
-def told(cell: Cell, item: Any) -> str:
-    """What a turn handles, in a word or two."""
-    if item is NEXT_URGENT:
-        commands = cell.more.urgent if cell.more is not None else None
-        item = commands[0] if commands else item
-    elif isinstance(item, Fed):
-        feed = item.feed
-        return feed.name.rpartition(":")[2] or feed.kind
-    message = message_of(item)
-    return type(item if message is None else message).__name__
+    def _choose_in_round(self, count: int, keys: Keys) -> int:
+        assert self._rounds is not None
+        return self._rounds.first(keys()) if self._rounds.is_late else self.choices.turn(count, keys)

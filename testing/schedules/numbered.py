@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from queue import Queue
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -17,7 +18,9 @@ T = TypeVar("T")
 class NumberedFuture(asyncio.Future[T]):
     """A future of a simulated run."""
 
-    number = 0
+    __slots__ = ("number",)
+
+    number: int
 
     def __hash__(self) -> int:
         return self.number
@@ -26,7 +29,7 @@ class NumberedFuture(asyncio.Future[T]):
 class NumberedTask(asyncio.Task[T]):
     """A task of a simulated run."""
 
-    number = 0
+    __slots__ = ("number",)
 
     def __init__(self, number: int, *args: Any, **options: Any) -> None:
         self.number = number  # First: the task is put into a set while it is made.
@@ -58,6 +61,29 @@ def scope_in_order(real: Callable[..., None]) -> Callable[..., None]:
     def made(scope: Any, *args: Any, **options: Any) -> None:
         real(scope, *args, **options)
         scope._child_scopes = InOrder()
+
+    return made
+
+
+class NumberingQueue(Queue[Any]):
+    """The work of a thread of anyio; the future of each piece has its number from when it was given."""
+
+    def __init__(self, number: Callable[[asyncio.Future[Any]], None]) -> None:
+        super().__init__(2)  # as anyio's
+        self._number = number
+
+    def put_nowait(self, item: Any) -> None:
+        if item is not None:  # None ends the thread.
+            self._number(item[3])
+        super().put_nowait(item)
+
+
+def numbering(real: Callable[..., None], number: Callable[[asyncio.Future[Any]], None]) -> Callable[..., None]:
+    """As the `__init__` of a thread of anyio, whose work is numbered."""
+
+    def made(thread: Any, *args: Any, **options: Any) -> None:
+        real(thread, *args, **options)
+        thread.queue = NumberingQueue(number)
 
     return made
 

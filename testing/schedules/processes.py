@@ -28,8 +28,8 @@ from ...actors.process.worker_pool import Worker, Workers
 from ...system.worker_main import WorkerComposition
 from ..swaps import Swaps
 from .choices import Choices
-from .control import Place, inside
 from .disk import Latency
+from .places import Place, inside
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node

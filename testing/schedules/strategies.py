@@ -16,13 +16,11 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Hashable, Sequence
-from typing import TYPE_CHECKING, Final, Literal, Protocol, get_args
+from typing import Final, Literal, Protocol, get_args
 
 from ...actors.errors import SpecError
 from .choices import TURN, Choices, Keys, Production, Replay, Taken, Walk
-
-if TYPE_CHECKING:
-    from .control import Control
+from .footprints import ALL, Footprint, Footprints
 
 Name = Literal["mixed", "random", "pct", "exhaustive", "coverage"]
 NAMES: Final = get_args(Name)
@@ -37,10 +35,6 @@ CHANGES: Final = 8
 """At most so many choices are changed in a schedule that `coverage` builds on."""
 
 Trace = Sequence[tuple[str, str]]
-Footprint = frozenset[Hashable]
-"""The actors that one step has touched."""
-ALL: Final[Footprint] = frozenset({"all"})
-"""A step whose effects are not known to be messages alone."""
 
 
 class Strategy(Protocol):
@@ -245,7 +239,7 @@ class Explored(Choices):
 
     def __init__(self, seed: int, path: list[Point]) -> None:
         super().__init__(seed)
-        self.control: Control | None = None  # tells what a step has touched
+        self.footprints: Footprints | None = None  # tells what a step has touched
         self._path = path
         self._names: dict[Hashable, Hashable] = {}
         self._is_redundant = False
@@ -255,16 +249,16 @@ class Explored(Choices):
         return self._names.setdefault(key, getattr(key, "path", None) or len(self._names))
 
     def choose(self, count: int, keys: Keys) -> int:
-        assert self.control is not None
+        assert self.footprints is not None
         number = self.steps - 1
         options = tuple(map(self._name, keys()))
         if self._is_redundant:
             return 0
         if number < len(self._path):
             if number:
-                self._path[number - 1].footprint = self.control.footprint()
+                self._path[number - 1].footprint = self.footprints.footprint()
             point = self._path[number]
-            self.control.begin_footprint()
+            self.footprints.begin()
             return min(point.taken, count - 1)
         self.close()
         last = self._path[-1] if self._path else None
@@ -280,7 +274,7 @@ class Explored(Choices):
             self._is_redundant = True
             return 0
         self._path.append(point)
-        self.control.begin_footprint()
+        self.footprints.begin()
         return point.taken
 
     def end(self) -> None:
@@ -289,5 +283,5 @@ class Explored(Choices):
 
     def close(self) -> None:
         """Note what the last step has touched, with all that came without a choice after it."""
-        if self._path and not self._is_redundant and self.control is not None and self.steps >= len(self._path):
-            self._path[-1].footprint = self.control.footprint()
+        if self._path and not self._is_redundant and self.footprints is not None and self.steps >= len(self._path):
+            self._path[-1].footprint = self.footprints.footprint()

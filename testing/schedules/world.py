@@ -11,6 +11,7 @@ import functools
 import os
 import random
 import socket
+import stat
 import subprocess
 import sys
 import threading
@@ -20,18 +21,23 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from anyio._backends._asyncio import CancelScope
+from anyio._backends._asyncio import CancelScope, WorkerThread
 
 from ..swaps import Swaps
-from .numbered import as_completed, scope_in_order
+from ..threads import Onlooker
+from .numbered import as_completed, numbering, scope_in_order
+
+if TYPE_CHECKING:
+    from .control import ControlledLoop
 
 EPOCH = 1_700_000_000.0
 """Unix time at which each simulated run begins."""
 NODE = 0x010000000001
 """The machine in a UUID of version 1."""
-OURS = str(Path(__file__).resolve().parents[2])
+_PACKAGE = Path(__file__).resolve().parents[2]
+OURS = tuple(f"{_PACKAGE}/{room}/" for room in ("actors", "checkpoint", "ftm", "supervision", "system", "testing"))
 """Threads of this library are waited for, and no news."""
 
 
@@ -48,7 +54,7 @@ class World:
         escaped: what the run has used that is not the seed's, each once.
     """
 
-    def __init__(self, seed: int, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, seed: int, loop: ControlledLoop) -> None:
         self.escaped: dict[str, None] = {}
         self._seed, self._loop = seed, loop
         self._swaps = Swaps()
@@ -76,7 +82,8 @@ class World:
             put(uuid, name, value)  # Its first version asks the C library otherwise, and goes on from the last run.
         self._put_clocks()
         loop: Any = self._loop
-        start, add_reader = threading.Thread.start, loop._add_reader  # By which transports read, too.
+        start, add_signal_handler = threading.Thread.start, loop.add_signal_handler
+        add_reader, add_writer = loop._add_reader, loop._add_writer  # By which transports read and write, too.
 
         def started(thread: threading.Thread) -> None:
             if threading.get_ident() == self._thread:
@@ -85,13 +92,28 @@ class World:
 
         def reads(fd: Any, callback: Any, *args: Any) -> Any:
             if not _is_ours(callback):
-                self._tell(f"a file or socket is read ({_name(callback)}): its data comes when the machine brings it")
+                what = _kind_of_file(fd)
+                self._tell(f"{what} is read ({_name(callback)}): its data comes when the machine brings it")
             return add_reader(fd, callback, *args)
+
+        def writes(fd: Any, callback: Any, *args: Any) -> Any:
+            if not _is_ours(callback):
+                self._tell(
+                    f"{_kind_of_file(fd)} is written ({_name(callback)}): when it takes more is up to the machine"
+                )
+            return add_writer(fd, callback, *args)
+
+        def hears(number: int, callback: Any, *args: Any) -> None:
+            self._tell(f"a signal is waited for ({_name(callback)}): it comes when the machine brings it")
+            add_signal_handler(number, callback, *args)
 
         put(asyncio, "as_completed", functools.partial(as_completed, asyncio.as_completed))
         put(CancelScope, "__init__", scope_in_order(CancelScope.__init__))
         put(threading.Thread, "start", started)
         put(loop, "_add_reader", reads)
+        put(loop, "_add_writer", writes)
+        put(loop, "add_signal_handler", hears)
+        put(WorkerThread, "__init__", numbering(WorkerThread.__init__, self._loop.number_work))
         self._tell_of(socket.socket, "__init__", "a socket was opened", "what comes through it")
         self._tell_of(subprocess.Popen, "__init__", "a process was started", "what it does")
         for name in ("fork", "forkpty", "posix_spawn", "posix_spawnp", "system"):
@@ -173,6 +195,11 @@ class World:
         return chosen
 
     def _look_at_thread(self, thread: threading.Thread) -> None:
+        if isinstance(thread, threading.Timer):
+            if not isinstance(thread, Onlooker):
+                called = _name(getattr(thread, "function", None))
+                self._tell(f"a threading.Timer was started ({called}): it waits for real time, which is not the run's")
+            return
         target = getattr(thread, "_target", None)
         if target is None:
             target = type(thread).run
@@ -215,7 +242,16 @@ def _in_ns(made: Callable[[], float]) -> Callable[[], int]:
 
 def _is_ours(function: Any) -> bool:
     code = getattr(getattr(function, "__func__", function), "__code__", None)
-    return code is not None and code.co_filename.startswith(OURS) and "/tests/" not in code.co_filename
+    return code is not None and code.co_filename.startswith(OURS)
+
+
+def _kind_of_file(fd: Any) -> str:
+    """What a loop watches, in words."""
+    try:
+        mode = os.fstat(fd if isinstance(fd, int) else fd.fileno()).st_mode
+    except (OSError, ValueError):
+        return "a file or socket"
+    return "a pipe" if stat.S_ISFIFO(mode) else "a socket" if stat.S_ISSOCK(mode) else "a file"
 
 
 def _name(function: Any) -> str:

@@ -476,6 +476,34 @@ async def test_finds(system, n):
     result.stdout.fnmatch_lines(["*seed=0: repeat it*"])
 
 
+FAILING = """
+from holdfast.testing import simulate
+
+def check(total):
+    assert total == 4, "not four"
+
+@simulate(seeds=2)
+async def test_fails(system):
+    check(await system.spawn(hf.start(Counter)).ask(Add(3)))
+
+@simulate(seeds=2)
+async def test_crashes(system):
+    system.spawn(hf.start(Counter)).tell(Add(-1))
+"""
+
+
+@pytest.mark.parametrize("option", ["--tb=auto", "--tb=short", "--tb=native", "--holdfast-real"])
+def test_a_failure_of_a_simulated_test_shows_the_lines_of_the_test(suite, option: str) -> None:
+    result = suite(FAILING, option)
+    result.assert_outcomes(failed=2)
+    shown = result.stdout.str()
+    assert "check(await system.spawn" in shown
+    assert "not four" in shown
+    assert "negative" in shown
+    for hidden in ("_run_all", "run_schedule", "base_events.py", "runners.py"):
+        assert hidden not in shown
+
+
 REAL = """
 import os
 from holdfast.testing import simulate

@@ -4,10 +4,13 @@ The suite is the same each time: tests in a loop of each scope, two systems at o
 fail: one shows that the guard still looks, the other one that a failing schedule is still told.
 """
 
+import itertools
+import random
 from importlib.metadata import entry_points
 
 import pytest
 
+from tests.pairs import covering
 from tests.testing.suites import CONFTEST
 
 TESTS = """
@@ -77,28 +80,57 @@ async def test_leaks(actor_system):
 async def test_fails(system):
     assert await system.spawn(hf.start(Counter)).ask(Add(3)) == 4
 """
-OTHERS = ("randomly", "timeout", "xdist", "pytest_cov")
+OF_ANYIO = """
+@pytest.fixture
+def anyio_backend():
+    return "asyncio"
+
+@pytest.mark.anyio
+async def test_of_anyio(anyio_backend_name):
+    await asyncio.sleep(0)
+    assert anyio_backend_name == "asyncio"
+"""
+OTHERS = ("randomly", "timeout", "xdist", "pytest_cov", "anyio")
+SCOPES = ("function", "class", "module", "session")
+MATRIX: dict[str, dict[str, str]] = {
+    "xdist": {"one process": "-p no:xdist", "a worker": "-n 1"},
+    "randomly": {"in order": "-p no:randomly", "shuffled": "--randomly-seed=3"},
+    "timeout": {
+        "no limit": "-p no:timeout",
+        "signal": "--timeout=300 --timeout-method=signal",
+        "thread": "--timeout=300 --timeout-method=thread",
+    },
+    "cov": {"not covered": "-p no:pytest_cov", "covered": "--cov=. --cov-report=term"},
+    "anyio": {"no anyio": "-p no:anyio", "anyio": "", "anyio takes all": "-o anyio_mode=auto"},
+    "loop of tests": {f"tests {scope}": f"-o asyncio_default_test_loop_scope={scope}" for scope in SCOPES},
+    "loop of fixtures": {f"fixtures {scope}": f"-o asyncio_default_fixture_loop_scope={scope}" for scope in SCOPES},
+    "mode": {"auto": "-o asyncio_mode=auto", "strict": "-o asyncio_mode=strict"},
+    "loops": {"its loop": "", "chosen": "-o holdfast_loops=uvloop"},
+}
+"""What each plugin may be told, by what it is called in the name of a row."""
+VALUES = [[(plugin, name) for name in values] for plugin, values in MATRIX.items()]
+CROSSED = list(itertools.product(*VALUES))
+SOME = random.Random(5).sample(CROSSED, 400)
+"""Of the 4,608 rows: to find few that cover all pairs takes too long among all of them."""
 ROWS = {
-    "none of them": ((), ()),
-    "strict": ((), ("-o", "asyncio_mode=strict")),
-    "chosen loops": ((), ("-o", "holdfast_loops=uvloop")),
-    "session loops": ((), ("-o", "asyncio_default_test_loop_scope=session")),
-    "xdist": (("xdist",), ("-n", "1")),
-    "randomly": (("randomly",), ("-p", "randomly", "--randomly-seed=3")),
-    "timeout by signal": (("timeout",), ("--timeout=300", "--timeout-method=signal")),
-    "timeout by thread": (("timeout",), ("--timeout=300", "--timeout-method=thread")),
-    "cov": (("pytest_cov",), ("--cov=.", "--cov-report=term")),
-    "all of them": (OTHERS, ("-n", "1", "--randomly-seed=5", "--timeout=300", "--cov=.")),
+    ", ".join(name for _, name in SOME[number]): [MATRIX[plugin][name] for plugin, name in SOME[number]]
+    for number in covering([tuple(VALUES[at].index(value) for at, value in enumerate(row)) for row in SOME])
 }
 
 
-def session(pytester: pytest.Pytester, tests: str, loaded: tuple[str, ...], *args: str) -> pytest.RunResult:
-    """Run a suite of a user's with these plugins and pytest-asyncio."""
+def session(pytester: pytest.Pytester, tests: str, *args: str) -> pytest.RunResult:
+    """Run a suite of a user's with pytest-asyncio and the other plugins."""
     pytester.makeconftest(CONFTEST)
     pytester.makeini("[pytest]\nasyncio_mode = auto\nasyncio_default_fixture_loop_scope = function\n")
     pytester.makepyfile(test_suite=tests)
-    left_out = [option for name in OTHERS if name not in loaded for option in ("-p", f"no:{name}")]
-    return pytester.runpytest_subprocess("-p", "no:cacheprovider", "-p", "no:hypothesispytest", *left_out, *args)
+    return pytester.runpytest_subprocess("-p", "no:cacheprovider", "-p", "no:hypothesispytest", *args)
+
+
+def test_the_rows_have_every_pair() -> None:
+    """Of what two plugins are told."""
+    pairs = {pair for row in CROSSED for pair in itertools.combinations(row, 2)}
+    named = [list(zip(MATRIX, row.split(", "), strict=True)) for row in ROWS]
+    assert {pair for row in named for pair in itertools.combinations(row, 2)} == pairs
 
 
 @pytest.mark.parametrize("row", ROWS)
@@ -106,13 +138,17 @@ def test_the_fixtures_work_beside_other_plugins(
     pytester: pytest.Pytester, row: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("PYTEST_XDIST_WORKER", raising=False)
-    loaded, args = ROWS[row]
-    result = session(pytester, TESTS, loaded, *args)
-    result.assert_outcomes(passed=8, failed=1, errors=1)
-    result.stdout.fnmatch_lines_random(["*a timer was left: builtins.print*", "*repeat it with @simulate(seed=*"])
-    if "randomly" in loaded:
-        result.stdout.fnmatch_lines(["*--randomly-seed=[35]*"])
-    if "pytest_cov" in loaded:
+    names = row.split(", ")
+    result = session(pytester, TESTS + OF_ANYIO * ("no anyio" not in names), *" ".join(ROWS[row]).split())
+    if "anyio takes all" in names:  # Not even pytest-asyncio's own fixtures are in the loop of the test then.
+        result.assert_outcomes(passed=2, failed=1, errors=7, warnings=None)
+        result.stdout.fnmatch_lines(["*anyio's plugin takes the async fixtures*: set anyio_mode = strict"])
+    else:
+        result.assert_outcomes(passed=8 + ("anyio" in names), failed=1, errors=1)
+        result.stdout.fnmatch_lines_random(["*a timer was left: builtins.print*", "*repeat it with @simulate(seed=*"])
+    if "shuffled" in names:
+        result.stdout.fnmatch_lines(["*--randomly-seed=3*"])
+    if "covered" in names:
         result.stdout.fnmatch_lines(["*test_suite.py *%*"])
 
 
@@ -127,7 +163,7 @@ async def test_hangs(actor_system):
 async def test_goes_on(actor_system):
     assert actor_system.tree() == ["/app"]
 """
-    result = session(pytester, tests, ("timeout",), "--timeout=2", "--timeout-method=signal")
+    result = session(pytester, tests, "--timeout=2", "--timeout-method=signal")
     result.assert_outcomes(passed=1, failed=1)
     result.stdout.fnmatch_lines(["*Timeout*"])
 
@@ -139,7 +175,7 @@ import pytest
 @pytest.mark.anyio
 async def test_adds(actor_system): ...
 """
-    result = session(pytester, tests, (), "-o", "asyncio_mode=strict")
+    result = session(pytester, tests, "-o", "asyncio_mode=strict")
     assert result.parseoutcomes()["errors"] >= 1
     result.stdout.fnmatch_lines(["*mark it with @pytest.mark.asyncio instead of @pytest.mark.anyio*"])
 
@@ -147,4 +183,4 @@ async def test_adds(actor_system): ...
 def test_the_plugins_are_there() -> None:
     """Else the rows above would show nothing."""
     names = {one.name for one in entry_points(group="pytest11")}
-    assert {*OTHERS, "asyncio", "anyio"} <= names
+    assert {*OTHERS, "asyncio"} <= names

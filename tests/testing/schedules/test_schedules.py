@@ -37,7 +37,7 @@ from holdfast.testing.schedules.choices import (
 from holdfast.testing.schedules.shrinking import shrink
 from holdfast.testing.schedules.strategies import NAMES, Priorities, mixed, strategy
 from holdfast.testing.schedules.world import EPOCH, EscapesSimulation
-from holdfast.testing.simulation import NotExhausted, Search, run_schedule
+from holdfast.testing.simulation import NotExhausted, Search, Settings, run_schedule
 from tests.testing.schedules.planted import PLANTED, Go, Note, Planted, Step, Teller, order_of, restart_order
 
 OWN = {"system"}
@@ -117,8 +117,8 @@ def test_the_exhaustive_search_sees_each_order_and_ends() -> None:
         actor: Any = note._cell.actor
         orders[tuple(actor.got)] += 1
 
-    search = Search(tells, OWN, {}, strategy("exhaustive"), "exhaustive")
-    search.run(1000)
+    search = Search(tells, OWN, Settings(1000, strategy="exhaustive"))
+    search.run()
     assert search.is_complete
     assert set(orders) == set(itertools.permutations(range(3)))
     assert search.runs == 30
@@ -138,8 +138,8 @@ def test_turns_that_have_nothing_to_do_with_each_other_are_not_tried_in_every_or
             system.spawn(hf.start(Teller, note, number), f"teller{number}").tell(Go())
         await idle(system)
 
-    search = Search(pairs, OWN, {}, strategy("exhaustive"), "exhaustive")
-    search.run(1000)
+    search = Search(pairs, OWN, Settings(1000, strategy="exhaustive"))
+    search.run()
     assert search.is_complete
     assert search.runs < 20
 
@@ -271,7 +271,7 @@ def test_a_server_is_told() -> None:
 
     with pytest.warns(EscapesSimulation) as told:
         run_schedule(serves, Production(0), OWN, {})
-    assert any("a file or socket is read (asyncio." in str(one.message) for one in told)
+    assert any("a socket is read (asyncio." in str(one.message) for one in told)
 
 
 def test_what_a_thread_brings_comes_when_nothing_else_can_happen() -> None:

@@ -6,8 +6,21 @@ from collections.abc import Sequence
 
 from holdfast.checkpoint.journal import Saved
 from tests.checkpoint.one_file import Contents, OneFile
+from tests.testing.stores.broken_writes import WritesAtClose
 
 Drop = Sequence[int] | range
+
+
+class MoreThanACut(OneFile):
+    """Changes something else in a second write behind a cut."""
+
+    def spoil(self, contents: Contents, address: str, drop: Drop) -> None:
+        """Change what else the store has."""
+
+    def cut(self, address: str, snapshot: bytes, drop: Drop, *, turn: int, keep: int = 2) -> None:
+        super().cut(address, snapshot, drop, turn=turn, keep=keep)
+        with self._changing() as contents:
+            self.spoil(contents, address, drop)
 
 
 class CutInTwoWrites(OneFile):
@@ -34,22 +47,11 @@ class DropInASecondWrite(OneFile):
             contents.entries[address] = {at: entry for at, entry in known.items() if at not in gone}
 
 
-class OlderOnesInMemory(OneFile):
+class OlderOnesInMemory(WritesAtClose):
     """Has older snapshots in memory alone, until it is closed."""
 
-    def _write(self, contents: Contents) -> None:
-        if self._refusal == "closing":
-            super()._write(contents)
-            return
-        newest = contents.copy()
-        newest.snapshots = {address: kept[-1:] for address, kept in contents.snapshots.items()}
-        super()._write(newest)
-
-    def close(self) -> None:
-        if self._owner >= 0:
-            self._refusal = "closing"
-            self._write(self._contents)
-        super().close()
+    def leave_out(self, contents: Contents) -> None:
+        contents.snapshots = {address: kept[-1:] for address, kept in contents.snapshots.items()}
 
 
 class IgnoresRanges(OneFile):
@@ -59,15 +61,13 @@ class IgnoresRanges(OneFile):
         super().cut(address, snapshot, [] if isinstance(drop, range) else drop, turn=turn, keep=keep)
 
 
-class DropsOfAllAddresses(OneFile):
+class DropsOfAllAddresses(MoreThanACut):
     """Forgets the positions in `drop` whosever they are."""
 
-    def cut(self, address: str, snapshot: bytes, drop: Drop, *, turn: int, keep: int = 2) -> None:
-        super().cut(address, snapshot, drop, turn=turn, keep=keep)
-        with self._changing() as contents:
-            for other, known in contents.entries.items():
-                if other != address:
-                    contents.entries[other] = {at: entry for at, entry in known.items() if at not in set(drop)}
+    def spoil(self, contents: Contents, address: str, drop: Drop) -> None:
+        for other, known in contents.entries.items():
+            if other != address:
+                contents.entries[other] = {at: entry for at, entry in known.items() if at not in set(drop)}
 
 
 class DropsUpTo(OneFile):
@@ -79,14 +79,12 @@ class DropsUpTo(OneFile):
         super().cut(address, snapshot, below, turn=turn, keep=keep)
 
 
-class DropsWhatIsToCome(OneFile):
+class DropsWhatIsToCome(MoreThanACut):
     """Remembers positions in `drop` that nobody has yet, and drops them when they come."""
 
-    def cut(self, address: str, snapshot: bytes, drop: Drop, *, turn: int, keep: int = 2) -> None:
-        super().cut(address, snapshot, drop, turn=turn, keep=keep)
-        with self._changing() as contents:
-            data, after, contained = contents.snapshots[address][-1]
-            contents.snapshots[address][-1] = (data, after, contained | set(drop))
+    def spoil(self, contents: Contents, address: str, drop: Drop) -> None:
+        data, after, contained = contents.snapshots[address][-1]
+        contents.snapshots[address][-1] = (data, after, contained | set(drop))
 
 
 class DropsEverything(OneFile):
@@ -146,13 +144,11 @@ class OlderWithTooFew(OneFile):
         return super().load(address, older=older)._replace(entries=super().load(address).entries)
 
 
-class HighestTurnFirst(OneFile):
+class HighestTurnFirst(MoreThanACut):
     """Takes the snapshot of the highest turn for the newest."""
 
-    def cut(self, address: str, snapshot: bytes, drop: Drop, *, turn: int, keep: int = 2) -> None:
-        super().cut(address, snapshot, drop, turn=turn, keep=keep)
-        with self._changing() as contents:
-            contents.snapshots[address].sort(key=lambda one: one[1])
+    def spoil(self, contents: Contents, address: str, drop: Drop) -> None:
+        contents.snapshots[address].sort(key=lambda one: one[1])
 
 
 class LosesTheTurn(OneFile):
@@ -195,19 +191,15 @@ class SameBytesOnce(OneFile):
             super().cut(address, snapshot, drop, turn=turn, keep=keep)
 
 
-class ForgetsNotesAtACut(OneFile):
+class ForgetsNotesAtACut(MoreThanACut):
     """Forgets all notes with a cut."""
 
-    def cut(self, address: str, snapshot: bytes, drop: Drop, *, turn: int, keep: int = 2) -> None:
-        super().cut(address, snapshot, drop, turn=turn, keep=keep)
-        with self._changing() as contents:
-            contents.notes.clear()
+    def spoil(self, contents: Contents, address: str, drop: Drop) -> None:
+        contents.notes.clear()
 
 
-class ForgetsPacksAtACut(OneFile):
+class ForgetsPacksAtACut(MoreThanACut):
     """Forgets the blocks of all other addresses with a cut."""
 
-    def cut(self, address: str, snapshot: bytes, drop: Drop, *, turn: int, keep: int = 2) -> None:
-        super().cut(address, snapshot, drop, turn=turn, keep=keep)
-        with self._changing() as contents:
-            contents.blocks = {key: pack for key, pack in contents.blocks.items() if key[0] == address}
+    def spoil(self, contents: Contents, address: str, drop: Drop) -> None:
+        contents.blocks = {key: pack for key, pack in contents.blocks.items() if key[0] == address}

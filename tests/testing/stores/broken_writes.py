@@ -20,52 +20,44 @@ class EpochStays(OneFile):
         self.epoch = 1
 
 
-class EpochAtClose(OneFile):
+class WritesAtClose(OneFile):
+    """Has something in memory alone until it is closed in good order."""
+
+    def leave_out(self, contents: Contents) -> None:
+        """Take out of a copy what is not written yet."""
+
+    def _write(self, contents: Contents) -> None:
+        written = contents.copy()
+        if self._refusal != "closing":
+            self.leave_out(written)
+        super()._write(written)
+
+    def close(self) -> None:
+        if self._owner >= 0:
+            self._refusal = "closing"
+            self._write(self._contents)
+        super().close()
+
+
+class EpochAtClose(WritesAtClose):
     """Writes the epoch when it is closed in good order: after a kill the next life has the same."""
 
-    def _write(self, contents: Contents) -> None:
-        written = contents.copy()
-        if self._refusal != "closing":
-            written.epoch -= 1
-        super()._write(written)
-
-    def close(self) -> None:
-        if self._owner >= 0:
-            self._refusal = "closing"
-            self._write(self._contents)
-        super().close()
+    def leave_out(self, contents: Contents) -> None:
+        contents.epoch -= 1
 
 
-class NotesAtClose(OneFile):
+class NotesAtClose(WritesAtClose):
     """Writes notes when it is closed in good order."""
 
-    def _write(self, contents: Contents) -> None:
-        written = contents.copy()
-        if self._refusal != "closing":
-            written.notes = {}
-        super()._write(written)
-
-    def close(self) -> None:
-        if self._owner >= 0:
-            self._refusal = "closing"
-            self._write(self._contents)
-        super().close()
+    def leave_out(self, contents: Contents) -> None:
+        contents.notes = {}
 
 
-class PacksAtClose(OneFile):
+class PacksAtClose(WritesAtClose):
     """Writes blocks when it is closed in good order."""
 
-    def _write(self, contents: Contents) -> None:
-        written = contents.copy()
-        if self._refusal != "closing":
-            written.blocks = {}
-        super()._write(written)
-
-    def close(self) -> None:
-        if self._owner >= 0:
-            self._refusal = "closing"
-            self._write(self._contents)
-        super().close()
+    def leave_out(self, contents: Contents) -> None:
+        contents.blocks = {}
 
 
 class LastPositionAtClose(OneFile):

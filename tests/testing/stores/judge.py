@@ -21,7 +21,14 @@ MODULES: dict[str, ModuleType] = {
     "kills, failures, owners, threads": broken_writes,
 }
 """Broken engines, by what they break."""
-BASES = (OneFile, broken_entries.Changing, broken_names.RenamingNotes, broken_names.RenamingAddresses)
+BASES = (
+    OneFile,
+    broken_entries.Changing,
+    broken_names.RenamingNotes,
+    broken_names.RenamingAddresses,
+    broken_snapshots.MoreThanACut,
+    broken_writes.WritesAtClose,
+)
 """What they are derived from, and breaks nothing itself."""
 SEEDS = 3
 

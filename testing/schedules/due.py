@@ -1,0 +1,118 @@
+"""The callbacks of a loop that are due, and which of them may be called next.
+
+What asyncio promises is kept. Callbacks that are no steps of tasks are called in the order in which they were
+scheduled, and before the steps of tasks that were scheduled after them; a task's steps are in order among themselves.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Hashable, Iterator
+from typing import Any, Protocol
+
+from ...actors.kernel.node import Node
+from .places import is_dead, lane_of
+
+Option = tuple[Hashable, asyncio.Handle, bool]
+"""Whose step it is (a node, a task, a timer, or the lane of other callbacks), what is called, and whether its place
+among the others matters."""
+STEPS = (None, "task_wakeup", "__step", "__wakeup")
+"""How the methods of a task are named that go on with it, in C and in Python."""
+
+
+class Chooser(Protocol):
+    """Decides which callback is called next."""
+
+    def choose_callback(self, due: Due) -> Option:
+        """One of those that are due."""
+        ...
+
+    def called(self, option: Option) -> None:
+        """A callback was taken, and is called now."""
+        ...
+
+
+class Due:
+    """Stands in for the queue of an asyncio loop: who takes the next callback gets the one that was chosen.
+
+    Attributes:
+        chooser: who chooses; None: they come in order.
+        is_told: whether it hears of each callback that is called.
+        has_dead: whether places have died. What is scheduled for them later must not run either.
+        options: all that are due, in order.
+    """
+
+    def __init__(self) -> None:
+        self.chooser: Chooser | None = None
+        self.is_told = False
+        self.has_dead = False
+        self.options: list[Option] = []
+        self._ordered = 0  # so many of them have a place that matters
+
+    def append(self, handle: Any) -> None:
+        """Put a callback last."""
+        callback = handle._callback
+        owner = getattr(callback, "__self__", None)
+        key: Hashable
+        if isinstance(owner, asyncio.Task):
+            key, has_place = owner, getattr(callback, "__name__", None) not in STEPS
+        elif type(owner) is Node:
+            key, has_place = owner, False
+        elif type(handle) is asyncio.TimerHandle:
+            key, has_place = handle, False
+        else:
+            key, has_place = lane_of(handle), True
+        self._ordered += has_place
+        self.options.append((key, handle, has_place))
+        if self.has_dead and is_dead(handle):
+            handle.cancel()
+
+    def popleft(self) -> asyncio.Handle:
+        """Take the callback that is called next."""
+        options, chooser = self.options, self.chooser
+        if chooser is None or len(options) == 1:
+            chosen = options.pop(0)
+        else:
+            chosen = chooser.choose_callback(self)
+            for index, option in enumerate(options):
+                if option is chosen:
+                    del options[index]
+                    break
+        if self.is_told and chooser is not None:
+            chooser.called(chosen)
+        self._ordered -= chosen[2]
+        return chosen[1]
+
+    def next_options(self) -> list[Option]:
+        """Those that may be called next."""
+        if not self._ordered:
+            return [option for option in self.options if not option[1]._cancelled]
+        found: list[Option] = []
+        tasks: set[int] = set()
+        lanes: set[Hashable] = set()
+        for option in self.options:
+            key, handle, has_place = option
+            if handle.cancelled():
+                continue
+            if isinstance(key, asyncio.Task):
+                # A step that is in the queue behind a callback comes after it, in production too.
+                if id(key) not in tasks and not (lanes and lane_of(handle) in lanes):
+                    found.append(option)
+                tasks.add(id(key))
+            elif not has_place:
+                found.append(option)
+            elif key not in lanes:
+                lanes.add(key)
+                found.append(option)
+        return found
+
+    def clear(self) -> None:
+        """Forget all of them."""
+        self.options.clear()
+        self._ordered = 0
+
+    def __iter__(self) -> Iterator[asyncio.Handle]:
+        return (handle for _, handle, _ in self.options)
+
+    def __len__(self) -> int:
+        return len(self.options)

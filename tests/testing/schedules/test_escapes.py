@@ -1,0 +1,162 @@
+"""What no seed decides is told in the run in which it is used, or found by the run that is made twice."""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+import os
+import signal
+import threading
+from collections.abc import Awaitable, Callable
+
+import anyio
+import anyio.to_thread
+import pytest
+
+import holdfast as hf
+from holdfast.testing import GuardedSystem, simulate
+from holdfast.testing.schedules.choices import NotRepeatable, Production, Walk
+from holdfast.testing.schedules.world import EscapesSimulation
+from holdfast.testing.simulation import run_schedule
+
+
+class Go(hf.Message):
+    """A turn that is seen in the trace."""
+
+
+class Goer(hf.Actor):
+    """Takes turns."""
+
+    @hf.on(Go)
+    def go(self, message: Go) -> None:
+        pass
+
+
+async def waits_for_a_timer() -> None:
+    loop = asyncio.get_running_loop()
+    done = loop.create_future()
+    threading.Timer(0.001, ring, (loop, done)).start()
+    await done
+
+
+def ring(loop: asyncio.AbstractEventLoop, done: asyncio.Future[None]) -> None:
+    loop.call_soon_threadsafe(done.set_result, None)
+
+
+async def watches_a_pipe(end: int) -> None:
+    loop, pipe = asyncio.get_running_loop(), os.pipe()
+    os.write(pipe[1], b"x")
+    done = loop.create_future()
+
+    def heard() -> None:
+        (loop.remove_writer if end else loop.remove_reader)(pipe[end])
+        done.set_result(None)
+
+    (loop.add_writer if end else loop.add_reader)(pipe[end], heard)
+    await done
+    for number in pipe:
+        os.close(number)
+
+
+async def waits_for_a_pipe_by_anyio() -> None:
+    pipe = os.pipe()
+    os.write(pipe[1], b"x")
+    await anyio.wait_readable(pipe[0])
+    for number in pipe:
+        os.close(number)
+
+
+async def streams_through_a_pipe() -> None:
+    loop, pipe, reader = asyncio.get_running_loop(), os.pipe(), asyncio.StreamReader()
+    with os.fdopen(pipe[0], "rb") as file:
+        transport, _ = await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), file)
+        os.close(pipe[1])
+        await reader.read()
+        transport.close()
+        await asyncio.sleep(0)
+
+
+def handle_signal() -> None:
+    """It never comes."""
+
+
+async def waits_for_a_signal() -> None:
+    loop = asyncio.get_running_loop()
+    loop.add_signal_handler(signal.SIGUSR1, handle_signal)
+    loop.remove_signal_handler(signal.SIGUSR1)
+
+
+@pytest.mark.parametrize(
+    ("escape", "told"),
+    [
+        (waits_for_a_timer, r"a threading\.Timer was started \(.*\.ring\): it waits for real time"),
+        (lambda: watches_a_pipe(0), r"a pipe is read \(.*watches_a_pipe.<locals>.heard\)"),
+        (lambda: watches_a_pipe(1), r"a pipe is written \(.*watches_a_pipe.<locals>.heard\)"),
+        (waits_for_a_pipe_by_anyio, r"a pipe is read \(anyio"),
+        (streams_through_a_pipe, r"a pipe is read \(asyncio.unix_events._UnixReadPipeTransport"),
+        (waits_for_a_signal, r"a signal is waited for \(.*\.handle_signal\)"),
+    ],
+)
+def test_what_comes_from_outside_is_told_by_name(escape: Callable[[], Awaitable[None]], told: str) -> None:
+    async def escapes(system: GuardedSystem) -> None:
+        await escape()
+
+    with pytest.warns(EscapesSimulation, match=told):
+        run_schedule(escapes, Production(0), {"system"}, {})
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_threads_of_anyio_bring_comes_in_the_order_in_which_it_was_asked_for(seed: int) -> None:
+    ended: list[int] = []
+
+    async def works(system: GuardedSystem) -> None:
+        gates = [threading.Event() for _ in range(4)]
+        gates[3].set()
+
+        def work(number: int) -> int:
+            gates[number].wait()
+            if number:  # The last one ends first.
+                gates[number - 1].set()
+            return number
+
+        async def one(number: int) -> None:
+            ended.append(await anyio.to_thread.run_sync(work, number))
+
+        async with anyio.create_task_group() as group:
+            for number in range(4):
+                group.start_soon(one, number)
+
+    run_schedule(works, Walk(seed), {"system"}, {})
+    first, ended = ended, []
+    run_schedule(works, Walk(seed), {"system"}, {})
+    assert first == ended
+    assert sorted(first) == [0, 1, 2, 3]
+
+
+def test_the_date_of_now_is_found_by_the_second_run() -> None:
+    """A class in C, which others have imported by name: there is nothing that could be exchanged for all of them."""
+
+    async def dated(system: GuardedSystem) -> None:
+        system.spawn(hf.start(Goer), f"at{datetime.datetime.now():%H%M%S%f}").tell(Go())
+        await asyncio.sleep(1)
+
+    with pytest.raises(NotRepeatable, match=r"/app/at\d+ Go.*datetime.now\(\)"):
+        simulate(dated, seeds=1)()
+
+
+class Plain:
+    """Has no order but that of its address."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_order_of_a_set_of_objects_is_found_by_the_second_run(seed: int) -> None:
+    async def in_order(system: GuardedSystem) -> None:
+        for one in {Plain(number) for number in range(8)}:
+            system.spawn(hf.start(Goer), f"goer{one.number}").tell(Go())
+        await asyncio.sleep(1)
+
+    with pytest.raises(NotRepeatable, match="the addresses of objects"):
+        simulate(in_order, seed=10 * seed)()
