@@ -108,7 +108,8 @@ def judge_asks(sent: int, answers: Mapping[int, int], handled: Mapping[int, int]
 def recovery_ms(recoveries: Sequence[MapperRecovery]) -> dict[str, float]:
     """Median milliseconds by phase, and of whole recoveries under `total`; empty without a recovery.
 
-    >>> recovery_ms([Recovery({"detect": 0.001, "replay": 0.25}, 9), Recovery({"detect": 0.003, "replay": 0.25}, 8)])
+    >>> phases = {"detect": 0.001, "replay": 0.25}, {"detect": 0.003, "replay": 0.25}
+    >>> recovery_ms([MapperRecovery(one, 9) for one in phases])
     {'detect': 2.0, 'replay': 250.0, 'total': 252.0}
     """
     if not recoveries:

@@ -18,9 +18,10 @@ from holdfast.checkpoint.snapshot.key_variables import StateMismatch, restore_st
 
 
 class Place:
-    """Stands for `ctx`: all that saving asks of it is the address."""
+    """Stands for `ctx`: all that saving asks of it is the address, and that no recovery file names its variables."""
 
     path = "/app/it"
+    named_variables = None
 
 
 def at_place(actor: hf.Actor) -> Any:
