@@ -6,7 +6,7 @@ import asyncio
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
-from ..control.orders_lane import OrderAsk
+from ..control.orders_lane import OrderAsk, take_orders
 from ..errors import AskFailed, BadMessage, CannotMove, error_text
 from ..exit_reasons import KILLED, ExitReason
 from ..kernel import mailbox
@@ -174,15 +174,10 @@ class FromOwnWorker(Leaving):
     def retire(self) -> None:
         """What is left in the process ends; orders that it has not carried out come here."""
         worker, cell, transit = self.worker, self.cell, self.move.transit
-        calls = [ask.call for ask in worker.pending.values() if isinstance(ask, OrderAsk) and ask.call is not None]
-        worker.pending = {
-            key: ask for key, ask in worker.pending.items() if not (isinstance(ask, OrderAsk) and ask.call is not None)
-        }
+        calls = take_orders(worker)
         worker.leave(cell, self.move.reason(), PATIENCE)
         for call in calls:
-            if not call.ask.is_done:
-                call.ask.started = False
-                cell.host.control(cell, call)
+            cell.host.control(cell, call)
         old = transit.old.place if transit is not None else None
         if isinstance(old, WorkerPlace) and old.stop_sent is not None:  # It came when the actor was at rest already.
             cell.host.stop(cell, old.stop_sent)

@@ -370,3 +370,25 @@ async def test_nonsense_is_refused(system: hf.ActorSystem) -> None:
     await system.stop(one)
     with pytest.raises(hf.ActorStopped):
         await system.set_isolation(one, "process")
+
+
+@pytest.mark.parametrize("method", [None, hf.hybrid(interval=60.0)], ids=["no recovery", "hybrid"])
+async def test_what_is_ordered_below_a_supervisor_in_a_process_follows_the_actor(
+    system: hf.ActorSystem, tmp_path: Path, method: Any
+) -> None:
+    """An order that was on its way to the process that the actor leaves is carried out where it lives."""
+    child = hf.child("one", hf.start(Account), recovery=method)
+    await system.start(hf.supervisor("top", isolation="process", children=[child]))
+    one = system.ref("/app/top/one", Account)
+    for to in ("process", "task"):
+        gate = tmp_path / to
+        busy = one.ask(Wait(str(gate)), timeout=30.0)
+        moving = asyncio.create_task(system.set_isolation(one, to, timeout=30.0))  # type: ignore[arg-type]
+        ordered = []
+        for _ in range(30):  # Those that come when it is to rest next find it there, or gone.
+            ordered.append(asyncio.create_task(system.get_state(one, timeout=30.0)))
+            await asyncio.sleep(0.02)
+        gate.touch()
+        await moving
+        assert await busy == "waited"
+        assert {state["total"] for state in await asyncio.gather(*ordered)} == {0}
