@@ -19,7 +19,7 @@ from ..process.wire.start_codec import pack_recipe
 from .here import let_in
 from .luggage import unpack, unpack_items
 from .move import Entering, Leaving
-from .quiesce import now, sorted_out
+from .quiesce import carry, now, sorted_out
 
 if TYPE_CHECKING:
     from ..kernel.actor import Actor
@@ -98,6 +98,7 @@ class ToWorker(Entering):
                 worker.send_item(cell, cell.path, item, 0)
         self.move.say(worker, "go", suspended=luggage.suspended)
         outlet.worker = worker
+        carry(luggage.queue)
         cell.queue = deque(luggage.queue)
         send_queue(cell)
         for item in luggage.waiting:

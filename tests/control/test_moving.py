@@ -392,3 +392,26 @@ async def test_what_is_ordered_below_a_supervisor_in_a_process_follows_the_actor
         await moving
         assert await busy == "waited"
         assert {state["total"] for state in await asyncio.gather(*ordered)} == {0}
+
+
+@pytest.mark.parametrize("below", ["task", "process"])
+async def test_ends_that_an_actor_has_not_heard_of_go_along(system: hf.ActorSystem, below: Any) -> None:
+    """Its ties are over by then: it hears of each end once all the same."""
+    await system.start(hf.supervisor("top", isolation=below, children=[hf.child("one", hf.start(Friend))]))
+    one = system.ref("/app/top/one", Friend)
+    for to in ("process", "task"):
+        others = [system.spawn(hf.start(Account), f"{to}-{n}") for n in range(40)]
+        for other in others:
+            one.tell(Bond(link=other, watch=other))
+        await one.ask(Downs())
+        await system.suspend(one)
+        for other in others[:4]:  # They wait in its queue.
+            other.kill()
+        moving = asyncio.create_task(system.set_isolation(one, to, timeout=30.0))  # type: ignore[arg-type]
+        for other in others[4:]:  # Some of them end while it is carried over.
+            other.kill()
+            await asyncio.sleep(0.002)
+        await moving
+        await system.resume(one)
+        heard = [text for text in await one.ask(Downs()) if f"/{to}-" in text and text[:4] in ("exit", "down")]
+        assert sorted(heard) == sorted(f"{what} {other.path}" for other in others for what in ("exit", "down"))

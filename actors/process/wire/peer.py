@@ -463,6 +463,8 @@ def send_signal(peer: Peer, path: str, item: Item) -> None:
     connection = peer.connection
     if isinstance(item, links.Exit):
         data: dict[str, Any] = {"source": item.source.path, "reason": pack_exit(item.reason)}
+        if item.is_carried:
+            data["carried"] = True
         connection.send(frames.Command(connection.names.to_wire(path), "exit", data))
     elif isinstance(item, links.Down):
         data = {
@@ -471,13 +473,17 @@ def send_signal(peer: Peer, path: str, item: Item) -> None:
             "recovering": item.recovering,
             "for_good": item.watch.for_good,
         }
+        if item.is_carried:
+            data["carried"] = True
         connection.send(frames.Command(connection.names.to_wire(path), "down", data))
     else:
         raise HoldfastError(f"{type(item).__name__} cannot be sent to {path}")
 
 
-def obey(node: Node, cell: Cell, frame: frames.Command) -> None:
+def obey(node: Node, cell: Cell, frame: frames.Command, *, by_root: bool = False) -> None:
     """Do what the other side wants of an actor on this one: stop and kill, and all about links and monitors.
+
+    The root alone may carry a signal behind an actor whose tie is over: a process could end anybody by it.
 
     Raises:
         BadFrame, DecodeError: it is no such command.
@@ -490,12 +496,15 @@ def obey(node: Node, cell: Cell, frame: frames.Command) -> None:
             cell.kill()
         case "exit":
             source, reason = named(node, frame, "source"), unpack_exit(data.get("reason"))
-            if links.sever(cell, source):  # Else it was unlinked while this was on its way.
+            if links.sever(cell, source) or (
+                by_root and data.get("carried")
+            ):  # Else it was unlinked while this was on its way.
                 cell.push(links.Exit(source, reason))
         case "down":
             source, reason = named(node, frame, "source"), unpack_exit(data.get("reason"))
             recovering, for_good = bool(data.get("recovering")), bool(data.get("for_good"))
-            links.down_arrived(cell, source, reason, recovering=recovering, for_good=for_good)
+            carried = by_root and bool(data.get("carried"))
+            links.down_arrived(cell, source, reason, recovering=recovering, for_good=for_good, is_carried=carried)
         case "monitor":
             links.monitor(named(node, frame, "watcher"), cell, for_good=bool(data.get("for_good")))
         case "demonitor":
