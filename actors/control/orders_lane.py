@@ -144,6 +144,26 @@ def _send(peer: Peer, path: str, ask: Ask, verb: str, data: bytes) -> None:
     ask.started = True  # From here on we cannot know.
 
 
+def take_orders(peer: Peer, cell: Cell | None = None) -> list[Call]:
+    """Take back what the process of an actor that leaves it has not carried out: it is to be ordered elsewhere.
+
+    The actor has come to rest, so whatever was carried out has been answered. An answer that still comes is dropped.
+
+    Args:
+        cell: the actor; left out where the process is its own.
+    """
+    found = {
+        key: ask
+        for key, ask in peer.pending.items()
+        if isinstance(ask, OrderAsk) and ask.call is not None and (cell is None or ask.to is cell)
+    }
+    peer.pending = {key: ask for key, ask in peer.pending.items() if key not in found}
+    waiting = [ask for ask in found.values() if not ask.is_done]
+    for ask in waiting:
+        ask.started = False
+    return [ask.call for ask in waiting]
+
+
 def ask_status(peer: Peer, cell: Cell, timeout: float) -> asyncio.Future[Any]:
     """The status that the process of an actor gives of it."""
     node = cell.node

@@ -154,8 +154,13 @@ def gone(cell: Cell, reason: ExitReason) -> None:
         watch.watcher.push(Down(watch, reason, recovering=False))
 
 
-def down_arrived(watcher: Cell, target: Cell, reason: ExitReason, *, recovering: bool, for_good: bool) -> None:
-    """A DOWN came from another process: it belongs to the oldest such watch that is still wanted."""
+def down_arrived(
+    watcher: Cell, target: Cell, reason: ExitReason, *, recovering: bool, for_good: bool, is_carried: bool = False
+) -> None:
+    """A DOWN came from another process: it belongs to the oldest such watch that is still wanted.
+
+    One that is carried behind an actor that moves is told also if its watch is not known here: that was over before.
+    """
     monitors: list[Monitor] = target.more.ties.monitors if target.more is not None else []
     for watch in monitors:
         if watch.watcher is watcher and watch.for_good is for_good:
@@ -166,17 +171,20 @@ def down_arrived(watcher: Cell, target: Cell, reason: ExitReason, *, recovering:
                 watch.forget()
             watcher.push(Down(watch, reason, recovering))
             return
+    if is_carried:
+        watcher.push(Down(Monitor(watcher, target, for_good), reason, recovering))
 
 
 class Exit(Item):
     """An EXIT signal over a link, in its place after earlier messages."""
 
-    __slots__ = ("active", "name", "reason", "source")
+    __slots__ = ("active", "is_carried", "name", "reason", "source")
 
     def __init__(self, source: Cell, reason: ExitReason, name: str = "") -> None:
         self.source, self.reason = source, reason
         self.name = name or source.path  # the address that it is known by where this goes
         self.active = True
+        self.is_carried = False  # it waited while the actor moved: the tie is over, and not known where it lives now
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -199,10 +207,11 @@ class Exit(Item):
 class Down(Item):
     """Tells a monitoring actor that the life it watched is over."""
 
-    __slots__ = ("reason", "recovering", "watch")
+    __slots__ = ("is_carried", "reason", "recovering", "watch")
 
     def __init__(self, watch: Monitor, reason: ExitReason, recovering: bool) -> None:
         self.watch, self.reason, self.recovering = watch, reason, recovering
+        self.is_carried = False  # as of an EXIT
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:

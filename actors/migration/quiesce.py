@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from ..control.orders_lane import Call
@@ -19,6 +19,7 @@ from ..kernel.codec import Parcel
 from ..kernel.context import Piped
 from ..kernel.envelope import LEAVE, Ask, Envelope, Item
 from ..kernel.lifecycle import LOCAL, Kill
+from ..kernel.links import Down, Exit
 from ..kernel.timers import Tick
 from ..ordered import Ordered
 from ..process.wire.peer import RelayedAsk
@@ -133,6 +134,13 @@ class Settle(Item):
         return LEAVE
 
 
+def carry(items: Iterable[Any]) -> None:
+    """Have the signals among them told where the actor goes, though the ties that they come from are over."""
+    for item in items:
+        if isinstance(item, (Exit, Down)):
+            item.is_carried = True
+
+
 class Transit:
     """Stands for the host of an actor that is at rest: what is asked for is done when it is known where it lives."""
 
@@ -157,6 +165,7 @@ class Transit:
         self.old.retired(cell)
 
     def push(self, cell: Cell, item: Item) -> None:
+        carry([item])
         self.waiting.append(lambda host: host.push(cell, item))
 
     def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:

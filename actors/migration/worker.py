@@ -6,7 +6,7 @@ import asyncio
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
-from ..control.orders_lane import OrderAsk
+from ..control.orders_lane import OrderAsk, take_orders
 from ..errors import AskFailed, BadMessage, CannotMove, error_text
 from ..exit_reasons import KILLED, ExitReason
 from ..kernel import mailbox
@@ -19,7 +19,7 @@ from ..process.wire.start_codec import pack_recipe
 from .here import let_in
 from .luggage import unpack, unpack_items
 from .move import Entering, Leaving
-from .quiesce import now, sorted_out
+from .quiesce import carry, now, sorted_out
 
 if TYPE_CHECKING:
     from ..kernel.actor import Actor
@@ -98,6 +98,7 @@ class ToWorker(Entering):
                 worker.send_item(cell, cell.path, item, 0)
         self.move.say(worker, "go", suspended=luggage.suspended)
         outlet.worker = worker
+        carry(luggage.queue)
         cell.queue = deque(luggage.queue)
         send_queue(cell)
         for item in luggage.waiting:
@@ -174,15 +175,10 @@ class FromOwnWorker(Leaving):
     def retire(self) -> None:
         """What is left in the process ends; orders that it has not carried out come here."""
         worker, cell, transit = self.worker, self.cell, self.move.transit
-        calls = [ask.call for ask in worker.pending.values() if isinstance(ask, OrderAsk) and ask.call is not None]
-        worker.pending = {
-            key: ask for key, ask in worker.pending.items() if not (isinstance(ask, OrderAsk) and ask.call is not None)
-        }
+        calls = take_orders(worker)
         worker.leave(cell, self.move.reason(), PATIENCE)
         for call in calls:
-            if not call.ask.is_done:
-                call.ask.started = False
-                cell.host.control(cell, call)
+            cell.host.control(cell, call)
         old = transit.old.place if transit is not None else None
         if isinstance(old, WorkerPlace) and old.stop_sent is not None:  # It came when the actor was at rest already.
             cell.host.stop(cell, old.stop_sent)

@@ -427,7 +427,7 @@ class Guest(Peer):
         elif frame.verb == "control":
             obey_order(self, cell, frame)
         else:
-            obey(self.node, cell, cell.path, frame)
+            obey(self.node, cell, cell.path, frame, by_root=True)
 
     def _readdress(self, path: str) -> None:
         """Our own actor has moved to another supervisor."""

@@ -231,6 +231,7 @@ class Life:
         """A turn begins; a replayed one gets the number it had."""
         if feed.turn >= 0:
             self.turn, self.stage.has_replayed = feed.turn, True
+            self.returned.pop(feed.id, None)  # It has come again: its feed may have been here before it was put back.
         else:
             self.turn += 1
         self.feed, self.outs, self.last_k = feed, [], 0

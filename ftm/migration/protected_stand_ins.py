@@ -90,7 +90,7 @@ class ChildAtRoot(ChildPlace):
             self.gave_up_start(cell)
 
     def control(self, cell: Cell, call: Call) -> None:
-        why = "it lives in another process: order it from the root"
+        why = "it lives in another process: order it from the root"  # Which has taken back what it had ordered here.
         call.ask.fail(ControlFailed(cell.path, call.order.verb, why))
 
     def is_up(self, cell: Cell) -> bool:

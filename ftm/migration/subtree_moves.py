@@ -11,6 +11,7 @@ import asyncio
 from collections import deque
 from typing import TYPE_CHECKING, Any, cast
 
+from ...actors.control.orders_lane import take_orders
 from ...actors.errors import CannotMove, HoldfastError, StartFailed, error_text
 from ...actors.exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...actors.kernel import links
@@ -167,7 +168,7 @@ class FromRecordedSubtree(Leaving):
         spec, reason = spec_data(self._host, self._spec), pack_exit(self.move.reason())
         self.move.say_now(self._worker, "leave", number=parent.number, spec=spec, reason=reason)
         cell.extra().start = self._spec.start
-        return []
+        return [*take_orders(self._worker, cell)]
 
     def resume(self) -> None:
         cell, move = self.cell, self.move
@@ -267,7 +268,7 @@ class FromSubtree(Leaving):
         wanted = Wanted(NUMBER, message_name(kind), list(kind._topics), UNKEPT, chosen)
         self._parent.comes_to_root(cell, wanted)
         more.start = self._spec.start
-        return []
+        return [*take_orders(self._worker, cell)]
 
     def _keep_watches(self, told: list[tuple[str, bool]]) -> None:
         """What it watches in the process that it leaves is known here from now on; all else that it watches is."""

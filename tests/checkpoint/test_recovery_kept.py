@@ -75,6 +75,52 @@ async def test_the_stash_survives(system: hf.ActorSystem, isolation: str, interv
     assert await ref.ask(Seen()) == ["open", "0", "1", "2", "last"]
 
 
+class Shutter(hf.Actor):
+    """Takes one note each time it is opened; the others wait."""
+
+    def __init__(self) -> None:
+        self.is_open = False
+        self.taken: list[str] = []
+
+    @hf.on(Note)
+    def note(self, message: Note) -> int:
+        if not self.is_open:
+            self.ctx.stash()
+            return 0
+        self.is_open = False
+        self.taken.append(message.text)
+        return len(self.taken)
+
+    @hf.on(Do)
+    def open(self, message: Do) -> str:
+        self.is_open = True
+        self.ctx.unstash()
+        return ""
+
+    @hf.on(Seen)
+    def read(self, message: Seen) -> list[str]:
+        return self.taken
+
+
+@pytest.mark.parametrize("recovery", [hf.hybrid(interval=NEVER), hf.replay_only()], ids=["hybrid", "replay"])
+async def test_what_was_put_aside_again_is_not_handled_twice(
+    system: hf.ActorSystem, isolation: str, recovery: Any
+) -> None:
+    """The replay has each of its turns in the queue before the first of them has put it back."""
+    ref = await start(system, isolation, "shutter", hf.start(Shutter), recovery=recovery)
+    asked = [ref.ask(Note(text), timeout=30.0) for text in "abcd"]
+    await ref.ask(Do([]), timeout=30.0)
+    assert await asked[0] == 1
+    await struck(system, ref)
+    with system.events() as events:
+        for n in (2, 3, 4):
+            await ref.ask(Do([]), timeout=30.0)
+            assert await asked[n - 1] == n
+        await ref.ask(Do([]), timeout=30.0)
+        assert await ref.ask(Seen(), timeout=30.0) == list("abcd")
+    assert not [one for one in events.take() if isinstance(one, hf.ActorCrashed | hf.TrustBreached)]
+
+
 async def test_a_stashed_message_that_crashes_later_is_not_run_again(system: hf.ActorSystem, isolation: str) -> None:
     """Replay stashes and unstashes it once more; its own turn failed, so it must not come a second time."""
     ref = await doer(system, isolation)

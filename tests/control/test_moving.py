@@ -370,3 +370,48 @@ async def test_nonsense_is_refused(system: hf.ActorSystem) -> None:
     await system.stop(one)
     with pytest.raises(hf.ActorStopped):
         await system.set_isolation(one, "process")
+
+
+@pytest.mark.parametrize("method", [None, hf.hybrid(interval=60.0)], ids=["no recovery", "hybrid"])
+async def test_what_is_ordered_below_a_supervisor_in_a_process_follows_the_actor(
+    system: hf.ActorSystem, tmp_path: Path, method: Any
+) -> None:
+    """An order that was on its way to the process that the actor leaves is carried out where it lives."""
+    child = hf.child("one", hf.start(Account), recovery=method)
+    await system.start(hf.supervisor("top", isolation="process", children=[child]))
+    one = system.ref("/app/top/one", Account)
+    for to in ("process", "task"):
+        gate = tmp_path / to
+        busy = one.ask(Wait(str(gate)), timeout=30.0)
+        moving = asyncio.create_task(system.set_isolation(one, to, timeout=30.0))  # type: ignore[arg-type]
+        ordered = []
+        for _ in range(30):  # Those that come when it is to rest next find it there, or gone.
+            ordered.append(asyncio.create_task(system.get_state(one, timeout=30.0)))
+            await asyncio.sleep(0.02)
+        gate.touch()
+        await moving
+        assert await busy == "waited"
+        assert {state["total"] for state in await asyncio.gather(*ordered)} == {0}
+
+
+@pytest.mark.parametrize("below", ["task", "process"])
+async def test_ends_that_an_actor_has_not_heard_of_go_along(system: hf.ActorSystem, below: Any) -> None:
+    """Its ties are over by then: it hears of each end once all the same."""
+    await system.start(hf.supervisor("top", isolation=below, children=[hf.child("one", hf.start(Friend))]))
+    one = system.ref("/app/top/one", Friend)
+    for to in ("process", "task"):
+        others = [system.spawn(hf.start(Account), f"{to}-{n}") for n in range(40)]
+        for other in others:
+            one.tell(Bond(link=other, watch=other))
+        await one.ask(Downs())
+        await system.suspend(one)
+        for other in others[:4]:  # They wait in its queue.
+            other.kill()
+        moving = asyncio.create_task(system.set_isolation(one, to, timeout=30.0))  # type: ignore[arg-type]
+        for other in others[4:]:  # Some of them end while it is carried over.
+            other.kill()
+            await asyncio.sleep(0.002)
+        await moving
+        await system.resume(one)
+        heard = [text for text in await one.ask(Downs()) if f"/{to}-" in text and text[:4] in ("exit", "down")]
+        assert sorted(heard) == sorted(f"{what} {other.path}" for other in others for what in ("exit", "down"))

@@ -460,6 +460,8 @@ def send_signal(peer: Peer, path: str, item: Item) -> None:
     connection = peer.connection
     if isinstance(item, links.Exit):
         data: dict[str, Any] = {"source": item.name, "reason": pack_exit(item.reason)}
+        if item.is_carried:
+            data["carried"] = True
         connection.send(frames.Command(connection.names.to_wire(path), "exit", data))
     elif isinstance(item, links.Down):
         data = {
@@ -468,15 +470,18 @@ def send_signal(peer: Peer, path: str, item: Item) -> None:
             "recovering": item.recovering,
             "for_good": item.watch.for_good,
         }
+        if item.is_carried:
+            data["carried"] = True
         connection.send(frames.Command(connection.names.to_wire(path), "down", data))
     else:
         raise HoldfastError(f"{type(item).__name__} cannot be sent to {path}")
 
 
-def obey(node: Node, cell: Cell, name: str, frame: frames.Command) -> None:
+def obey(node: Node, cell: Cell, name: str, frame: frames.Command, *, by_root: bool = False) -> None:
     """Do what the other side wants of an actor on this one: stop and kill, and all about links and monitors.
 
-    `name` is the address that it has given; the actor may have moved since.
+    `name` is the address that it has given; the actor may have moved since. The root alone may carry a signal behind an
+    actor whose tie is over: a process could end anybody by it.
 
     Raises:
         BadFrame, DecodeError: it is no such command.
@@ -490,12 +495,14 @@ def obey(node: Node, cell: Cell, name: str, frame: frames.Command) -> None:
         case "exit":
             source, reason = named(node, frame, "source"), unpack_exit(data.get("reason"))
             known = cell.more.ties.links.get(source) if cell.more is not None else None
-            if links.sever(cell, source):  # Else it was unlinked while this was on its way.
+            is_carried = by_root and bool(data.get("carried"))
+            if links.sever(cell, source) or is_carried:  # Else it was unlinked while this was on its way.
                 cell.push(links.Exit(source, reason, known or ""))
         case "down":
             source, reason = named(node, frame, "source"), unpack_exit(data.get("reason"))
             recovering, for_good = bool(data.get("recovering")), bool(data.get("for_good"))
-            links.down_arrived(cell, source, reason, recovering=recovering, for_good=for_good)
+            carried = by_root and bool(data.get("carried"))
+            links.down_arrived(cell, source, reason, recovering=recovering, for_good=for_good, is_carried=carried)
         case "monitor":
             links.monitor(named(node, frame, "watcher"), cell, for_good=bool(data.get("for_good")), name=name)
         case "demonitor":
