@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
@@ -15,24 +16,26 @@ import msgspec
 from ...actors.control.orders_lane import Call
 from ...actors.errors import ControlFailed, StartFailed, StartIgnored
 from ...actors.exit_reasons import ExitReason, pack_exit, unpack_exit
-from ...actors.kernel import lifecycle
+from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.migration.here import dispose
-from ...actors.migration.quiesce import farewell, obey_commands, part, settle_with_queue, sorted_out, twin
+from ...actors.migration.quiesce import Settle, farewell, obey_commands, part, settle_with_queue, sorted_out, twin
 from ...actors.migration.worker_moves import GuestMove
 from ...actors.process.resource_limits import Limits, limits_data
 from ...actors.process.wire.frames import BadFrame
 from ...actors.process.wire.start_codec import pack_recipe
 from ...checkpoint.life.child_stub import ChildPlace, RootHome
 from ...checkpoint.life.recorded_inbox import StopRecorded
-from ...checkpoint.life.recorded_life import Life
+from ...checkpoint.life.recorded_life import HomePort, Life
 from ...checkpoint.life.worker_lives import ChildHere, child_here
 from ...checkpoint.protocol import (
     AtRoot,
     Closed,
+    Live,
     Over,
     Respec,
     Started,
+    ToHome,
 )
 from ...supervision.respec import replace_mechanism
 from ..group.transient_homes import UNKEPT
@@ -166,9 +169,9 @@ class RecordedChild:
         other = twin(cell)
         other.life -= 1  # Counted up by the life that begins; it is no other one.
         other.extra().start, other.extra().bindings = start, cell.extra().bindings
-        life = Life(other, port, recovery, guest.page[slot : slot + 1], may_fork=True)
+        life = Life(other, HeldWhenLive(port, other), recovery, guest.page[slot : slot + 1], may_fork=True)
         life.stage.begins_suspended = told["is_suspended"]
-        self._arriving = Arriving(child_here(guest, recovery), other, life, number)
+        self._arriving = Arriving(child_here(guest, recovery), other, life, port, number)
 
         def ended_early(done: asyncio.Future[ExitReason]) -> None:
             if self._arriving is not None and self._arriving.other is other:
@@ -191,7 +194,7 @@ class RecordedChild:
     def _settle(cell: Cell, arriving: Arriving) -> None:
         """From here on the new life is the one."""
         settle_with_queue(arriving.other, cell)
-        arriving.life.cell = cell
+        arriving.life.cell, arriving.life.port = cell, arriving.port
         arriving.place.home.life = arriving.life
         arriving.place.take_up(cell, arriving.number)
         respec(cell, Respec([]))
@@ -204,4 +207,26 @@ class Arriving(NamedTuple):
     place: ChildHere
     other: Cell
     life: Life
+    port: HomePort
     number: int
+
+
+class HeldWhenLive:
+    """The way home of a life that arrives: when it is live it handles nothing, for it is not the one yet.
+
+    What its replay has put back stands in its queue already; a turn in hand would be left behind when it settles.
+    """
+
+    def __init__(self, port: HomePort, other: Cell) -> None:
+        self._port, self._other = port, other
+
+    def to_home(self, record: ToHome) -> None:
+        if isinstance(record, Live):
+            mailbox.queue_of(self._other).appendleft(Settle(self._other.node.loop.create_future()))
+        self._port.to_home(record)
+
+    def when_told(self, then: Callable[[], None]) -> None:
+        self._port.when_told(then)
+
+    def closed(self) -> None:
+        self._port.closed()

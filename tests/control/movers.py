@@ -343,3 +343,25 @@ def lives_in(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> Any:
 
 def moved(stream: hf.EventStream) -> list[tuple[str, str]]:
     return [(event.origin, event.to) for event in stream.take() if isinstance(event, hf.Moved)]
+
+
+class Shutter(hf.Actor):
+    """Takes one note each time it is opened, and takes its time; the others wait."""
+
+    def __init__(self) -> None:
+        self.is_open = False
+        self.taken: list[int] = []
+
+    @hf.on(Open)
+    def open(self, message: Open) -> None:
+        self.is_open = True
+        self.ctx.unstash()
+
+    @hf.on(Count)
+    async def count(self, message: Count) -> int:
+        if not self.is_open:
+            self.ctx.stash()
+            return 0
+        await asyncio.sleep(0.05)
+        self.taken.append(message.n)
+        return len(self.taken)

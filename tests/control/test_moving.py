@@ -15,6 +15,7 @@ from tests.control.movers import (
     Answer,
     Begin,
     Bond,
+    Count,
     Delayed,
     Door,
     Downs,
@@ -27,6 +28,7 @@ from tests.control.movers import (
     Open,
     Picky,
     Put,
+    Shutter,
     Spawns,
     Started,
     Tick,
@@ -415,3 +417,17 @@ async def test_ends_that_an_actor_has_not_heard_of_go_along(system: hf.ActorSyst
         await system.resume(one)
         heard = [text for text in await one.ask(Downs()) if f"/{to}-" in text and text[:4] in ("exit", "down")]
         assert sorted(heard) == sorted(f"{what} {other.path}" for other in others for what in ("exit", "down"))
+
+
+async def test_what_a_replay_has_put_back_waits_until_the_new_life_is_the_one(system: hf.ActorSystem) -> None:
+    """A turn that it began before was left behind: its message came again, behind those that followed it."""
+    child = hf.child("one", hf.start(Shutter), recovery=hf.replay_only(), isolation="process")
+    await system.start(hf.supervisor("top", isolation="process", children=[child]))
+    one = system.ref("/app/top/one", Shutter)
+    asked = [one.ask(Count("outside", n), timeout=30.0) for n in range(8)]
+    one.tell(Open())
+    with system.events() as events:
+        await system.set_isolation(one, "task", timeout=30.0)
+        assert await asyncio.gather(*asked) == list(range(1, 9))
+        assert (await system.get_state(one))["taken"] == list(range(8))
+    assert not [event for event in events.take() if isinstance(event, hf.RecoveryFailed | hf.TrustBreached)]
