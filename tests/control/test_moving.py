@@ -385,7 +385,7 @@ async def test_what_is_ordered_below_a_supervisor_in_a_process_follows_the_actor
     for to in ("process", "task"):
         gate = tmp_path / to
         busy = one.ask(Wait(str(gate)), timeout=30.0)
-        moving = asyncio.create_task(system.set_isolation(one, to, timeout=30.0))  # type: ignore[arg-type]
+        moving = asyncio.create_task(system.set_isolation(one, to, timeout=30.0))
         ordered = []
         for _ in range(30):  # Those that come when it is to rest next find it there, or gone.
             ordered.append(asyncio.create_task(system.get_state(one, timeout=30.0)))
@@ -409,7 +409,7 @@ async def test_ends_that_an_actor_has_not_heard_of_go_along(system: hf.ActorSyst
         await system.suspend(one)
         for other in others[:4]:  # They wait in its queue.
             other.kill()
-        moving = asyncio.create_task(system.set_isolation(one, to, timeout=30.0))  # type: ignore[arg-type]
+        moving = asyncio.create_task(system.set_isolation(one, to, timeout=30.0))
         for other in others[4:]:  # Some of them end while it is carried over.
             other.kill()
             await asyncio.sleep(0.002)
