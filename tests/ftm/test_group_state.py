@@ -424,6 +424,29 @@ def test_a_life_that_has_been_told_to_go_on_gets_nothing_while_nobody_could_take
     assert [one.id for one in later[0]] == [1]
 
 
+def test_each_input_in_whose_company_a_replica_has_died_goes_alone() -> None:
+    """One that is new goes with its like before and behind them."""
+    delivery, numbers = Delivery(is_live=True), dict.fromkeys(range(7))
+    for number in range(3):
+        delivery.put(feed(number))
+    delivery.out = work(delivery, *sent(delivery, numbers))
+    delivery.send_again(numbers, -1, careful=True)
+    delivery.out = None
+    for number in range(3, 5):
+        delivery.put(feed(number))
+    delivery.waiting.rotate(1)  # One that is not careful is ahead of them.
+    batches = []
+    while delivery.waiting:
+        batches.append([one.id for one in sent(delivery, numbers)[0]])
+    assert batches == [[4], [0], [1], [2], [3]]
+
+
+def sent(delivery: Delivery, open_inputs: dict[int, None]) -> tuple[list[Feed], Go | None]:
+    taken = delivery.next_batch(open_inputs)
+    assert taken is not None
+    return taken
+
+
 def test_who_leads_next_is_told_again_that_it_goes_on() -> None:
     delivery = Delivery()
     for record in (feed(0), Go(recovered=False, turn=0)):

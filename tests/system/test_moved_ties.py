@@ -46,6 +46,14 @@ class Party(hf.Actor):
         self.heard.append("exit")
 
 
+async def hears_once(one: hf.ActorRef[Party], notice: str) -> None:
+    async with asyncio.timeout(IN_TIME):
+        while not await one.ask(Heard(), IN_TIME):
+            await asyncio.sleep(0.005)
+    for _ in range(3):
+        assert await one.ask(Heard(), IN_TIME) == [notice]
+
+
 PLACES: dict[str, dict[str, Any]] = {
     "task": {},
     "process": {"isolation": "process"},
@@ -87,12 +95,7 @@ async def test_it_hears_of_the_end_once(watcher: str, target: str, when: str, ve
         assert await other.ask(Heard(), IN_TIME) == []
         async with system.transaction(timeout=IN_TIME) as change:
             change.remove(other)
-        wanted = ["exit" if verb == "link" else "down"]
-        async with asyncio.timeout(IN_TIME):
-            while await one.ask(Heard(), IN_TIME) != wanted:
-                await asyncio.sleep(0.005)
-        for _ in range(3):
-            assert await one.ask(Heard(), IN_TIME) == wanted
+        await hears_once(one, "exit" if verb == "link" else "down")
 
 
 @pytest.mark.parametrize("verb", ["monitor", "watch", "link"])
@@ -115,11 +118,7 @@ async def test_who_lives_with_its_supervisor_hears_of_the_end_once(
             await system.set_isolation(one, isolation, timeout=IN_TIME)
         async with system.transaction(timeout=IN_TIME) as change:
             change.remove(other)
-        wanted = ["exit" if verb == "link" else "down"]
-        async with asyncio.timeout(IN_TIME):
-            while await one.ask(Heard(), IN_TIME) != wanted:
-                await asyncio.sleep(0.005)
-        assert await one.ask(Heard(), IN_TIME) == wanted
+        await hears_once(one, "exit" if verb == "link" else "down")
 
 
 class Who(hf.Message[str]): ...
