@@ -146,3 +146,17 @@ def _frames() -> list[f.Frame]:
                 break
             data = data[4 + size :]
     return found
+
+
+async def test_a_signal_that_says_it_was_carried_behind_a_move_ends_nobody(world: World) -> None:
+    """The root may say so to a process, of a tie that is over; a process is not believed."""
+    crash = {"exit": "Crash", "type_name": "Boom", "text": "boom"}
+    victim = world.system.ref(VICTIM, Victim)
+    life = victim._cell.life
+    await world.write(
+        command(VICTIM, "exit", source=EVIL, reason=crash, carried=True)
+        + command(VICTIM, "down", source=EVIL, reason=crash, recovering=False, for_good=False, carried=True)
+    )
+    for _ in range(2):
+        await world.judge()
+    assert victim._cell.life == life

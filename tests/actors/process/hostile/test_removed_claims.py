@@ -46,6 +46,13 @@ CHECKS = {
         CLAIMS,
         "test_bindings_that_cannot_be_are_a_breach",
     ),
+    "a process is not believed that a signal was carried behind a move": Check(
+        "actors/process/process_host.py",
+        "            obey(node, cell, path, frame)\n",
+        "            obey(node, cell, path, frame, by_root=True)\n",
+        "tests/actors/process/hostile/test_hostile.py",
+        "test_a_signal_that_says_it_was_carried",
+    ),
     "a life's bindings, too": Check(
         GATE,
         '    gate.claims(frame.data.get("bindings", {}))\n',
