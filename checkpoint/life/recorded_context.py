@@ -265,11 +265,9 @@ class RecordedContext(ActorContext):
             life.restored.unstashes = True
         stash, life.stash = life.stash, []
         again = [Fed(life, once_more(fed.feed), fed.message, fed.sender) for fed in stash]
+        life.returned = {fed.feed.id: fed for fed in again} | life.returned  # in front of those put back before
         if life.is_live:
-            mailbox.queue_of(self.cell).extendleft(reversed(again))
-            self.cell.schedule()
-        else:
-            life.returned = {fed.feed.id: fed for fed in again} | life.returned  # in front of those put back before
+            life.handle_returned()
 
     def monitor(self, other: ActorRef[Any]) -> Monitor:
         self.acting().put("monitor", other.path)

@@ -186,7 +186,7 @@ class Life:
 
     def _take(self, feed: Feed) -> None:
         cell = self.cell
-        returned = self.returned.pop(feed.id, None)
+        returned = self.returned.get(feed.id)  # until its turn begins: it may be taken from the queue again
         if returned is not None:
             fed = Fed(self, feed, returned.message, returned.sender)
         else:
@@ -231,9 +231,10 @@ class Life:
         """A turn begins; a replayed one gets the number it had."""
         if feed.turn >= 0:
             self.turn, self.stage.has_replayed = feed.turn, True
-            self.returned.pop(feed.id, None)  # It has come again: its feed may have been here before it was put back.
         else:
             self.turn += 1
+        if self.returned:
+            self.returned.pop(feed.id, None)  # It has come again: its feed may have been here before it was put back.
         self.feed, self.outs, self.last_k = feed, [], 0
         if self.page is not None:
             self.page[0] = feed.id + 1
@@ -368,9 +369,7 @@ class Life:
         for key in gone:
             self.returned.pop(key, None)
         if self.returned:  # Unstashed under replay, and not handled before the crash: they come first.
-            queue = mailbox.queue_of(self.cell)
-            queue.extendleft(reversed(self.returned.values()))
-            self.returned.clear()
+            self.handle_returned()
         if stage.begins_suspended:  # Behind what comes first: it is not handled either.
             mailbox.suspend(self.cell)
         self.port.to_home(Live(self.restored.seconds))
@@ -383,6 +382,12 @@ class Life:
             self.cell.urge(call)
         if stage.stop_wanted is not None:
             self.cell.request_stop(stage.stop_wanted)
+
+    def handle_returned(self) -> None:
+        """Handle what was put aside and is put back, before anything else."""
+        mailbox.queue_of(self.cell).extendleft(reversed(self.returned.values()))
+        self.returned.clear()
+        self.cell.schedule()
 
     def _snapshot_of_replay(self) -> None:
         if self.cell.actor is not None and not self.stage.is_over:

@@ -80,7 +80,7 @@ def plain(run: Run, *, with_state: bool = True) -> tuple[Any, ...]:
     if run.state is None:
         return ends, run.digest
     state = run.state
-    return ends, state.turn, state.data, state.deltas, [feed.id for feed in state.stash]
+    return ends, state.turn, state.data, state.deltas, _aside(state)
 
 
 def form(run: Run, *, with_state: bool = True) -> Any:
@@ -97,8 +97,12 @@ def form(run: Run, *, with_state: bool = True) -> Any:
 def state_form(state: State) -> Any:
     """The canonical form of a state."""
     saved = state.data.value()
-    stash = ("list", *(f"{feed.id}" for feed in state.stash))
-    return ("state", f"{state.turn}", canonical(saved), canonical(list(map(decode_value, state.deltas))), stash)
+    aside = canonical(_aside(state))
+    return ("state", f"{state.turn}", canonical(saved), canonical(list(map(decode_value, state.deltas))), aside)
+
+
+def _aside(state: State) -> tuple[list[int], list[int]]:
+    return [feed.id for feed in state.stash], [feed.id for feed in state.returned]
 
 
 def digest_of_state(state: State) -> bytes:
@@ -129,7 +133,7 @@ class Digests:
         for delta in state.deltas[known:]:
             self._chain = state_digest([self._chain, decode_value(delta)])
         self._deltas = state.deltas
-        return state_digest([state.turn, [feed.id for feed in state.stash], self._chain])
+        return state_digest([state.turn, _aside(state), self._chain])
 
 
 def vote(voter: AnyVoter, runs: Sequence[Run | None], *, with_state: bool = True) -> Agreed[Run] | Undecided:
@@ -211,8 +215,7 @@ class Shadow(Server):
         point, life = self.points.point, self.life
         if life is not None and point is not None and not self.points.tail and point == before:
             return  # It stands there already.
-        is_plain = not (before.stash or before.returned) and life is not None and not life.returned
-        if is_plain and life is not None and life.is_live == before.live and life.feed is None:
+        if life is not None and not before.stash and life.is_live == before.live and life.feed is None:
             self.rewind(before)
             return
         await self.drop_life()

@@ -44,7 +44,7 @@ def take_up(life: ServerLife, point: State, *, has_deltas: bool) -> None:
         delattr(actor._state_root(), name)
     _apply_deltas(actor, point.deltas, has_deltas=has_deltas)
     life.stash += _fed(life, point.stash)
-    life.returned.update((fed.feed.id, fed) for fed in _fed(life, point.returned))
+    life.returned |= _returned(life, point)
 
 
 def rewind_to(life: ServerLife, point: State, names: set[str] | None, *, has_deltas: bool) -> None:
@@ -66,7 +66,7 @@ def rewind_to(life: ServerLife, point: State, names: set[str] | None, *, has_del
         for name in set(variables(actor)) - set(saved[2]):
             delattr(actor._state_root(), name)
     life.cell.extra().trap_exits = point.traps
-    life.rewind(point.turn, _fed(life, point.stash))
+    life.rewind(point.turn, _fed(life, point.stash), _returned(life, point))
 
 
 def _apply_deltas(actor: Any, deltas: list[bytes], *, has_deltas: bool) -> None:
@@ -81,6 +81,10 @@ def _fed(life: ServerLife, feeds: Iterable[Feed]) -> list[Fed]:
     return [Fed(life, feed, None, None if feed.sender is None else node.cell_at(feed.sender)) for feed in feeds]
 
 
+def _returned(life: ServerLife, point: State) -> dict[int, Fed]:
+    return {fed.feed.id: fed for fed in _fed(life, point.returned)}
+
+
 def digest_of_life(life: ServerLife) -> bytes:
     """Take a digest of the state after the last turn, the same on each replica."""
     assert life.feed is None
@@ -89,7 +93,8 @@ def digest_of_life(life: ServerLife) -> bytes:
     value: Any = state.value
     if type(value) is dict and all(type(name) is str for name in value):
         value = sorted(value.items())
-    return state_digest([life.turn, [fed.feed.id for fed in life.stash], [state.version, state.form, value]])
+    aside = [fed.feed.id for fed in life.stash], list(life.returned)
+    return state_digest([life.turn, aside, [state.version, state.form, value]])
 
 
 def snapshot_of(life: ServerLife, points: RewindPoints) -> list[Snapshot]:

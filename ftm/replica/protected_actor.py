@@ -475,7 +475,7 @@ class Server(lifecycle.HerePlace):
                 attempts.crashes = 0
                 now = time.perf_counter()
                 attempts.size = size_after(attempts.size, len(chunk), now - at)
-                if (now - begin > PART and not state.is_again) or part.has_released:
+                if (now - begin > PART and not state.is_again) or part.is_cut:
                     break
             elif why is UNDONE:
                 self._take_back()
@@ -590,6 +590,22 @@ class Server(lifecycle.HerePlace):
         answer = Answer(*codec.encode_error(error)) if request.feed.is_ask else Answer()
         self.attempts.skips[end.id] = TurnEnd(end.turn, end.id, FAILED, [], answer)
 
+    def returned_first(self, pending: deque[Request]) -> None:
+        """Have what was put aside and is put back handled before anything else, each once."""
+        life, point = self.life, self.points.point
+        if self.part.is_given_up or self.state.is_over:
+            return
+        if life is not None:
+            feeds = [fed.feed for fed in life.returned.values()] if life.is_live else []
+        else:
+            feeds = point.returned if point is not None and point.live else []
+        if feeds:
+            numbers = {feed.id for feed in feeds}
+            behind = [one for one in pending if one.feed.id not in numbers]
+            pending.clear()
+            pending.extend(Request("", 0, feed) for feed in feeds)
+            pending.extend(behind)
+
     def has_taken(self, request: Request) -> bool:
         """Whether the life has a request without an end: its stash has it, or it is the tick of a cancelled timer."""
         life, number = self.life, request.feed.id
@@ -641,7 +657,17 @@ class Server(lifecycle.HerePlace):
     def _let_out(self, life: ServerLife) -> None:
         """What has left cannot be undone: the part ends with this turn, whatever was to come after it."""
         self.traces.release(life.turn, life.outs)
-        self.part.has_released = True
+        self._cut_part(life)
+        life.release_now()
+
+    def puts_back(self, life: ServerLife) -> None:
+        """A turn has put back what was put aside: that comes next, and may want something released before its end."""
+        if life is self.life and life.feed is not None and not self.state.is_quiet:
+            self._cut_part(life)
+
+    def _cut_part(self, life: ServerLife) -> None:
+        """The part ends with the turn in hand, whatever was to come after it."""
+        self.part.is_cut = True
         queue, left = mailbox.queue_of(life.cell), set[int]()
         for index, item in enumerate(queue):
             if type(item) is Fed and item.life is life:
@@ -649,7 +675,6 @@ class Server(lifecycle.HerePlace):
                 queue[index] = mailbox.NOTHING  # Not removed: the run loop has counted them.
         if left and life.feed is not None:
             self.part.send_back(left)
-        life.release_now()
 
     def _look(self, life: ServerLife, feed: Feed | None) -> None:
         """A turn that is not at the front has wanted to release something: does it wait for that?"""

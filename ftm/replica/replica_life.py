@@ -114,14 +114,18 @@ class ServerLife(Life):
         made.recorded = self
         return made
 
-    def rewind(self, turn: int, stash: list[Fed]) -> None:
+    def rewind(self, turn: int, stash: list[Fed], returned: dict[int, Fed]) -> None:
         """Go on from after an earlier turn: what was run since is run again, or something else is."""
-        self.turn, self.stash = turn, stash
+        self.turn, self.stash, self.returned = turn, stash, returned
         self._context_made.draw_anew()
 
     def close_turn(self, status: str, answer: Answer) -> None:
         self.ended = self.feed
         super().close_turn(status, answer)
+
+    def handle_returned(self) -> None:
+        """They are requests again, the first of the next part: any of them may have to stand at the front."""
+        self.server.puts_back(self)
 
     def release(self) -> None:
         if self.feed is not None and self.outs:

@@ -52,7 +52,7 @@ class Part:
     pending: deque[Request]
     begun: list[Request] = dataclasses.field(default_factory=list)
     ends: list[TurnEnd] = dataclasses.field(default_factory=list)
-    has_released: bool = False  # a turn has let something out in its middle: the part ends behind it
+    is_cut: bool = False  # it ends behind the turn in hand, which has let something out, or has put messages back
     is_given_up: bool = False
 
     def take_back(self) -> None:

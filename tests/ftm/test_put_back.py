@@ -1,0 +1,175 @@
+"""What was put aside and is put back behind a mechanism: handled once, in order, before all else, whatever dies."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import signal
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.ftm.accounts import Add, Counter, Tags
+from tests.ftm.test_failover import group_of, is_complete, pid_of, two_again
+
+# Processes do not care which event loop the root has.
+pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
+
+SEED = int(os.environ.get("HOLDFAST_SEED", "20261125"))
+OTHER = "/app/other"
+
+
+class Meet(hf.Message[int]):
+    """Answered with how many have met somebody before, when the house is open for this kind of guest."""
+
+    tag: int
+    kind: str
+
+
+class Open(hf.Message[None]):
+    kind: str
+
+
+class Close(hf.Message[None]): ...
+
+
+class Host(Counter):
+    """Puts guests aside while it is closed for their kind. Each guest that may come in has it ask somebody, or not."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_open: set[str] = set()
+
+    @hf.on(Meet)
+    async def meet(self, message: Meet) -> int:
+        if message.kind not in self.is_open:
+            self.ctx.stash()
+            return 0
+        self.tags.append(message.tag)
+        if message.kind == "asks":
+            await self.ctx.find(OTHER, Counter).ask(Add(message.tag), timeout=60.0)
+        return len(self.tags)
+
+    @hf.on(Open)
+    async def open(self, message: Open) -> None:
+        self.is_open.add(message.kind)
+        self.ctx.unstash()
+
+    @hf.on(Close)
+    def close(self, message: Close) -> None:
+        self.is_open.clear()
+
+
+class Sworn(Host):
+    """Keeps what it has put aside through a restart, and takes it back when it is there again."""
+
+    async def on_start(self, restored: bool) -> None:
+        if restored:
+            self.is_open.update(("asks", "says"))
+            self.ctx.unstash()
+
+
+MECHANISMS = {
+    "none": lambda: None,
+    "pbr": hf.PBR,
+    "lfr": hf.LFR,
+    "tr": hf.TR,
+    "tmr": hf.TMR,
+    "tr+pbr": lambda: hf.compose(hf.PBR(), hf.TR()),
+    "tr+lfr": lambda: hf.compose(hf.LFR(), hf.TR()),
+}
+
+
+def script(rng: random.Random, length: int) -> list[Any]:
+    """Guests come, and the house opens and closes; at the end it is open for all."""
+    tags = iter(range(1, length + 1))
+    made: list[Any] = []
+    for _ in range(length):
+        kind = rng.choice(("asks", "says"))
+        made.append(rng.choices((Meet(next(tags), kind), Add(100), Open(kind), Close()), (6, 1, 2, 1))[0])
+    return [*made, Open("says"), Open("asks")]
+
+
+async def played(system: hf.ActorSystem, ref: hf.ActorRef[Any], messages: list[Any]) -> tuple[list[Any], list[int]]:
+    """The replies to a script, and the order in which guests and others have been handled."""
+    asks = [asyncio.ensure_future(ref.ask(one, timeout=60.0)) for one in messages]
+    replies = await asyncio.gather(*asks)
+    return replies, await ref.ask(Tags(), timeout=60.0)
+
+
+async def expected(system: hf.ActorSystem, messages: list[Any]) -> tuple[list[Any], list[int]]:
+    """What an actor that nothing protects makes of it."""
+    plain = await system.start(hf.child("plain", hf.start(Host)))
+    found = await played(system, plain, messages)
+    await system.terminate(plain)
+    return found
+
+
+def numbers(messages: list[Any]) -> list[int]:
+    return sorted(one.tag for one in messages if isinstance(one, Meet) and one.kind == "asks")
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("method", ["without recovery", "hybrid"])
+@pytest.mark.parametrize("mechanism", MECHANISMS)
+async def test_what_is_put_back_is_handled_as_without_a_mechanism(
+    system: hf.ActorSystem, mechanism: str, method: str, seed: int
+) -> None:
+    messages = script(random.Random(f"{SEED} {seed}"), 40)
+    print(f"HOLDFAST_SEED={SEED}, script {seed}")
+    other = await system.start(hf.child("other", hf.start(Counter)))
+    want = await expected(system, messages)
+    assert sorted(await other.ask(Tags())) == numbers(messages)
+    recovery = hf.hybrid(interval=0.05) if method == "hybrid" else None
+    spec = hf.child("host", hf.start(Host), mechanism=MECHANISMS[mechanism](), recovery=recovery)
+    ref = await system.start(spec)
+    assert await played(system, ref, messages) == want
+    assert sorted(await other.ask(Tags())) == sorted(2 * numbers(messages))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("mechanism", ["pbr", "lfr", "tmr", "tr+pbr"])
+async def test_whoever_leads_dies_while_what_was_put_back_is_handled(
+    system: hf.ActorSystem, mechanism: str, seed: int
+) -> None:
+    rng = random.Random(f"{SEED} killed {seed}")
+    messages = script(rng, 60)
+    print(f"HOLDFAST_SEED={SEED}, script {seed}")
+    other = await system.start(hf.child("other", hf.start(Counter)))
+    want = await expected(system, messages)
+    spec = hf.child("host", hf.start(Host), mechanism=MECHANISMS[mechanism](), recovery=hf.hybrid(interval=0.05))
+    ref = await system.start(spec)
+    await two_again(ref)
+    kills = sorted(rng.sample(range(len(messages)), 3))
+    asks = list[asyncio.Future[Any]]()
+    for number, message in enumerate(messages):
+        asks.append(asyncio.ensure_future(ref.ask(message, timeout=60.0)))
+        if number in kills:
+            await asyncio.sleep(rng.random() * 0.004)  # Anywhere in between: which step that is, the seed decides.
+            if is_complete(ref):
+                primary = group_of(ref).membership.primary
+                assert primary is not None
+                os.kill(pid_of(system, ref, primary), signal.SIGKILL)
+    replies = await asyncio.gather(*asks)
+    assert (replies, await ref.ask(Tags(), timeout=60.0)) == want
+    assert sorted(await other.ask(Tags())) == sorted(2 * numbers(messages))
+
+
+@pytest.mark.parametrize("mechanism", ["pbr", "lfr", "tr"])
+async def test_a_life_that_takes_back_in_its_start_handles_it_without_being_asked_for_more(
+    system: hf.ActorSystem, mechanism: str
+) -> None:
+    """No batch has it: whoever leads next handles it by itself."""
+    other = await system.start(hf.child("other", hf.start(Counter)))
+    spec = hf.child("host", hf.start(Sworn), mechanism=MECHANISMS[mechanism](), recovery=hf.hybrid(interval=0.05))
+    ref = await system.start(spec)
+    if mechanism != "tr":
+        await two_again(ref)
+    guests = [asyncio.ensure_future(ref.ask(Meet(tag, "asks"), timeout=60.0)) for tag in (1, 2, 3)]
+    assert await ref.ask(Add(100), timeout=60.0) == 1
+    for name in ("r1",) if mechanism == "tr" else ("r1", "r2"):
+        os.kill(pid_of(system, ref, name), signal.SIGKILL)
+    assert await asyncio.gather(*guests) == [2, 3, 4]
+    assert await other.ask(Tags()) == [1, 2, 3]
