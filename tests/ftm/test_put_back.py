@@ -169,6 +169,7 @@ async def test_a_life_that_takes_back_in_its_start_handles_it_without_being_aske
         await two_again(ref)
     guests = [asyncio.ensure_future(ref.ask(Meet(tag, "asks"), timeout=60.0)) for tag in (1, 2, 3)]
     assert await ref.ask(Add(100), timeout=60.0) == 1
+    await system.checkpoint(ref)
     for name in ("r1",) if mechanism == "tr" else ("r1", "r2"):
         os.kill(pid_of(system, ref, name), signal.SIGKILL)
     assert await asyncio.gather(*guests) == [2, 3, 4]
