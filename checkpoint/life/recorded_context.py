@@ -12,7 +12,6 @@ import msgspec
 
 from ...actors.errors import ControlFailed, HoldfastError, remote_crash
 from ...actors.exit_reasons import NORMAL, ExitReason
-from ...actors.kernel import mailbox
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.context import ActorContext, StashError

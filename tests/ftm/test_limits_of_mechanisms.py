@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import signal
 import time
@@ -34,32 +33,6 @@ class Blocks(Counter):
     def add(self, message: Add) -> int:
         time.sleep(3600.0)
         return 0
-
-
-class Meet(hf.Message[int]): ...
-
-
-class Open(hf.Message[None]): ...
-
-
-class Host(Counter):
-    """Puts guests aside until it is open; each then has it ask somebody."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.is_open = False
-
-    @hf.on(Meet)
-    async def meet(self, message: Meet) -> int:
-        if not self.is_open:
-            self.ctx.stash()
-            return 0
-        return await self.ctx.find("/app/other", Counter).ask(Add(1), timeout=60.0)
-
-    @hf.on(Open)
-    def open(self, message: Open) -> None:
-        self.is_open = True
-        self.ctx.unstash()
 
 
 def is_lucky(message: Any) -> bool:
@@ -132,16 +105,3 @@ async def test_an_alternate_that_blocks_costs_the_life_and_its_message_is_put_as
     with pytest.raises(hf.Quarantined):
         await ref.ask(Add(13), timeout=60)
     assert await ref.ask(Add(2), timeout=60) == 1, "without recovery the state went with the life"
-
-
-@pytest.mark.parametrize("mechanism", [hf.PBR(), hf.LFR(), hf.TR()], ids=["pbr", "lfr", "tr"])
-async def test_what_is_taken_back_and_asks_somebody_stands_still_and_the_system_ends_all_the_same(
-    system: hf.ActorSystem, mechanism: Any
-) -> None:
-    await system.start(hf.child("other", hf.start(Counter)))
-    ref = await system.start(hf.child("host", hf.start(Host), mechanism=mechanism))
-    meeting = asyncio.ensure_future(ref.ask(Meet(), timeout=60.0))
-    with pytest.raises(hf.AskTimeout):
-        await ref.ask(Open(), timeout=1.0)
-    assert not meeting.done()
-    meeting.cancel()

@@ -6,6 +6,7 @@ import asyncio
 import os
 import random
 import signal
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -62,6 +63,52 @@ class Host(Counter):
         self.is_open.clear()
 
 
+class Fatal(hf.Message[int]):
+    """A guest who kills the first host that lets it in; the note says that there was one."""
+
+    note: str
+
+
+class Mortal(Host):
+    """Dies of its first fatal guest."""
+
+    @hf.on(Fatal)
+    def meet_once(self, message: Fatal) -> int:
+        if not self.is_open:
+            self.ctx.stash()
+            return 0
+        if not Path(message.note).exists():
+            Path(message.note).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return len(self.tags)
+
+
+class Welcome(hf.Message[bool]):
+    """Answered with whether it has opened the house for all."""
+
+
+class Forgetful(Host):
+    """Says that it has opened nothing, and has not."""
+
+    @hf.on(Welcome)
+    def welcome(self, message: Welcome) -> bool:
+        return False
+
+
+class Attentive(Forgetful):
+    """The same house, run better."""
+
+    @hf.on(Welcome)
+    def welcome(self, message: Welcome) -> bool:
+        self.is_open.update(("asks", "says"))
+        self.ctx.unstash()
+        return True
+
+
+def is_not_false(reply: Any) -> bool:
+    return reply is not False
+
+
 class Sworn(Host):
     """Keeps what it has put aside through a restart, and takes it back when it is there again."""
 
@@ -71,7 +118,7 @@ class Sworn(Host):
             self.ctx.unstash()
 
 
-MECHANISMS = {
+MECHANISMS: dict[str, Any] = {
     "none": lambda: None,
     "pbr": hf.PBR,
     "lfr": hf.LFR,
@@ -155,6 +202,31 @@ async def test_whoever_leads_dies_while_what_was_put_back_is_handled(
     replies = await asyncio.gather(*asks)
     assert (replies, await ref.ask(Tags(), timeout=60.0)) == want
     assert sorted(await other.ask(Tags())) == sorted(2 * numbers(messages))
+
+
+@pytest.mark.parametrize("mechanism", ["pbr", "lfr", "tr"])
+async def test_who_dies_of_what_was_put_back_leaves_it_in_no_batch_and_its_heir_handles_it(
+    system: hf.ActorSystem, mechanism: str, tmp_path: Path
+) -> None:
+    """Home knows that it was put aside, and the heir's state that it was put back."""
+    spec = hf.child("host", hf.start(Mortal), mechanism=MECHANISMS[mechanism](), recovery=hf.hybrid(interval=0.05))
+    ref = await system.start(spec)
+    if mechanism != "tr":
+        await two_again(ref)
+    guest = asyncio.ensure_future(ref.ask(Fatal(str(tmp_path / "killed")), timeout=60.0))
+    await ref.ask(Open("asks"), timeout=60.0)
+    assert await guest == 0
+    assert (tmp_path / "killed").exists()
+
+
+async def test_what_an_alternate_has_put_back_is_in_no_batch_and_is_handled(system: hf.ActorSystem) -> None:
+    other = await system.start(hf.child("other", hf.start(Counter)))
+    blocks = hf.RB(alternates=(Attentive,), test=(is_not_false,))
+    ref = await system.start(hf.child("host", hf.start(Forgetful), mechanism=blocks))
+    guests = [asyncio.ensure_future(ref.ask(Meet(tag, "asks"), timeout=60.0)) for tag in (1, 2, 3)]
+    assert await ref.ask(Welcome(), timeout=60.0)
+    assert await asyncio.gather(*guests) == [1, 2, 3]
+    assert await other.ask(Tags()) == [1, 2, 3]
 
 
 @pytest.mark.parametrize("mechanism", ["pbr", "lfr", "tr"])

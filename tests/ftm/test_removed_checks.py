@@ -11,6 +11,7 @@ from tests.removing import Check, as_tests
 JOINING = "tests/ftm/test_pbr_joining.py"
 PBR, LFR, SEC = "tests/ftm/test_pbr.py", "tests/ftm/test_lfr.py", "tests/ftm/test_sec.py"
 SUBTREE, STATE = "tests/ftm/test_subtree.py", "tests/ftm/test_group_state.py"
+PUT_BACK = "tests/ftm/test_put_back.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 CHECKS = {
     "T36: a batch of an earlier epoch is refused": Check(
@@ -448,6 +449,34 @@ CHECKS = {
         "        heard = next(iter(self.movers.values()), None)\n",
         "tests/migration/test_words.py",
         "earlier_attempt",
+    ),
+    "what is put back begins a part of its own": Check(
+        "ftm/replica/protected_actor.py",
+        "        if life is self.life and life.feed is not None and not self.state.is_quiet:\n",
+        "        if False:\n",
+        PUT_BACK,
+        "as_without_a_mechanism and pbr-without",
+    ),
+    "what is put back comes before all else": Check(
+        "ftm/bricks/bricks.py",
+        "            server.returned_first(pending)\n            is_last",
+        "            is_last",
+        PUT_BACK,
+        "as_without_a_mechanism and pbr-without",
+    ),
+    "what is put back is part of the state until its turn begins": Check(
+        "checkpoint/life/recorded_life.py",
+        "self.returned.get(feed.id)",
+        "self.returned.pop(feed.id, None)",
+        PUT_BACK,
+        "as_without_a_mechanism and tr-without",
+    ),
+    "what was put back, and is in no batch, is handled": Check(
+        "ftm/bricks/bricks.py",
+        "                elif returned := self._returned():\n",
+        "                elif returned := []:\n",
+        PUT_BACK,
+        "an_alternate_has_put_back",
     ),
     "a message that kills is found out": Check(
         "ftm/group/delivery.py",
