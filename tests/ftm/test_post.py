@@ -112,7 +112,7 @@ async def test_a_vote_goes_on_when_an_order_to_compute_is_lost(
 async def test_a_large_letter_of_which_a_sheet_is_lost_is_sent_again(
     system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("holdfast.ftm.bricks.peer_channel.LETTER_BYTES", 10)
+    monkeypatch.setattr("holdfast.ftm.bricks.letters.LETTER_BYTES", 10)
     driver = await pair(system)
     struck = strike(monkeypatch, StateUpdate, Sheet, lambda handler, actor, item: None, each=3, most=3)
     for n in range(9):
