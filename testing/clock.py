@@ -18,7 +18,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any, TypeVar, TypeVarTuple
 
 from ..actors.errors import HoldfastError
-from .threads import Threads
+from .threads import NewThreads
 
 if TYPE_CHECKING:
     from .barrier import NotIdle
@@ -85,7 +85,7 @@ class _JumpingSelector(selectors.DefaultSelector):
         self.ticks, self.jumps = 0, 0
         self.most_ticks, self._most_jumps = ticks, jumps
         self._loop = loop
-        self._threads = Threads()
+        self._threads = NewThreads()
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         is_busy = timeout is not None and timeout <= 0

@@ -289,7 +289,7 @@ def go_on_with(cell: Cell, actor: Actor, prepared: Prepared) -> None:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Look(Order):
+class ObserveTurns(Order):
     """Count (`statistics`) and follow (`trace`) what the actor does, or do not any more; returns the counts."""
 
     verb: ClassVar[str] = "look"
@@ -303,7 +303,7 @@ class Look(Order):
         return {"counting": self.counting, "tracing": self.tracing}
 
     @classmethod
-    def unpack(cls, data: dict[str, Any]) -> Look:
+    def unpack(cls, data: dict[str, Any]) -> ObserveTurns:
         return cls(data["counting"], data["tracing"])
 
 
@@ -327,7 +327,7 @@ class Ready(Order):
 
 ORDERS: dict[str, type[Order]] = {
     kind.verb: kind
-    for kind in (Suspend, Resume, GetState, ReplaceState, ReplaceCode, Prepare, Conclude, Look, Mark, Ready)
+    for kind in (Suspend, Resume, GetState, ReplaceState, ReplaceCode, Prepare, Conclude, ObserveTurns, Mark, Ready)
 }
 
 

@@ -40,7 +40,7 @@ class Stays(HoldfastError, text="{why}"):
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Held:
+class PackedHandle:
     """Stands in a packed state for a handle: "timer", "reply", "ref" or "watch", and what it is known by."""
 
     kind: str
@@ -101,17 +101,17 @@ class StatePacker:
 
     def _stand_in(self, value: Any) -> Any:
         if isinstance(value, Timer):
-            return Held("timer", self._timers.index(value) if value in self._timers else -1)
+            return PackedHandle("timer", self._timers.index(value) if value in self._timers else -1)
         if type(value) is ReplyHandle:
             ask = value.ask
             if ask is None or ask.is_done:
-                return Held("reply", -1)
+                return PackedHandle("reply", -1)
             self._owed.add(id(ask))
-            return Held("reply", self._owe(ask))
+            return PackedHandle("reply", self._owe(ask))
         if isinstance(value, ActorRef):
-            return Held("ref", value.path)
+            return PackedHandle("ref", value.path)
         if isinstance(value, Monitor):
-            return Held("watch", [value.name, value.for_good])
+            return PackedHandle("watch", [value.name, value.for_good])
         return value
 
 
@@ -157,7 +157,7 @@ def unpack(
         timers.append(Timer.unpacked(cell, message, left, interval, queued))
 
     def found(value: Any) -> Any:
-        if not isinstance(value, Held):
+        if not isinstance(value, PackedHandle):
             return value
         match value.kind:
             case "timer":

@@ -31,7 +31,7 @@ from .wire.start_codec import pack_recipe
 from .worker_pool import Worker, Workers
 
 if TYPE_CHECKING:
-    from ..control.orders_lane import Call
+    from ..control.orders_lane import QueuedOrder
     from ..kernel.node import Node
 
 
@@ -485,7 +485,7 @@ class WorkerPlace(Place):
 
     # -- what else a place does -------------------------------------------------------------------------------------
 
-    def control(self, cell: Cell, call: Call) -> None:
+    def control(self, cell: Cell, call: QueuedOrder) -> None:
         from ..control.orders_lane import send_call
 
         worker = self.workers.of(cell)
@@ -526,7 +526,7 @@ def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
             worker.on_ask(worker.gate.target(frame.to), frame, None)
         case frames.Failure():
             worker.on_failure(frame)
-        case frames.Moved():
+        case frames.PageChanged():
             worker.on_moved()
         case frames.Offer():
             worker.on_offer([worker.gate.target(frame.to)], frame)
@@ -548,7 +548,7 @@ def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
             worker.on_migrate(frame)
         case frames.Forget():
             worker.on_forget(frame)
-        case frames.Launch() | frames.Run():
+        case frames.Launch() | frames.TellRun():
             raise AssertionError(f"{type(frame).__name__} has no way in")
 
 

@@ -11,7 +11,7 @@ from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message, Refusal, message_name
 from ...actors.kernel.ref import ActorRef
 from ...checkpoint.protocol import pieces
-from .brick_messages import NotFollowing, StaleEpoch
+from .brick_messages import NotFollowing, StaleLeader
 from .sealed_frames import Back, Call, LinkLost, Part, Refused, Sealed
 from .standing import PeerLost
 
@@ -149,7 +149,7 @@ class Letters(Actor):
         if back.kind == "reply":
             return back.body
         error = standing.node.codec.decode_error(back.kind, back.name, back.body)
-        if isinstance(error, StaleEpoch):
+        if isinstance(error, StaleLeader):
             standing.fence()
         raise error
 

@@ -18,7 +18,7 @@ from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.bindings import Binding
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message, Refusal, message_name
-from .brick_messages import ConfigMismatch, NotFollowing, StaleEpoch
+from .brick_messages import ConfigMismatch, NotFollowing, StaleLeader
 from .letters import FOREVER, SEALED, Letter, Letters, Sheet, tell_in_sheets
 from .sealed_frames import OpenNumbers, Part, Refused
 from .standing import PeerLost
@@ -209,7 +209,7 @@ class Posting(Letters):
                 reply = await self._reply_to(posted)
             except (PeerLost, ConfigMismatch):
                 raise
-            except StaleEpoch:
+            except StaleLeader:
                 standing.fence()
                 raise
             except HoldfastError:  # It has died, which we shall be told, or its brick was exchanged.
@@ -269,7 +269,7 @@ class Posting(Letters):
             return codec.decode_reply(type(message), back)  # type: ignore[no-any-return]
         try:
             reply = await self._reply_to(self._post(await self._find(path, slot, key), message, body))
-        except StaleEpoch:
+        except StaleLeader:
             standing.fence()
             raise
         except HoldfastError:

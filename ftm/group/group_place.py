@@ -51,7 +51,7 @@ from .steering import bind, give_order
 from .transient_homes import UNKEPT, TransientHome, is_unkept
 
 if TYPE_CHECKING:
-    from ...actors.control.orders_lane import Call
+    from ...actors.control.orders_lane import QueuedOrder
     from ...checkpoint.home.switch import Switch
     from ...checkpoint.protocol import Live, TurnEnd
     from ..model.mechanism import Mechanism
@@ -560,7 +560,7 @@ class GroupPlace(Place):
 
     # -- what else a host does --------------------------------------------------------------------------------------
 
-    def control(self, cell: Cell, call: Call) -> None:
+    def control(self, cell: Cell, call: QueuedOrder) -> None:
         give_order(self.group if cell.host.is_up(cell) else None, cell, call)
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:

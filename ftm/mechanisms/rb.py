@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 from ...actors.errors import HoldfastError, type_name
 from ...actors.kernel.actor import Actor
 from ..alarms import Objected
-from ..bricks.brick_messages import Request, State
+from ..bricks.brick_messages import Request, ServerState
 from ..bricks.runs import Deciding, Missing, Remembering, Run, Shadow
 from ..model.mechanism import Mechanism, MechanismRefused, Role
 from ..votes.assertions import Assertion, Inspector, names_of
@@ -53,7 +53,7 @@ class Alternating(Deciding):
         for _, shadow in self._alternates:
             await shadow.close()
 
-    async def choose(self, before: State, requests: list[Request], first: Run | None) -> Run | HoldfastError:
+    async def choose(self, before: ServerState, requests: list[Request], first: Run | None) -> Run | HoldfastError:
         """The first that is accepted."""
         standing = self._standing
         own = first or await self.run_here(before, requests)

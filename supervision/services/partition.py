@@ -12,7 +12,7 @@ from ...actors.errors import HoldfastError, SpecError
 from ...actors.exit_reasons import SHUTDOWN
 from ...actors.kernel.actor import Start, on
 from ...actors.kernel.envelope import ReplyHandle
-from ...actors.kernel.message import Message, Order
+from ...actors.kernel.message import Message, RuntimeOrder
 from ...actors.kernel.ref import ActorRef
 from ...actors.process.resource_limits import Limits
 from ...actors.values import state_digest
@@ -33,7 +33,7 @@ class CountPartitions(Message[int]):
     """How many partitions there are now."""
 
 
-class ResizePartitions(Order[int]):
+class ResizePartitions(RuntimeOrder[int]):
     """Have this many partitions, at most as many as at the start; the reply is how many there were."""
 
     count: int

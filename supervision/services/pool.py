@@ -18,7 +18,7 @@ from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Actor, Start, on, start
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.mailbox import Bounded
-from ...actors.kernel.message import Message, Order
+from ...actors.kernel.message import Message, RuntimeOrder
 from ...actors.kernel.node import Node
 from ...actors.kernel.ref import ActorRef
 from ...actors.persistence import child_key
@@ -52,7 +52,7 @@ class PoolInfo(Message[PoolStatus]):
     """Asks a pool how it is."""
 
 
-class ResizePool(Order[int]):
+class ResizePool(RuntimeOrder[int]):
     """Have this many workers; the reply is how many there were, and comes when it is done.
 
     New ones are started. Those that go get nothing new, handle what they have for up to `deadline` seconds, and are

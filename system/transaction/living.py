@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ...actors.control.orders import Change, Migrate, next_start
-from ...actors.control.orders import ReplaceCode as CodeOrder
-from ...actors.control.orders import ReplaceState as StateOrder
+from ...actors.control.orders import Change, Migrate, ReplaceCode, ReplaceState, next_start
 from ...actors.errors import SpecError, type_name
 from ...actors.kernel.actor import Actor, Start
-from .draft import Draft, Place, Target, is_elsewhere
+from .draft import Draft, DraftPlace, Target, is_elsewhere
 from .operation import Operation, wrong
 from .rework import Rework
 from .structure import text_of
@@ -28,7 +26,7 @@ class OnLiving(Operation):
     def __init__(self, target: Target) -> None:
         super().__init__(text_of(target))
         self._at = target
-        self._place: Place | None = None
+        self._place: DraftPlace | None = None
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = self._place = draft.find(self._at, parts=self.on_parts)
@@ -73,7 +71,7 @@ class OnRework(OnLiving):
             await self._rework.release(system)
 
 
-class Suspend(OnRework):
+class SuspendActor(OnRework):
     """Have an actor handle no message until it is resumed."""
 
     verb: ClassVar[str] = "suspend"
@@ -86,7 +84,7 @@ class Suspend(OnRework):
         self._place.is_suspended = self._place.rework.suspended = True
 
 
-class Resume(OnRework):
+class ResumeActor(OnRework):
     """Have it handle messages again."""
 
     verb: ClassVar[str] = "resume"
@@ -99,7 +97,7 @@ class Resume(OnRework):
         self._place.is_suspended = self._place.rework.suspended = False
 
 
-class ReplaceState(OnRework):
+class ReplaceActorState(OnRework):
     """Put another state in the place of an actor's."""
 
     verb: ClassVar[str] = "replace state of"
@@ -111,10 +109,10 @@ class ReplaceState(OnRework):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         assert self._place is not None
-        self._place.rework_of().add(StateOrder(self._change))
+        self._place.rework_of().add(ReplaceState(self._change))
 
 
-class ReplaceCode(OnRework):
+class ReplaceActorCode(OnRework):
     """Have an actor go on as another class, now and after restarts."""
 
     verb: ClassVar[str] = "replace code of"
@@ -139,11 +137,11 @@ class ReplaceCode(OnRework):
         cell, keeps = place.cell, not isinstance(new, Start)
         if cell is not None and not is_elsewhere(cell):
             next_start(cell, start, keeps_arguments=keeps)
-        place.rework_of().add(CodeOrder(start, keeps, self._migrate))
+        place.rework_of().add(ReplaceCode(start, keeps, self._migrate))
         place.kind = start.kind
 
 
-def check_unprotected(place: Place) -> None:
+def check_unprotected(place: DraftPlace) -> None:
     """Refuse what would change one replica of a protected actor, and not the others. Raises SpecError."""
     if place.spec is not None and place.spec.mechanism is not None:
         raise wrong(place.path, "it is protected by a mechanism: detach that, and attach it again after")

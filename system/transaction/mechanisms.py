@@ -9,7 +9,7 @@ from ...actors.errors import SpecError
 from ...supervision.arbiter import Hand, arbiter_of
 from ...supervision.respec import recipe_spec
 from ...supervision.spec import Isolation
-from .draft import Draft, Place, Target, is_elsewhere, rules
+from .draft import Draft, DraftPlace, Target, is_elsewhere, rules
 from .living import OnLiving
 from .operation import wrong
 from .relocation import Relocation, described
@@ -285,7 +285,7 @@ class Update(Adapt):
         return layers
 
 
-def check_layers(place: Place, mechanism: Any) -> None:
+def check_layers(place: DraftPlace, mechanism: Any) -> None:
     """Whether these go together, and with the actor. Raises MechanismRefused."""
     layers = mechanism if isinstance(mechanism, tuple) else (mechanism,)
     rules().check_stack(layers, place.kind, place.path)

@@ -9,7 +9,7 @@ from ...actors.errors import SpecError
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
-    from .draft import Draft, Place
+    from .draft import Draft, DraftPlace
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Operation:
         self.target = target
         self.waiting = ""
         """What the transaction waits for because of this step, told when the time is up."""
-        self.between_turns_of: tuple[Place, ...] = ()
+        self.between_turns_of: tuple[DraftPlace, ...] = ()
         """Whose turns have to be over for this; known after the check."""
 
     @property

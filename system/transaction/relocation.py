@@ -22,7 +22,7 @@ from .draft import rules
 if TYPE_CHECKING:
     from ...ftm.group.probation import Probation
     from ..system import ActorSystem
-    from .draft import Place
+    from .draft import DraftPlace
 
 MOVED_WITHIN = 60.0
 """Seconds that a life may take to move; the transaction's own time limit is shorter."""
@@ -31,7 +31,7 @@ MOVED_WITHIN = 60.0
 class Gated:
     """A change of one live actor that waits, when all is ready, for the commit; until then it can be given up."""
 
-    def __init__(self, place: Place, text: str) -> None:
+    def __init__(self, place: DraftPlace, text: str) -> None:
         self._place, self._text = place, text
         self.task: asyncio.Task[None] | None = None
         self._gate: Gate | None = None
@@ -88,7 +88,7 @@ class Gated:
 class Relocation:
     """One actor that is to live elsewhere, or behind other mechanisms: the way from its spec to that of the draft."""
 
-    def __init__(self, place: Place, text: str) -> None:
+    def __init__(self, place: DraftPlace, text: str) -> None:
         self._place, self._text = place, text
         assert place.spec is not None
         self.before: ChildSpec = place.spec
@@ -122,7 +122,7 @@ class Relocation:
     @property
     def _comes_last(self) -> bool:
         """Its state, its code or its address is changed too: it is where it is until that is done."""
-        at: Place | None = self._place
+        at: DraftPlace | None = self._place
         while at is not None and not at.is_moved:
             at = at.parent
         return self._place.rework is not None or at is not None

@@ -15,7 +15,7 @@ from ...checkpoint.protocol import SnapshotNow
 from ...supervision.admin import NotSupported
 from ...supervision.children import STOPPED, UP
 from .arrangement import busy, child_of
-from .draft import Draft, Place, Target, is_elsewhere
+from .draft import Draft, DraftPlace, Target, is_elsewhere
 from .operation import Operation, wrong
 from .relocation import MOVED_WITHIN, Gated
 from .structure import check_child, text_of
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ..system import ActorSystem
 
 
-class Move(Operation):
+class Reparent(Operation):
     """Put a child under another supervisor of this process."""
 
     verb: ClassVar[str] = "move"
@@ -32,12 +32,12 @@ class Move(Operation):
     def __init__(self, target: Target, supervisor: Target) -> None:
         super().__init__(text_of(target))
         self._at, self._to = target, supervisor
-        self._place: Place | None = None
-        self._above: Place | None = None  # the new supervisor, at this point
-        self._root: Place | None = None
+        self._place: DraftPlace | None = None
+        self._above: DraftPlace | None = None  # the new supervisor, at this point
+        self._root: DraftPlace | None = None
         self._leads = False  # it is the first step that moves this actor: it brings it to where the last one wants it
         self._asked: dict[Switch, int] = {}  # who was asked for a snapshot, behind which turn
-        self._rests: dict[Place, Gated] = {}
+        self._rests: dict[DraftPlace, Gated] = {}
 
     @property
     def text(self) -> str:
@@ -86,7 +86,7 @@ class Move(Operation):
             else:
                 await rest.reach(system, functools.partial(system._moves.pause, one.living(system.node), MOVED_WITHIN))
 
-    def _resting(self, system: ActorSystem) -> list[tuple[Place, Gated]]:
+    def _resting(self, system: ActorSystem) -> list[tuple[DraftPlace, Gated]]:
         """Those that replay turns, of the actor and all below it, and how each comes to rest."""
         assert self._place is not None
         for one in self._place.walk():
@@ -145,7 +145,7 @@ class Move(Operation):
             await rest.give_up(system)
 
 
-def check_movable(place: Place) -> None:
+def check_movable(place: DraftPlace) -> None:
     """Whether an actor can have another address.
 
     Raises:

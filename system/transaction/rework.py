@@ -27,7 +27,7 @@ from .operation import wrong
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
-    from .draft import Place
+    from .draft import DraftPlace
 
 SNAPSHOT: msgspec.msgpack.Decoder[Snapshot] = msgspec.msgpack.Decoder(Snapshot)
 PREPARED_WITHIN = 3600.0
@@ -41,7 +41,7 @@ CONCLUDED_WITHIN = 60.0
 class Rework:
     """One actor that is held, all that is wanted of it, and what it has prepared."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: DraftPlace) -> None:
         self._place = place
         self._wanted: list[ReplaceState | ReplaceCode] = []
         self.suspended: bool | None = None

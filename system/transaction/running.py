@@ -11,7 +11,7 @@ from ...actors.kernel.ref import ActorRef
 from ...supervision.admin import ChildBusy, NoSuchChild, NotSupported, RestartChild, TerminateChild
 from ...supervision.supervisor import Supervisor
 from .arrangement import child_of
-from .draft import START_TIMEOUT, Draft, Place, Target, check_awake, is_elsewhere
+from .draft import START_TIMEOUT, Draft, DraftPlace, Target, check_awake, is_elsewhere
 from .operation import Operation, wrong
 from .structure import text_of
 
@@ -24,10 +24,10 @@ class OnChild(Operation):
 
     def __init__(self, target: str) -> None:
         super().__init__(target)
-        self._place: Place | None = None
+        self._place: DraftPlace | None = None
         self._name = ""
 
-    def _take(self, draft: Draft, place: Place, *, starts: bool) -> None:
+    def _take(self, draft: Draft, place: DraftPlace, *, starts: bool) -> None:
         above = place.parent
         assert above is not None
         self._place, self._name = place, place.name

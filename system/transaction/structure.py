@@ -25,7 +25,7 @@ from ...supervision.spec import NAMELESS, ChildSpec, Flags, Plan, check_spec, ch
 from ...supervision.supervisor import Supervisor
 from ...supervision.supervisor_changes import check_subtree
 from .arrangement import planned_spec
-from .draft import START_TIMEOUT, Draft, Place, Target, check_awake, is_elsewhere
+from .draft import START_TIMEOUT, Draft, DraftPlace, Target, check_awake, is_elsewhere
 from .lasting import recipe_specs
 from .operation import Operation, wrong
 
@@ -48,7 +48,7 @@ class Newcomer:
     If that supervisor is added too it begins with it; where somebody lives until the commit it is started behind it.
     """
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: DraftPlace) -> None:
         self.place = place
         place.candidate = next(CANDIDATES)
         self._asked: Cell | None = None  # the supervisor that was asked
@@ -56,7 +56,7 @@ class Newcomer:
         self._is_over = False  # it has been up, and has ended by itself as it may
 
     @property
-    def _above(self) -> Place | None:
+    def _above(self) -> DraftPlace | None:
         """Its supervisor; None if that one is not asked to start it before the commit."""
         place, above = self.place, self.place.parent
         assert above is not None
@@ -130,7 +130,7 @@ class Newcomer:
             pass  # The same.
 
 
-class Add(Operation):
+class AddChild(Operation):
     """Start one more child of a supervisor, and those that come with it."""
 
     verb: ClassVar[str] = "add"
@@ -168,7 +168,7 @@ class Add(Operation):
             await one.release()
 
 
-def check_child(above: Place, spec: ChildSpec) -> None:
+def check_child(above: DraftPlace, spec: ChildSpec) -> None:
     """Whether a supervisor in the draft can take this child.
 
     Raises:
@@ -187,9 +187,9 @@ def check_child(above: Place, spec: ChildSpec) -> None:
         raise MaxChildren(most)
 
 
-def _planned(draft: Draft, above: Place, spec: ChildSpec) -> Place:
+def _planned(draft: Draft, above: DraftPlace, spec: ChildSpec) -> DraftPlace:
     """The place of a child to be, and of those that come with it."""
-    place = above.children[spec.id] = Place(spec.id, above, None, spec)
+    place = above.children[spec.id] = DraftPlace(spec.id, above, None, spec)
     place.is_planned, place.is_stopped = True, False
     for port, path in spec.bindings.items():
         place.bindings[port] = draft.find(path)
@@ -201,7 +201,7 @@ def _planned(draft: Draft, above: Place, spec: ChildSpec) -> Place:
     return place
 
 
-def _fill(place: Place, cell: Cell) -> None:
+def _fill(place: DraftPlace, cell: Cell) -> None:
     """The place is lived in now: later steps find who does."""
     place.cell = cell
     for name, below in (cell.children or {}).items():
@@ -209,7 +209,7 @@ def _fill(place: Place, cell: Cell) -> None:
             _fill(place.children[name], below)
 
 
-def _grant(place: Place) -> None:
+def _grant(place: DraftPlace) -> None:
     """Who is started in another process is bound, there, to what its spec names: it is the root that says so."""
     for one in place.walk():
         if one.cell is not None and one.spec is not None:
@@ -217,7 +217,7 @@ def _grant(place: Place) -> None:
                 one.cell.node.bind(one.cell, port, one.cell.node.cell_at(path))
 
 
-class Remove(Operation):
+class RemoveActor(Operation):
     """Stop an actor for good, when all else is in force."""
 
     verb: ClassVar[str] = "remove"
@@ -225,7 +225,7 @@ class Remove(Operation):
     def __init__(self, target: Target) -> None:
         super().__init__(text_of(target))
         self._at = target
-        self._place: Place | None = None
+        self._place: DraftPlace | None = None
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = self._place = draft.find(self._at)
@@ -263,7 +263,7 @@ class OnSupervisor(Operation):
     def __init__(self, supervisor: Target) -> None:
         super().__init__(text_of(supervisor))
         self._at = supervisor
-        self._place: Place | None = None
+        self._place: DraftPlace | None = None
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = self._place = await draft.supervisor(self._at)
