@@ -21,6 +21,7 @@ from ..kernel.links import Down, Exit, Monitor
 from ..kernel.message import message_name
 from ..kernel.ref import ActorRef
 from ..kernel.timers import Timer
+from ..state_hooks import state_getter
 from ..values import UnsavableValue, decode_value, encode_value
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ class StatePacker:
 
     def _named(self, where: str, state: Any) -> Any:
         lifted = lift(state, self._stand_in)
-        if hasattr(self._actor, "get_state"):
+        if state_getter(self._actor) is not None:
             encode_value(lifted, where=f"{where}.get_state()")
         else:
             for name, value in lifted.items():

@@ -36,7 +36,7 @@ from ..bricks.brick_messages import Lead
 from ..bricks.replica_orders import Finish, Install, Setting
 from ..events import ReplicaLost
 from ..model.detection import Detection
-from ..model.mechanism import NOTHING, compose, detection_in, has_state_access
+from ..model.mechanism import NOTHING, compose, detection_in
 from .adaptation_engine import AdaptationEngine
 from .detector import Detector
 from .failover import FailoverManager
@@ -123,7 +123,7 @@ class GroupPlace(Place):
             home.subscribe(cell, self.parent.topics(cell))
             await self.lead(group, switch)
             start = cell.extra().start
-            if start is not None and not has_state_access(start.kind) and not switch.turns:
+            if start is not None and not start.kind.state_access and not switch.turns:
                 group.joins_early = True  # Nobody can be brought to what it has when it has handled something.
                 await self.protected(group)
             await home.replay(cell, group, entered)

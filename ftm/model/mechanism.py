@@ -121,7 +121,7 @@ class Mechanism(MechanismDeclaration, Described):
             MechanismRefused: naming what is missing.
         """
         who, name = where or type_name(kind), self.name or type_name(type(self))
-        if "state_access" in self.needs and not has_state_access(kind):
+        if "state_access" in self.needs and not kind.state_access:
             why = "saves and restores the state, and the class says state_access = False"
             raise MechanismRefused(name, f"{who}: it {why}")
         if "determinism" in self.needs and not kind.deterministic:
@@ -208,11 +208,6 @@ def find_class(code: Code) -> Any:
 def _plain(value: Any) -> Any:
     """A setting as it travels; a mechanism that has structs among its settings takes them back as dicts."""
     return msgspec.to_builtins(value) if isinstance(value, msgspec.Struct | Detection) else value
-
-
-def has_state_access(kind: type[Actor]) -> bool:
-    """Whether an actor's state can be saved, as far as its class says."""
-    return kind.state_access
 
 
 def detection_in(layers: Iterable[Mechanism]) -> Detection | None:

@@ -49,7 +49,6 @@ from ...checkpoint.snapshot.key_variables import variables
 from ..alarms import ProtectionCostly, ProtectionLost
 from ..bricks.brick_messages import Beside, Request, ServerState, WorkLost
 from ..bricks.state_images import Images
-from ..model.mechanism import has_state_access
 from .actor_state import digest_of_life, names_of_state, point_of, rewind_to, snapshot_of, take_up
 from .replica_life import (
     ABANDONED,
@@ -155,7 +154,7 @@ class Server(lifecycle.HerePlace):
         kind: Any = start.kind
         cell.table = table = kind._table
         state = self.state
-        state.has_access = has_state_access(kind)
+        state.has_access = kind.state_access
         state.has_deltas = state.has_access and gives_deltas(kind)
         state.waiting = frozenset(
             message_name(one) for one in kind._declared if inspect.iscoroutinefunction(table[one])

@@ -246,7 +246,9 @@ def _seen(done: asyncio.Future[Any]) -> None:
 
 def mechanism_of(cell: Cell) -> Any:
     """The mechanism that a live child has; None if it has none."""
-    return getattr(cell.spec, "mechanism", None)  # One that lives elsewhere has no spec here.
+    return (
+        cell.spec.mechanism if isinstance(cell.spec, ChildSpec) else None
+    )  # One that lives elsewhere has no spec here.
 
 
 def described(mechanism: Any) -> Any:
