@@ -16,13 +16,12 @@ import msgspec
 from ..actors.control.orders import pack_function, unpack_function
 from ..actors.errors import HoldfastError, RemoteCrash, SpecError, error_text, rebuild_error, type_name
 from ..actors.kernel.actor import Actor, Start
+from ..actors.kernel.codec import MAX_BYTES
 from ..actors.process.wire.frame_buffer import LENGTH
 from ..actors.process.wire.start_codec import pack_data, pack_recipe, unpack_data, unpack_recipe
 from ..actors.values import decode_value, encode_value
 from ..supervision.spec import ChildSpec
 
-LARGEST = 16 * 1024 * 1024
-"""Bytes of one frame."""
 CREDENTIALS = struct.Struct("3i")
 
 
@@ -217,8 +216,8 @@ def frame(value: ControlRequest | ControlResponse) -> bytes:
 def body_size(head: bytes) -> int:
     """The bytes that follow the head of a frame. Raises BadRequest: too many."""
     (size,) = LENGTH.unpack(head)
-    if size > LARGEST:
-        raise BadRequest(f"it has {size} bytes, and {LARGEST} are allowed")
+    if size > MAX_BYTES:
+        raise BadRequest(f"it has {size} bytes, and {MAX_BYTES} are allowed")
     return int(size)
 
 

@@ -15,13 +15,13 @@ import msgspec
 import pytest
 
 import holdfast as hf
+from holdfast.actors.kernel.codec import MAX_BYTES
 from holdfast.actors.process.wire.frame_buffer import LENGTH
 from holdfast.actors.values import encode_value
 from holdfast.console import endpoint as endpoint_module
 from holdfast.console.endpoint import Endpoint, EndpointInUse, claimed, control_endpoint
 from holdfast.console.remote import Client, NotReached, RemoteRef, RemoteSystem
 from holdfast.console.wire import (
-    LARGEST,
     RESPONSE,
     BadRequest,
     ControlActor,
@@ -176,7 +176,7 @@ BAD = {
     "no MessagePack": LENGTH.pack(3) + b"\xc1\xc1\xc1",
     "no request": LENGTH.pack(1) + b"\x01",
     "unknown request": LENGTH.pack(20) + msgspec.msgpack.encode({"ask": "shutdown all"})[:20].ljust(20, b"\0"),
-    "too large": LENGTH.pack(LARGEST + 1),
+    "too large": LENGTH.pack(MAX_BYTES + 1),
     "unknown field": (lambda body: LENGTH.pack(len(body)) + body)(msgspec.msgpack.encode({"ask": "tree", "all": True})),
     "no UTF-8": (lambda body: LENGTH.pack(len(body)) + body)(b"\x82\xa3ask\xa7whereis\xa4name\xa2\xff\xfe"),
     "nesting without end": (lambda body: LENGTH.pack(len(body)) + body)(b"\x81\xa3ask" * 300_000),
@@ -484,6 +484,6 @@ async def test_an_answer_beyond_the_limit_is_not_read(tmp_path: Path) -> None:
         listening.bind(str(path))
         listening.listen(1)
         with contextlib.closing(Client(path)) as client, listening.accept()[0] as other:
-            other.sendall(LENGTH.pack(LARGEST + 1))
-            with pytest.raises(BadRequest, match=f"it has {LARGEST + 1} bytes"):
+            other.sendall(LENGTH.pack(MAX_BYTES + 1))
+            with pytest.raises(BadRequest, match=f"it has {MAX_BYTES + 1} bytes"):
                 client.call(Tree(), 5.0)
