@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from ...actors.errors import SpecError
 from ...supervision.arbiter import Hand, arbiter_of
-from ...supervision.respec import recipe_spec
+from ...supervision.respec import NO_RECIPE, recipe_spec
 from ...supervision.spec import Isolation
 from .draft import Draft, DraftPlace, Target, is_elsewhere, rules
 from .living import OnLiving
@@ -34,10 +34,7 @@ class OnPlace(OnLiving):
         if place.spec is None and above is not None and above.cell is not None and is_elsewhere(above.cell):
             place.spec = recipe_spec(place.cell) if place.cell is not None else None
             if place.spec is None:
-                why = (
-                    "its supervisor lives in another process, and no recipe here has its spec: add it by a transaction"
-                )
-                raise wrong(self.target, why)
+                raise wrong(self.target, NO_RECIPE)
         if place.spec is None:
             raise wrong(self.target, self.unsupervised)
         if place.relocation is None:
@@ -130,7 +127,7 @@ class Protect(OnProtection):
             self._after = layers[0] if len(layers) == 1 else layers
             check_layers(place, self._after)
             begins = place.is_planned or place.spec.mechanism is not None
-            if not begins and not getattr(place.kind, "state_access", True):
+            if not begins and place.kind is not None and not place.kind.state_access:
                 why = "its class says state_access = False, so its state cannot go along"
                 raise wrong(self.target, f"{why}: name the mechanism in its spec, and it begins with it")
         place.spec = dataclasses.replace(place.spec, mechanism=self._after)
