@@ -8,7 +8,7 @@ from ...actors.control.orders import Change, Migrate, ReplaceCode, ReplaceState,
 from ...actors.errors import SpecError, type_name
 from ...actors.kernel.actor import Actor, Start
 from .draft import Draft, DraftPlace, Target, is_elsewhere
-from .operation import Operation, wrong
+from .operation import Operation, StagedWork, wrong
 from .rework import Rework
 from .structure import text_of
 
@@ -26,49 +26,50 @@ class OnLiving(Operation):
     def __init__(self, target: Target) -> None:
         super().__init__(text_of(target))
         self._at = target
-        self._place: DraftPlace | None = None
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
-        place = self._place = draft.find(self._at, parts=self.on_parts)
+        place = self._found = draft.find(self._at, parts=self.on_parts)
         self.target, self.between_turns_of = place.path, (place,)
         place.check_lived_in(system.node)
 
     def cell(self, system: ActorSystem) -> Cell:
         """Who lives there now. Raises NoSuchActor."""
-        assert self._place is not None
         return self._place.living(system.node)
 
 
-class OnRework(OnLiving):
-    """Base of operations that hold an actor until the transaction is over; the first one does it for the others too."""
+class OnSharedWork(OnLiving):
+    """Base of operations on one actor that are carried out together: the first one has the work for the others too."""
 
-    _rework: Rework | None = None  # that of the first such step, which carries it out
+    _work: StagedWork | None = None
+
+    async def prepare(self, system: ActorSystem) -> None:
+        if self._work is not None:
+            await self._work.prepare(system)
+
+    def ready(self, system: ActorSystem) -> str:
+        return "" if self._work is None else self._work.ready(system)
+
+    def commit(self, system: ActorSystem) -> None:
+        if self._work is not None:
+            self._work.commit(system)
+
+    async def finish(self, system: ActorSystem) -> None:
+        if self._work is not None:
+            await self._work.finish(system)
+
+    async def release(self, system: ActorSystem) -> None:
+        if self._work is not None:
+            await self._work.release(system)
+
+
+class OnRework(OnSharedWork):
+    """Base of operations that hold an actor until the transaction is over."""
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
-        assert place is not None
         if place.rework is None:
-            place.rework = self._rework = Rework(place)
-
-    async def prepare(self, system: ActorSystem) -> None:
-        if self._rework is not None:
-            await self._rework.prepare(system)
-
-    def ready(self, system: ActorSystem) -> str:
-        return "" if self._rework is None else self._rework.ready(system)
-
-    def commit(self, system: ActorSystem) -> None:
-        if self._rework is not None:
-            self._rework.commit(system)
-
-    async def finish(self, system: ActorSystem) -> None:
-        if self._rework is not None:
-            await self._rework.finish(system)
-
-    async def release(self, system: ActorSystem) -> None:
-        if self._rework is not None:
-            await self._rework.release(system)
+            place.rework = self._work = Rework(place)
 
 
 class SuspendActor(OnRework):
@@ -79,7 +80,6 @@ class SuspendActor(OnRework):
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
-        assert self._place is not None
         assert self._place.rework is not None
         self._place.is_suspended = self._place.rework.suspended = True
 
@@ -92,7 +92,6 @@ class ResumeActor(OnRework):
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
-        assert self._place is not None
         assert self._place.rework is not None
         self._place.is_suspended = self._place.rework.suspended = False
 
@@ -108,7 +107,6 @@ class ReplaceActorState(OnRework):
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
-        assert self._place is not None
         self._place.rework_of().add(ReplaceState(self._change))
 
 
@@ -133,7 +131,6 @@ class ReplaceActorCode(OnRework):
         if start is None:
             raise SpecError(self.target, f"replace_code takes an Actor class or start(Class, ...), not {new!r}")
         place = self._place
-        assert place is not None
         cell, keeps = place.cell, not isinstance(new, Start)
         if cell is not None and not is_elsewhere(cell):
             next_start(cell, start, keeps_arguments=keeps)

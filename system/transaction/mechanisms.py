@@ -10,7 +10,7 @@ from ...supervision.arbiter import Hand, arbiter_of
 from ...supervision.respec import NO_RECIPE, recipe_spec
 from ...supervision.spec import Isolation
 from .draft import Draft, DraftPlace, Target, is_elsewhere, rules
-from .living import OnLiving
+from .living import OnSharedWork
 from .operation import wrong
 from .relocation import Relocation, described
 
@@ -19,17 +19,14 @@ if TYPE_CHECKING:
     from ..system import ActorSystem
 
 
-class OnPlace(OnLiving):
-    """Base of operations on where an actor lives, and behind which mechanisms; the first one does it for the others."""
+class OnPlace(OnSharedWork):
+    """Base of operations on where an actor lives, and behind which mechanisms."""
 
-    def __init__(self, target: Target) -> None:
-        super().__init__(target)
-        self._relocation: Relocation | None = None  # that of the first such step, which carries it out
+    unsupervised: ClassVar[str] = "nobody supervises it, so nobody would start it again"
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
-        assert place is not None
         above = place.parent
         if place.spec is None and above is not None and above.cell is not None and is_elsewhere(above.cell):
             place.spec = recipe_spec(place.cell) if place.cell is not None else None
@@ -38,28 +35,7 @@ class OnPlace(OnLiving):
         if place.spec is None:
             raise wrong(self.target, self.unsupervised)
         if place.relocation is None:
-            place.relocation = self._relocation = Relocation(place, self.text)
-
-    unsupervised: ClassVar[str] = "nobody supervises it, so nobody would start it again"
-
-    async def prepare(self, system: ActorSystem) -> None:
-        if self._relocation is not None:
-            await self._relocation.prepare(system)
-
-    def ready(self, system: ActorSystem) -> str:
-        return "" if self._relocation is None else self._relocation.ready(system)
-
-    def commit(self, system: ActorSystem) -> None:
-        if self._relocation is not None:
-            self._relocation.commit(system)
-
-    async def finish(self, system: ActorSystem) -> None:
-        if self._relocation is not None:
-            await self._relocation.finish(system)
-
-    async def release(self, system: ActorSystem) -> None:
-        if self._relocation is not None:
-            await self._relocation.release(system)
+            place.relocation = self._work = Relocation(place, self.text)
 
 
 class Isolate(OnPlace):
@@ -79,7 +55,6 @@ class Isolate(OnPlace):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
-        assert place is not None
         assert place.spec is not None
         if self._to not in ("task", "process"):
             raise SpecError(self.target, f"isolation must be one of task, process, not {self._to!r}")
@@ -97,7 +72,7 @@ class OnProtection(OnPlace):
     @property
     def probation(self) -> Probation | None:
         """Whether it stays is known when this is over; None: at once."""
-        return self._relocation.probation if self._relocation is not None else None
+        return self._work.probation if isinstance(self._work, Relocation) else None
 
 
 class Protect(OnProtection):
@@ -119,7 +94,6 @@ class Protect(OnProtection):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
-        assert place is not None
         assert place.spec is not None
         self.refuse(place.spec.mechanism)
         if self._mechanism is not None:
@@ -162,7 +136,6 @@ class Detach(OnProtection):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
-        assert place is not None
         assert place.spec is not None
         if place.spec.mechanism is None:
             raise wrong(self.target, "it has no mechanism")
@@ -188,7 +161,6 @@ class Adapt(OnProtection):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
-        assert place is not None
         assert place.spec is not None
         self._was = place.spec.mechanism
         if self._was is None:

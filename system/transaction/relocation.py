@@ -18,6 +18,7 @@ from ...supervision.respec import recipe_spec, replace_mechanism, replace_place
 from ...supervision.spec import ChildSpec
 from ..live_moves import to_its_end
 from .draft import rules
+from .operation import StagedWork
 
 if TYPE_CHECKING:
     from ...ftm.group.probation import Probation
@@ -85,7 +86,7 @@ class Gated:
         self.task = self._gate = None
 
 
-class Relocation:
+class Relocation(StagedWork):
     """One actor that is to live elsewhere, or behind other mechanisms: the way from its spec to that of the draft."""
 
     def __init__(self, place: DraftPlace, text: str) -> None:

@@ -32,7 +32,6 @@ class Reparent(Operation):
     def __init__(self, target: Target, supervisor: Target) -> None:
         super().__init__(text_of(target))
         self._at, self._to = target, supervisor
-        self._place: DraftPlace | None = None
         self._above: DraftPlace | None = None  # the new supervisor, at this point
         self._root: DraftPlace | None = None
         self._leads = False  # it is the first step that moves this actor: it brings it to where the last one wants it
@@ -68,7 +67,7 @@ class Reparent(Operation):
         check_child(new, place.spec)
         del old.children[place.name]
         new.children[place.name], place.parent = place, new
-        self._place, self._above, self._root = place, new, draft.root
+        self._found, self._above, self._root = place, new, draft.root
         self._leads = not (place.is_moved or place.is_planned)  # Who is added is started where it is to be.
         place.is_moved = True
         self.between_turns_of = (old, new)
@@ -77,7 +76,7 @@ class Reparent(Operation):
 
     async def prepare(self, system: ActorSystem) -> None:
         """Have recorded actors rest, with a snapshot: no turn of theirs is to be repeated under another address."""
-        if self._place is None or not (self._leads and self._place.has_moved):
+        if self._found is None or not (self._leads and self._place.has_moved):
             return
         waits = bool(self._others_settle(system))
         for one, rest in self._resting(system):
@@ -88,7 +87,6 @@ class Reparent(Operation):
 
     def _resting(self, system: ActorSystem) -> list[tuple[DraftPlace, Gated]]:
         """Those that replay turns, of the actor and all below it, and how each comes to rest."""
-        assert self._place is not None
         for one in self._place.walk():
             cell = one.now(system.node) if not (one.is_planned or one.rework is not None) else None
             switch = switch_of(cell) if cell is not None else None  # Who is reworked rests for that, and is saved.
@@ -108,7 +106,6 @@ class Reparent(Operation):
 
     def ready(self, system: ActorSystem) -> str:
         place = self._place
-        assert place is not None
         if not (self._leads and place.has_moved):
             return ""
         assert place.was.below is not None

@@ -23,7 +23,7 @@ from ...checkpoint.home.recorded_home import switch_of
 from ...checkpoint.protocol import Snapshot
 from ...supervision.respec import respec
 from .arrangement import busy
-from .operation import wrong
+from .operation import StagedWork, wrong
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
@@ -38,7 +38,7 @@ CONCLUDED_WITHIN = 60.0
 """Seconds that an actor in another process may take to hear that the transaction is over."""
 
 
-class Rework:
+class Rework(StagedWork):
     """One actor that is held, all that is wanted of it, and what it has prepared."""
 
     def __init__(self, place: DraftPlace) -> None:

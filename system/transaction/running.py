@@ -24,13 +24,12 @@ class OnChild(Operation):
 
     def __init__(self, target: str) -> None:
         super().__init__(target)
-        self._place: DraftPlace | None = None
         self._name = ""
 
     def _take(self, draft: Draft, place: DraftPlace, *, starts: bool) -> None:
         above = place.parent
         assert above is not None
-        self._place, self._name = place, place.name
+        self._found, self._name = place, place.name
         self.target, self.between_turns_of = place.path, (above,)
         if above.is_dynamic or above.is_partitioned:
             raise NotSupported("a child without a place of its own cannot be stopped for a while: remove it")
@@ -72,7 +71,6 @@ class StopChild(OnChild):
 
     def ready(self, system: ActorSystem) -> str:
         place = self._place
-        assert place is not None
         assert place.was.below is not None
         if child_of(place.was.below.living(system.node), self._name) is None:
             raise NoSuchActor(self.target)
@@ -80,7 +78,6 @@ class StopChild(OnChild):
 
     async def finish(self, system: ActorSystem) -> None:
         place = self._place
-        assert place is not None
         assert place.parent is not None
         await stop_child(place.parent.living(system.node), self._name)
 
@@ -119,7 +116,6 @@ class StartAgain(OnChild):
 
     def _supervisor(self, system: ActorSystem) -> Cell:
         """Who has it until the transaction is in force: there it is started, and goes from there if it is moved."""
-        assert self._place is not None
         assert self._place.was.below is not None
         return self._place.was.below.living(system.node)
 
@@ -136,7 +132,6 @@ class StartAgain(OnChild):
             if not is_asked_again:
                 raise
             return  # A life of its supervisor has ended before it answered; the next one has heard it too.
-        assert self._place is not None
         if ref is None:
             self._is_over = True
         else:

@@ -225,10 +225,9 @@ class RemoveActor(Operation):
     def __init__(self, target: Target) -> None:
         super().__init__(text_of(target))
         self._at = target
-        self._place: DraftPlace | None = None
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
-        place = self._place = draft.find(self._at)
+        place = self._found = draft.find(self._at)
         above = place.parent
         if above is None:
             raise wrong(place.path, "the root is not removed: leave the system")
@@ -243,7 +242,6 @@ class RemoveActor(Operation):
 
     async def finish(self, system: ActorSystem) -> None:
         place = self._place
-        assert place is not None
         cell, above = place.now(system.node), place.parent
         if cell is not None:
             await system.stop(cell.ref)
@@ -263,10 +261,9 @@ class OnSupervisor(Operation):
     def __init__(self, supervisor: Target) -> None:
         super().__init__(text_of(supervisor))
         self._at = supervisor
-        self._place: DraftPlace | None = None
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
-        place = self._place = await draft.supervisor(self._at)
+        place = self._found = await draft.supervisor(self._at)
         self.target, self.between_turns_of = place.path, (place,)
         draft.arrangement.touch(place, self, is_told=True)
 
@@ -287,7 +284,6 @@ class Reorder(OnSupervisor):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
-        assert place is not None
         if place.is_dynamic or place.is_partitioned:
             raise NotSupported("its children have no order of their own")
         missing = [name for name in self._ids if name not in place.children]
@@ -317,7 +313,6 @@ class SetFlags(OnSupervisor):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
-        assert place is not None
         if place.flags is None:
             raise NotSupported(
                 "it lives in another process and its class has an init of its own: only it knows its flags"
