@@ -56,6 +56,16 @@ class Outlet:
         else:
             self.send(cell, item)
 
+    def hand_over_queue(self, cell: Cell) -> None:
+        """Send all that is queued; what turns out not to be sendable is undelivered."""
+        queue = cell.queue
+        while queue:
+            item = queue.popleft()
+            try:
+                self.hand_over(cell, item)
+            except BadMessage as error:
+                undelivered(cell, item, error)
+
     def send(self, cell: Cell, item: Any) -> None:
         """Send to the process; raises BadMessage if the item cannot be coded."""
         worker = self.worker
@@ -287,16 +297,11 @@ class FlightHome(WorkerHome):
             node.emit(ActorStarted(cell.path, cell.life))
         outlet: Outlet = cell.extra().outlet
         outlet.worker = worker
-        bound, queue = cell.extra().bound, cell.queue
+        bound = cell.extra().bound
         if isinstance(bound, RemoteBound):
             bound.send(cell)
         else:
-            while queue:
-                item = queue.popleft()
-                try:
-                    outlet.hand_over(cell, item)
-                except BadMessage as error:
-                    undelivered(cell, item, error)
+            outlet.hand_over_queue(cell)
 
     def readdressed(self, cell: Cell) -> None:
         outlet: Outlet | None = cell.extra().outlet

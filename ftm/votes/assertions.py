@@ -13,7 +13,7 @@ from typing import Any
 
 from ...actors.errors import HoldfastError, type_name
 from ...checkpoint.protocol import FAILED, MESSAGE, OK, REPLY, TurnEnd
-from ..model.mechanism import FILES, SCRIPTS
+from ..model.mechanism import FILES, SCRIPTS, MechanismRefused
 from ..replica.protected_actor import Server
 
 PARAMETERS = frozenset({"reply", "message", "state"})
@@ -62,6 +62,20 @@ def imported(name: str) -> Any:
     for part in path.split("."):
         found = getattr(found, part)
     return found
+
+
+def check_assertions(names: Iterable[str], mechanism: str, what: str) -> None:
+    """Whether these can be asked.
+
+    Raises:
+        MechanismRefused: one cannot; `what` is what the mechanism calls it.
+    """
+    for name in names:
+        try:
+            Assertion(name)
+        except Exception as error:  # Importing runs the module: anything may be raised.
+            why = f"the {what} {name} cannot be used: {type_name(type(error))}: {error}"
+            raise MechanismRefused(mechanism, why) from error
 
 
 class Assertion:

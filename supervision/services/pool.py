@@ -22,12 +22,11 @@ from ...actors.kernel.message import Message, RuntimeOrder
 from ...actors.kernel.node import Node
 from ...actors.kernel.ref import ActorRef
 from ...actors.persistence import child_key
-from ..admin import DeleteChild, NotSupported, RemoveChild, StartChild
 from ..children import Child
 from ..rules import Rule
 from ..spec import ChildSpec, Isolation, Plan, Restart, Shutdown, check_spec, child
-from ..supervisor import Supervisor
 from ..tree import supervisor
+from .partition import UniformSupervisor
 from .readiness import by_name
 from .router import Key, Restarting, Router, Routing
 
@@ -63,12 +62,14 @@ class ResizePool(RuntimeOrder[int]):
     deadline: float = DRAIN_SECONDS
 
 
-class PoolSupervisor(Supervisor):
+class PoolSupervisor(UniformSupervisor):
     """Keeps a pool's workers and its router alive. Built by `pool(...)`.
 
     When it is itself restarted the pool has its first size again. What was sent to recorded workers waits for them in
     their journals, so those that were added come back too.
     """
+
+    instead = "the children of a pool are its workers: use ResizePool"
 
     _crew: list[Child]  # who gets messages, in the router's order; not those that are on their way out
     _template: ChildSpec
@@ -182,23 +183,6 @@ class PoolSupervisor(Supervisor):
         self._forget(one)
         self._leaving.discard(one.spec.id)
         gone.set_result(None)
-
-    @on(StartChild)
-    def _start_child(self, message: StartChild) -> Any:
-        """Refuse, because all workers are alike."""
-        raise NotSupported("the children of a pool are its workers: use ResizePool")
-
-    @on(RemoveChild)
-    def _remove_child(self, message: RemoveChild) -> ReplyHandle[Any]:
-        """Its members are all alike: none of them is removed alone."""
-        self._child(message.id)
-        raise NotSupported("the children of a pool are its workers: use ResizePool")
-
-    @on(DeleteChild)
-    def _delete_child(self, message: DeleteChild) -> Any:
-        """Refuse, because all workers are alike."""
-        self._child(message.id)
-        raise NotSupported("the children of a pool are its workers: use ResizePool")
 
 
 def pool(

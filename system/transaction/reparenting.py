@@ -12,13 +12,12 @@ from ...actors.errors import HoldfastError
 from ...checkpoint.home.recorded_home import switch_of
 from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import SnapshotNow
-from ...supervision.admin import NotSupported
 from ...supervision.children import STOPPED, UP
 from .arrangement import busy, child_of
 from .draft import Draft, DraftPlace, Target, is_elsewhere
 from .operation import Operation, wrong
 from .relocation import MOVED_WITHIN, Gated
-from .structure import check_child, text_of
+from .structure import check_child, check_not_uniform, text_of
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
@@ -50,8 +49,7 @@ class Reparent(Operation):
             raise wrong(place.path, "no supervisor looks after it, so it cannot be moved to another")
         if new in place.walk():
             raise wrong(place.path, f"it cannot be moved below itself, to {new.path}")
-        if old.is_partitioned:
-            raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
+        check_not_uniform(old)
         for above in (old, new):
             if above.cell is not None and is_elsewhere(above.cell):
                 raise wrong(above.path, "it lives in another process, which a life cannot enter or leave")

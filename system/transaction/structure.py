@@ -20,7 +20,8 @@ from ...supervision.admin import (
     RemoveChild,
     StartChild,
 )
-from ...supervision.dynamic import check_dynamic
+from ...supervision.dynamic import DynamicSupervisor, check_dynamic
+from ...supervision.services.partition import UniformSupervisor
 from ...supervision.spec import NAMELESS, ChildSpec, Flags, Plan, check_spec, child
 from ...supervision.supervisor import Supervisor
 from ...supervision.supervisor_changes import check_subtree
@@ -168,16 +169,21 @@ class AddChild(Operation):
             await one.release()
 
 
+def check_not_uniform(above: DraftPlace) -> None:
+    """Raises NotSupported: the children of this supervisor are all alike, and none of them comes or goes alone."""
+    if above.kind is not None and issubclass(above.kind, UniformSupervisor):
+        raise NotSupported(above.kind.instead)
+
+
 def check_child(above: DraftPlace, spec: ChildSpec) -> None:
     """Whether a supervisor in the draft can take this child.
 
     Raises:
         SpecError, NotSupported, AlreadyPresent, MaxChildren: why not.
     """
-    if above.is_partitioned:
-        raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
+    check_not_uniform(above)
     actor = above.actor
-    if getattr(actor, "_template", None) is not None:
+    if isinstance(actor, DynamicSupervisor) and actor._template is not None:
         raise wrong(above.path, "it has a template: ask it with StartChild(args=...)")
     check_spec(above.path, spec, above.flags.auto_shutdown if above.flags is not None else None)
     if spec.id in above.children:
@@ -231,8 +237,7 @@ class RemoveActor(Operation):
         above = place.parent
         if above is None:
             raise wrong(place.path, "the root is not removed: leave the system")
-        if above.is_partitioned:
-            raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
+        check_not_uniform(above)
         if place.is_planned:
             raise wrong(place.path, "it is added by this very transaction")
         self.target = place.path
