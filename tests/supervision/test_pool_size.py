@@ -198,7 +198,7 @@ async def test_children_cannot_be_added_or_taken_away_by_hand() -> None:
             with pytest.raises(hf.NotSupported, match="use ResizePool"):
                 await top.ask(call)
         side = await system.start(hf.supervisor("side"))
-        changes: tuple[Callable[[hf.Change], None], ...] = (
+        changes: tuple[Callable[[hf.Change], object], ...] = (
             lambda change: change.add(top, hf.child("x", hf.start(Worker))),
             lambda change: change.remove(f"{top.path}/0"),
             lambda change: change.move(f"{top.path}/0", side),
