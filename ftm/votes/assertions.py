@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable
-from importlib import import_module
 from typing import Any
 
 from ...actors.errors import HoldfastError, type_name
+from ...actors.process.wire.start_codec import imported
 from ...checkpoint.protocol import FAILED, MESSAGE, OK, REPLY, TurnEnd
 from ..model.mechanism import FILES, SCRIPTS, MechanismRefused
 from ..replica.protected_actor import Server
@@ -49,19 +49,6 @@ def names_of(values: Any) -> tuple[str, ...]:
     if isinstance(values, str) or not isinstance(values, Iterable):
         values = (values,)
     return tuple(map(name_of, values))
-
-
-def imported(name: str) -> Any:
-    """What has this name.
-
-    Raises:
-        ImportError, AttributeError: there is none. What importing raises.
-    """
-    module, _, path = name.partition(":")
-    found: Any = import_module(module)
-    for part in path.split("."):
-        found = getattr(found, part)
-    return found
 
 
 def check_assertions(names: Iterable[str], mechanism: str, what: str) -> None:

@@ -6,8 +6,8 @@ from typing import Any
 
 from ...actors.errors import type_name
 from ...actors.kernel.actor import Actor, handled_by
+from ...actors.process.wire.start_codec import imported
 from ..model.mechanism import MechanismRefused
-from .assertions import imported
 
 
 def version(kind: type[Actor], name: str, mechanism: str) -> type[Actor]:
