@@ -13,10 +13,10 @@ from ...supervision.spec import ChildSpec, Isolation, Strategy
 from . import living
 from .draft import Target
 from .mechanisms import Attach, Compose, Detach, DetachLayer, Isolate, OnProtection, Protect, Transition, Update
-from .operation import Operation, Step
+from .operation import Operation, Step, text_of
 from .reparenting import Reparent
 from .running import StartAgain, StopChild
-from .structure import AddChild, RemoveActor, Reorder, SetFlags, named_spec, text_of
+from .structure import AddChild, RemoveActor, Reorder, SetFlags, named_spec
 from .wiring import Bind, RegisterName, Unbind, UnregisterName
 
 if TYPE_CHECKING:

@@ -10,7 +10,6 @@ from ...actors.kernel.actor import Actor, Start
 from .draft import Draft, DraftPlace, Target, is_elsewhere
 from .operation import Operation, StagedWork, wrong
 from .rework import Rework
-from .structure import text_of
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
@@ -22,10 +21,6 @@ class OnLiving(Operation):
 
     on_parts: ClassVar[bool] = False
     """Whether it may be a part of a mechanism."""
-
-    def __init__(self, target: Target) -> None:
-        super().__init__(text_of(target))
-        self._at = target
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = self._found = draft.find(self._at, parts=self.on_parts)

@@ -9,7 +9,7 @@ from ...actors.errors import SpecError
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
-    from .draft import Draft, DraftPlace
+    from .draft import Draft, DraftPlace, Target
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -71,8 +71,9 @@ class Operation(StagedWork):
 
     verb: ClassVar[str] = ""
 
-    def __init__(self, target: str) -> None:
-        self.target = target
+    def __init__(self, at: Target, child: str = "") -> None:
+        self._at = at
+        self.target = f"{text_of(at)}/{child}" if child else text_of(at)
         self.waiting = ""
         """What the transaction waits for because of this step, told when the time is up."""
         self.between_turns_of: tuple[DraftPlace, ...] = ()
@@ -98,6 +99,11 @@ class Operation(StagedWork):
             HoldfastError: why not.
         """
         raise NotImplementedError
+
+
+def text_of(target: Target) -> str:
+    """A target as text."""
+    return target if isinstance(target, str) else target.path
 
 
 def wrong(where: str, problem: str) -> SpecError:

@@ -15,9 +15,9 @@ from ...checkpoint.protocol import SnapshotNow
 from ...supervision.children import STOPPED, UP
 from .arrangement import busy, child_of
 from .draft import Draft, DraftPlace, Target, is_elsewhere
-from .operation import Operation, wrong
+from .operation import Operation, text_of, wrong
 from .relocation import MOVED_WITHIN, Gated
-from .structure import check_child, check_not_uniform, text_of
+from .structure import check_child, check_not_uniform
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
@@ -29,8 +29,8 @@ class Reparent(Operation):
     verb: ClassVar[str] = "move"
 
     def __init__(self, target: Target, supervisor: Target) -> None:
-        super().__init__(text_of(target))
-        self._at, self._to = target, supervisor
+        super().__init__(target)
+        self._to = supervisor
         self._above: DraftPlace | None = None  # the new supervisor, at this point
         self._root: DraftPlace | None = None
         self._leads = False  # it is the first step that moves this actor: it brings it to where the last one wants it

@@ -13,7 +13,6 @@ from ...supervision.supervisor import Supervisor
 from .arrangement import child_of
 from .draft import START_TIMEOUT, Draft, DraftPlace, Target, check_awake, is_elsewhere
 from .operation import Operation, wrong
-from .structure import text_of
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
@@ -22,9 +21,7 @@ if TYPE_CHECKING:
 class OnChild(Operation):
     """Base: a child of a supervisor of this process, by its name."""
 
-    def __init__(self, target: str) -> None:
-        super().__init__(target)
-        self._name = ""
+    _name = ""
 
     def _take(self, draft: Draft, place: DraftPlace, *, starts: bool) -> None:
         above = place.parent
@@ -46,10 +43,6 @@ class StopChild(OnChild):
     """Stop a child; its spec stays, and says that it is not started until it is started by order."""
 
     verb: ClassVar[str] = "stop"
-
-    def __init__(self, target: Target) -> None:
-        super().__init__(text_of(target))
-        self._at = target
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = draft.find(self._at)
@@ -94,8 +87,8 @@ class StartAgain(OnChild):
     verb: ClassVar[str] = "start"
 
     def __init__(self, supervisor: Target, name: str) -> None:
-        super().__init__(f"{text_of(supervisor)}/{name}")
-        self._at, self._name = supervisor, name
+        super().__init__(supervisor, name)
+        self._name = name
         self._asked: Cell | None = None  # the supervisor that was asked
         self._is_asked = False
         self._life = 0

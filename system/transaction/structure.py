@@ -28,15 +28,10 @@ from ...supervision.supervisor_changes import check_subtree
 from .arrangement import planned_spec
 from .draft import START_TIMEOUT, Draft, DraftPlace, Target, check_awake, is_elsewhere
 from .lasting import recipe_specs
-from .operation import Operation, wrong
+from .operation import Operation, text_of, wrong
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
-
-
-def text_of(target: Target) -> str:
-    """A target as text."""
-    return target if isinstance(target, str) else target.path
 
 
 CANDIDATES = itertools.count(1)
@@ -137,8 +132,8 @@ class AddChild(Operation):
     verb: ClassVar[str] = "add"
 
     def __init__(self, supervisor: Target, spec: ChildSpec) -> None:
-        super().__init__(f"{text_of(supervisor)}/{spec.id}")
-        self._at, self.spec = supervisor, spec
+        super().__init__(supervisor, spec.id)
+        self.spec = spec
         self._newcomers: list[Newcomer] = []
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
@@ -228,10 +223,6 @@ class RemoveActor(Operation):
 
     verb: ClassVar[str] = "remove"
 
-    def __init__(self, target: Target) -> None:
-        super().__init__(text_of(target))
-        self._at = target
-
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = self._found = draft.find(self._at)
         above = place.parent
@@ -262,10 +253,6 @@ class OnSupervisor(Operation):
     """Base of operations on what a supervisor is made of. One in another process is told when it is in force."""
 
     verb: ClassVar[str] = "set"
-
-    def __init__(self, supervisor: Target) -> None:
-        super().__init__(text_of(supervisor))
-        self._at = supervisor
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = self._found = await draft.supervisor(self._at)

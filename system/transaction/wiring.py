@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 from ...actors.errors import ActorStopped, NameTaken, NoSuchActor, type_name
 from ...actors.kernel.cell import RUNNING
 from .draft import Draft, DraftPlace, Target
-from .operation import Operation, wrong
-from .structure import text_of
+from .operation import Operation, text_of, wrong
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
@@ -20,8 +19,8 @@ class Bind(Operation):
     verb: ClassVar[str] = "bind"
 
     def __init__(self, owner: Target, port: str, target: Target) -> None:
-        super().__init__(text_of(owner))
-        self._at, self._port, self._to = owner, port, target
+        super().__init__(owner)
+        self._port, self._to = port, target
         self._owner: DraftPlace | None = None
         self._bound: DraftPlace | None = None
 
@@ -62,8 +61,8 @@ class Unbind(Operation):
     verb: ClassVar[str] = "unbind"
 
     def __init__(self, owner: Target, port: str) -> None:
-        super().__init__(text_of(owner))
-        self._at, self._port = owner, port
+        super().__init__(owner)
+        self._port = port
         self._owner: DraftPlace | None = None
 
     @property
@@ -101,8 +100,8 @@ class RegisterName(Operation):
     verb: ClassVar[str] = "register"
 
     def __init__(self, name: str, target: Target) -> None:
-        super().__init__(text_of(target))
-        self._name, self._at = name, target
+        super().__init__(target)
+        self._name = name
 
     @property
     def text(self) -> str:
