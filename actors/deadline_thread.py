@@ -22,7 +22,7 @@ BLOCKED = 70
 """The exit code of a process that was ended for it: EX_SOFTWARE."""
 
 
-class Due:
+class OpenLimit:
     """A time limit of something that is not over."""
 
     __slots__ = ("at", "timer", "what")
@@ -37,13 +37,13 @@ class Overdue:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop, self._blocked = loop, threading.get_ident()
-        self._due: set[Due] = set()
+        self._due: set[OpenLimit] = set()
         self._changed = threading.Condition()
         self._is_watched = False
 
     def begin(self, what: str, seconds: float) -> Callable[[], None]:
         """Something has to be over in so many seconds; the caller says when it is, by calling what is returned."""
-        due = Due(what, monotonic() + seconds)
+        due = OpenLimit(what, monotonic() + seconds)
         due.timer = self._loop.call_later(seconds, self._came, due)
         with self._changed:
             self._due.add(due)
@@ -62,7 +62,7 @@ class Overdue:
 
         return end
 
-    def _came(self, due: Due) -> None:
+    def _came(self, due: OpenLimit) -> None:
         """The loop has come to the limit: whoever keeps it has, too. What follows may block it as well."""
         with self._changed:
             due.at = monotonic() + LATE
@@ -86,7 +86,7 @@ class Overdue:
                     late = late + 1 if monotonic() - begin < LATE else 0
             self._is_watched = False
 
-    def _end(self, due: Due) -> None:
+    def _end(self, due: OpenLimit) -> None:
         stack = traceback.format_stack(sys._current_frames()[self._blocked])
         told = f"holdfast: the process ends, for its thread is blocked, and {due.what}; it is here:\n{''.join(stack)}"
         os.write(2, told.encode(errors="backslashreplace"))  # The streams of Python may be locked by who blocks.

@@ -38,6 +38,7 @@ Arguments equal fields in each class, so the codec can rebuild an error in anoth
 from __future__ import annotations
 
 import inspect
+import string
 from collections.abc import Iterator
 from copy import copy
 from typing import Any, ClassVar
@@ -52,9 +53,9 @@ LONGEST_TEXT = 64 * 1024
 class HoldfastError(Exception):
     """Base of every error holdfast raises.
 
-    A subclass declares its fields as a dataclass does, and what it says as `text`, a format string of them. The fields
-    are its arguments (`args`), all of them, so that it can be made again in another process. A class without fields
-    takes what an exception takes.
+    A subclass declares its fields as a dataclass does, and what it says as `text`, a format string of them (the format
+    of a tuple is what joins it: `{names:, }`). The fields are its arguments (`args`), all of them, so that it can be
+    made again in another process. A class without fields takes what an exception takes.
 
     >>> class TooHot(HoldfastError, text="{room} has {degrees:.0f} degrees"):
     ...     room: str
@@ -92,7 +93,16 @@ class HoldfastError(Exception):
         return tuple(given[name] if name in given else copy(getattr(kind, name)) for name in names)
 
     def __str__(self) -> str:
-        return self._text.format_map(vars(self)) if self._text else super().__str__()
+        return _ErrorText().vformat(self._text, (), vars(self)) if self._text else super().__str__()
+
+
+class _ErrorText(string.Formatter):
+    """Fills in the text of an error; a tuple is joined by what stands as its format: `{kept:, }`."""
+
+    def format_field(self, value: object, format_spec: str) -> str:
+        return (
+            format_spec.join(map(str, value)) if isinstance(value, tuple) else super().format_field(value, format_spec)
+        )
 
 
 class SendError(HoldfastError):

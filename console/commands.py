@@ -25,7 +25,7 @@ DIFFERS = 1
 UNUSABLE = 2
 
 
-class Method(StrEnum):
+class RecoveryChoice(StrEnum):
     """How a killed mapper comes back."""
 
     HYBRID = "hybrid"
@@ -59,7 +59,7 @@ def demo(
     ] = None,
     kills: Annotated[int, typer.Option(min=0, max=1000, help="How often the mapper's process is killed.")] = 5,
     seed: Annotated[int, typer.Option(help="Draws the moments of the kills, and the questions.")] = 7,
-    method: Annotated[Method, typer.Option(help="How the mapper comes back.")] = Method.HYBRID,
+    method: Annotated[RecoveryChoice, typer.Option(help="How the mapper comes back.")] = RecoveryChoice.HYBRID,
     interval: Annotated[float, typer.Option(min=0.05, help="Seconds between two snapshots.")] = 2.0,
     speed: Annotated[
         float, typer.Option(min=0.0, help="Times the pace of the recording; 0: as fast as it goes.")

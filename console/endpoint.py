@@ -18,14 +18,13 @@ import msgspec
 from ..actors.errors import HoldfastError
 from ..actors.kernel.actor import Actor
 from ..actors.ordered import Ordered
+from ..actors.process.wire.frame_buffer import LENGTH
 from ..actors.streams import Listener
 from ..actors.values import encode_value
 from ..system.script import check_folders
 from ..system.system import ActorSystem
 from .trust import Needed, trusted_imports
 from .wire import (
-    HEAD,
-    LARGEST,
     REQUEST,
     AnyRequest,
     BadRequest,
@@ -35,6 +34,7 @@ from .wire import (
     Transact,
     Tree,
     Whereis,
+    body_size,
     check_user,
     failure,
     frame,
@@ -348,10 +348,8 @@ async def read(reader: asyncio.StreamReader) -> bytes | None:
         return None
     try:
         async with asyncio.timeout(PATIENCE):
-            (size,) = HEAD.unpack(first + await reader.readexactly(HEAD.size - 1))
-            if size > LARGEST:
-                raise BadRequest(f"it has {size} bytes, and {LARGEST} are allowed")
-            return await reader.readexactly(size)
+            head = first + await reader.readexactly(LENGTH.size - 1)
+            return await reader.readexactly(body_size(head))
     except asyncio.IncompleteReadError as error:
         raise BadRequest("it is cut short") from error
 

@@ -19,19 +19,18 @@ from ..actors.control.orders import Migrate, Status
 from ..actors.control.tracing import Statistics
 from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.actor import Actor, Start
+from ..actors.process.wire.frame_buffer import LENGTH
 from ..ftm.group.protected import ProtectionStatus
 from ..supervision.spec import NAMELESS, ChildSpec, Isolation, Strategy, child
 from ..system.transaction.operation import Step
 from .wire import (
-    HEAD,
-    LARGEST,
     RESPONSE,
     AnyRequest,
-    BadRequest,
     ControlActor,
     Transact,
     Tree,
     Whereis,
+    body_size,
     check_user,
     frame,
     open_arg,
@@ -106,10 +105,7 @@ class Client:
             try:
                 self._sock.settimeout(timeout + GRACE)
                 self._sock.sendall(frame(request))
-                (size,) = HEAD.unpack(self._read(HEAD.size))
-                if size > LARGEST:
-                    raise BadRequest(f"the answer has {size} bytes, and {LARGEST} are allowed")
-                body = self._read(size)
+                body = self._read(body_size(self._read(LENGTH.size)))
             except OSError as error:
                 raise NotReached(self.path, error.strerror or str(error)) from error
         return outcome(RESPONSE.decode(body))

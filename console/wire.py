@@ -1,7 +1,7 @@
 """What an operator's command and a running system say to each other over the control endpoint.
 
-A frame is a 4-byte length and MessagePack. Requests are typed and bounded; what has to be rebuilt with its classes
-(child specs, functions, states) travels as packed bytes inside and is opened only when the request is carried out.
+A frame is a length, as between processes, and MessagePack. Requests are typed and bounded; what has to be rebuilt with
+its classes (child specs, functions, states) travels as packed bytes and is opened only when the request is carried out.
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ import msgspec
 from ..actors.control.orders import pack_function, unpack_function
 from ..actors.errors import HoldfastError, RemoteCrash, SpecError, error_text, rebuild_error, type_name
 from ..actors.kernel.actor import Actor, Start
+from ..actors.kernel.codec import MAX_BYTES
+from ..actors.process.wire.frame_buffer import LENGTH
 from ..actors.process.wire.start_codec import pack_data, pack_recipe, unpack_data, unpack_recipe
 from ..actors.values import decode_value, encode_value
 from ..supervision.spec import ChildSpec
 
-HEAD = struct.Struct(">I")
-LARGEST = 16 * 1024 * 1024
-"""Bytes of one frame."""
 CREDENTIALS = struct.Struct("3i")
 
 
@@ -209,9 +208,17 @@ RESPONSE: msgspec.msgpack.Decoder[ControlResponse] = msgspec.msgpack.Decoder(Con
 def frame(value: ControlRequest | ControlResponse) -> bytes:
     """Head and body. Raises BadRequest: too large."""
     body = msgspec.msgpack.encode(value)
-    if len(body) > LARGEST:
-        raise BadRequest(f"it has {len(body)} bytes, and {LARGEST} are allowed")
-    return HEAD.pack(len(body)) + body
+    head = LENGTH.pack(len(body))
+    body_size(head)
+    return head + body
+
+
+def body_size(head: bytes) -> int:
+    """The bytes that follow the head of a frame. Raises BadRequest: too many."""
+    (size,) = LENGTH.unpack(head)
+    if size > MAX_BYTES:
+        raise BadRequest(f"it has {size} bytes, and {MAX_BYTES} are allowed")
+    return int(size)
 
 
 def failure(error: BaseException) -> ControlResponse:

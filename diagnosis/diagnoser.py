@@ -20,6 +20,7 @@ from .messages import (
     REPAIR,
     ROS_DIAGNOSTICS,
     STARTS,
+    ComponentsStarted,
     Explained,
     GetDiagnosis,
     GetExplanation,
@@ -28,7 +29,6 @@ from .messages import (
     ModelChanged,
     NextBest,
     RosDiagnostics,
-    Started,
     Touched,
 )
 from .model import Declaration, Model
@@ -152,8 +152,8 @@ class DiagnoserActor(Actor):
         self._due()
 
     @subscribe(STARTS)
-    @on(Started)
-    async def _started(self, message: Started) -> None:
+    @on(ComponentsStarted)
+    async def _started(self, message: ComponentsStarted) -> None:
         """Who was started by others is given as much time as who was started by repair."""
         names = _names_below(self._engine.model, message.components)
         await self.ctx.publish(GRACE, Grace(names, message.seconds, is_counted=True))

@@ -25,7 +25,7 @@ MODEL: Final = "/model"
 GRACE: Final = "/grace"
 """`Grace`, from whoever acts upon the system."""
 STARTS: Final = "/starts"
-"""`Started`, from whoever sees that a component has begun a new life."""
+"""`ComponentsStarted`, from whoever sees that a component has begun a new life."""
 REPAIR: Final = "/repair"
 """`Touched`, and whatever else repair tells."""
 
@@ -56,7 +56,7 @@ class Touched(Message):
     grace: float = 0.0
 
 
-class Started(Message):
+class ComponentsStarted(Message):
     """These components have begun a new life: their supervisor, or a person, has started them again.
 
     `seconds`: how long what is seen of them, and of what depends on them, says nothing yet.
@@ -120,6 +120,7 @@ __all__ = [
     "REPAIR",
     "ROS_DIAGNOSTICS",
     "STARTS",
+    "ComponentsStarted",
     "Explained",
     "GetDiagnosis",
     "GetExplanation",
@@ -128,6 +129,5 @@ __all__ = [
     "ModelChanged",
     "NextBest",
     "RosDiagnostics",
-    "Started",
     "Touched",
 ]

@@ -8,7 +8,7 @@ import msgspec
 
 from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.codec import Packable, Packed
-from ..actors.kernel.message import Message, Order, Refusal
+from ..actors.kernel.message import Message, Refusal, RuntimeOrder
 from ..actors.kernel.node import Node
 from ..actors.kernel.ref import ActorRef
 from ..actors.process.wire.start_codec import pack_data, unpack_data
@@ -113,7 +113,7 @@ def opened(value: Any, node: Node) -> Any:
         raise SpecError("supervisor", str(error)) from error
 
 
-class StartChild(Order[Any]):
+class StartChild(RuntimeOrder[Any]):
     """Start one more child; the reply is its ref, or None if it did not want to be started (`Ignore`).
 
     `spec` is a child spec; a dynamic supervisor takes a bare `start(...)` too. From a template a child is started by
@@ -133,7 +133,7 @@ class StartChild(Order[Any]):
         msgspec.structs.force_setattr(self, "spec", boxed(self.spec))
 
 
-class TerminateChild(Order[None]):
+class TerminateChild(RuntimeOrder[None]):
     """Stop a child by its spec; the spec stays, unless it is temporary. A pending restart is void.
 
     `reason` is what `pack_exit` gives; None is SHUTDOWN. The child is parked then: repair does not start it
@@ -145,7 +145,7 @@ class TerminateChild(Order[None]):
     parks: bool = True
 
 
-class RestartChild(Order[Any]):
+class RestartChild(RuntimeOrder[Any]):
     """Start a stopped child again; the reply is its ref, or None if it did not want to be started.
 
     With `fresh` what was recorded of it (of a supervisor: of all below it) is erased first. With `running` a child that
@@ -162,7 +162,7 @@ class RestartChild(Order[Any]):
     older: bool = False
 
 
-class DeleteChild(Order[None]):
+class DeleteChild(RuntimeOrder[None]):
     """Forget a stopped child, and (unless `erase` is False) what was recorded of it and of all below it.
 
     A dynamic supervisor forgets those that have ended by itself; this erases what was recorded of one.
@@ -172,7 +172,7 @@ class DeleteChild(Order[None]):
     erase: bool = True
 
 
-class RemoveChild(Order[None]):
+class RemoveChild(RuntimeOrder[None]):
     """Stop a child and forget its spec, and with `erase` what was recorded of it; nobody starts it in between.
 
     With a `candidate` only if it was started as that one: if not, there is nothing to be done, and whoever has it keeps
@@ -217,7 +217,7 @@ class GetChildSpec(Message[Any]):
     id: str
 
 
-class ChangeSupervisor(Order[None]):
+class ChangeSupervisor(RuntimeOrder[None]):
     """Change a supervisor while it works. What is left out stays; with nothing given its `init` is asked anew.
 
     Flags hold at once. A child whose id is known gets its new spec and goes on; a new one is added and not started; one

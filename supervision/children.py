@@ -36,7 +36,7 @@ class Child:
     up_since: float = 0.0
     retry: int = 0  # the number of the retry that counts; stale ones are dropped
     up: asyncio.Future[None] | None = None  # a start that is waited for outside our turn; None once it is known or void
-    row: Row | None = None  # those that are started one after another, and it is one of them
+    row: StartRow | None = None  # those that are started one after another, and it is one of them
     candidate: int = 0  # as whose candidate it was started; 0: it is none
 
     @property
@@ -80,7 +80,7 @@ def new_cell(own: Cell, one: Child) -> Cell:
     return cell
 
 
-class Row:
+class StartRow:
     """Children that are started one after another. Each is in one row at most: who is stopped meanwhile is in none."""
 
     __slots__ = ("_waiting",)

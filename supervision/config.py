@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -11,6 +10,7 @@ from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.mailbox import bounded
 from ..actors.process.resource_limits import Limits
+from ..actors.process.wire.start_codec import imported
 from .backoff import Backoff
 from .dynamic import dynamic
 from .rules import rule
@@ -148,14 +148,10 @@ def _named(name: object, where: str) -> Any:
     """Import the class or function that `package.module:Name` stands for."""
     if not isinstance(name, str) or name.count(":") != 1:
         raise SpecError(where, f"must be a name such as 'package.module:Class', not {name!r}")
-    module, _, path = name.partition(":")
     try:
-        found: object = importlib.import_module(module)
-        for part in path.split("."):
-            found = getattr(found, part)
+        return imported(name)
     except Exception as error:  # Importing a module runs it: it may raise anything.
         raise SpecError(where, f"{name!r}: {error}") from error
-    return found
 
 
 def _table(value: object, where: str) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from ..actors.persistence import child_key
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.start_codec import pack_data, unpack_data
 from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
-from .children import STARTING, Child, Row, complete
+from .children import STARTING, Child, StartRow, complete
 from .rules import Rule
 from .spec import NAMELESS, ChildSpec, Flags, Isolation, Plan, Restart, Shutdown, check_spec, child
 from .supervisor import Supervisor
@@ -70,7 +70,7 @@ class DynamicSupervisor(Supervisor):
             except HoldfastError as error:  # It stays in the journal: perhaps its class is only not there today.
                 node.emit(ChildStartFailed(f"{self.ctx.path}/{name}", str(error)))
         self._children.update((one.spec.id, one) for one in noted)
-        row = Row(noted, STARTING)
+        row = StartRow(noted, STARTING)
         while (one := row.next()) is not None:
             try:
                 await self._come_up_in(row, one)

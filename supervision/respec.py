@@ -12,6 +12,11 @@ from .spec import ChildSpec
 from .supervisor import Supervisor
 
 Change = Callable[[ChildSpec], ChildSpec]
+NO_RECIPE = (
+    "its supervisor lives in another process, and no recipe here has its spec: "
+    "add it by a transaction, or say it in the template"
+)
+"""Why a child that was started by a message, or by an `init` in another process, cannot be placed anew."""
 
 
 def respec(cell: Cell, start: Start[Any]) -> None:

@@ -39,8 +39,8 @@ from .children import (
     UP,
     Child,
     Retry,
-    Row,
     StartLimit,
+    StartRow,
     begin_start,
     complete,
     new_cell,
@@ -139,7 +139,7 @@ class Supervisor(Inquiries):
 
     async def _start_all(self) -> None:
         """Start the children of the plan."""
-        row = Row((one for one in self._children.values() if one.spec.autostart), STARTING)
+        row = StartRow((one for one in self._children.values() if one.spec.autostart), STARTING)
         while (one := row.next()) is not None:
             try:
                 await self._come_up_in(row, one)
@@ -153,13 +153,13 @@ class Supervisor(Inquiries):
         Raises:
             StartFailed, or another HoldfastError: naming the child and why.
         """
-        row = Row((one,), STARTING)
+        row = StartRow((one,), STARTING)
         is_up = await self._come_up_in(row, one)
         if is_up is None:
             raise StartFailed(self._path_of(one), "it was stopped while it started")
         return is_up
 
-    async def _come_up_in(self, row: Row, one: Child) -> bool | None:
+    async def _come_up_in(self, row: StartRow, one: Child) -> bool | None:
         """Start a child of a row and wait until it is up. False: it did not want to be; None: it is not ours any more.
 
         Raises:
@@ -401,7 +401,7 @@ class Supervisor(Inquiries):
     async def _restart_group(self, failed: Child, group: list[Child], reason: ExitReason) -> None:
         """Stop the others newest first, then start all of them in order; siblings wait for one that takes its time."""
         running = [one for one in group if one is not failed and one.state != STOPPED]
-        row = Row(group, RESTARTING)
+        row = StartRow(group, RESTARTING)
         for one in reversed(running):
             if one.row is not row:
                 continue
@@ -428,7 +428,7 @@ class Supervisor(Inquiries):
 
     # -- stopping ---------------------------------------------------------------------------------------------------
 
-    async def _stop(self, one: Child, reason: ExitReason = SHUTDOWN, *, row: Row | None = None) -> None:
+    async def _stop(self, one: Child, reason: ExitReason = SHUTDOWN, *, row: StartRow | None = None) -> None:
         """Stop a child as its spec says, and wait for its end; its address and queue stay.
 
         `row` is that with which it will be started again; without one, whoever waits for its start hears that it was
@@ -507,7 +507,7 @@ class Supervisor(Inquiries):
         self, one: Child, enlist: Callable[[Child], None], undo: Callable[[Child], None], *, fresh: bool
     ) -> Any:
         """Start a child that somebody waits for; its ref, or None if it did not want to be started."""
-        row = Row((one,), STARTING)
+        row = StartRow((one,), STARTING)
         try:
             enlist(one)
             if fresh:
@@ -601,7 +601,7 @@ class Supervisor(Inquiries):
             raise ChildParked(message.id)
         self._parked.discard(message.id)
         if message.running and one.state == UP:
-            row = Row((one,), RESTARTING)
+            row = StartRow((one,), RESTARTING)
             await self._stop(one, row=row)
             if one.row is not row:  # Whoever has it now says what becomes of it.
                 raise StartFailed(self._path_of(one), "it was stopped, or started by somebody else, meanwhile")
@@ -641,7 +641,7 @@ class Supervisor(Inquiries):
         if one.cell is not None:
             lifecycle.retire(one.cell, "it was deleted")
         if message.erase:
-            row = Row((one,), STOPPING)  # Nobody starts or deletes it meanwhile.
+            row = StartRow((one,), STOPPING)  # Nobody starts or deletes it meanwhile.
             try:
                 await self._erase(one)
             finally:  # If the store refuses, it can be deleted again.

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 from ..actors.control.orders import (
     Change,
     GetState,
-    Look,
     Migrate,
+    ObserveTurns,
     Order,
     ReplaceCode,
     ReplaceState,
@@ -180,7 +180,7 @@ class Controls:
         and `messages_in`).
         """
         cell = self._living(ref)
-        counts = cast("Statistics | None", await self._order(ref, Look(on, None), timeout))
+        counts = cast("Statistics | None", await self._order(ref, ObserveTurns(on, None), timeout))
         if not has_process(cell):
             return counts
         own = tap_of(cell).switch(on, None)
@@ -195,7 +195,7 @@ class Controls:
         """
         cell = self._living(ref)
         tap = tap_of(cell)
-        await self._order(ref, Look(None, True), timeout)
+        await self._order(ref, ObserveTurns(None, True), timeout)
         stream = tap.listen()
         if has_process(cell):
             tap.attach()
@@ -314,5 +314,5 @@ def _done(counts: Statistics) -> dict[str, Any]:
 def _no_more(cell: Cell) -> None:
     """Nobody follows any more: tell the process."""
     if not cell.is_dead:
-        done = order(cell, Look(None, False), DEFAULT_TIMEOUT)
+        done = order(cell, ObserveTurns(None, False), DEFAULT_TIMEOUT)
         done.add_done_callback(lambda future: future.cancelled() or future.exception())

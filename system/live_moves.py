@@ -12,6 +12,7 @@ from ..actors.control.orders import Ready
 from ..actors.control.orders_lane import order
 from ..actors.errors import CannotMove, SpecError
 from ..actors.events import Moved
+from ..actors.kernel.actor import Actor
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import cell_kind
 from ..actors.kernel.ref import current
@@ -25,7 +26,7 @@ from ..actors.process.wire.peer import OutsideHost
 from ..checkpoint.home.journal_home import JournalHome
 from ..checkpoint.places.far_parent import FarParent
 from ..checkpoint.places.recorded_moves import ToRecordedHere, ToRecordedWorker, leaving
-from ..supervision.respec import recipe_spec, replace_mechanism, replace_place
+from ..supervision.respec import NO_RECIPE, recipe_spec, replace_mechanism, replace_place
 from ..supervision.spec import ChildSpec, Isolation
 from ..supervision.supervisor import Supervisor
 
@@ -352,6 +353,9 @@ def _spec_of(cell: Cell) -> ChildSpec:
     """The spec of a child, also if its supervisor lives in another process. Raises CannotMove: it is not known."""
     spec = cell.spec if isinstance(cell.spec, ChildSpec) else recipe_spec(cell)
     if spec is None:
+        above = cell.parent
+        if above is not None and above.actor is None and issubclass(cell_kind(above) or Actor, Supervisor):
+            raise CannotMove(cell.path, NO_RECIPE)
         raise CannotMove(cell.path, "nobody restarts it, so nobody knows how; start it as a child of a supervisor")
     return spec
 

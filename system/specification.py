@@ -29,7 +29,7 @@ from ..supervision.supervisor_changes import everything
 
 if TYPE_CHECKING:
     from ..checkpoint.home.homes import Homes
-    from .transaction.draft import Place
+    from .transaction.draft import DraftPlace
 
 KEPT = "specification "
 """How the notes begin; the address of a child of the root follows."""
@@ -138,7 +138,7 @@ class Specifications:
                 has_started = True
         return has_started
 
-    def check(self, root: Place) -> None:
+    def check(self, root: DraftPlace) -> None:
         """Whether the next root could start the tree as it would be.
 
         Raises:
@@ -150,7 +150,7 @@ class Specifications:
         added = [one for one in tops if one.is_planned or one.has_moved or one.path in self._added]
         declared = [one for one in tops if one not in added and one.path in self._declared]
         led = [one for top in (*declared, *added) for one in _led_outside(top) if one[2] in (*declared, *added)]
-        order: list[Place] = []
+        order: list[DraftPlace] = []
         waiting = list(added)
         for top in (None, *declared):  # As `system.start` and `start_added` will do it.
             if top is not None:
@@ -238,9 +238,9 @@ class Specifications:
             self._kept[address] = value
 
 
-def _led_outside(top: Place) -> list[tuple[Place, str, Place]]:
+def _led_outside(top: DraftPlace) -> list[tuple[DraftPlace, str, DraftPlace]]:
     """The bindings in specs that lead from a child of the root, or from below it, to another: owner, port, that one."""
-    found: list[tuple[Place, str, Place]] = []
+    found: list[tuple[DraftPlace, str, DraftPlace]] = []
     for place in top.walk():
         if place.spec is None or place.is_leaving or (place is not top and not place.comes_back_with(top)):
             continue
@@ -251,7 +251,7 @@ def _led_outside(top: Place) -> list[tuple[Place, str, Place]]:
     return found
 
 
-def _top(place: Place) -> Place:
+def _top(place: DraftPlace) -> DraftPlace:
     """The child of the root that it is, or is below."""
     while place.parent is not None and place.parent.parent is not None:
         place = place.parent

@@ -18,7 +18,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any, TypeVar, TypeVarTuple
 
 from ..actors.errors import HoldfastError
-from .threads import Threads
+from .threads import NewThreads
 
 if TYPE_CHECKING:
     from .barrier import NotIdle
@@ -42,18 +42,15 @@ JUMPS = 500_000
 PIDFD = "anon_inode:[pidfd]"
 
 
-class NothingToWaitFor(RuntimeError):
+class NothingToWaitFor(
+    HoldfastError,
+    RuntimeError,
+    text="nothing can happen any more at virtual time {now:g} s: every task waits for something that nobody will do "
+    "(no timer is set, no callback is due, no file is watched, no thread is at work)",
+):
     """The loop would wait for ever: no timer is set, no callback is due, no file is watched, no thread is at work."""
 
-    def __init__(self, now: float) -> None:
-        super().__init__(now)
-        self.now = now
-
-    def __str__(self) -> str:
-        return (
-            f"nothing can happen any more at virtual time {self.now:g} s: every task waits for something that nobody "
-            "will do (no timer is set, no callback is due, no file is watched, no thread is at work)"
-        )
+    now: float
 
 
 class RealTimeNeeded(
@@ -66,18 +63,16 @@ class RealTimeNeeded(
     what: str
 
 
-class ThreadAtWork(RuntimeError):
+class ThreadAtWork(
+    HoldfastError,
+    RuntimeError,
+    text="the virtual clock has stood still for {seconds:g} real seconds, because a thread is at work: {names:, }. "
+    "A thread that does not come to an end needs a real loop",
+):
     """Virtual time has stood still for long, because a thread that may wake the loop does not end its work."""
 
-    def __init__(self, names: tuple[str, ...], seconds: float) -> None:
-        super().__init__(names, seconds)
-        self.names, self.seconds = names, seconds
-
-    def __str__(self) -> str:
-        return (
-            f"the virtual clock has stood still for {self.seconds:g} real seconds, because a thread is at work: "
-            f"{', '.join(self.names)}. A thread that does not come to an end needs a real loop"
-        )
+    names: tuple[str, ...]
+    seconds: float
 
 
 class _JumpingSelector(selectors.DefaultSelector):
@@ -90,7 +85,7 @@ class _JumpingSelector(selectors.DefaultSelector):
         self.ticks, self.jumps = 0, 0
         self.most_ticks, self._most_jumps = ticks, jumps
         self._loop = loop
-        self._threads = Threads()
+        self._threads = NewThreads()
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         is_busy = timeout is not None and timeout <= 0

@@ -53,13 +53,10 @@ class Expected:
         return "\n".join([f"{len(happened)} {what} ({expected})", *lines])
 
 
-class UnexpectedEnd(HoldfastError, AssertionError):
+class UnexpectedEnd(HoldfastError, AssertionError, text="{problems:\n}"):
     """A guarded system saw what its test did not expect; each problem is a text."""
 
     problems: tuple[str, ...]
-
-    def __str__(self) -> str:
-        return "\n".join(self.problems)
 
 
 class GuardedSystem(ActorSystem):

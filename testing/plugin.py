@@ -20,7 +20,7 @@ import pytest
 if TYPE_CHECKING:
     from .guarded import Guard, GuardedSystem
     from .probes import Probe
-    from .wanted import Wanted
+    from .wanted import SystemsWanted
 
     ActorSystems = Callable[..., Awaitable[GuardedSystem]]
 
@@ -143,15 +143,15 @@ def _loop_factory(name: str) -> Callable[[], asyncio.AbstractEventLoop]:
     return asyncio.new_event_loop
 
 
-WANTED = pytest.StashKey["Wanted"]()
+WANTED = pytest.StashKey["SystemsWanted"]()
 
 
-def _wanted(item: pytest.Item) -> Wanted:
+def _wanted(item: pytest.Item) -> SystemsWanted:
     """What the test expects, which is read once."""
-    from .wanted import Wanted
+    from .wanted import SystemsWanted
 
     if WANTED not in item.stash:
-        item.stash[WANTED] = Wanted(item, EXPECTABLE)
+        item.stash[WANTED] = SystemsWanted(item, EXPECTABLE)
     return item.stash[WANTED]
 
 

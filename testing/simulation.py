@@ -63,7 +63,7 @@ from .schedules.turn_log import TurnLog
 from .schedules.world import EPOCH, World
 from .swaps import Swaps
 from .turns import Tracer, watch_turns
-from .wanted import Wanted, running
+from .wanted import SystemsWanted, running
 
 SEED = "HOLDFAST_SEED"
 """The environment variable that picks one seed for every simulated test of a run."""
@@ -338,7 +338,7 @@ def _is_called_by(task: asyncio.Task[Any], system: GuardedSystem, node: Node) ->
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class SimulationSettings:
     """What is said of a simulated test beside the test itself: as the arguments of `simulate`, which are refused here.
 
     Raises:
@@ -366,7 +366,7 @@ class Settings:
         if self.replay is not None:
             from_text(self.replay)
 
-    def said(self, wanted: Wanted, seeds: int | None = None) -> range | str:
+    def said(self, wanted: SystemsWanted, seeds: int | None = None) -> range | str:
         """The seeds to try, or the schedule to repeat. The command line and the environment have the last word."""
         file: str | None = wanted.option("replay")
         if file:
@@ -415,7 +415,7 @@ class Settings:
             if running.get().option("real"):
                 run_real(test, own, self.options, self.said(running.get(), REAL_RUNS))
             else:
-                Search(test, own, self).run()
+                ScheduleSearch(test, own, self).run()
         finally:
             leaks.close()
         if left := leaks.outside():
@@ -463,7 +463,7 @@ def simulate(
         whatever the test raises, with a note that shows the run and says how to repeat it. NotRepeatable: two runs with
         the same choices differ. SpecError, ValueError, TypeError: the arguments are wrong.
     """
-    settings = Settings(seeds, seed, replay, strategy, depth, latency, sync, ticks, options)
+    settings = SimulationSettings(seeds, seed, replay, strategy, depth, latency, sync, ticks, options)
     return settings.decorate if test is None else settings.decorate(test)
 
 
@@ -474,7 +474,7 @@ def _seconds(name: str, given: float | Seconds) -> Seconds:
     return seconds
 
 
-class Search:
+class ScheduleSearch:
     """The runs of one test, one schedule after the other, until one fails.
 
     Args:
@@ -486,7 +486,7 @@ class Search:
         is_complete: whether there is no other schedule.
     """
 
-    def __init__(self, test: Test, own: Iterable[str], settings: Settings) -> None:
+    def __init__(self, test: Test, own: Iterable[str], settings: SimulationSettings) -> None:
         self.runs = 0
         self.is_complete = False
         self._test, self._own, self._settings = test, set(own), settings

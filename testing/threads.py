@@ -44,7 +44,7 @@ class Onlooker(threading.Timer):
         self.daemon = True
 
 
-class Threads:
+class NewThreads:
     """The threads that began after this was made, and those of pools; what else ran before is no business of ours.
 
     Args:

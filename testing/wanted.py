@@ -17,7 +17,7 @@ LEAKS = frozenset({"descriptors", "processes", "tasks", "threads", "timers"})
 """What a test can leave behind."""
 
 
-class Wanted:
+class SystemsWanted:
     """What a test may do to its systems, and the options of these.
 
     Attributes:
@@ -82,5 +82,5 @@ def _kinds(said: Any) -> frozenset[str]:
     return kinds
 
 
-running: ContextVar[Wanted] = ContextVar("holdfast test", default=Wanted())  # noqa: B039  # it is never changed
+running: ContextVar[SystemsWanted] = ContextVar("holdfast test", default=SystemsWanted())  # noqa: B039  # it is never changed
 """Of the test that pytest runs now."""

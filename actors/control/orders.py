@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import importlib
 import os
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
@@ -18,7 +16,7 @@ from ..kernel import mailbox
 from ..kernel.actor import Actor, Start
 from ..kernel.envelope import message_in
 from ..kernel.message import message_name
-from ..process.wire.start_codec import pack_recipe, unpack_recipe
+from ..process.wire.start_codec import imported, pack_recipe, unpack_recipe
 from ..state_hooks import state_migrator
 from ..values import UnsavableValue
 from .live_state import change_state, state_to_show, tried_state
@@ -289,7 +287,7 @@ def go_on_with(cell: Cell, actor: Actor, prepared: Prepared) -> None:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Look(Order):
+class ObserveTurns(Order):
     """Count (`statistics`) and follow (`trace`) what the actor does, or do not any more; returns the counts."""
 
     verb: ClassVar[str] = "look"
@@ -303,7 +301,7 @@ class Look(Order):
         return {"counting": self.counting, "tracing": self.tracing}
 
     @classmethod
-    def unpack(cls, data: dict[str, Any]) -> Look:
+    def unpack(cls, data: dict[str, Any]) -> ObserveTurns:
         return cls(data["counting"], data["tracing"])
 
 
@@ -327,7 +325,7 @@ class Ready(Order):
 
 ORDERS: dict[str, type[Order]] = {
     kind.verb: kind
-    for kind in (Suspend, Resume, GetState, ReplaceState, ReplaceCode, Prepare, Conclude, Look, Mark, Ready)
+    for kind in (Suspend, Resume, GetState, ReplaceState, ReplaceCode, Prepare, Conclude, ObserveTurns, Mark, Ready)
 }
 
 
@@ -410,7 +408,7 @@ def pack_function(function: Callable[..., Any], where: str, order: str) -> list[
     if "<" not in path:
         name = message_name(cast("Any", function))
         try:
-            if _found(name) == function:
+            if imported(name) == function:
                 return [name, [], {}]
         except (ImportError, AttributeError):
             pass
@@ -430,15 +428,7 @@ def unpack_function(packed: Any) -> Callable[..., Any]:
             "control", f"{packed!r:.100} is no function: a name, its arguments, and the named ones"
         ) from None
     try:
-        function = _found(name)
+        function: Callable[..., Any] = imported(name)
     except BaseException as error:  # Importing a module runs it: it may raise anything.
         raise SpecError("control", f"{name} cannot be imported: {error_text(error)}") from error
     return functools.partial(function, *args, **kwargs) if args or kwargs else function
-
-
-def _found(name: str) -> Callable[..., Any]:
-    module, _, path = name.partition(":")
-    found: Any = sys.modules.get(module) or importlib.import_module(module)
-    for part in path.split("."):
-        found = getattr(found, part)
-    return cast("Callable[..., Any]", found)

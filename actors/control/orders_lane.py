@@ -46,7 +46,7 @@ class OrderAsk(Ask, eq=False):
             self.future.set_result(value)
 
 
-class Call(Item):
+class QueuedOrder(Item):
     """An order in the queue of its actor: a command, ahead of all messages (but for `Mark`)."""
 
     __slots__ = ("ask", "order")
@@ -57,7 +57,7 @@ class Call(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        call: Call = item
+        call: QueuedOrder = item
         ask, ctx = call.ask, actor.ctx
         if ask.is_done or ask.deadline <= ctx.cell.node.loop.time():
             return None  # Whoever gave it was told that it was not carried out.
@@ -116,14 +116,14 @@ def order(cell: Cell, wanted: Order, timeout: float) -> asyncio.Future[Any]:
     ask = OrderAsk(ORDERED, None, (), timeout, node.loop.time() + timeout, future, living)
     node.deadlines.add(ask)
     try:
-        living.host.control(living, Call(ask, wanted))
+        living.host.control(living, QueuedOrder(ask, wanted))
     except BaseException:
         future.cancel()
         raise
     return future
 
 
-def send_call(peer: Peer, path: str, call: Call) -> None:
+def send_call(peer: Peer, path: str, call: QueuedOrder) -> None:
     """Give the order to the actor at `path` on the other side of a connection.
 
     Raises:
@@ -144,7 +144,7 @@ def _send(peer: Peer, path: str, ask: Ask, verb: str, data: bytes) -> None:
     ask.started = True  # From here on we cannot know.
 
 
-def take_orders(peer: Peer, cell: Cell | None = None) -> list[Call]:
+def take_orders(peer: Peer, cell: Cell | None = None) -> list[QueuedOrder]:
     """Take back what the process of an actor that leaves it has not carried out: it is to be ordered elsewhere.
 
     The actor has come to rest, so whatever was carried out has been answered. An answer that still comes is dropped.
@@ -197,7 +197,7 @@ def obey_order(guest: Guest, cell: Cell, frame: frames.Command) -> None:
         raise BadFrame(f"unknown order {verb!r}")
     try:
         fields: Any = decode_value(body)
-        call = Call(ask, kind.unpack(fields))
+        call = QueuedOrder(ask, kind.unpack(fields))
     except HoldfastError as error:
         ask.fail(error)
         return

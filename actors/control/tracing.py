@@ -45,7 +45,7 @@ class Statistics:
     """Lives that began since."""
 
 
-class Tap:
+class TurnTap:
     """Counts and tells for one address; it outlives the lives there."""
 
     def __init__(self, cell: Cell) -> None:
@@ -185,11 +185,11 @@ class Tap:
         self._tell(TurnEnded(self.cell.path, message, seconds, outcome))
 
 
-def tap_of(cell: Cell) -> Tap:
+def tap_of(cell: Cell) -> TurnTap:
     """The tap of an address, made now if there was none."""
     more = cell.extra()
     if more.tap is None:
-        more.tap = Tap(cell)
+        more.tap = TurnTap(cell)
     return more.tap
 
 
@@ -201,7 +201,7 @@ def _message(item: Any) -> object:
 class TappedTable(Table):
     """A class's table with a look at every handler's begin and end."""
 
-    def __init__(self, table: Table, tap: Tap) -> None:
+    def __init__(self, table: Table, tap: TurnTap) -> None:
         super().__init__()
         for kind, handler in table.items():
             self[kind] = handler if issubclass(kind, Item) else _watched(handler, tap)
@@ -215,7 +215,7 @@ class TappedTable(Table):
         return self[kind]
 
 
-def _watched(handler: Handler, tap: Tap) -> Handler:
+def _watched(handler: Handler, tap: TurnTap) -> Handler:
     def turn(actor: Any, message: Any) -> object:
         tap.begun(message)
         try:
@@ -231,7 +231,7 @@ def _watched(handler: Handler, tap: Tap) -> Handler:
     return turn
 
 
-async def _followed(turn: Any, message: Any, tap: Tap) -> object:
+async def _followed(turn: Any, message: Any, tap: TurnTap) -> object:
     try:
         result = await turn
     except BaseException as error:
@@ -282,7 +282,7 @@ def _own(ctx: Any) -> Any:
     return super(TappedContext, ctx)
 
 
-def _tap(ctx: Any) -> Tap:
+def _tap(ctx: Any) -> TurnTap:
     return tap_of(ctx.cell)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ..control.orders_lane import Call as Call
+    from ..control.orders_lane import QueuedOrder as QueuedOrder
     from ..exit_reasons import ExitReason
     from .actor import Start
     from .cell import Cell
@@ -79,7 +79,7 @@ class Place:
         """End the life at once."""
         raise NotImplementedError
 
-    def control(self, cell: Cell, call: Call) -> None:
+    def control(self, cell: Cell, call: QueuedOrder) -> None:
         """Have an order carried out between two turns of the actor, ahead of all messages."""
         raise NotImplementedError
 
@@ -195,7 +195,7 @@ class AddressHost:
     def kill(self, cell: Cell) -> None:
         self.place.kill(cell)
 
-    def control(self, cell: Cell, call: Call) -> None:
+    def control(self, cell: Cell, call: QueuedOrder) -> None:
         self.place.control(cell, call)
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:

@@ -58,7 +58,7 @@ def wait_on_loop(
             return outcome.done()
 
 
-class Threads(concurrent.futures.Executor):
+class HandlerThreads(concurrent.futures.Executor):
     """The worker threads of a node: started when first needed, reused, never more than `MOST`."""
 
     def __init__(self) -> None:

@@ -14,14 +14,14 @@ from ..ordered import Ordered
 from . import mailbox
 from .envelope import AnyTable, Ask, Item, Table
 from .links import Ties
-from .message import Message, Order, require_message
+from .message import Message, RuntimeOrder, require_message
 from .ref import ActorRef
 
 if TYPE_CHECKING:
-    from ..control.tracing import Tap
+    from ..control.tracing import TurnTap
     from ..errors import StartFailed
     from .actor import Actor, Start
-    from .address_host import Call, Home, Parent, Place
+    from .address_host import Home, Parent, Place, QueuedOrder
     from .context import ActorContext
     from .loop import Suspended
     from .mailbox import Bound
@@ -94,7 +94,7 @@ class Host(Protocol):
         """Admit a message for a sender that waits until it is accepted. None: it is."""
         ...
 
-    def control(self, cell: Cell, call: Call) -> None:
+    def control(self, cell: Cell, call: QueuedOrder) -> None:
         """Have an order carried out between two turns of the actor, ahead of all messages."""
         ...
 
@@ -162,7 +162,7 @@ class More:
 
     belongings: Belongings
     bindings: dict[str, Cell]
-    calls: list[Call]  # control that waits for the actor's process to be up
+    calls: list[QueuedOrder]  # control that waits for the actor's process to be up
     ties: Ties
 
     def __init__(self) -> None:
@@ -178,7 +178,7 @@ class More:
         self.starting: asyncio.Future[None] | None = None  # whoever waits for `on_start` of this life waits for it
         self.stash: deque[Any] | None = None
         self.suspended = 0  # by whom, see `control/orders.py`
-        self.tap: Tap | None = None  # whoever counts or follows what the actor does
+        self.tap: TurnTap | None = None  # whoever counts or follows what the actor does
         self.trap_exits = False
         self.turn: Suspended | None = None
         self.urgent: deque[Item] | None = None
@@ -267,7 +267,7 @@ class Cell(_Hot):
             UnknownMessage: the class is known and handles nothing of this type. BadMessage: this is no message.
             NotGranted: it is an order, and this process may give none there.
         """
-        if isinstance(message, Order) and (uplink := self.node.ports.uplink) is not None:
+        if isinstance(message, RuntimeOrder) and (uplink := self.node.ports.uplink) is not None:
             uplink.require_granted(self.path, type_name(type(message)))
         if not self.table.knows(type(message)):
             require_message(self.path, message)

@@ -28,7 +28,7 @@ from .ref import current
 
 if TYPE_CHECKING:
     from .actor import Start
-    from .address_host import Call
+    from .address_host import QueuedOrder
     from .loop import Suspended
 
 GRACE = 1.0
@@ -82,7 +82,7 @@ class HerePlace(Place):
         elif cell.state is RUNNING:
             cell.urge(Kill())
 
-    def control(self, cell: Cell, call: Call) -> None:
+    def control(self, cell: Cell, call: QueuedOrder) -> None:
         if call.is_urgent:
             urge(cell, call)
         else:

@@ -33,7 +33,7 @@ class Message(msgspec.Struct, Generic[R], frozen=True, array_like=True):
     """
 
 
-class Order(Message[R], Generic[R]):
+class RuntimeOrder(Message[R], Generic[R]):
     """Base of messages that are orders of the runtime: they start or end lives, or change what runs.
 
     From another process only whoever was granted the receiver's address may send them there.

@@ -18,7 +18,7 @@ from ..events import DeadLetter, Event, EventHub, SupervisorGaveUp
 from ..exit_reasons import KILLED, ExitReason
 from ..persistence import Keeper, NothingKept
 from . import lifecycle
-from .blocking_handlers import Threads
+from .blocking_handlers import HandlerThreads
 from .cell import DOWN, GONE, RUNNING, Cell, Host
 from .codec import Codec
 from .deadlines import Deadlines
@@ -40,7 +40,7 @@ SAME_CLOCK = 60.0
 """Seconds by which a loop's clock may be behind the monotonic one that it reads; the clock of a test is elsewhere."""
 
 
-class Kept(Protocol):
+class KeptByAddress(Protocol):
     """What belongs to an address, whoever lives there."""
 
     def given_up(self, error: ActorStopped) -> None:
@@ -140,9 +140,11 @@ class Node(RunLoop):
         self.numbers = Numbers(seed)
         self.ports = Ports()
         self.topics = topics or Topics()
-        self.threads = Threads()
+        self.threads = HandlerThreads()
         self.names: dict[str, Cell] = {}
-        self.kept: weakref.WeakKeyDictionary[Cell, Kept] = weakref.WeakKeyDictionary()  # outlives an actor's lives
+        self.kept: weakref.WeakKeyDictionary[Cell, KeptByAddress] = (
+            weakref.WeakKeyDictionary()
+        )  # outlives an actor's lives
         self.remains: dict[asyncio.Future[Any], str] = {}  # what killed lives have left and is still ending: address
         self.safe: dict[str, asyncio.TimerHandle] = {}  # who is in safe state here: when that should be over
         self.led: dict[str, dict[str, set[str]]] = {}  # of who is replayed: where bindings led, by where they lead

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
-from ..control.orders_lane import Call
+from ..control.orders_lane import QueuedOrder
 from ..errors import CannotMove, StartFailed, error_text
 from ..exit_reasons import ExitReason
 from ..kernel import lifecycle, mailbox
@@ -19,7 +19,7 @@ from ..kernel.mailbox import Bound
 from ..kernel.timers import Timer
 from .luggage import check_sendable, pack_rest
 from .move import Entering, Leaving, Move
-from .quiesce import Take, Transit, decoded, farewell, now, part, resume, settle, sorted_out, twin
+from .quiesce import PackLife, Transit, decoded, farewell, now, part, resume, settle, sorted_out, twin
 from .worker_moves import await_up
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class FromHere(Leaving):
 
     def __init__(self, ignored: tuple[str, ...] = ()) -> None:
         self._ignored = ignored  # children that are not the actor's own
-        self._take: Take | None = None
+        self._take: PackLife | None = None
         self._old: Cell | None = None
         self._topics: set[str] = set()
         self._links: set[Cell] = set()
@@ -42,7 +42,7 @@ class FromHere(Leaving):
         move, entering = self.move, self.move.entering
         self._start = move.cell.extra().start
         self._rested: asyncio.Future[None] = move.node.loop.create_future()
-        take = self._take = Take(entering.owe, self._at_rest, move.give_up, self._ignored, stays=move.stays)
+        take = self._take = PackLife(entering.owe, self._at_rest, move.give_up, self._ignored, stays=move.stays)
         lifecycle.urge(move.cell, take)
         await move.within(self._rested, move.timeout, lambda: f"{take.why}, and that did not change")
 
@@ -78,8 +78,8 @@ class FromHere(Leaving):
         luggage.bound = cell.extra().bound
         self._old = part(cell)
         items, commands = sorted_out(cell)
-        luggage.queue = [item for item in items if not isinstance(item, Call)]
-        return [*commands, *(item for item in items if isinstance(item, Call))]
+        luggage.queue = [item for item in items if not isinstance(item, QueuedOrder)]
+        return [*commands, *(item for item in items if isinstance(item, QueuedOrder))]
 
     def retire(self) -> None:
         assert self._old is not None

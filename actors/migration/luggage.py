@@ -21,6 +21,7 @@ from ..kernel.links import Down, Exit, Monitor
 from ..kernel.message import message_name
 from ..kernel.ref import ActorRef
 from ..kernel.timers import Timer
+from ..state_hooks import state_getter
 from ..values import UnsavableValue, decode_value, encode_value
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class Stays(HoldfastError, text="{why}"):
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Held:
+class PackedHandle:
     """Stands in a packed state for a handle: "timer", "reply", "ref" or "watch", and what it is known by."""
 
     kind: str
@@ -92,7 +93,7 @@ class StatePacker:
 
     def _named(self, where: str, state: Any) -> Any:
         lifted = lift(state, self._stand_in)
-        if hasattr(self._actor, "get_state"):
+        if state_getter(self._actor) is not None:
             encode_value(lifted, where=f"{where}.get_state()")
         else:
             for name, value in lifted.items():
@@ -101,17 +102,17 @@ class StatePacker:
 
     def _stand_in(self, value: Any) -> Any:
         if isinstance(value, Timer):
-            return Held("timer", self._timers.index(value) if value in self._timers else -1)
+            return PackedHandle("timer", self._timers.index(value) if value in self._timers else -1)
         if type(value) is ReplyHandle:
             ask = value.ask
             if ask is None or ask.is_done:
-                return Held("reply", -1)
+                return PackedHandle("reply", -1)
             self._owed.add(id(ask))
-            return Held("reply", self._owe(ask))
+            return PackedHandle("reply", self._owe(ask))
         if isinstance(value, ActorRef):
-            return Held("ref", value.path)
+            return PackedHandle("ref", value.path)
         if isinstance(value, Monitor):
-            return Held("watch", [value.name, value.for_good])
+            return PackedHandle("watch", [value.name, value.for_good])
         return value
 
 
@@ -157,7 +158,7 @@ def unpack(
         timers.append(Timer.unpacked(cell, message, left, interval, queued))
 
     def found(value: Any) -> Any:
-        if not isinstance(value, Held):
+        if not isinstance(value, PackedHandle):
             return value
         match value.kind:
             case "timer":

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
-from ..control.orders_lane import Call
+from ..control.orders_lane import QueuedOrder
 from ..errors import HoldfastError, error_text
 from ..kernel import lifecycle, mailbox
 from ..kernel.cell import GONE, RUNNING, Cell, Host
@@ -37,7 +37,7 @@ LOOK_AGAIN = 0.005
 """Seconds between two looks at whether background work is over."""
 
 
-class Take(Item):
+class PackLife(Item):
     """A command: come to rest, as soon as no background work is out, with the state packed. Until then all goes on."""
 
     __slots__ = ("_ignored", "_owe", "_refused", "_stays", "_taken", "is_done", "is_void", "why")
@@ -60,7 +60,7 @@ class Take(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        take: Take = item
+        take: PackLife = item
         ctx = actor.ctx
         cell: Cell = ctx.cell
         if take.is_void or ctx.postpones(take) or any(map(_ends, cell.extra().urgent or ())):
@@ -180,7 +180,7 @@ class Transit:
     def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
         return True
 
-    def control(self, cell: Cell, call: Call) -> None:
+    def control(self, cell: Cell, call: QueuedOrder) -> None:
         self.waiting.append(lambda host: host.control(cell, call))
 
     def is_up(self, cell: Cell) -> bool:
@@ -314,7 +314,7 @@ def sorted_out(cell: Cell, *, ticks: bool = False) -> tuple[list[Any], list[Item
 def obey_commands(cell: Cell, commands: list[Item]) -> None:
     """What had been ordered of a life before it was moved is ordered of it now."""
     for command in commands:
-        if isinstance(command, Call):
+        if isinstance(command, QueuedOrder):
             cell.host.control(cell, command)
         elif isinstance(command, Kill):
             cell.host.kill(cell)

@@ -7,14 +7,14 @@ from collections import deque
 from typing import TYPE_CHECKING, Any
 
 from ..control.orders_lane import OrderAsk, take_orders
-from ..errors import AskFailed, BadMessage, CannotMove, error_text
+from ..errors import AskFailed, CannotMove, error_text
 from ..exit_reasons import KILLED, ExitReason
 from ..kernel import mailbox
 from ..kernel.cell import Cell
 from ..kernel.envelope import Ask, Item
 from ..kernel.lifecycle import PATIENCE
 from ..kernel.links import Monitor
-from ..process.process_host import Outlet, RemoteBound, WorkerPlace, admit_remote, admit_remote_bounded, undelivered
+from ..process.process_host import Outlet, RemoteBound, WorkerPlace, admit_remote, admit_remote_bounded
 from ..process.wire.start_codec import pack_recipe
 from .here import let_in
 from .luggage import unpack, unpack_items
@@ -281,16 +281,11 @@ class FromWorker(FromOwnWorker):
 
 def send_queue(cell: Cell) -> None:
     """Send what is queued to the process of the actor."""
-    more, queue = cell.extra(), cell.queue
+    more = cell.extra()
     outlet: Outlet = more.outlet
     if isinstance(more.bound, RemoteBound):
         more.bound.recount(cell)
         more.bound.send(cell)
         let_in(cell, more.bound)
-        return
-    while queue:
-        item = queue.popleft()
-        try:
-            outlet.hand_over(cell, item)
-        except BadMessage as error:
-            undelivered(cell, item, error)
+    else:
+        outlet.hand_over_queue(cell)

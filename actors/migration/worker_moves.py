@@ -19,7 +19,7 @@ from ..process.wire.frames import BadFrame
 from ..process.wire.peer import Arrived, RelayedAsk
 from ..process.wire.start_codec import unpack_recipe
 from .luggage import pack_items, pack_rest, unpack
-from .quiesce import Settle, Take, now, resume
+from .quiesce import PackLife, Settle, now, resume
 from .words import Incoming, say
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ class GuestMove:
     def __init__(self, guest: Guest, path: str, number: int) -> None:
         self._guest, self._path, self._number = guest, path, number
         self._luggage: dict[str, Any] | None = None
-        self._take: Take | None = None
+        self._take: PackLife | None = None
         self._state = b""
         self._stash: list[Any] = []
         self._admit: Admit | None = None
@@ -119,7 +119,7 @@ class GuestMove:
             case "go":
                 self._go(cell, suspended=bool(told["suspended"]))
             case "take":
-                self._take = Take(_number, self._taken, self._refused, stays=bool(told.get("stays")))
+                self._take = PackLife(_number, self._taken, self._refused, stays=bool(told.get("stays")))
                 if cell.state is RUNNING:
                     lifecycle.urge(cell, self._take)
             case "pack":

@@ -31,7 +31,7 @@ from .wire.start_codec import pack_recipe
 from .worker_pool import Worker, Workers
 
 if TYPE_CHECKING:
-    from ..control.orders_lane import Call
+    from ..control.orders_lane import QueuedOrder
     from ..kernel.node import Node
 
 
@@ -55,6 +55,16 @@ class Outlet:
             send_signal(worker, self.path, item)
         else:
             self.send(cell, item)
+
+    def hand_over_queue(self, cell: Cell) -> None:
+        """Send all that is queued; what turns out not to be sendable is undelivered."""
+        queue = cell.queue
+        while queue:
+            item = queue.popleft()
+            try:
+                self.hand_over(cell, item)
+            except BadMessage as error:
+                undelivered(cell, item, error)
 
     def send(self, cell: Cell, item: Any) -> None:
         """Send to the process; raises BadMessage if the item cannot be coded."""
@@ -287,16 +297,11 @@ class FlightHome(WorkerHome):
             node.emit(ActorStarted(cell.path, cell.life))
         outlet: Outlet = cell.extra().outlet
         outlet.worker = worker
-        bound, queue = cell.extra().bound, cell.queue
+        bound = cell.extra().bound
         if isinstance(bound, RemoteBound):
             bound.send(cell)
         else:
-            while queue:
-                item = queue.popleft()
-                try:
-                    outlet.hand_over(cell, item)
-                except BadMessage as error:
-                    undelivered(cell, item, error)
+            outlet.hand_over_queue(cell)
 
     def readdressed(self, cell: Cell) -> None:
         outlet: Outlet | None = cell.extra().outlet
@@ -485,7 +490,7 @@ class WorkerPlace(Place):
 
     # -- what else a place does -------------------------------------------------------------------------------------
 
-    def control(self, cell: Cell, call: Call) -> None:
+    def control(self, cell: Cell, call: QueuedOrder) -> None:
         from ..control.orders_lane import send_call
 
         worker = self.workers.of(cell)
@@ -526,7 +531,7 @@ def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
             worker.on_ask(worker.gate.target(frame.to), frame, None)
         case frames.Failure():
             worker.on_failure(frame)
-        case frames.Moved():
+        case frames.PageChanged():
             worker.on_moved()
         case frames.Offer():
             worker.on_offer([worker.gate.target(frame.to)], frame)
@@ -548,7 +553,7 @@ def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
             worker.on_migrate(frame)
         case frames.Forget():
             worker.on_forget(frame)
-        case frames.Launch() | frames.Run():
+        case frames.Launch() | frames.TellRun():
             raise AssertionError(f"{type(frame).__name__} has no way in")
 
 

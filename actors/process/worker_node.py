@@ -26,7 +26,7 @@ from ..kernel.address_host import AddressHost
 from ..kernel.cell import RUNNING, Cell
 from ..kernel.envelope import AnyTable
 from ..kernel.lifecycle import HERE, MAILBOX
-from ..kernel.message import Message, Order, message_name
+from ..kernel.message import Message, RuntimeOrder, message_name
 from ..kernel.node import Node, Ports
 from ..kernel.ref import current
 from ..kernel.topics import Topics
@@ -131,7 +131,7 @@ class OutsideTable(AnyTable):
     """The table of an actor that is not in this process: whether an order may be given there is looked at each time."""
 
     def __contains__(self, kind: object) -> bool:
-        return self.knows(kind) and not issubclass(kind, Order)  # type: ignore[arg-type]  # a message's type
+        return self.knows(kind) and not issubclass(kind, RuntimeOrder)  # type: ignore[arg-type]  # a message's type
 
     def knows(self, kind: type) -> bool:
         return issubclass(kind, Message)
@@ -157,7 +157,7 @@ class NudgingPage:
 
     def _tell(self) -> None:
         self._is_told = False
-        self._guest.connection.send(frames.Moved())
+        self._guest.connection.send(frames.PageChanged())
 
 
 class Guest(Peer):
@@ -192,7 +192,7 @@ class Guest(Peer):
         self.node.events.add_sink(self._on_event)
         self.takers: dict[type[frames.Frame], Callable[[Any], None]] = {
             frames.Tell: self._tell,
-            frames.Run: self._run,
+            frames.TellRun: self._run,
             frames.Ask: self._ask,
             frames.Offer: lambda frame: self.on_offer([self._target(frame.to)], frame),
             frames.Reply: self.on_reply,
@@ -315,7 +315,7 @@ class Guest(Peer):
                 return
         self.on_tell(self._target(frame.to), frame, self.page if frame.number else None)
 
-    def _run(self, frame: frames.Run) -> None:
+    def _run(self, frame: frames.TellRun) -> None:
         """Many such messages: decoded in one call."""
         route = self.routes.get((frame.to, frame.name))
         number, page = frame.first, self.page

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..control.orders import Look
+from ..control.orders import ObserveTurns
 from ..control.orders_lane import order, send_call
 from ..errors import AskFailed, ProcessUnavailable, StartFailed, StartIgnored
 from ..events import TRACED, LogLine, ProcessDied, ProcessStarted, TrustBreached
@@ -148,7 +148,7 @@ class Worker(Peer):
         if more.tap is not None and more.tap.is_on:
             more.tap.attach()
             wanted = more.tap.wanted
-            seen = order(cell, Look(wanted["counting"], wanted["tracing"]), ORDER_TIMEOUT)
+            seen = order(cell, ObserveTurns(wanted["counting"], wanted["tracing"]), ORDER_TIMEOUT)
             seen.add_done_callback(_seen)
 
     # -- an actor that is moved here, or leaves ---------------------------------------------------------------------

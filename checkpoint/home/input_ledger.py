@@ -212,7 +212,11 @@ class InputLedger:
         if past is None or seen != len(past.digests) or end.status != past.status:
             raise ReplayDiverged(self.path, number, seen + 1)
         if end.state != past.state and end.state and past.state:
-            raise StateDiverged(self.path, number, past.input.name or past.input.kind)
+            cause = (
+                f"after {past.input.name or past.input.kind} its state is not what it was before the crash; use "
+                "ctx.now(), ctx.random and ctx.uuid(), and find the cause with hybrid(strict=True)"
+            )
+            raise StateDiverged(self.path, number, 0, cause)
         if past.reply and past.reply != answer_digest(end.answer):
             cause = f"the reply to {past.input.name} is not what it was before the crash; {DIVERGES}"
             raise ReplayDiverged(self.path, number, seen + 1, cause)

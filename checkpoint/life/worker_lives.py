@@ -31,7 +31,7 @@ from .recorded_inbox import StopRecorded
 from .recorded_life import FED, Life, LifePlace
 
 if TYPE_CHECKING:
-    from ...actors.control.orders_lane import Call
+    from ...actors.control.orders_lane import QueuedOrder
     from ...actors.process.worker_node import Guest
 
 FROM_HOME: msgspec.msgpack.Decoder[ToLife] = msgspec.msgpack.Decoder(ToLife)
@@ -299,7 +299,7 @@ class ChildHere(ChildPlace):
         if not self.gave_up_start(cell):
             HERE.kill(cell)
 
-    def control(self, cell: Cell, call: Call) -> None:
+    def control(self, cell: Cell, call: QueuedOrder) -> None:
         HERE.control(cell, call)
 
     def is_up(self, cell: Cell) -> bool:

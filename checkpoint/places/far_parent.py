@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from ...actors.control.orders_lane import Call, send_call
+from ...actors.control.orders_lane import QueuedOrder, send_call
 from ...actors.errors import HoldfastError, StartFailed, StartIgnored
 from ...actors.exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
 from ...actors.kernel import lifecycle, links
@@ -391,7 +391,7 @@ class SlotPlace(Place):
         if worker is not None and cell.state is RUNNING:
             worker.connection.send(frames.Command(worker.connection.names.to_wire(cell.path), verb, data))
 
-    def control(self, cell: Cell, call: Call) -> None:
+    def control(self, cell: Cell, call: QueuedOrder) -> None:
         worker = self._parent.worker
         if worker is not None and cell.state is RUNNING:
             send_call(worker, cell.path, call)

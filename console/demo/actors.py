@@ -82,7 +82,7 @@ class MapperState(Message):
     questions: dict[int, int]
 
 
-class GetState(Message[MapperState]):
+class GetMap(Message[MapperState]):
     """The whole map, and how often each question was handled; counts as no question itself."""
 
 
@@ -181,8 +181,8 @@ class Mapper(Actor):
         self._count(question.serial)
         return _part(self.grid.window(question.low, question.high), self.last_scan)
 
-    @on(GetState, readonly=True)
-    def get_everything(self, question: GetState) -> MapperState:
+    @on(GetMap, readonly=True)
+    def get_everything(self, question: GetMap) -> MapperState:
         return MapperState(_part(self.grid, self.last_scan), self.scans, self.gaps, self.questions)
 
     def _count(self, serial: int) -> None:

@@ -22,7 +22,7 @@ from ... import (
     start,
     supervisor,
 )
-from .actors import FindPath, GetState, LogRead, Mapper, MapperState, NoWay, Planner, Reader, ReadLog, as_grid
+from .actors import FindPath, GetMap, LogRead, Mapper, MapperState, NoWay, Planner, Reader, ReadLog, as_grid
 from .grid import USABLE_RANGE, Geometry
 from .killer import Killer, schedule
 from .log import Survey, survey
@@ -131,7 +131,7 @@ class DemoRun:
             await _cancel(asking)
         await questions.drain()
         path = await self._path(planner, questions)
-        state = await mapper.ask(GetState(), timeout=PATIENCE)
+        state = await mapper.ask(GetMap(), timeout=PATIENCE)
         seconds = monotonic() - began
         await self._hear_the_last(killer)
         return self._outcome(state, questions, killer.kills, read, path, seconds)

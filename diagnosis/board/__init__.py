@@ -8,7 +8,7 @@ Source: Zaman et al. 2013, section IV-A (figure 4).
 """
 
 from .board_actor import TOPIC, BoardActor, BoardFailed, BoardMeasured, GetSpecification, SwitchChannel
-from .board_frames import CHANNELS, BadFrame, ChannelSpecification, Measurements, Reading, Specification
+from .board_frames import CHANNELS, BadBoardFrame, ChannelSpecification, Measurements, Reading, Specification
 from .client import Board, BoardError, BoardLost, BoardRefused, BoardSilent, BoardUnreachable
 from .simulated_board import Load, SimulatedBoard
 from .simulator_actor import (
@@ -30,7 +30,7 @@ from .simulator_actor import (
 from .tcp_server import BoardServer, Device
 
 __all__ = [
-    "BadFrame",
+    "BadBoardFrame",
     "Board",
     "BoardActor",
     "BoardError",

@@ -33,7 +33,7 @@ FASTEST, SLOWEST = 10, 3_600_000
 """Milliseconds between two broadcasts, at least and at most; 0 is none."""
 
 
-class BadFrame(HoldfastError, text="bad frame: {why}"):
+class BadBoardFrame(HoldfastError, text="bad frame: {why}"):
     """Bytes that are no frame, or a frame that says what cannot be.
 
     Attributes:
@@ -152,10 +152,10 @@ def encode(sequence: int, frame: Frame) -> bytes:
     try:
         body = _body(frame)
         if len(body) > LARGEST:
-            raise BadFrame(f"the body has {len(body)} bytes, and {LARGEST} are allowed", sequence)
+            raise BadBoardFrame(f"the body has {len(body)} bytes, and {LARGEST} are allowed", sequence)
         head = HEAD.pack(MAGIC, VERSION, NUMBERS[type(frame)], sequence, len(body))
     except struct.error as error:
-        raise BadFrame(f"a number does not fit: {error}") from error
+        raise BadBoardFrame(f"a number does not fit: {error}") from error
     return head + body + TAIL.pack(zlib.crc32(head + body))
 
 
@@ -181,20 +181,20 @@ class BoardDecoder:
             BadFrame: unless it is fatal, the next call goes on with the next frame.
         """
         if not MAGIC.startswith(self._buffer[: len(MAGIC)]):
-            raise BadFrame("it does not begin as one", is_fatal=True)
+            raise BadBoardFrame("it does not begin as one", is_fatal=True)
         if len(self._buffer) < HEAD.size:
             return None
         _, version, number, sequence, size = HEAD.unpack_from(self._buffer)
         if version != VERSION:
-            raise BadFrame(f"it is of version {version}, and this is {VERSION}", sequence, is_fatal=True)
+            raise BadBoardFrame(f"it is of version {version}, and this is {VERSION}", sequence, is_fatal=True)
         if size > LARGEST:
-            raise BadFrame(f"the body has {size} bytes, and {LARGEST} are allowed", sequence, is_fatal=True)
+            raise BadBoardFrame(f"the body has {size} bytes, and {LARGEST} are allowed", sequence, is_fatal=True)
         end = HEAD.size + size
         if len(self._buffer) < end + TAIL.size:
             return None
         whole = bytes(self._buffer[:end])
         if TAIL.unpack_from(self._buffer, end)[0] != zlib.crc32(whole):
-            raise BadFrame("its checksum is wrong", is_fatal=True)
+            raise BadBoardFrame("its checksum is wrong", is_fatal=True)
         del self._buffer[: end + TAIL.size]
         return sequence, _decoded(number, sequence, whole[HEAD.size :])
 
@@ -202,16 +202,16 @@ class BoardDecoder:
 def _decoded(number: int, sequence: int, body: bytes) -> Frame:
     kind = KINDS.get(number)
     if kind is None:
-        raise BadFrame(f"there is no kind 0x{number:02x}", sequence)
+        raise BadBoardFrame(f"there is no kind 0x{number:02x}", sequence)
     try:
         frame = _frame(kind, body)
         again = _body(frame)  # Numbers that cannot be are found here, too.
     except (struct.error, UnicodeDecodeError, IndexError) as error:
-        raise BadFrame(f"the body of {kind.__name__} is wrong: {error}", sequence) from error
-    except BadFrame as error:
-        raise BadFrame(error.why, sequence) from error
+        raise BadBoardFrame(f"the body of {kind.__name__} is wrong: {error}", sequence) from error
+    except BadBoardFrame as error:
+        raise BadBoardFrame(error.why, sequence) from error
     if again != body:
-        raise BadFrame(f"the body of {kind.__name__} holds more than it should", sequence)
+        raise BadBoardFrame(f"the body of {kind.__name__} holds more than it should", sequence)
     return frame
 
 
@@ -223,7 +223,7 @@ def _body(frame: Frame) -> bytes:
             return _SWITCH.pack(_channel(channel), on)
         case Broadcast(milliseconds):
             if milliseconds and not FASTEST <= milliseconds <= SLOWEST:
-                raise BadFrame(f"a broadcast comes every {FASTEST} to {SLOWEST} ms, or 0, not {milliseconds}")
+                raise BadBoardFrame(f"a broadcast comes every {FASTEST} to {SLOWEST} ms, or 0, not {milliseconds}")
             return _MILLISECONDS.pack(milliseconds)
         case SetDefaults(channels):
             return _MASK.pack(_mask(channels))
@@ -233,7 +233,7 @@ def _body(frame: Frame) -> bytes:
             for one in channels:
                 name = one.name.encode()
                 if len(name) > LONGEST_NAME:
-                    raise BadFrame(f"a name has up to {LONGEST_NAME} bytes, {one.name!r} has {len(name)}")
+                    raise BadBoardFrame(f"a name has up to {LONGEST_NAME} bytes, {one.name!r} has {len(name)}")
                 parts += [_CHANNEL.pack(one.millivolts, one.milliamperes, len(name)), name]
             return b"".join(parts)
         case Measurements(uptime, channels):
@@ -279,13 +279,13 @@ def _specification(body: bytes) -> Specification:
 
 def _channel(number: int) -> int:
     if not 0 <= number < CHANNELS:
-        raise BadFrame(f"there is no channel {number}: they are 0 to {CHANNELS - 1}")
+        raise BadBoardFrame(f"there is no channel {number}: they are 0 to {CHANNELS - 1}")
     return number
 
 
 def _flag(value: int) -> bool:
     if value > 1:
-        raise BadFrame(f"on is 1 and off is 0, not {value}")
+        raise BadBoardFrame(f"on is 1 and off is 0, not {value}")
     return bool(value)
 
 
@@ -299,4 +299,4 @@ def _channels(mask: int) -> frozenset[int]:
 
 def _ten(channels: tuple[object, ...]) -> None:
     if len(channels) != CHANNELS:
-        raise BadFrame(f"a board has {CHANNELS} channels, not {len(channels)}")
+        raise BadBoardFrame(f"a board has {CHANNELS} channels, not {len(channels)}")

@@ -17,7 +17,7 @@ from .board_frames import (
     Answer,
     AskMeasurements,
     AskSpecification,
-    BadFrame,
+    BadBoardFrame,
     BoardDecoder,
     Broadcast,
     DoneFrame,
@@ -188,7 +188,7 @@ class Board:
     async def _ask(self, request: Request, kind: type[A]) -> A:
         try:
             encode(1, request)  # Refused before anybody waits.
-        except BadFrame as error:
+        except BadBoardFrame as error:
             raise BoardRefused(self.url, error.why) from error
         loop = asyncio.get_running_loop()
         began = loop.time()
@@ -257,7 +257,7 @@ class Board:
                     has_spoken = True
         except (OSError, TimeoutError) as error:
             self._problem = str(error) or "it has fallen silent"
-        except BadFrame as error:
+        except BadBoardFrame as error:
             self._problem = str(error)
         finally:
             self._lose()
@@ -273,10 +273,10 @@ class Board:
 
     def _heard(self, sequence: int, frame: object) -> None:
         if not isinstance(frame, Answer):
-            raise BadFrame(f"{type(frame).__name__} is not for a board to say")
+            raise BadBoardFrame(f"{type(frame).__name__} is not for a board to say")
         self._silent = 0
         if sequence == 0 and isinstance(frame, RefusedFrame):
-            raise BadFrame(f"the board ends it: {frame.why}")
+            raise BadBoardFrame(f"the board ends it: {frame.why}")
         if sequence == 0 and isinstance(frame, Measurements):
             for watcher in self._watchers:
                 if not watcher.done():

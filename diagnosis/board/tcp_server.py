@@ -12,7 +12,7 @@ from .board_frames import (
     Answer,
     AskMeasurements,
     AskSpecification,
-    BadFrame,
+    BadBoardFrame,
     BoardDecoder,
     Broadcast,
     DoneFrame,
@@ -171,7 +171,7 @@ class _Client:
                 return None
             sequence, frame = taken
             answer = await self._answer(frame)
-        except BadFrame as error:
+        except BadBoardFrame as error:
             await self._reply(error.sequence, RefusedFrame(error.why))
             return not error.is_fatal
         await self._reply(sequence, answer)

@@ -27,13 +27,10 @@ class ModelProblem(msgspec.Struct, frozen=True):
         return f"{self.where}: {self.text}" if self.where else self.text
 
 
-class ModelError(HoldfastError):
+class ModelError(HoldfastError, text="{problems:\n}"):
     """A model that cannot be used: all that is wrong with it, one line each, with file and line where there is one."""
 
     problems: tuple[str, ...]
-
-    def __str__(self) -> str:
-        return "\n".join(self.problems)
 
 
 class Model:

@@ -79,14 +79,11 @@ class Version(msgspec.Struct, frozen=True):
     time: float = 0.0
 
 
-class NoSuchVersion(HoldfastError):
+class NoSuchVersion(HoldfastError, text="there is no version {version} of the model; kept are {kept:, }"):
     """A version that never was, or that is not kept any more."""
 
     version: int
     kept: tuple[int, ...]
-
-    def __str__(self) -> str:
-        return f"there is no version {self.version} of the model; kept are {', '.join(map(str, self.kept))}"
 
 
 class History:

@@ -14,7 +14,7 @@ from ...actors.process.process_host import WorkerPlace
 from ...actors.process.wire.peer import OutsideHost, Peer
 from ...supervision.intensity import admit_restart
 from ..literals import Literal, running
-from ..messages import STARTS, Started
+from ..messages import STARTS, ComponentsStarted
 from .observer import Manner, Observer
 
 FREE: Final = 3
@@ -59,7 +59,7 @@ class NodeObserver(Observer):
     async def look(self) -> None:
         """Look them all up; those that have to be asked are asked at the same time."""
         if started := [atom.args[0] for atom, path in self._actors.items() if self._is_new(atom, path)]:
-            await self.ctx.publish(STARTS, Started(tuple(started), self._settling))
+            await self.ctx.publish(STARTS, ComponentsStarted(tuple(started), self._settling))
         asked: list[Literal] = []
         answers: list[Awaitable[bool | None]] = []
         for atom, path in self._actors.items():

@@ -13,7 +13,7 @@ from typing import Final
 import msgspec
 import psutil
 
-from ...actors.control.orders import Look as LookAt
+from ...actors.control.orders import ObserveTurns as LookAt
 from ...actors.control.orders import Status, status_of
 from ...actors.control.orders_lane import ask_status, order
 from ...actors.control.tracing import Statistics

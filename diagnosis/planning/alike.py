@@ -13,7 +13,7 @@ from typing import TypeAlias
 from ..engine.breath import breathing
 from ..engine.connected import connected
 from .grounding import GroundAction
-from .language import Atom, Literal, Problem
+from .language import Atom, PlanLiteral, Problem
 from .relevance import atoms
 
 Numbered: TypeAlias = tuple[int, bool]
@@ -26,7 +26,7 @@ class ActionGroup:
 
     actions: Sequence[GroundAction]
     atoms: dict[Atom, int]
-    goals: list[Literal]
+    goals: list[PlanLiteral]
 
 
 class OneOfEach:
@@ -41,7 +41,7 @@ class OneOfEach:
         self._problem = problem
         parts = [_numbered(some) for some in connected(actions, atoms)]
         owner = {atom: part for part, _ in parts for atom in part.atoms}
-        fixed: list[Literal] = []
+        fixed: list[PlanLiteral] = []
         for goal in problem.goals:
             part = owner.get(goal.atom)
             (fixed if part is None else part.goals).append(goal)
@@ -63,16 +63,16 @@ class OneOfEach:
         place = part.actions.index(action)
         return [alike.actions[place] for alike in self._alike[id(part)]]
 
-    def same(self, goals: Iterable[Literal]) -> tuple[Literal, ...]:
+    def same(self, goals: Iterable[PlanLiteral]) -> tuple[PlanLiteral, ...]:
         """These goals, and those that are the same in parts that are alike; in the problem's order."""
-        found: set[Literal] = set()
+        found: set[PlanLiteral] = set()
         for goal in goals:
             part = self._owner.get(goal.atom)
             if part is None:
                 found.add(goal)
                 continue
             place = part.atoms[goal.atom]
-            found.update(Literal(list(alike.atoms)[place], goal.value) for alike in self._alike[id(part)])
+            found.update(PlanLiteral(list(alike.atoms)[place], goal.value) for alike in self._alike[id(part)])
         return tuple(goal for goal in self._problem.goals if goal in found)
 
 
@@ -80,7 +80,7 @@ def _numbered(actions: Sequence[GroundAction]) -> tuple[ActionGroup, object]:
     """A part, and its form: equal only for parts that are alike."""
     numbers: dict[Atom, int] = {}
 
-    def number(literal: Literal) -> Numbered:
+    def number(literal: PlanLiteral) -> Numbered:
         return numbers.setdefault(literal.atom, len(numbers)), literal.value
 
     form = tuple(

@@ -8,7 +8,7 @@ from typing import Protocol, TypeAlias
 
 import msgspec
 
-from .language import Literal, Problem
+from .language import PlanLiteral, Problem
 
 
 class Step(msgspec.Struct, frozen=True, order=True, array_like=True):
@@ -38,7 +38,7 @@ class Plan(msgspec.Struct, frozen=True):
     stages: tuple[tuple[Step, ...], ...]
     cost: int = 0
     is_optimal: bool = True
-    unmet: tuple[Literal, ...] = ()
+    unmet: tuple[PlanLiteral, ...] = ()
 
     @property
     def steps(self) -> tuple[Step, ...]:
@@ -49,7 +49,7 @@ class Plan(msgspec.Struct, frozen=True):
 class Unsolvable(msgspec.Struct, frozen=True):
     """It is proven that no plan reaches these goals: none of them, if `is_each`; else not all of them together."""
 
-    goals: tuple[Literal, ...]
+    goals: tuple[PlanLiteral, ...]
     is_each: bool
     why: str
 

@@ -9,7 +9,7 @@ import msgspec
 
 from ..engine.breath import beside_a_loop
 from .answers import Budget, Outcome, OutOfTime, Plan, Planner, TimedOut, Unsolvable
-from .language import Literal, Problem
+from .language import PlanLiteral, Problem
 from .plan_check import check_plan
 
 GRACE = 1.0
@@ -65,7 +65,7 @@ def _solve(planner: Planner, problem: Problem, budget: Budget, degrade: bool) ->
 
 def _what_can_be_had(planner: Planner, problem: Problem, budget: Budget) -> Outcome:
     """Give up what is proven impossible, one after the other, and then see what need not have been given up."""
-    goals, impossible, given_up = list(problem.goals), list[Literal](), list[Literal]()
+    goals, impossible, given_up = list(problem.goals), list[PlanLiteral](), list[PlanLiteral]()
     while True:
         outcome = planner.solve(problem.wanting(goals), budget)
         if not isinstance(outcome, Unsolvable):

@@ -20,16 +20,16 @@ from .language import (
     Fact,
     ForAll,
     Formula,
-    Literal,
     Not,
     Or,
+    PlanLiteral,
     PlanningError,
     Problem,
     Same,
 )
 from .static_facts import Binding, StaticFacts, fill, statics
 
-Term: TypeAlias = frozenset[Literal]
+Term: TypeAlias = frozenset[PlanLiteral]
 """A conjunction."""
 
 MOST_ACTIONS = 100_000
@@ -47,7 +47,7 @@ class GroundEffect:
     """If the condition is true before, the literal is true after."""
 
     condition: Term
-    literal: Literal
+    literal: PlanLiteral
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -124,10 +124,10 @@ def _ground_action(world: StaticFacts, action: Action, budget: Budget) -> Iterat
 def _effects(
     world: StaticFacts, conditions: Conditions, effects: Iterable[Effect], bound: Binding
 ) -> Iterator[GroundEffect]:
-    made: dict[tuple[Term, Literal], None] = {}
+    made: dict[tuple[Term, PlanLiteral], None] = {}
     for effect in effects:
         for inner in world.places(effect, bound):
-            literal = Literal(fill(effect.literal.atom, inner), effect.literal.value)
+            literal = PlanLiteral(fill(effect.literal.atom, inner), effect.literal.value)
             for condition in conditions.terms(effect.condition, inner):
                 made[condition, literal] = None
     added = {literal.atom for condition, literal in made if literal.value and not condition}
@@ -146,7 +146,7 @@ class Conditions:
         """The formula, or its negation, as a disjunction of conjunctions. Raises PlanningError if they are too many."""
         match formula:
             case Fact(atom):
-                literal = Literal(fill(atom, bound), value)
+                literal = PlanLiteral(fill(atom, bound), value)
                 if atom[0] in self._world.changing:
                     return [frozenset((literal,))]
                 return TRUE if (literal.atom in self._world.statics) is value else FALSE
@@ -168,7 +168,7 @@ class Conditions:
                 return self._any(parts) if value else self._all(parts)
 
     def _all(self, parts: Iterable[list[Term]]) -> list[Term]:
-        certain: set[Literal] = set()
+        certain: set[PlanLiteral] = set()
         open_parts: list[list[Term]] = []
         for part in parts:
             if not part:

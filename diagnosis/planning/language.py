@@ -12,7 +12,7 @@ Atom: TypeAlias = tuple[str, ...]
 """A predicate and its arguments; an argument that begins with `?` is a variable."""
 
 
-class Literal(NamedTuple):
+class PlanLiteral(NamedTuple):
     """That an atom is true, or that it is false."""
 
     atom: Atom
@@ -98,7 +98,7 @@ class Effect:
 
     variables: tuple[Variable, ...]
     condition: Formula
-    literal: Literal
+    literal: PlanLiteral
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -158,7 +158,7 @@ class Problem:
     domain: Domain
     objects: Mapping[str, str]
     init: frozenset[Atom]
-    goals: tuple[Literal, ...]
+    goals: tuple[PlanLiteral, ...]
 
     def __post_init__(self) -> None:
         known = {kind for kind, _ in self.domain.types} | {"object"}
@@ -180,7 +180,7 @@ class Problem:
         """All objects, the domain's constants among them."""
         return {**dict(self.domain.constants), **self.objects}
 
-    def wanting(self, goals: Iterable[Literal]) -> Problem:
+    def wanting(self, goals: Iterable[PlanLiteral]) -> Problem:
         """The same with other goals."""
         return dataclasses.replace(self, goals=tuple(goals))
 
@@ -190,11 +190,11 @@ def _check_atom(
 ) -> None:
     expected = declared.get(atom[0])
     if expected is None:
-        raise PlanningError(str(Literal(atom)), f"there is no predicate {atom[0]}")
+        raise PlanningError(str(PlanLiteral(atom)), f"there is no predicate {atom[0]}")
     if len(expected) != len(atom) - 1:
-        raise PlanningError(str(Literal(atom)), f"{atom[0]} takes {len(expected)} objects, not {len(atom) - 1}")
+        raise PlanningError(str(PlanLiteral(atom)), f"{atom[0]} takes {len(expected)} objects, not {len(atom) - 1}")
     for name, kinds in zip(atom[1:], expected, strict=True):
         if name not in types:
-            raise PlanningError(str(Literal(atom)), f"there is no object {name}")
+            raise PlanningError(str(PlanLiteral(atom)), f"there is no object {name}")
         if types[name].isdisjoint(kinds):
-            raise PlanningError(str(Literal(atom)), f"{name} is no {' or '.join(kinds)}")
+            raise PlanningError(str(PlanLiteral(atom)), f"{name} is no {' or '.join(kinds)}")

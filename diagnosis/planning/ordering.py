@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 
 from .grounding import GroundAction, holds
-from .language import Atom, Literal
+from .language import Atom, PlanLiteral
 
 
 def predecessors(sequence: Sequence[GroundAction], init: Iterable[Atom]) -> list[set[int]]:
@@ -15,9 +15,9 @@ def predecessors(sequence: Sequence[GroundAction], init: Iterable[Atom]) -> list
     makes so what is so already has touched nothing, as long as nobody undoes it before.
     """
     state = set(init)
-    made: dict[Literal, list[int]] = {}
-    touched: dict[Literal, list[int]] = {}
-    needed: dict[Literal, list[int]] = {}
+    made: dict[PlanLiteral, list[int]] = {}
+    touched: dict[PlanLiteral, list[int]] = {}
+    needed: dict[PlanLiteral, list[int]] = {}
     asked: dict[Atom, list[int]] = {}  # conditions of effects: any change of them matters
     found: list[set[int]] = []
     for index, action in enumerate(sequence):
@@ -25,9 +25,9 @@ def predecessors(sequence: Sequence[GroundAction], init: Iterable[Atom]) -> list
         writes = {effect.literal for effect in action.effects}
         conditions = {literal.atom for effect in action.effects for literal in effect.condition}
         for atom in {literal.atom for literal in action.needs} | conditions:
-            before.update(touched.get(Literal(atom, True), ()), touched.get(Literal(atom, False), ()))
+            before.update(touched.get(PlanLiteral(atom, True), ()), touched.get(PlanLiteral(atom, False), ()))
         for atom, value in writes:
-            opposite = Literal(atom, not value)
+            opposite = PlanLiteral(atom, not value)
             before.update(made.get(opposite, ()), needed.get(opposite, ()), asked.get(atom, ()))
         found.append(before)
         for literal in action.needs:
@@ -49,8 +49,8 @@ def disturbances(actions: Sequence[GroundAction]) -> set[tuple[int, int]]:
 
     Pairs are left out whose needs contradict each other: they never come together anyway.
     """
-    needing: dict[Literal, list[int]] = {}
-    making: dict[Literal, list[int]] = {}
+    needing: dict[PlanLiteral, list[int]] = {}
+    making: dict[PlanLiteral, list[int]] = {}
     asking: dict[Atom, list[int]] = {}
     for index, action in enumerate(actions):
         for literal in action.needs:
@@ -61,14 +61,14 @@ def disturbances(actions: Sequence[GroundAction]) -> set[tuple[int, int]]:
                 asking.setdefault(literal.atom, []).append(index)
     found: set[tuple[int, int]] = set()
     for (atom, value), makers in making.items():
-        opposite = Literal(atom, not value)
+        opposite = PlanLiteral(atom, not value)
         others = {*needing.get(opposite, ()), *making.get(opposite, ()), *asking.get(atom, ())}
         found.update((min(a, b), max(a, b)) for a in makers for b in others if a != b)
     return {(a, b) for a, b in found if not _contradict(actions[a], actions[b])}
 
 
 def _contradict(a: GroundAction, b: GroundAction) -> bool:
-    return any(Literal(atom, not value) in b.needs for atom, value in a.needs)
+    return any(PlanLiteral(atom, not value) in b.needs for atom, value in a.needs)
 
 
 def stages(

@@ -23,9 +23,9 @@ from .language import (
     Fact,
     ForAll,
     Formula,
-    Literal,
     Not,
     Or,
+    PlanLiteral,
     PlanningError,
     Problem,
     Same,
@@ -253,9 +253,9 @@ def _effects(
             narrower = And((condition, _formula(parsed.condition, where)))
             _effects(parsed.effect, variables, narrower, effects, costs, where)
         case "Predicate":
-            effects.append(Effect(variables, condition, Literal(_atom(parsed))))
+            effects.append(Effect(variables, condition, PlanLiteral(_atom(parsed))))
         case "Not" if type(parsed.argument).__name__ == "Predicate":
-            effects.append(Effect(variables, condition, Literal(_atom(parsed.argument), False)))
+            effects.append(Effect(variables, condition, PlanLiteral(_atom(parsed.argument), False)))
         case "Increase" if not variables and condition == And():
             costs.append(_cost(parsed, where))
         case other:
@@ -270,12 +270,12 @@ def _cost(parsed: Any, where: str) -> int:
     return int(value)
 
 
-def _goals(formula: Formula, where: str) -> Iterable[Literal]:
+def _goals(formula: Formula, where: str) -> Iterable[PlanLiteral]:
     match formula:
         case Fact(atom):
-            yield Literal(atom)
+            yield PlanLiteral(atom)
         case Not(Fact(atom)):
-            yield Literal(atom, False)
+            yield PlanLiteral(atom, False)
         case And(of):
             for part in of:
                 yield from _goals(part, where)

@@ -15,9 +15,9 @@ from .language import (
     Fact,
     ForAll,
     Formula,
-    Literal,
     Not,
     Or,
+    PlanLiteral,
     Problem,
     Same,
     Variable,
@@ -108,7 +108,7 @@ def _formula(formula: Formula, names: Names) -> str:
             return f"(exists ({_variables(variables)}) {_formula(of, names)})"
 
 
-def _literal(literal: Literal, names: Names) -> str:
+def _literal(literal: PlanLiteral, names: Names) -> str:
     text = _atom(literal.atom, names)
     return text if literal.value else f"(not {text})"
 

@@ -15,9 +15,9 @@ from .language import (
     Fact,
     ForAll,
     Formula,
-    Literal,
     Not,
     Or,
+    PlanLiteral,
     PlanningError,
     Problem,
     Same,
@@ -51,7 +51,7 @@ class Simulator:
         action, bound = self._bind(step)
         return self._why_not(action.precondition, bound)
 
-    def do(self, step: Step) -> frozenset[Literal]:
+    def do(self, step: Step) -> frozenset[PlanLiteral]:
         """Do it, and say what it has changed.
 
         Raises:
@@ -62,27 +62,27 @@ class Simulator:
             raise InvalidPlan(str(step), missing)
         return self.put(self.effects(step))
 
-    def put(self, literals: Iterable[Literal]) -> frozenset[Literal]:
+    def put(self, literals: Iterable[PlanLiteral]) -> frozenset[PlanLiteral]:
         """Make these so (what is made both true and false becomes true), and say what that has changed."""
         made = list(literals)
         before = {atom for atom, _ in made if atom in self.state}
         self.state -= {atom for atom, value in made if not value}
         self.state |= {atom for atom, value in made if value}
         return frozenset(
-            Literal(atom, atom in self.state) for atom, _ in made if (atom in before) is not (atom in self.state)
+            PlanLiteral(atom, atom in self.state) for atom, _ in made if (atom in before) is not (atom in self.state)
         )
 
-    def effects(self, step: Step) -> list[Literal]:
+    def effects(self, step: Step) -> list[PlanLiteral]:
         """What would be so if the step were done now."""
         action, bound = self._bind(step)
         return [
-            Literal(fill(effect.literal.atom, inner), effect.literal.value)
+            PlanLiteral(fill(effect.literal.atom, inner), effect.literal.value)
             for effect in action.effects
             for inner in self._world.places(effect, bound)
             if self.holds(effect.condition, inner)
         ]
 
-    def unmet(self) -> tuple[Literal, ...]:
+    def unmet(self) -> tuple[PlanLiteral, ...]:
         """The goals that are not met."""
         return tuple(goal for goal in self.problem.goals if (goal.atom in self.state) is not goal.value)
 
@@ -140,9 +140,9 @@ class Simulator:
             case Or((Not(condition), then)) if self.holds(condition, bound):
                 return self._why_not(then, bound)
             case Fact(atom):
-                return "" if self.holds(formula, bound) else f"{Literal(fill(atom, bound))} is not so"
+                return "" if self.holds(formula, bound) else f"{PlanLiteral(fill(atom, bound))} is not so"
             case Not(Fact(atom)):
-                return "" if self.holds(formula, bound) else f"{Literal(fill(atom, bound))} is so"
+                return "" if self.holds(formula, bound) else f"{PlanLiteral(fill(atom, bound))} is so"
             case _:
                 return "" if self.holds(formula, bound) else "its precondition is not met"
 
@@ -179,27 +179,27 @@ def check_plan(problem: Problem, plan: Plan) -> Simulator:
     return simulator
 
 
-def _check_stage(simulator: Simulator, stage: Iterable[Step]) -> list[Literal]:
+def _check_stage(simulator: Simulator, stage: Iterable[Step]) -> list[PlanLiteral]:
     """What the stage makes so. All of it can be done now, and no step writes what another reads or writes otherwise.
 
     Then any order is as good, and leads to the same.
     """
     steps = list(stage)
-    written: dict[Literal, list[Step]] = {}
+    written: dict[PlanLiteral, list[Step]] = {}
     for step in breathing(steps, 64):
         if missing := simulator.missing(step):
             raise InvalidPlan(str(step), missing)
         effects = simulator.effects(step)
         added = {literal.atom for literal in effects if literal.value}
         for atom in {literal.atom for literal in effects}:
-            written.setdefault(Literal(atom, atom in added), []).append(step)
+            written.setdefault(PlanLiteral(atom, atom in added), []).append(step)
     for (atom, value), writers in written.items():
-        if undoing := written.get(Literal(atom, not value)):
+        if undoing := written.get(PlanLiteral(atom, not value)):
             raise InvalidPlan(str(writers[0]), f"{undoing[0]} undoes what it does in the same stage")
     for step in breathing(steps, 64):
         for atom in simulator.reads(step):
             # To write what is so already changes nothing.
-            for other in written.get(Literal(atom, atom not in simulator.state), ()):
+            for other in written.get(PlanLiteral(atom, atom not in simulator.state), ()):
                 if other != step:
-                    raise InvalidPlan(str(step), f"{other} changes {Literal(atom)} in the same stage")
+                    raise InvalidPlan(str(step), f"{other} changes {PlanLiteral(atom)} in the same stage")
     return list(written)

@@ -12,7 +12,7 @@ from typing import TypeAlias
 from ..engine.connected import connected
 from .answers import Budget, OutOfTime, Unsolvable
 from .grounding import GroundAction, changing_part, holds
-from .language import Atom, Literal, Problem
+from .language import Atom, PlanLiteral, Problem
 
 State: TypeAlias = frozenset[Atom]
 
@@ -46,13 +46,13 @@ class Task:
 
     useful: tuple[Useful, ...]
     init: State
-    goals: tuple[Literal, ...]
-    hopeless: tuple[Literal, ...]
+    goals: tuple[PlanLiteral, ...]
+    hopeless: tuple[PlanLiteral, ...]
     least: int
 
 
 def task_of(
-    problem: Problem, actions: Sequence[GroundAction], budget: Budget, goals: Iterable[Literal] | None = None
+    problem: Problem, actions: Sequence[GroundAction], budget: Budget, goals: Iterable[PlanLiteral] | None = None
 ) -> Task:
     """The task of a problem, whose ground actions these are; some of its goals only, if given. Raises OutOfTime."""
     changing = problem.domain.changing()
@@ -69,11 +69,11 @@ def hopeless(task: Task) -> Unsolvable:
     return Unsolvable(task.hopeless, True, "no action brings them about, whatever is done before")
 
 
-def cut_down(actions: Sequence[GroundAction], init: State, goals: tuple[Literal, ...], budget: Budget) -> Task:
+def cut_down(actions: Sequence[GroundAction], init: State, goals: tuple[PlanLiteral, ...], budget: Budget) -> Task:
     """Keep the actions that can be reached and that matter. Raises OutOfTime."""
     earliest, levels = _reached(actions, init, budget)
 
-    def level(goal: Literal) -> int | None:
+    def level(goal: PlanLiteral) -> int | None:
         return 0 if (goal.atom in init) is goal.value else levels.get(goal)
 
     hopeless = tuple(goal for goal in goals if level(goal) is None)
@@ -86,14 +86,14 @@ def cut_down(actions: Sequence[GroundAction], init: State, goals: tuple[Literal,
 
 def _reached(
     actions: Sequence[GroundAction], init: State, budget: Budget
-) -> tuple[dict[GroundAction, int], dict[Literal, int]]:
+) -> tuple[dict[GroundAction, int], dict[PlanLiteral, int]]:
     """When each action, and each literal, could be had first if nothing were ever undone.
 
     An action's effects wait at one literal that they lack; when that comes, they look for the next one.
     """
     earliest: dict[GroundAction, int] = {}
-    levels: dict[Literal, int] = {}
-    waiting: dict[Literal, list[tuple[GroundAction, frozenset[Literal], list[Literal]]]] = {}
+    levels: dict[PlanLiteral, int] = {}
+    waiting: dict[PlanLiteral, list[tuple[GroundAction, frozenset[PlanLiteral], list[PlanLiteral]]]] = {}
     ready = [
         (action, action.needs | condition, made) for action in actions for condition, made in _by_condition(action)
     ]
@@ -101,7 +101,7 @@ def _reached(
     while ready:
         budget.check()
         level += 1
-        reached: dict[Literal, None] = {}
+        reached: dict[PlanLiteral, None] = {}
         for entry in ready:
             action, term, made = entry
             for literal in term:
@@ -121,17 +121,17 @@ def _reached(
     return earliest, levels
 
 
-def _by_condition(action: GroundAction) -> Iterable[tuple[frozenset[Literal], list[Literal]]]:
+def _by_condition(action: GroundAction) -> Iterable[tuple[frozenset[PlanLiteral], list[PlanLiteral]]]:
     """An action's effects, those of one condition together."""
-    made: dict[frozenset[Literal], list[Literal]] = {}
+    made: dict[frozenset[PlanLiteral], list[PlanLiteral]] = {}
     for effect in action.effects:
         made.setdefault(effect.condition, []).append(effect.literal)
     return made.items()
 
 
-def _lags(actions: Sequence[GroundAction], goals: Iterable[Literal]) -> dict[GroundAction, int]:
+def _lags(actions: Sequence[GroundAction], goals: Iterable[PlanLiteral]) -> dict[GroundAction, int]:
     """How many stages must follow each action at least: whoever makes no goal must be followed by who needs it."""
-    makers: dict[Literal, list[GroundAction]] = {}
+    makers: dict[PlanLiteral, list[GroundAction]] = {}
     for action in actions:
         for effect in action.effects:
             makers.setdefault(effect.literal, []).append(action)
@@ -147,7 +147,7 @@ def _lags(actions: Sequence[GroundAction], goals: Iterable[Literal]) -> dict[Gro
             wanted.update(dict.fromkeys(literal for literal in action.needs if literal not in seen))
             for effect in action.effects:
                 for atom, _ in effect.condition:
-                    both = (Literal(atom, True), Literal(atom, False))
+                    both = (PlanLiteral(atom, True), PlanLiteral(atom, False))
                     wanted.update(dict.fromkeys(literal for literal in both if literal not in seen))
         seen |= wanted.keys()
         lag += 1
@@ -155,20 +155,20 @@ def _lags(actions: Sequence[GroundAction], goals: Iterable[Literal]) -> dict[Gro
 
 
 def _relevant(
-    actions: Sequence[GroundAction], init: State, goals: Iterable[Literal], budget: Budget
+    actions: Sequence[GroundAction], init: State, goals: Iterable[PlanLiteral], budget: Budget
 ) -> tuple[GroundAction, ...]:
     """The actions that bring about what is needed, or bring back what another of them may take away."""
-    makers: dict[Literal, list[GroundAction]] = {}
+    makers: dict[PlanLiteral, list[GroundAction]] = {}
     for action in actions:
         for effect in action.effects:
             makers.setdefault(effect.literal, []).append(action)
-    needed: set[Literal] = set()
-    broken: set[Literal] = set()
-    sought: set[Literal] = set()
+    needed: set[PlanLiteral] = set()
+    broken: set[PlanLiteral] = set()
+    sought: set[PlanLiteral] = set()
     chosen: set[GroundAction] = set()
-    queue: list[Literal] = []
+    queue: list[PlanLiteral] = []
 
-    def seek(literal: Literal) -> None:
+    def seek(literal: PlanLiteral) -> None:
         """Literals that are needed and not simply there from the beginning to the end."""
         if literal not in needed or literal in sought:
             return
@@ -176,7 +176,7 @@ def _relevant(
             sought.add(literal)
             queue.append(literal)
 
-    def need(literal: Literal) -> None:
+    def need(literal: PlanLiteral) -> None:
         needed.add(literal)
         seek(literal)
 
@@ -193,9 +193,9 @@ def _relevant(
             for effect in action.effects:
                 for atom, value in effect.condition:
                     # Also the opposite: that an effect fails to come may be what is wanted of it.
-                    need(Literal(atom, value))
-                    need(Literal(atom, not value))
-                opposite = Literal(effect.literal.atom, not effect.literal.value)
+                    need(PlanLiteral(atom, value))
+                    need(PlanLiteral(atom, not value))
+                opposite = PlanLiteral(effect.literal.atom, not effect.literal.value)
                 broken.add(opposite)
                 seek(opposite)
     return tuple(action for action in actions if action in chosen)
@@ -205,7 +205,7 @@ def _relevant(
 class Proof:
     """Goals that no sequence of actions reaches: none of them, if `is_each`; else not all of them together."""
 
-    goals: tuple[Literal, ...]
+    goals: tuple[PlanLiteral, ...]
     is_each: bool
 
 
@@ -221,11 +221,11 @@ def prove_unsolvable(task: Task, budget: Budget) -> Proof | None:
     return None
 
 
-def parts(task: Task) -> list[tuple[Sequence[GroundAction], tuple[Literal, ...]]]:
+def parts(task: Task) -> list[tuple[Sequence[GroundAction], tuple[PlanLiteral, ...]]]:
     """The actions and goals that share no atom with the others."""
     made = connected([one.action for one in task.useful], atoms)
     owner = {atom: number for number, actions in enumerate(made) for action in actions for atom in atoms(action)}
-    goals: dict[int, list[Literal]] = {}
+    goals: dict[int, list[PlanLiteral]] = {}
     for goal in task.goals:
         if goal.atom in owner:
             goals.setdefault(owner[goal.atom], []).append(goal)
@@ -242,12 +242,12 @@ def atoms(action: GroundAction) -> set[Atom]:
 
 
 def _prove_part(
-    actions: Sequence[GroundAction], init: State, goals: tuple[Literal, ...], budget: Budget
+    actions: Sequence[GroundAction], init: State, goals: tuple[PlanLiteral, ...], budget: Budget
 ) -> Proof | None:
     mine = frozenset(atom for action in actions for atom in atoms(action)) | {goal.atom for goal in goals}
     start = init & mine
     seen, queue = {start}, [start]
-    met: set[Literal] = set()
+    met: set[PlanLiteral] = set()
     try:
         for state in queue:  # It grows meanwhile.
             budget.check()

@@ -12,7 +12,7 @@ import functools
 from collections.abc import Collection, Iterable, Mapping
 from importlib.resources import files
 
-from .language import Atom, Domain, Literal, PlanningError, Problem
+from .language import Atom, Domain, PlanLiteral, PlanningError, Problem
 from .pddl_reader import read_domain, with_actions
 
 
@@ -90,7 +90,7 @@ def repair_problem(
     init |= {("on", name) for name in on} | {("running", name) for name in running}
     init |= {("drives", node, name) for node, needed in drives.items() for name in needed}
     ranked = sorted(kinds, key=lambda name: name in set(optional))  # As they were given, otherwise.
-    goals = tuple(Literal(("good", name)) for name in ranked)
+    goals = tuple(PlanLiteral(("good", name)) for name in ranked)
     return Problem(domain, {**kinds, **(objects or {})}, frozenset(init) | frozenset(facts), goals)
 
 

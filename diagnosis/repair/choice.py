@@ -17,7 +17,7 @@ from ..literals import Literal
 from ..model import Kind, Model
 from ..observations import Observed
 from ..planning import Problem, repair_problem
-from ..planning.language import Literal as Goal
+from ..planning.language import PlanLiteral as Goal
 from .actions import Repertoire
 from .ledger import Ledger
 from .policy import Policy

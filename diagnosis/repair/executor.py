@@ -18,7 +18,7 @@ from ...supervision.arbiter import Arbiter, Grant, GrantLost, Hand, InOtherHands
 from ..literals import Literal
 from ..planning import Plan, Problem, Simulator, Step
 from ..planning.language import Atom
-from ..planning.language import Literal as Effect
+from ..planning.language import PlanLiteral as Effect
 from .actions import Act, RepairAction
 
 DONE: Final = "done"

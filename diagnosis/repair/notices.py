@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ...actors.events import Event
-from ...actors.kernel.message import Message, Order, Refusal
+from ...actors.kernel.message import Message, Refusal, RuntimeOrder
 from ..literals import Literal
 from ..messages import REPAIR, Touched
 from ..planning import Step
@@ -94,13 +94,13 @@ class RepairGaveUp(Event, frozen=True, eq=False):
     why: str
 
 
-class Approve(Order[None]):
+class Approve(RuntimeOrder[None]):
     """A person allows a dangerous action. Refused with NobodyWaits."""
 
     number: int
 
 
-class Deny(Order[None]):
+class Deny(RuntimeOrder[None]):
     """A person forbids a dangerous action. Refused with NobodyWaits."""
 
     number: int
@@ -113,13 +113,13 @@ class NobodyWaits(Refusal):
     number: int
 
 
-class SetMode(Order[None]):
+class SetMode(RuntimeOrder[None]):
     """The mode the system is in from now on; what may be done in it is in the policy."""
 
     mode: str
 
 
-class RetryRepair(Order[None]):
+class RetryRepair(RuntimeOrder[None]):
     """Try components again that were given up: the cause was seen to. All of them, if none are named."""
 
     components: tuple[str, ...] = ()

@@ -26,10 +26,10 @@ from ..messages import (
     MODEL,
     OBSERVATIONS,
     STARTS,
+    ComponentsStarted,
     GetDiagnosis,
     GetObserved,
     ModelChanged,
-    Started,
 )
 from ..model import Model
 from ..observations import Observation, ObservationSet
@@ -151,8 +151,8 @@ class Repairer(Actor):
         self._begin()
 
     @subscribe(STARTS)
-    @on(Started)
-    def _started(self, message: Started) -> None:
+    @on(ComponentsStarted)
+    def _started(self, message: ComponentsStarted) -> None:
         if self._outlook.note_start(message.components, message.seconds, self.now()):
             self.ctx.tell_after(message.seconds + MOMENT, _GraceIsOver())
 

@@ -266,7 +266,7 @@ async def _command(act: Act, *names: str, command: Sequence[str]) -> None:
 # -- fault-tolerance mechanisms -------------------------------------------------------------------------------------
 
 
-class Transaction(Protocol):
+class TransactionPort(Protocol):
     """`system.transaction`: the system gives it, since repair knows nothing of mechanisms."""
 
     def __call__(self, *, timeout: float) -> AbstractAsyncContextManager[object]:
@@ -275,7 +275,7 @@ class Transaction(Protocol):
 
 
 def attach_mechanism(
-    transaction: Transaction, mechanism: Any, addresses: Mapping[str, str], **options: Any
+    transaction: TransactionPort, mechanism: Any, addresses: Mapping[str, str], **options: Any
 ) -> RepairAction:
     """`attach_pbr(n)`: protect an actor by a mechanism, while requests flow. The other two take the same.
 
@@ -289,14 +289,14 @@ def attach_mechanism(
 
 
 def compose_mechanism(
-    transaction: Transaction, mechanism: Any, addresses: Mapping[str, str], *, outside: bool = False, **options: Any
+    transaction: TransactionPort, mechanism: Any, addresses: Mapping[str, str], *, outside: bool = False, **options: Any
 ) -> RepairAction:
     """`compose_tr(n)`: nest one more mechanism inside of those that an actor has, or `outside`."""
     return _mechanism("compose", transaction, mechanism, addresses, options, outside=outside)
 
 
 def transition_mechanism(
-    transaction: Transaction, mechanism: Any, addresses: Mapping[str, str], **options: Any
+    transaction: TransactionPort, mechanism: Any, addresses: Mapping[str, str], **options: Any
 ) -> RepairAction:
     """`transition_lfr(n)`: put a mechanism in the place of the one of its sort, or several in the place of all."""
     return _mechanism("transition", transaction, mechanism, addresses, options)
@@ -304,7 +304,7 @@ def transition_mechanism(
 
 def _mechanism(
     verb: str,
-    transaction: Transaction,
+    transaction: TransactionPort,
     mechanism: Any,
     addresses: Mapping[str, str],
     options: Mapping[str, Any],

@@ -23,7 +23,7 @@ from ...checkpoint.protocol import (
 from .state_images import Image, Patch
 
 
-class StaleEpoch(Refusal):
+class StaleLeader(Refusal):
     """Whoever says this has been replaced: a higher epoch has been seen here."""
 
     path: str
@@ -152,7 +152,7 @@ class Done(Message[Taken]):
     """Outcomes on their way out, in turn order: all of a batch, or a part of it. Asked by Proceed, told to the Proxy.
 
     `more` goes home behind the ends, and behind all turns up to `behind`; `live` goes behind all. `part` counts what
-    Proceed hands over; with `wait` it waits for `Ended` of it.
+    Proceed hands over; with `wait` it waits for `PartEnded` of it.
     """
 
     epoch: int
@@ -181,14 +181,14 @@ class Outward(Message):
     records: list[Released | PipeDone | Snapshot | Unsaved | Ignored | Hooked]
 
 
-class Ended(Message):
+class PartEnded(Message):
     """The home has the outcomes of part `number` and of all before it. Sent only if a `Done` asks for it."""
 
     epoch: int
     number: int
 
 
-class State(msgspec.Struct, array_like=True, tag=1):
+class ServerState(msgspec.Struct, array_like=True, tag=1):
     """The state of the server after turn `turn`, with what belongs to it: `data`, and `deltas` on top of that.
 
     `live`: it has caught up with its home. Large ones travel in pieces.
@@ -205,7 +205,7 @@ class State(msgspec.Struct, array_like=True, tag=1):
     absent: list[str] = []  # variables that `__init__` has made, and that are no more
 
 
-class Change(msgspec.Struct, array_like=True, tag=2):
+class StateDelta(msgspec.Struct, array_like=True, tag=2):
     """What leads from the state after turn `base` to that after `turn`.
 
     Either `deltas` (with their checksum) on top of those that are there, or, with a `patch`, another image with these.

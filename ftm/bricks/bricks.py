@@ -21,7 +21,7 @@ from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message
 from ...actors.kernel.ref import current
 from ...checkpoint.protocol import DROPPED, MESSAGE, REPLY, Answer, Live, Outcome, Released, Snapshot, TurnEnd
-from .brick_messages import FORWARDED, Done, Ended, Inward, Outward, Request, StaleEpoch, Taken, Work
+from .brick_messages import FORWARDED, Done, Inward, Outward, PartEnded, Request, StaleLeader, Taken, Work
 from .letters import FOREVER as FOREVER
 from .peer_channel import Inbox, Posting
 
@@ -34,7 +34,7 @@ NO_BATCH: Final = -1
 """In place of the number of the last batch, before there is one."""
 
 
-class Settle(Message[None]):
+class AwaitHandled(Message[None]):
     """Answered when all that came before it was handled."""
 
 
@@ -89,8 +89,8 @@ class Brick(Posting):
         """Take what the same brick of the other replica says; its epoch and configuration are ours."""
         raise TypeError(f"{type(self).__name__} takes nothing from its peer, and got {type(message).__name__}")
 
-    @on(Settle)
-    def _settle(self, message: Settle) -> None:
+    @on(AwaitHandled)
+    def _settle(self, message: AwaitHandled) -> None:
         """All that came before is done."""
 
     async def drain(self) -> None:
@@ -178,7 +178,7 @@ class After(Brick):
                 out = await self.after(done)
                 if out is None and self._standing.leads:  # Whoever let the batch in hears that it is over.
                     out = msgspec.structs.replace(done, ends=[], more=[])
-            except StaleEpoch:
+            except StaleLeader:
                 out = None  # Another one leads: these outcomes never were.
             if out is not None:
                 await self.next.ask(out, timeout=FOREVER)
@@ -359,8 +359,8 @@ class Proceed(Brick):
 
     # -- past the bricks --------------------------------------------------------------------------------------------
 
-    @on(Ended)
-    def _ended(self, message: Ended) -> None:
+    @on(PartEnded)
+    def _ended(self, message: PartEnded) -> None:
         state = self._standing.server.state
         if self._refuses(message.epoch):
             return

@@ -11,7 +11,7 @@ from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message, Refusal, message_name
 from ...actors.kernel.ref import ActorRef
 from ...checkpoint.protocol import pieces
-from .brick_messages import NotFollowing, StaleEpoch
+from .brick_messages import NotFollowing, StaleLeader
 from .sealed_frames import Back, Call, LinkLost, Part, Refused, Sealed
 from .standing import PeerLost
 
@@ -49,6 +49,16 @@ class Sheet(Message):
     data: bytes
 
 
+def tell_in_sheets(ref: ActorRef[Any], body: bytes, numbers: Iterator[int]) -> tuple[int, bytes]:
+    """Tell a body that is too large for one letter ahead of it; the number of its sheets (0: none), what is left."""
+    if len(body) <= LETTER_BYTES:
+        return 0, body
+    number = next(numbers)
+    for piece in pieces(body):
+        ref.tell(Sheet(number, piece))
+    return number, b""
+
+
 class Letters(Actor):
     """Opens sealed letters, and seals what is answered."""
 
@@ -83,6 +93,21 @@ class Letters(Actor):
                 raise NotFollowing(standing.path, standing.epoch, epoch)
             standing.epoch = epoch
 
+    def _kind_of(self, name: str) -> type[Message[Any]] | None:
+        return next((one for one in self.peer_messages if message_name(one) == name), None)
+
+    async def _handle_part(self, epoch: int, config: int, name: str, body: bytes) -> bytes:
+        """Have `from_peer` handle what the peer says, and encode what it returns.
+
+        Raises:
+            Refusal: the sender does not count, or what `from_peer` raises.
+        """
+        self._check_sender(epoch, config)
+        kind, codec = self._kind_of(name), self._standing.node.codec
+        if kind is None:
+            raise TypeError(f"{type(self).__name__} takes no {name} from its peer")
+        return codec.encode(await self.from_peer(codec.decode(kind, body)), self.ctx.path)
+
     async def _ask_sealed(
         self,
         link: SecuredLink,
@@ -108,7 +133,8 @@ class Letters(Actor):
                     ref, out = standing.node.cell_at(f"{path}/protocol").ref, said
                 else:
                     ref = await find()
-                    out = self._sheets_of(ref, said.frame)
+                    number, frame = tell_in_sheets(ref, said.frame, self._numbers)
+                    out = Letter(-1, -1, SEALED, frame, number)
                 return await standing.other.wait_for(ref.ask(out, timeout=seconds))
             except (PeerLost, AskTimeout, Refused):
                 raise
@@ -123,18 +149,9 @@ class Letters(Actor):
         if back.kind == "reply":
             return back.body
         error = standing.node.codec.decode_error(back.kind, back.name, back.body)
-        if isinstance(error, StaleEpoch):
+        if isinstance(error, StaleLeader):
             standing.fence()
         raise error
-
-    def _sheets_of(self, ref: ActorRef[Any], frame: bytes) -> Letter:
-        number = 0
-        if len(frame) > LETTER_BYTES:
-            number = next(self._numbers)
-            for part in pieces(frame):
-                ref.tell(Sheet(number, part))
-            frame = b""
-        return Letter(-1, -1, SEALED, frame, number)
 
     async def _take_sealed(self, link: SecuredLink, frame: bytes) -> bytes | ReplyHandle[bytes]:
         if not self.answers_later:
@@ -151,13 +168,11 @@ class Letters(Actor):
 
     async def _read(self, call: Call) -> Back:
         """What was in a sealed letter."""
-        codec = self._standing.node.codec
+        part = call.parts[0]
         try:
-            self._check_sender(call.epoch, call.config)
-            kind = next((one for one in self.peer_messages if message_name(one) == call.parts[0].name), None)
-            if kind is None or call.stream != self.slot:
+            if call.stream != self.slot or self._kind_of(part.name) is None:
                 raise Refused(path=self.ctx.path, reason="malformed")
-            reply = await self.from_peer(codec.decode(kind, call.parts[0].body))
+            reply = await self._handle_part(call.epoch, call.config, part.name, part.body)
         except Refusal as no:
-            return Back(*codec.encode_error(no))
-        return Back("reply", "", codec.encode(reply, self.ctx.path))
+            return Back(*self._standing.node.codec.encode_error(no))
+        return Back("reply", "", reply)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextvars
 import random
-from collections.abc import Callable
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ...actors.errors import AskTimeout, HoldfastError
@@ -18,10 +18,9 @@ from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.bindings import Binding
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message, Refusal, message_name
-from ...checkpoint.protocol import pieces
-from .brick_messages import ConfigMismatch, NotFollowing, StaleEpoch
-from .letters import FOREVER, LETTER_BYTES, SEALED, Letter, Letters, Sheet
-from .sealed_frames import Part, Refused
+from .brick_messages import ConfigMismatch, NotFollowing, StaleLeader
+from .letters import FOREVER, SEALED, Letter, Letters, Sheet, tell_in_sheets
+from .sealed_frames import OpenNumbers, Part, Refused
 from .standing import PeerLost
 
 if TYPE_CHECKING:
@@ -65,31 +64,15 @@ class Outbox:
     def __init__(self, ref: ActorRef[Any]) -> None:
         self.ref = ref
         self.stream = random.getrandbits(62) + 1
-        self._last = 0
-        self._open: dict[int, None] = {}
-
-    def open(self) -> int:
-        """The number of the next letter."""
-        self._last += 1
-        self._open[self._last] = None
-        return self._last
-
-    def close(self, number: int) -> None:
-        """Nobody waits for this answer any more."""
-        self._open.pop(number, None)
-
-    @property
-    def floor(self) -> int:
-        """All before it are answered, or given up."""
-        return next(iter(self._open), self._last + 1)
+        self.numbers = OpenNumbers()
 
 
 class Posted:
     """A letter that is on its way, until its answer is there."""
 
-    def __init__(self, standing: Standing, outbox: Outbox, name: str, body: bytes, sheets: Callable[[], int]) -> None:
+    def __init__(self, standing: Standing, outbox: Outbox, name: str, body: bytes, sheets: Iterator[int]) -> None:
         self._standing, self._outbox, self._name, self._body, self._sheets = standing, outbox, name, body, sheets
-        self._number = outbox.open()
+        self._number = outbox.numbers.open()
         self._loop = standing.node.loop
         self._patience = PATIENCE
         self.answer: asyncio.Future[bytes] = self._loop.create_future()
@@ -97,15 +80,11 @@ class Posted:
         self._send()
 
     def _send(self) -> None:
-        standing, outbox, body, number = self._standing, self._outbox, self._body, 0
-        if len(body) > LETTER_BYTES:
-            number = self._sheets()
-            for part in pieces(body):
-                outbox.ref.tell(Sheet(number, part))
-            body = b""
+        standing, outbox = self._standing, self._outbox
+        number, body = tell_in_sheets(outbox.ref, self._body, self._sheets)
         letter = Letter(
             standing.epoch, standing.config, self._name, body, number, len(self._body),
-            outbox.stream, self._number, outbox.floor,
+            outbox.stream, self._number, outbox.numbers.floor,
         )  # fmt: skip
         outbox.ref.ask(letter, timeout=FOREVER).add_done_callback(self._answered)
 
@@ -133,7 +112,7 @@ class Posted:
     def close(self) -> None:
         """Nobody waits for it any more."""
         self._timer.cancel()
-        self._outbox.close(self._number)
+        self._outbox.numbers.close(self._number)
         self.answer.cancel()
 
 
@@ -230,7 +209,7 @@ class Posting(Letters):
                 reply = await self._reply_to(posted)
             except (PeerLost, ConfigMismatch):
                 raise
-            except StaleEpoch:
+            except StaleLeader:
                 standing.fence()
                 raise
             except HoldfastError:  # It has died, which we shall be told, or its brick was exchanged.
@@ -240,7 +219,7 @@ class Posting(Letters):
             return codec.decode_reply(type(message), reply)  # type: ignore[no-any-return]
 
     def _post(self, outbox: Outbox, message: Message[Any], body: bytes) -> Posted:
-        return Posted(self._standing, outbox, message_name(type(message)), body, lambda: next(self._numbers))
+        return Posted(self._standing, outbox, message_name(type(message)), body, self._numbers)
 
     async def _reply_to(self, posted: Posted) -> bytes:
         try:
@@ -290,7 +269,7 @@ class Posting(Letters):
             return codec.decode_reply(type(message), back)  # type: ignore[no-any-return]
         try:
             reply = await self._reply_to(self._post(await self._find(path, slot, key), message, body))
-        except StaleEpoch:
+        except StaleLeader:
             standing.fence()
             raise
         except HoldfastError:
@@ -352,13 +331,8 @@ class Posting(Letters):
         return inbox
 
     async def _open(self, letter: Letter, body: bytes, answered: Answered) -> None:
-        codec = self._standing.node.codec
         try:
-            self._check_sender(letter.epoch, letter.config)
-            kind = next((one for one in self.peer_messages if message_name(one) == letter.name), None)
-            if kind is None:
-                raise TypeError(f"{type(self).__name__} takes no {letter.name} from its peer")
-            answered.set(codec.encode(await self.from_peer(codec.decode(kind, body)), self.ctx.path))
+            answered.set(await self._handle_part(letter.epoch, letter.config, letter.name, body))
         except Refusal as no:
             answered.set(no)
 

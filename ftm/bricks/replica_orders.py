@@ -47,7 +47,7 @@ class Install(Message[None]):
     traps: bool = False  # `ctx.trap_exits` of the life that it comes from
 
 
-class Peer(Message[None]):
+class SetPeer(Message[None]):
     """Your other replica is the one at this path from now on; None: you are alone, wait for nobody."""
 
     epoch: int
@@ -80,7 +80,7 @@ class Quiesce(Message[Stand]):
     config: int
 
 
-class Prepare(Message[None]):
+class PrepareStack(Message[None]):
     """Start the bricks of another stack of mechanisms beside those of the present one."""
 
     config: int
@@ -149,7 +149,7 @@ class EndTurn(Message[None]):
     again: bool
 
 
-class Beat(Message):
+class ReplicaBeat(Message):
     """This replica's bricks are running. Goes as it is, over secured links too: see there."""
 
     name: str

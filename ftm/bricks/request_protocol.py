@@ -27,20 +27,20 @@ from .brick_messages import (
     CannotLead,
     ConfigMismatch,
     Done,
-    Ended,
     Follow,
     Inward,
     Lead,
+    PartEnded,
     ReplyEvicted,
     Request,
     RequestDropped,
-    State,
+    ServerState,
     Taken,
     Work,
     WorkLost,
     marker_of,
 )
-from .bricks import FOREVER, Brick, Flush, Proceed, Settle
+from .bricks import FOREVER, AwaitHandled, Brick, Flush, Proceed
 from .peer_channel import Where
 from .replica_orders import (
     Abort,
@@ -52,10 +52,10 @@ from .replica_orders import (
     Finish,
     Install,
     Join,
-    Peer,
-    Prepare,
+    PrepareStack,
     Quiesce,
     Rehearse,
+    SetPeer,
     Stand,
 )
 from .sealed_frames import Opened, Refused
@@ -250,7 +250,7 @@ class RequestProtocol(Transfer):
                 self._held.appendleft(msgspec.structs.replace(work, requests=left))
                 self._wanted = None
                 if not known:
-                    self.proceed.tell(Ended(self._standing.epoch, part))
+                    self.proceed.tell(PartEnded(self._standing.epoch, part))
                 return
 
     @on(Inward)
@@ -258,8 +258,8 @@ class RequestProtocol(Transfer):
         if self._admits():
             self.proceed.tell(message)
 
-    @on(Ended)
-    def _ended(self, message: Ended) -> None:
+    @on(PartEnded)
+    def _ended(self, message: PartEnded) -> None:
         if self._admits():
             self.proceed.tell(message)
 
@@ -307,7 +307,7 @@ class RequestProtocol(Transfer):
             data, self._pieces = b"".join(self._pieces), []
             server = self._standing.server
             await server.drop_life()
-            server.install(State(message.turn, image_from(data), [], [], [], False, message.stash, message.traps))
+            server.install(ServerState(message.turn, image_from(data), [], [], [], False, message.stash, message.traps))
             self._standing.log.replace(message.log)
 
     @on(Lead)
@@ -366,8 +366,8 @@ class RequestProtocol(Transfer):
         assert parent is not None
         return parent.ref.ask(Opened(self._standing.opened.put(message)), timeout=FOREVER)
 
-    @on(Prepare)
-    def _prepare(self, message: Prepare) -> Any:
+    @on(PrepareStack)
+    def _prepare(self, message: PrepareStack) -> Any:
         return self._passed_on(message)
 
     @on(Commit)
@@ -437,7 +437,7 @@ class RequestProtocol(Transfer):
         """Bricks of one that does not lead wait for nobody: what has come to them is handled soon."""
         node, paths = self._standing.node, self._standing.paths
         bricks = [path for slot, path in paths.items() if slot.endswith((".before", ".after"))]
-        asked = [node.cell_at(path).ref.ask(Settle(), timeout=message.seconds) for path in bricks]
+        asked = [node.cell_at(path).ref.ask(AwaitHandled(), timeout=message.seconds) for path in bricks]
         found = await asyncio.gather(*asked, return_exceptions=True)
         passes = not any(isinstance(one, AskTimeout) for one in found)
         handle.reply(msgspec.structs.replace(self._doing(message), passes=passes))
@@ -482,13 +482,13 @@ class RequestProtocol(Transfer):
 RequestProtocol.handlers = {
     Work: "_work",
     Inward: "_inward",
-    Ended: "_ended",
+    PartEnded: "_ended",
     Install: "_install",
     Lead: "_lead",
     Follow: "_follow",
-    Peer: "_peer",
+    SetPeer: "_peer",
     EndTurn: "_end_turn",
-    Prepare: "_prepare",
+    PrepareStack: "_prepare",
     Commit: "_commit",
     Abort: "_abort",
     Join: "_join",

@@ -27,7 +27,7 @@ from ..replica.protected_actor import Server
 from ..replica.replica_life import ServerLife
 from ..votes.canonical import canonical, end_form
 from ..votes.voters import Agreed, AnyVoter, Undecided, decide_by
-from .brick_messages import Done, Request, State, Work
+from .brick_messages import Done, Request, ServerState, Work
 from .bricks import After, Before
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class Run(msgspec.Struct):
 
     ends: list[TurnEnd]
     released: list[tuple[int, list[int]]]
-    state: State | None
+    state: ServerState | None
     digest: bytes = b""  # of the state, where that has stayed where it is
     objections: list[tuple[int, str]] = []
 
@@ -94,18 +94,18 @@ def form(run: Run, *, with_state: bool = True) -> Any:
     return ("run", ends, released, state_form(run.state))
 
 
-def state_form(state: State) -> Any:
+def state_form(state: ServerState) -> Any:
     """The canonical form of a state."""
     saved = state.data.value()
     aside = canonical(_aside(state))
     return ("state", f"{state.turn}", canonical(saved), canonical(list(map(decode_value, state.deltas))), aside)
 
 
-def _aside(state: State) -> tuple[list[int], list[int]]:
+def _aside(state: ServerState) -> tuple[list[int], list[int]]:
     return [feed.id for feed in state.stash], [feed.id for feed in state.returned]
 
 
-def digest_of_state(state: State) -> bytes:
+def digest_of_state(state: ServerState) -> bytes:
     """A digest of a state; the order of sets and dicts does not count. See `Digests`, if it is one of many."""
     return Digests().of(state)
 
@@ -122,7 +122,7 @@ class Digests:
         self._deltas: list[bytes] = []
         self._chain = b""
 
-    def of(self, state: State) -> bytes:
+    def of(self, state: ServerState) -> bytes:
         """The digest of one state."""
         known = len(self._deltas)
         if state.data is not self._data or state.deltas[:known] != self._deltas:
@@ -177,7 +177,7 @@ class Shadow(Server):
         self.hooks = main.hooks
         self.state.is_again = True
 
-    async def run(self, before: State, requests: list[Request], heard: list[Outcome]) -> Run | Missing:
+    async def run(self, before: ServerState, requests: list[Request], heard: list[Outcome]) -> Run | Missing:
         """Run requests from a state."""
         self._why = ""
         self.traces.begin_anew(heard)
@@ -196,7 +196,7 @@ class Shadow(Server):
         objections = sorted(self.traces.objections.items())
         return Run(ends, sorted(self.traces.released.items()), state, objections=objections)
 
-    async def _run(self, before: State, requests: list[Request]) -> tuple[list[TurnEnd], State | None]:
+    async def _run(self, before: ServerState, requests: list[Request]) -> tuple[list[TurnEnd], ServerState | None]:
         self._place()
         await self._go_back(before)
         ends = await self._run_all(requests, even_stopping=False)
@@ -211,7 +211,7 @@ class Shadow(Server):
         await self.ensure()
         return ends, self.capture()
 
-    async def _go_back(self, before: State) -> None:
+    async def _go_back(self, before: ServerState) -> None:
         point, life = self.points.point, self.life
         if life is not None and point is not None and not self.points.tail and point == before:
             return  # It stands there already.
@@ -286,7 +286,7 @@ class Deciding(After):
     with a typed error, and leaves no trace.
     """
 
-    async def choose(self, before: State, requests: list[Request], first: Run | None) -> Run | HoldfastError:
+    async def choose(self, before: ServerState, requests: list[Request], first: Run | None) -> Run | HoldfastError:
         """The run that is right, or why there is none. Without `first`, the actor has not run these requests yet."""
         raise NotImplementedError
 
@@ -319,21 +319,21 @@ class Deciding(After):
         ends = await self._take(before, requests, found, first)
         return msgspec.structs.replace(done, ends=ends)
 
-    def _last_run(self, before: State, ends: list[TurnEnd]) -> Run:
+    def _last_run(self, before: ServerState, ends: list[TurnEnd]) -> Run:
         server = self._standing.server
         released = sorted((turn, one) for turn, one in server.traces.released.items() if turn > before.turn)
         known = {end.id for end in ends}
         objections = sorted((key, why) for key, why in server.traces.objections.items() if key in known)
         return Run(ends, released, server.capture(), objections=objections)
 
-    async def run_here(self, before: State, requests: list[Request]) -> Run:
+    async def run_here(self, before: ServerState, requests: list[Request]) -> Run:
         """Have the actor itself run requests, from a state."""
         server = self._standing.server
         ends = await server.run_again(before, requests)
         return self._last_run(before, ends)
 
     async def _take(
-        self, state: State, requests: list[Request], found: Run | HoldfastError, first: Run
+        self, state: ServerState, requests: list[Request], found: Run | HoldfastError, first: Run
     ) -> list[TurnEnd]:
         """Put what was found in place; one request after the other, if nothing was found for all of them."""
         server, ends = self._standing.server, list[TurnEnd]()
@@ -358,7 +358,9 @@ class Deciding(After):
         self._standing.server.traces.released.update(run.released)
         return run.ends
 
-    def _failed(self, state: State, ends: list[TurnEnd], error: HoldfastError) -> tuple[list[TurnEnd], State]:
+    def _failed(
+        self, state: ServerState, ends: list[TurnEnd], error: HoldfastError
+    ) -> tuple[list[TurnEnd], ServerState]:
         """These requests fail: their numbers are used, and nothing else has happened."""
         answer = Answer(*self._standing.node.codec.encode_error(error))
         numbers = list(dict.fromkeys(end.id for end in ends))
@@ -368,12 +370,12 @@ class Deciding(After):
         ]
         return failed, msgspec.structs.replace(state, turn=state.turn + len(failed))
 
-    def _is_ask(self, state: State, number: int) -> bool:
+    def _is_ask(self, state: ServerState, number: int) -> bool:
         request = self._standing.inside.get(number)
         feeds = [request.feed] if request is not None else [*state.stash, *state.returned]
         return any(feed.id == number and feed.is_ask for feed in feeds)
 
-    def heard(self, before: State) -> list[Outcome]:
+    def heard(self, before: ServerState) -> list[Outcome]:
         """What the actor's asks have come to since a state."""
         return [one for one in self._standing.server.traces.heard.values() if one.turn > before.turn]
 

@@ -65,6 +65,31 @@ class Part(msgspec.Struct, array_like=True):
     body: bytes
 
 
+class OpenNumbers:
+    """The numbers of what one end has said in a stream, from 1 on, and which of them have no answer yet."""
+
+    __slots__ = ("_last", "_open")
+
+    def __init__(self) -> None:
+        self._last = 0
+        self._open: dict[int, None] = {}
+
+    def open(self) -> int:
+        """The number of the next message."""
+        self._last += 1
+        self._open[self._last] = None
+        return self._last
+
+    def close(self, number: int) -> None:
+        """Nobody waits for this answer any more."""
+        self._open.pop(number, None)
+
+    @property
+    def floor(self) -> int:
+        """All before it are answered, or given up."""
+        return next(iter(self._open), self._last + 1)
+
+
 class Call(msgspec.Struct, array_like=True):
     """What is in a frame on its way there: the messages of one stream are numbered, and each is handled once.
 

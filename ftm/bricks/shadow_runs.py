@@ -8,7 +8,7 @@ import msgspec
 
 from ...actors.kernel.message import Message
 from ...checkpoint.protocol import Outcome, TurnEnd
-from .brick_messages import Logged, Request, State
+from .brick_messages import Logged, Request, ServerState
 from .runs import Digests, Missing, Remembering, Run, Shadow
 
 
@@ -17,7 +17,7 @@ class Computed(msgspec.Struct, array_like=True):
 
     ends: list[TurnEnd]
     released: list[tuple[int, list[int]]]
-    state: State | None
+    state: ServerState | None
     digest: bytes
     objections: list[tuple[int, str]]
     problem: str = ""
@@ -35,7 +35,7 @@ class Compute(Message[Computed]):
 
     turn: int
     base: bytes
-    state: State | None
+    state: ServerState | None
     requests: list[Request]
     heard: list[Outcome]
     keep: bool
@@ -59,7 +59,7 @@ class Helping(Remembering):
         self._shadow: Shadow | None = None
         self._digest = b""
         self._digests = Digests()
-        self._kept: State | None = None
+        self._kept: ServerState | None = None
 
     async def on_stop(self, reason: object) -> None:
         """Stop the shadow together with its brick."""
@@ -101,7 +101,7 @@ class Helping(Remembering):
                 return Computed([], [], None, b"", [], f"{self._standing.path} lives on from another state")
         return Computed(run.ends, run.released, None if order.keep else run.state, digest, run.objections)
 
-    def _base(self, order: Compute) -> State | None:
+    def _base(self, order: Compute) -> ServerState | None:
         """The state that is here, if it is the one that is meant."""
         standing = self._standing
         point = standing.server.points.point

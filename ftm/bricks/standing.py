@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ...actors.errors import HoldfastError
 from ...checkpoint.protocol import TurnEnd
-from .brick_messages import FORWARDED, ConfigMismatch, Logged, Request, StaleEpoch
+from .brick_messages import FORWARDED, ConfigMismatch, Logged, Request, StaleLeader
 from .reply_log import ReplyLog
 from .state_comparison import Looking
 
@@ -180,7 +180,7 @@ class Standing:
         """
         if epoch < self.epoch:
             self.refused += 1
-            raise StaleEpoch(self.path, self.epoch, epoch)
+            raise StaleLeader(self.path, self.epoch, epoch)
         if config is not None and config != self.config:
             self.refused += 1
             raise ConfigMismatch(self.path, self.config, config)

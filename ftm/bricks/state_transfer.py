@@ -17,9 +17,9 @@ from ...actors.kernel.bindings import Binding
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message
 from ...checkpoint.snapshot.key_variables import save_state
-from .brick_messages import CannotJoin, ConfigMismatch, Done, Logged, StaleEpoch, State, Strayed
+from .brick_messages import CannotJoin, ConfigMismatch, Done, Logged, ServerState, StaleLeader, Strayed
 from .bricks import FOREVER, Abandon, Brick, Flush
-from .replica_orders import Export, Exported, Join, Peer
+from .replica_orders import Export, Exported, Join, SetPeer
 from .sealed_gate import SealedGate
 from .standing import PeerLost
 
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
 
 
-class Take(Message[int]):
+class TakeState(Message[int]):
     """The state and reply log of the replica that leads, for one that joins; the reply is its turn."""
 
     leader: str
-    state: State | None
+    state: ServerState | None
     log: list[Logged]
 
 
@@ -64,7 +64,7 @@ class GoneAstray(Message):
 class Transfer(SealedGate):
     """The part of a RequestProtocol that speaks with that of the other replica."""
 
-    peer_messages = (Take, Astray)
+    peer_messages = (TakeState, Astray)
     answers_later = True
 
     next: Binding[Actor]
@@ -89,8 +89,8 @@ class Transfer(SealedGate):
         """Let in what waits, if nothing is inside."""
         raise NotImplementedError
 
-    @on(Peer)
-    def _peer(self, message: Peer) -> None:
+    @on(SetPeer)
+    def _peer(self, message: SetPeer) -> None:
         self._check(message.epoch)
         standing = self._standing
         if message.path != standing.other.path:
@@ -124,7 +124,7 @@ class Transfer(SealedGate):
                 raise CannotJoin(path=path, why=why)
             log = standing.log.entries()
             standing.other.replace(path, "joining", -2 if state is None else state.turn)
-            asked = self.ctx.create_task(self._offer(Take(standing.path, state, log)))
+            asked = self.ctx.create_task(self._offer(TakeState(standing.path, state, log)))
         finally:
             self._holds -= 1
             self._go_on()
@@ -146,10 +146,10 @@ class Transfer(SealedGate):
             if cell is not None and isinstance(cell.actor, Brick):
                 await cell.actor.drain()  # No ask: one of them may be waiting for us.
 
-    async def _offer(self, take: Take) -> int | HoldfastError:
+    async def _offer(self, take: TakeState) -> int | HoldfastError:
         try:
             return await self.ask_peer(take)
-        except (PeerLost, ConfigMismatch, StaleEpoch, HoldfastError) as error:
+        except (PeerLost, ConfigMismatch, StaleLeader, HoldfastError) as error:
             return error
 
     async def from_peer(self, message: Message[Any]) -> Any:
@@ -157,7 +157,7 @@ class Transfer(SealedGate):
         if isinstance(message, Astray):
             self._forsake(message.path)
             return None
-        assert isinstance(message, Take)
+        assert isinstance(message, TakeState)
         return await self._taken(message)
 
     def _forsake(self, path: str) -> None:
@@ -179,7 +179,7 @@ class Transfer(SealedGate):
         ):  # It has died, or counts no more: whoever leads now brings us its state.
             await self.ask_peer(Astray(self._standing.path))
 
-    async def _taken(self, take: Take) -> int:
+    async def _taken(self, take: TakeState) -> int:
         standing, server = self._standing, self._standing.server
         standing.other.replace(take.leader, "live")
         if not self._is_further(take):
@@ -196,7 +196,7 @@ class Transfer(SealedGate):
         standing.following.ready()
         return server.turn
 
-    def _is_further(self, take: Take) -> bool:
+    def _is_further(self, take: TakeState) -> bool:
         """Whether what was computed here for the leader, which waits for nobody to join, leads on from that state."""
         return self._standing.following.computed > (self._standing.epoch, -1 if take.state is None else take.state.turn)
 

@@ -22,8 +22,8 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.message import Message
 from ...supervision.admin import AlreadyPresent, StartChild
 from ...supervision.spec import ChildSpec
-from ..bricks.brick_messages import ConfigMismatch, StaleEpoch
-from ..bricks.replica_orders import Abort, Commit, Prepare, Quiesce, Stand
+from ..bricks.brick_messages import ConfigMismatch, StaleLeader
+from ..bricks.replica_orders import Abort, Commit, PrepareStack, Quiesce, Stand
 from .membership import LookAgain
 from .reconfiguration import names_for, still_silent, what_is_wrong
 from .replicas import GroupPart
@@ -133,7 +133,7 @@ class AdaptationEngine(GroupPart):
 
         The one that leads comes last: what goes wrong in another one keeps nobody waiting.
         """
-        leads, order = self._known.primary, Prepare(change.config, change.descriptions)
+        leads, order = self._known.primary, PrepareStack(change.config, change.descriptions)
         _, errors = await self._ask_all([name for name in members if name != leads], order, PREPARED_WITHIN)
         if not errors and leads in members:
             _, errors = await self._ask_all([leads], order, PREPARED_WITHIN)
@@ -256,7 +256,7 @@ class AdaptationEngine(GroupPart):
             if not future.done():
                 return False
             if (error := future.exception()) is not None:
-                if isinstance(error, (ConfigMismatch, StaleEpoch)):
+                if isinstance(error, (ConfigMismatch, StaleLeader)):
                     change.give_up(f"{name} stands elsewhere: {error}")
                 return False
         stands: dict[str, Stand] = {name: future.result() for name, future in asked.items()}

@@ -18,7 +18,7 @@ from ..bricks.brick_messages import MOST_REQUESTS
 
 if TYPE_CHECKING:
     from ...checkpoint.protocol import TurnEnd
-    from ..bricks.brick_messages import Ended, Work
+    from ..bricks.brick_messages import PartEnded, Work
 
 MOST_BYTES = 1_000_000
 """Of one batch."""
@@ -50,7 +50,7 @@ class Delivery:
 
     waiting: deque[Feed | Go] = dataclasses.field(default_factory=deque)
     inward: list[Outcome | SnapshotNow] = dataclasses.field(default_factory=list)
-    finished: list[Ended] = dataclasses.field(default_factory=list)
+    finished: list[PartEnded] = dataclasses.field(default_factory=list)
     fed: dict[int, Feed] = dataclasses.field(default_factory=dict)
     careful: set[int] = dataclasses.field(default_factory=set)
     inside: set[int] = dataclasses.field(default_factory=set)

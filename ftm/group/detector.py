@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from ...actors.kernel.actor import on
 from ...actors.observer_clock import OwnClock
-from ..bricks.replica_orders import Beat, Broken
+from ..bricks.replica_orders import Broken, ReplicaBeat
 from ..model.detection import Detection
 from .membership import is_within
 from .replicas import GroupPart
@@ -83,8 +83,8 @@ class Detector(GroupPart):
         self._clock = OwnClock(self.ctx.cell.node.loop.time(), self._period)
         self._look()
 
-    @on(Beat)
-    def heard(self, beat: Beat) -> None:
+    @on(ReplicaBeat)
+    def heard(self, beat: ReplicaBeat) -> None:
         """Take down that a replica is alive."""
         replicas, name = self._replicas, beat.name
         life = replicas.life_of(name)

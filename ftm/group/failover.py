@@ -14,7 +14,7 @@ from ...actors.errors import AskTimeout, HoldfastError
 from ...actors.kernel.actor import on
 from ...actors.kernel.message import Message
 from ..bricks.brick_messages import Lead
-from ..bricks.replica_orders import Commit, Peer, Prepare
+from ..bricks.replica_orders import Commit, PrepareStack, SetPeer
 from ..bricks.sealed_frames import Refused
 from ..events import FailedOver
 from .hung import end_stuck
@@ -174,7 +174,7 @@ class FailoverManager(GroupPart):
         life = known.members.get(name, 0)
         self._step("back")
         try:
-            await replicas.ask(name, Prepare(back.config, back.descriptions), BACK_WITHIN)
+            await replicas.ask(name, PrepareStack(back.config, back.descriptions), BACK_WITHIN)
             await replicas.ask(name, Commit(back.config, insists=True), BACK_WITHIN)
         except HoldfastError as error:
             if replicas.is_well(name):
@@ -217,7 +217,7 @@ class FailoverManager(GroupPart):
         assert primary is not None
         self._step("peer")
         left = replicas.backups()
-        order = Peer(known.epoch, replicas.place(left[0]) if left else None)
+        order = SetPeer(known.epoch, replicas.place(left[0]) if left else None)
         try:
             await replicas.ask(primary, order, ANSWERED_WITHIN)
         except HoldfastError:

@@ -19,7 +19,7 @@ from ...checkpoint.inputs import EXPIRED, Batch
 from ...checkpoint.protocol import FAILED, START, STASHED, Closed, Feed, Live, PipeDone, Released, Snapshot
 from ..bricks.background_work import Background
 from ..bricks.behind import Behind
-from ..bricks.brick_messages import Done, Ended, Inward, Outward, Request, Strayed, Work, WorkLost
+from ..bricks.brick_messages import Done, Inward, Outward, PartEnded, Request, Strayed, Work, WorkLost
 from ..events import BackgroundWorkLost, ReplicaFaulty
 from .delivery import Delivery
 from .hung import Stuck
@@ -228,7 +228,7 @@ class Group:
         if delivery.is_quiet and not self._take_beside(None):
             return
         if done.wait:
-            delivery.finished.append(Ended(known.epoch, done.part))
+            delivery.finished.append(PartEnded(known.epoch, done.part))
 
     def _take_beside(self, turn: int | None) -> bool:
         """What stands behind turns up to this one (None: any). False: the life is over by that."""

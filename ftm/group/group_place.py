@@ -36,7 +36,7 @@ from ..bricks.brick_messages import Lead
 from ..bricks.replica_orders import Finish, Install, Setting
 from ..events import ReplicaLost
 from ..model.detection import Detection
-from ..model.mechanism import NOTHING, compose, detection_in, has_state_access
+from ..model.mechanism import NOTHING, compose, detection_in
 from .adaptation_engine import AdaptationEngine
 from .detector import Detector
 from .failover import FailoverManager
@@ -51,7 +51,7 @@ from .steering import bind, give_order
 from .transient_homes import UNKEPT, TransientHome, is_unkept
 
 if TYPE_CHECKING:
-    from ...actors.control.orders_lane import Call
+    from ...actors.control.orders_lane import QueuedOrder
     from ...checkpoint.home.switch import Switch
     from ...checkpoint.protocol import Live, TurnEnd
     from ..model.mechanism import Mechanism
@@ -123,7 +123,7 @@ class GroupPlace(Place):
             home.subscribe(cell, self.parent.topics(cell))
             await self.lead(group, switch)
             start = cell.extra().start
-            if start is not None and not has_state_access(start.kind) and not switch.turns:
+            if start is not None and not start.kind.state_access and not switch.turns:
                 group.joins_early = True  # Nobody can be brought to what it has when it has handled something.
                 await self.protected(group)
             await home.replay(cell, group, entered)
@@ -560,7 +560,7 @@ class GroupPlace(Place):
 
     # -- what else a host does --------------------------------------------------------------------------------------
 
-    def control(self, cell: Cell, call: Call) -> None:
+    def control(self, cell: Cell, call: QueuedOrder) -> None:
         give_order(self.group if cell.host.is_up(cell) else None, cell, call)
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from ...actors.control.orders import Conclude, Prepare, Ready, ReplaceCode, ReplaceState, Resume, Suspend
-from ...actors.control.orders_lane import Call, send_call
+from ...actors.control.orders_lane import QueuedOrder, send_call
 from ...actors.errors import ControlFailed
 from ...actors.kernel import mailbox
 from ...actors.kernel.cell import Cell
@@ -19,7 +19,7 @@ AGAIN_AFTER = 0.01
 """Seconds after which an order is given again that nobody could take."""
 
 
-def give_order(group: Group | None, cell: Cell, call: Call) -> None:
+def give_order(group: Group | None, cell: Cell, call: QueuedOrder) -> None:
     """Give an order to the actor of the replica that leads; what would change one replica alone is refused.
 
     `group`: None if the actor is not up.
@@ -65,7 +65,7 @@ def bind_again(replicas: Replicas, name: str) -> None:
         bind(replicas, name, data)
 
 
-def give_again(cell: Cell, call: Call) -> None:
+def give_again(cell: Cell, call: QueuedOrder) -> None:
     """An order had to wait until somebody leads: give it to whoever lives there now, if it is still waited for."""
     if call.ask.is_done:
         return

@@ -18,14 +18,14 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar
 
-from ...actors.errors import HoldfastError, type_name
+from ...actors.errors import HoldfastError
 from ...actors.kernel.actor import Actor
 from ..alarms import Objected
-from ..bricks.brick_messages import Request, State
+from ..bricks.brick_messages import Request, ServerState
 from ..bricks.runs import Deciding, Run, plain
 from ..bricks.shadow_runs import Compute, Helping
-from ..model.mechanism import Mechanism, MechanismRefused, Role
-from ..votes.assertions import Assertion, AssertionFailed, Inspector, names_of
+from ..model.mechanism import Mechanism, Role
+from ..votes.assertions import AssertionFailed, Inspector, check_assertions, names_of
 
 
 class Assisting(Helping):
@@ -46,7 +46,7 @@ class Assisting(Helping):
 class Asserting(Deciding):
     """After of a replica that computes."""
 
-    async def choose(self, before: State, requests: list[Request], first: Run | None) -> Run | HoldfastError:
+    async def choose(self, before: ServerState, requests: list[Request], first: Run | None) -> Run | HoldfastError:
         """What was computed here, if nothing is against it; else what the other replica comes to."""
         standing = self._standing
         own = first or await self.run_here(before, requests)
@@ -61,7 +61,7 @@ class Asserting(Deciding):
         standing.node.emit(Objected(standing.address, standing.path, why, ""))
         return AssertionFailed(standing.address, why)
 
-    async def _at_peer(self, before: State, requests: list[Request]) -> Run | str:
+    async def _at_peer(self, before: ServerState, requests: list[Request]) -> Run | str:
         standing = self._standing
         if standing.other.path is None:
             return "there is no other replica"
@@ -112,9 +112,4 @@ class AD(Mechanism):
 
     def check(self, kind: type[Actor], where: str = "") -> None:
         super().check(kind, where)
-        for name in self.assertions:
-            try:
-                Assertion(name)
-            except Exception as error:  # Importing runs the module: anything may be raised.
-                why = f"the assertion {name} cannot be used: {type_name(type(error))}: {error}"
-                raise MechanismRefused(self.name, why) from error
+        check_assertions(self.assertions, self.name, "assertion")

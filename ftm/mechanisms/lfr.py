@@ -25,7 +25,7 @@ from ...actors.errors import HoldfastError
 from ...actors.kernel.message import Message
 from ...checkpoint.protocol import Outcome, TurnEnd
 from ..alarms import Diverged, NondeterminismFound, ProtectionLost, StatesDiffer
-from ..bricks.brick_messages import FORWARDED, Done, Request, State, Work
+from ..bricks.brick_messages import FORWARDED, Done, Request, ServerState, Work
 from ..bricks.bricks import After, Before, Brick, Proceed
 from ..bricks.runs import Missing, Shadow, digest_of_state
 from ..bricks.standing import PeerLost
@@ -282,7 +282,7 @@ class Comparing(After):
         self.ctx.cell.node.cell_at(standing.paths["protocol"]).ref.tell(GoneAstray())
 
     async def _compute_again(
-        self, before: State, requests: list[Request], number: int, name: str, known: set[int] | None
+        self, before: ServerState, requests: list[Request], number: int, name: str, known: set[int] | None
     ) -> None:
         """Run what has differed again, from the same state: an actor that is deterministic comes to the same each time.
 

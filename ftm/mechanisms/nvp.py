@@ -21,7 +21,7 @@ import msgspec
 from ...actors.errors import HoldfastError
 from ...actors.kernel.actor import Actor
 from ..alarms import Masked
-from ..bricks.brick_messages import Request, State
+from ..bricks.brick_messages import Request, ServerState
 from ..bricks.runs import Deciding, Remembering, Run, Shadow, turns_of, vote
 from ..model.mechanism import Mechanism, Role
 from ..model.mechanism_declaration import Cost
@@ -50,7 +50,7 @@ class Versions(Deciding):
         for shadow in self._others:
             await shadow.close()
 
-    async def choose(self, before: State, requests: list[Request], first: Run | None) -> Run | HoldfastError:
+    async def choose(self, before: ServerState, requests: list[Request], first: Run | None) -> Run | HoldfastError:
         """What the majority has come to."""
         standing, mechanism = self._standing, self.mechanism
         assert isinstance(mechanism, NVP)

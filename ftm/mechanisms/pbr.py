@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 
 from ...actors.kernel.message import Message
 from ..alarms import ProtectionLost
-from ..bricks.brick_messages import Change, Done, Logged, State
+from ..bricks.brick_messages import Done, Logged, ServerState, StateDelta
 from ..bricks.bricks import FOREVER, After
 from ..bricks.standing import PeerLost
 from ..model.mechanism import Mechanism, Role
@@ -30,7 +30,7 @@ class Checkpoint(Message[int]):
     The reply is the turn that the backup has; `MISFIT` if it wants all of the state.
     """
 
-    state: State | Change
+    state: ServerState | StateDelta
     log: list[Logged]
 
 
@@ -78,7 +78,7 @@ class Checkpointing(After):
         for task in list(self._out):
             await asyncio.wait((task,))
 
-    async def _hand_over(self, checkpoint: Checkpoint, said: int, state: State) -> None:
+    async def _hand_over(self, checkpoint: Checkpoint, said: int, state: ServerState) -> None:
         try:
             if await self.ask_peer(checkpoint) == MISFIT:
                 await self.ask_peer(Checkpoint(state, checkpoint.log))
@@ -91,7 +91,7 @@ class Checkpointing(After):
             del self._unheard[: said - self._heard]
             self._heard = said
 
-    def _send(self, checkpoint: Checkpoint, said: int, state: State) -> None:
+    def _send(self, checkpoint: Checkpoint, said: int, state: ServerState) -> None:
         task = self.ctx.create_task(self._hand_over(checkpoint, said, state))
         self._out.add(task)
         task.add_done_callback(self._out.discard)

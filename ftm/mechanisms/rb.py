@@ -15,13 +15,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar
 
-from ...actors.errors import HoldfastError, type_name
+from ...actors.errors import HoldfastError
 from ...actors.kernel.actor import Actor
 from ..alarms import Objected
-from ..bricks.brick_messages import Request, State
+from ..bricks.brick_messages import Request, ServerState
 from ..bricks.runs import Deciding, Missing, Remembering, Run, Shadow
-from ..model.mechanism import Mechanism, MechanismRefused, Role
-from ..votes.assertions import Assertion, Inspector, names_of
+from ..model.mechanism import Mechanism, Role
+from ..votes.assertions import Inspector, check_assertions, names_of
 from ..votes.versions import version
 
 
@@ -53,7 +53,7 @@ class Alternating(Deciding):
         for _, shadow in self._alternates:
             await shadow.close()
 
-    async def choose(self, before: State, requests: list[Request], first: Run | None) -> Run | HoldfastError:
+    async def choose(self, before: ServerState, requests: list[Request], first: Run | None) -> Run | HoldfastError:
         """The first that is accepted."""
         standing = self._standing
         own = first or await self.run_here(before, requests)
@@ -113,9 +113,4 @@ class RB(Mechanism):
         super().check(kind, where)
         for name in self.alternates:
             version(kind, name, self.name)
-        for name in self.test:
-            try:
-                Assertion(name)
-            except Exception as error:  # Importing runs the module: anything may be raised.
-                why = f"the test {name} cannot be used: {type_name(type(error))}: {error}"
-                raise MechanismRefused(self.name, why) from error
+        check_assertions(self.test, self.name, "test")

@@ -24,7 +24,7 @@ import msgspec
 
 from ...actors.errors import ActorStopped, HoldfastError
 from ..alarms import Masked, Outvoted, ProtectionLost
-from ..bricks.brick_messages import Done, NotFollowing, Request, StaleEpoch, State, Strayed, is_marker
+from ..bricks.brick_messages import Done, NotFollowing, Request, ServerState, StaleLeader, Strayed, is_marker
 from ..bricks.runs import Deciding, Digests, Run, turns_of, vote
 from ..bricks.shadow_runs import NEEDS_STATE, Compute, Computed, Helping, Settled
 from ..bricks.standing import PeerLost
@@ -45,7 +45,7 @@ class OutvotedHere(HoldfastError, text="{why}"):
     why: str
 
 
-class Computing(Helping):
+class ComputingAlong(Helping):
     """Before of all three: computes for the one that leads."""
 
     follows_at_once = True  # An order says which state it begins from: nobody is left out until it is told to follow.
@@ -61,7 +61,7 @@ class Voting(Deciding):
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
-        self._point: State | None = None
+        self._point: ServerState | None = None
         self._digest = b""
         self._was_alone = False
         self._digests = Digests()
@@ -86,7 +86,7 @@ class Voting(Deciding):
         order = Compute(point.turn, self._digest_of(point), None, [], [], True, point.live)
         await asyncio.gather(*(self._at(path, point, order) for path in self._others()))
 
-    async def choose(self, before: State, requests: list[Request], first: Run | None) -> Run | HoldfastError:
+    async def choose(self, before: ServerState, requests: list[Request], first: Run | None) -> Run | HoldfastError:
         """What two of three have come to."""
         standing, mechanism = self._standing, self.mechanism
         assert isinstance(mechanism, TMR)
@@ -130,7 +130,7 @@ class Voting(Deciding):
         order = Compute(point.turn, b"", point, [], [], True, point.live, log)
         await asyncio.gather(*(self._at(path, point, order) for path in self._others()))
 
-    def _digest_of(self, state: State) -> bytes:
+    def _digest_of(self, state: ServerState) -> bytes:
         if self._point is not state and self._point != state:
             begin = time.perf_counter()
             self._point, self._digest = state, self._digests.of(state)
@@ -141,7 +141,7 @@ class Voting(Deciding):
         above, _, own = self._standing.path.rpartition("/")
         return [f"{above}/{name}" for name in NAMES if name != own]
 
-    async def _at(self, path: str, before: State, order: Compute) -> Computed | None:
+    async def _at(self, path: str, before: ServerState, order: Compute) -> Computed | None:
         """What a replica has come to; None if it cannot be reached, or has not computed it: then it does not count."""
         for _ in range(TRIES):
             try:
@@ -149,7 +149,7 @@ class Voting(Deciding):
                 if done.problem == NEEDS_STATE:
                     whole = msgspec.structs.replace(order, state=before, log=self._standing.log.entries())
                     done = await self.ask_at(path, "tmr.before", whole)
-            except StaleEpoch:
+            except StaleLeader:
                 raise
             except PeerLost:
                 continue  # Another one has joined or gone meanwhile: this one may be there still.
@@ -189,8 +189,8 @@ class TMR(Mechanism):
     keeps_members: ClassVar[bool] = True
     cost: ClassVar[Cost | None] = Cost(latency=2, total=3, requests=4, recovery=0.02)
     roles: ClassVar[dict[str, Role]] = {
-        "leader": Role(before=Computing, after=Voting),
-        "follower": Role(before=Computing, computes=False),
+        "leader": Role(before=ComputingAlong, after=Voting),
+        "follower": Role(before=ComputingAlong, computes=False),
     }
 
     voter: Any = MAJORITY

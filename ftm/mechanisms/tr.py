@@ -17,7 +17,7 @@ from typing import ClassVar
 
 from ...actors.errors import HoldfastError
 from ..alarms import Masked
-from ..bricks.brick_messages import Request, State
+from ..bricks.brick_messages import Request, ServerState
 from ..bricks.runs import Deciding, Run, plain, turns_of
 from ..model.mechanism import Mechanism, Role
 from ..votes.voters import NoMajority
@@ -26,7 +26,7 @@ from ..votes.voters import NoMajority
 class Compare(Deciding):
     """After of time redundancy: what leaves was computed alike twice."""
 
-    async def choose(self, before: State, requests: list[Request], first: Run | None) -> Run | HoldfastError:
+    async def choose(self, before: ServerState, requests: list[Request], first: Run | None) -> Run | HoldfastError:
         """Run again what has just run, and compare; a third run decides."""
         first = first or await self.run_here(before, requests)
         second = await self.run_here(before, requests)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
-from ...actors.control.orders_lane import Call
+from ...actors.control.orders_lane import QueuedOrder
 from ...actors.errors import ControlFailed, StartFailed, StartIgnored
 from ...actors.exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...actors.kernel import lifecycle, mailbox
@@ -92,7 +92,7 @@ class ChildAtRoot(ChildPlace):
         else:
             self.gave_up_start(cell)
 
-    def control(self, cell: Cell, call: Call) -> None:
+    def control(self, cell: Cell, call: QueuedOrder) -> None:
         why = "it lives in another process: order it from the root"  # Which has taken back what it had ordered here.
         call.ask.fail(ControlFailed(cell.path, call.order.verb, why))
 

@@ -24,7 +24,7 @@ from ...actors.kernel.topics import Topics
 from ...actors.migration.here import Arrival
 from ...actors.migration.luggage import check_sendable, pack_rest
 from ...actors.migration.luggage import unpack as unpack_life
-from ...actors.migration.quiesce import Take, farewell, now, obey_commands, part, resume, sorted_out
+from ...actors.migration.quiesce import PackLife, farewell, now, obey_commands, part, resume, sorted_out
 from ...actors.migration.words import say
 from ...actors.process.wire.frames import BadFrame
 from ...checkpoint.protocol import Respec
@@ -41,7 +41,7 @@ class PlainChild:
 
     def __init__(self, guest: Guest, path: str, attempt: int) -> None:
         self._guest, self._path, self._attempt = guest, path, attempt
-        self._take: Take | None = None
+        self._take: PackLife | None = None
         self._cell: Cell | None = None  # where a life is at rest, or comes back to
         self._arrival: Arrival | None = None  # beside it: the life that comes back
         self._held: list[Any] | None = None  # what has been sent to it here meanwhile
@@ -78,7 +78,7 @@ class PlainChild:
             self._say("refused", why="it is being restarted; try again")
             return
         at_rest = self._at_rest_for_home if for_home else self._at_rest
-        take = Take(self._owe, at_rest, lambda why: self._say("refused", why=why))
+        take = PackLife(self._owe, at_rest, lambda why: self._say("refused", why=why))
         self._take, self._cell = take, cell
 
         def ended(done: asyncio.Future[Any]) -> None:

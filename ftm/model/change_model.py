@@ -22,10 +22,10 @@ from .application import Application
 from .mechanism_declaration import FAULTS, LAYERS, LEVELS, NEEDS, Cost, Entry, Mechanisms
 
 
-class Faults(msgspec.Struct, frozen=True):
+class FaultClasses(msgspec.Struct, frozen=True):
     """F: the classes of faults that must be tolerated.
 
-    >>> sorted(Faults.of("transient_value", "crash").classes)
+    >>> sorted(FaultClasses.of("transient_value", "crash").classes)
     ['crash', 'transient_value']
     """
 
@@ -37,12 +37,12 @@ class Faults(msgspec.Struct, frozen=True):
             raise ValueError(f"unknown faults {', '.join(sorted(unknown))}; there are {', '.join(FAULTS)}")
 
     @classmethod
-    def of(cls, *classes: str) -> Faults:
+    def of(cls, *classes: str) -> FaultClasses:
         """The faults with these names."""
         return cls(frozenset(classes))
 
-    def __or__(self, other: Faults) -> Faults:
-        return Faults(self.classes | other.classes)
+    def __or__(self, other: FaultClasses) -> FaultClasses:
+        return FaultClasses(self.classes | other.classes)
 
     def __str__(self) -> str:
         return ", ".join(name for name in FAULTS if name in self.classes) or "no faults"
@@ -73,7 +73,7 @@ class Resources(msgspec.Struct, frozen=True):
         )
 
 
-class Refused(msgspec.Struct, frozen=True):
+class RefusedStack(msgspec.Struct, frozen=True):
     """A mechanism or composition that is not valid, at which of F, A and R it failed, and why."""
 
     layers: tuple[str, ...]
@@ -111,9 +111,9 @@ class Selection(msgspec.Struct, frozen=True):
     of these is to give up a property, so nobody does it silently.
     """
 
-    faults: Faults
+    faults: FaultClasses
     valid: tuple[Choice, ...]
-    refused: tuple[Refused, ...]
+    refused: tuple[RefusedStack, ...]
     degraded: tuple[Choice, ...] = ()
 
     @property
@@ -128,7 +128,7 @@ class Selection(msgspec.Struct, frozen=True):
         if not self.valid:
             lines.append("  nothing is valid")
             lines += [f"  {refusal}" for refusal in self.refused]
-            lines += [f"  degraded: {one}, without {Faults(one.uncovered)}" for one in self.degraded[:1]]
+            lines += [f"  degraded: {one}, without {FaultClasses(one.uncovered)}" for one in self.degraded[:1]]
         return "\n".join(lines)
 
 
@@ -214,7 +214,7 @@ def _pair_problem(outer: Entry, inner: Entry) -> str:
 
 
 def select(
-    faults: Faults,
+    faults: FaultClasses,
     application: Application,
     resources: Resources,
     mechanisms: Mechanisms | None = None,
@@ -236,7 +236,7 @@ def select(
     """
     compositions = _compositions([Entry.of(one) for one in (built_in() if mechanisms is None else mechanisms)])
     valid: list[Choice] = []
-    refused: list[Refused] = []
+    refused: list[RefusedStack] = []
     partial: list[Choice] = []
     for entries in compositions:
         refusal = _refusal(entries, faults, application, resources)
@@ -245,32 +245,34 @@ def select(
                 valid.append(_choice(entries, faults, application, price, resources.energy))
             continue
         refused.append(refusal)
-        if refusal.stage == "F" and _refusal(entries, Faults(), application, resources) is None:
+        if refusal.stage == "F" and _refusal(entries, FaultClasses(), application, resources) is None:
             choice = _choice(entries, faults, application, price, resources.energy)
-            if not _has_needless(entries, Faults(faults.classes - choice.uncovered)):
+            if not _has_needless(entries, FaultClasses(faults.classes - choice.uncovered)):
                 partial.append(choice)
     valid.sort(key=lambda choice: (choice.price, choice.layers))
     partial.sort(key=lambda choice: (len(choice.uncovered), choice.price, choice.layers))
     return Selection(faults, tuple(valid), tuple(refused), () if valid else tuple(partial))
 
 
-def check(layers: Mechanisms, faults: Faults, application: Application, resources: Resources) -> tuple[Refused, ...]:
+def check(
+    layers: Mechanisms, faults: FaultClasses, application: Application, resources: Resources
+) -> tuple[RefusedStack, ...]:
     """Why one composition is not valid for (F, A, R): all reasons, in the order in which they count; none if it is."""
     entries = [Entry.of(layer) for layer in layers]
     names = tuple(entry.name for entry in entries)
-    reasons = [Refused(names, "nesting", problem) for problem in nesting_problems(entries)]
+    reasons = [RefusedStack(names, "nesting", problem) for problem in nesting_problems(entries)]
     for stage, problems in (
         ("F", _fault_problems(entries, faults)),
         ("A", _application_problems(entries, application, resources)),
         ("R", _resource_problems(entries, application, resources)),
     ):
-        reasons += [Refused(names, stage, problem) for problem in problems]
+        reasons += [RefusedStack(names, stage, problem) for problem in problems]
     return tuple(reasons)
 
 
 def choice_of(
     layers: Mechanisms,
-    faults: Faults,
+    faults: FaultClasses,
     application: Application,
     *,
     price: Pricing = resource_price,
@@ -295,26 +297,26 @@ def _compositions(entries: list[Entry]) -> list[tuple[Entry, ...]]:
 
 
 def _refusal(
-    entries: tuple[Entry, ...], faults: Faults, application: Application, resources: Resources
-) -> Refused | None:
+    entries: tuple[Entry, ...], faults: FaultClasses, application: Application, resources: Resources
+) -> RefusedStack | None:
     """The first stage at which it fails, with all reasons of that stage."""
     reasons = check(entries, faults, application, resources)
     if not reasons:
         return None
     stage = reasons[0].stage
-    return Refused(reasons[0].layers, stage, "; ".join(reason.why for reason in reasons if reason.stage == stage))
+    return RefusedStack(reasons[0].layers, stage, "; ".join(reason.why for reason in reasons if reason.stage == stage))
 
 
-def _fault_problems(entries: Sequence[Entry], faults: Faults) -> list[str]:
+def _fault_problems(entries: Sequence[Entry], faults: FaultClasses) -> list[str]:
     missing = faults.classes - _covered(entries)
-    return [f"does not tolerate {Faults(missing)}"] if missing else []
+    return [f"does not tolerate {FaultClasses(missing)}"] if missing else []
 
 
 def _covered(entries: Sequence[Entry]) -> frozenset[str]:
     return frozenset[str]().union(*(entry.tolerates for entry in entries))
 
 
-def _has_needless(entries: tuple[Entry, ...], faults: Faults) -> bool:
+def _has_needless(entries: tuple[Entry, ...], faults: FaultClasses) -> bool:
     """Whether it would do without one of its layers."""
     for at in range(len(entries)):
         rest = (*entries[:at], *entries[at + 1 :])
@@ -386,7 +388,7 @@ def _load(cost: Cost, application: Application) -> float:
 
 
 def _choice(
-    entries: tuple[Entry, ...], faults: Faults, application: Application, price: Pricing, energy: float
+    entries: tuple[Entry, ...], faults: FaultClasses, application: Application, price: Pricing, energy: float
 ) -> Choice:
     cost, units = _combined(entries), _units(entries)
     sent, load = _bytes_per_second(cost, application), _load(cost, application)

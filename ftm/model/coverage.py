@@ -9,7 +9,7 @@ from itertools import combinations
 import msgspec
 
 from .application import Application
-from .change_model import Choice, Faults, Resources, label, select
+from .change_model import Choice, FaultClasses, Resources, label, select
 from .mechanism_declaration import FAULTS, NEEDS, Entry, Mechanisms
 
 
@@ -55,7 +55,7 @@ class Coverage(msgspec.Struct, frozen=True):
 class Situation(msgspec.Struct, frozen=True):
     """One line of the selection table: (F, A) and what is chosen."""
 
-    faults: Faults
+    faults: FaultClasses
     application: Application
     best: Choice | None
     why: str
@@ -75,7 +75,7 @@ def selection_table(
     """What is chosen for each set of faults, with and without determinism and state access."""
     return tuple(
         _situation(
-            Faults(frozenset(chosen)),
+            FaultClasses(frozenset(chosen)),
             Application("it", is_deterministic=is_same, has_state_access=has_state),
             mechanisms,
             resources or Resources(units=3),
@@ -102,7 +102,7 @@ def selection_text(situations: tuple[Situation, ...]) -> str:
 
 
 def _situation(
-    faults: Faults, application: Application, mechanisms: Mechanisms | None, resources: Resources
+    faults: FaultClasses, application: Application, mechanisms: Mechanisms | None, resources: Resources
 ) -> Situation:
     selection = select(faults, application, resources, mechanisms)
     return Situation(faults, application, selection.best, selection.explain())

@@ -11,6 +11,7 @@ import dataclasses
 import hashlib
 import importlib
 import importlib.util
+import operator
 import os
 import sys
 from collections.abc import Callable, Iterable
@@ -22,7 +23,7 @@ import msgspec
 from ...actors.errors import HoldfastError, type_name
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.message import message_name
-from ...actors.process.wire.start_codec import Described
+from ...actors.process.wire.start_codec import Described, imported
 from .detection import Detection
 from .mechanism_declaration import MechanismDeclaration
 
@@ -121,7 +122,7 @@ class Mechanism(MechanismDeclaration, Described):
             MechanismRefused: naming what is missing.
         """
         who, name = where or type_name(kind), self.name or type_name(type(self))
-        if "state_access" in self.needs and not has_state_access(kind):
+        if "state_access" in self.needs and not kind.state_access:
             why = "saves and restores the state, and the class says state_access = False"
             raise MechanismRefused(name, f"{who}: it {why}")
         if "determinism" in self.needs and not kind.deterministic:
@@ -199,20 +200,14 @@ def find_class(code: Code) -> Any:
     Raises:
         MechanismRefused: its file is another one. What importing it raises.
     """
-    module, _, path = code.kind.partition(":")
     if code.file:
-        return _attribute(load_module(code.file, sha256=code.sha256), path)
-    return _attribute(sys.modules.get(module) or importlib.import_module(module), path)
+        return operator.attrgetter(code.kind.partition(":")[2])(load_module(code.file, sha256=code.sha256))
+    return imported(code.kind)
 
 
 def _plain(value: Any) -> Any:
     """A setting as it travels; a mechanism that has structs among its settings takes them back as dicts."""
     return msgspec.to_builtins(value) if isinstance(value, msgspec.Struct | Detection) else value
-
-
-def has_state_access(kind: type[Actor]) -> bool:
-    """Whether an actor's state can be saved, as far as its class says."""
-    return kind.state_access
 
 
 def detection_in(layers: Iterable[Mechanism]) -> Detection | None:
@@ -266,12 +261,6 @@ def revive(description: Description) -> Mechanism:
         except Exception as error:  # The same.
             raise MechanismRefused(name, f"{code.kind} cannot be loaded: {error}") from error
     return made
-
-
-def _attribute(holder: Any, path: str) -> Any:
-    for part in path.split("."):
-        holder = getattr(holder, part)
-    return holder
 
 
 def find(name: str) -> type[Mechanism]:

@@ -17,9 +17,9 @@ import msgspec
 from ..model.application import Application
 from ..model.change_model import (
     Choice,
-    Faults,
+    FaultClasses,
     Pricing,
-    Refused,
+    RefusedStack,
     Resources,
     Selection,
     check,
@@ -84,7 +84,7 @@ class Settings(msgspec.Struct, frozen=True):
         notice: seconds between telling a decision and carrying it out, for a person to object.
     """
 
-    required: Faults = Faults()
+    required: FaultClasses = FaultClasses()
     thresholds: dict[str, Threshold] = msgspec.field(default_factory=lambda: dict(THRESHOLDS))
     interval: float = 1.0
     smoothing: float = 0.3
@@ -122,7 +122,7 @@ class Verdict(msgspec.Struct, frozen=True):
     reason: str
     target: tuple[str, ...] | None = None
     is_urgent: bool = False
-    faults: Faults = Faults()
+    faults: FaultClasses = FaultClasses()
     resources: Resources = Resources()
     degraded: tuple[Choice, ...] = ()
 
@@ -238,10 +238,10 @@ class Judge:
 
     # -- what is decided --------------------------------------------------------------------------------------------
 
-    def faults(self, now: float) -> Faults:
+    def faults(self, now: float) -> FaultClasses:
         """The faults that have to be tolerated now."""
         present = frozenset(signals.threshold.fault for signals in self._signals.values() if signals.look(now))
-        return Faults(self.settings.required.classes | present)
+        return FaultClasses(self.settings.required.classes | present)
 
     def decide(self, now: float) -> Verdict:
         """What is to be done at this time."""
@@ -263,7 +263,7 @@ class Judge:
         """The declarations of the present mechanism, outermost first."""
         return [self._entries[name] for name in self.current]
 
-    def _want(self, faults: Faults, problems: list[str], now: float) -> tuple[object, Verdict]:
+    def _want(self, faults: FaultClasses, problems: list[str], now: float) -> tuple[object, Verdict]:
         """What would be done if it could be done at once, and what makes it another wish than one before."""
         selection = self._select(faults, now)
         best = selection.best
@@ -287,14 +287,14 @@ class Judge:
         """What there is for a choice that is to come."""
         return self.resources.scaled(1 - self.settings.margin)
 
-    def _select(self, faults: Faults, now: float) -> Selection:
+    def _select(self, faults: FaultClasses, now: float) -> Selection:
         selection = select(faults, self.application, self._narrow(), list(self._entries.values()), price=self.price)
         for layers, (until, _) in list(self.forbidden.items()):
             if now >= until:
                 del self.forbidden[layers]
         allowed = tuple(choice for choice in selection.valid if choice.layers not in self.forbidden)
         vetoed = [
-            Refused(choice.layers, "veto", self.forbidden[choice.layers][1])
+            RefusedStack(choice.layers, "veto", self.forbidden[choice.layers][1])
             for choice in selection.valid
             if choice.layers in self.forbidden
         ]

@@ -5,7 +5,7 @@ changed) and at the class of what lives there, measures resources, and lets `Jud
 with its reason, and a call of what it was given: it changes nothing itself (`watched.watch_of` gives it transactions).
 A person can forbid a mechanism, object to a decision that was announced, or be asked (`veto`).
 
-What it knows is in a `Watch` outside of it: it can be killed at any moment, and its next life goes on.
+What it knows is in a `MechanismWatch` outside of it: it can be killed at any moment, and its next life goes on.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ import psutil
 from ...actors.events import Event, EventHub, EventStream
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.actor import Actor, on
-from ...actors.kernel.message import Message, Order
+from ...actors.kernel.message import Message, RuntimeOrder
 from ...actors.kernel.node import cell_kind
 from ...actors.kernel.ref import ActorRef
 from ...supervision.arbiter import Hand, arbiter_of
 from ..events import MechanismAttached, MechanismChanged, MechanismDetached
 from ..model.application import Application
-from ..model.change_model import Choice, Faults, Resources, choice_of, label
+from ..model.change_model import Choice, FaultClasses, Resources, choice_of, label
 from .adaptations import (
     AdaptationDecided,
     AdaptationDone,
@@ -65,7 +65,7 @@ SIZES: Final = ("assertions", "versions", "state_bytes", "delta_bytes", "request
 # -- what it is told -------------------------------------------------------------------------------------------------
 
 
-class Adapt(Order[None]):
+class ChangeStack(RuntimeOrder[None]):
     """The order to change the mechanism of `address` to `target`, outermost layer first."""
 
     number: int
@@ -105,7 +105,7 @@ class MechanismIs(Message):
     layers: tuple[str, ...]
 
 
-class Forbid(Order[None]):
+class Forbid(RuntimeOrder[None]):
     """A person does not want this mechanism or composition for so many seconds."""
 
     layers: tuple[str, ...]
@@ -113,7 +113,7 @@ class Forbid(Order[None]):
     why: str = "forbidden"
 
 
-class Allow(Order[None]):
+class Allow(RuntimeOrder[None]):
     """A person has nothing against it any more."""
 
     layers: tuple[str, ...]
@@ -130,7 +130,7 @@ class Monitored(msgspec.Struct, frozen=True):
     """What the engine knows at the moment."""
 
     current: tuple[str, ...]
-    faults: Faults
+    faults: FaultClasses
     resources: Resources
     application: Application
     verdict: str
@@ -157,8 +157,8 @@ class Tried(Message):
     is_veto: bool = False
 
 
-Trigger = Callable[[Adapt], Awaitable[None] | None] | ActorRef[Any]
-Veto = Callable[[Adapt], Any]
+Trigger = Callable[[ChangeStack], Awaitable[None] | None] | ActorRef[Any]
+Veto = Callable[[ChangeStack], Any]
 Probe = Callable[[], Readings]
 
 
@@ -173,14 +173,14 @@ def read_machine() -> Readings:
     return Readings(units=len(os.sched_getaffinity(0)), cpu=idle, energy=energy)
 
 
-class Watch:
+class MechanismWatch:
     """What the engine knows and has been given; it outlives the engine's lives.
 
     Args:
         address: the protected one. Events count that happen there or below.
         judge: decides.
-        trigger: what carries out a decision: a function of `Adapt`, maybe async, or an actor that handles it. When it
-            returns, the mechanism is the target; when it raises, it is the one before.
+        trigger: what carries out a decision: a function of `ChangeStack`, maybe async, or an actor that handles it.
+            When it returns, the mechanism is the target; when it raises, it is the one before.
         probe: measures resources; None if they are told by `Measured`.
         veto: asked before a decision is carried out, maybe async; True or a text (why) forbids the target for `dwell`
             seconds. If it raises, that is a veto, too.
@@ -210,8 +210,8 @@ class Watch:
         self.signs = dict(signs)
         self.patience = patience
         self.verdict = Verdict(STAY, "nothing was looked at yet")
-        self.announced: Adapt | None = None
-        self.running: Adapt | None = None
+        self.announced: ChangeStack | None = None
+        self.running: ChangeStack | None = None
         self.told: object = None  # the last thing told about what is held back, or that nothing is valid
         self.numbers = 0
         self.changes = 0
@@ -265,7 +265,7 @@ class MonitoringEngine(Actor):
 
     deterministic = False
 
-    def __init__(self, watch: Watch) -> None:
+    def __init__(self, watch: MechanismWatch) -> None:
         self._watch = watch
 
     def on_start(self, restored: bool) -> None:
@@ -323,7 +323,7 @@ class MonitoringEngine(Actor):
         if readings.cpu is None:
             return readings
         judge = self._watch.judge
-        own = choice_of(judge.layers(), Faults(), judge.application).load
+        own = choice_of(judge.layers(), FaultClasses(), judge.application).load
         return msgspec.structs.replace(readings, cpu=min(1.0, readings.cpu + own))
 
     @on(Observe)
@@ -404,7 +404,7 @@ class MonitoringEngine(Actor):
         watch, judge = self._watch, self._watch.judge
         assert verdict.target is not None
         watch.numbers += 1
-        adapt = Adapt(
+        adapt = ChangeStack(
             watch.numbers, watch.address, judge.current, verdict.target, verdict.reason, is_urgent=verdict.is_urgent
         )
         notice = judge.settings.notice
@@ -430,7 +430,7 @@ class MonitoringEngine(Actor):
         watch.announced, watch.running = None, adapt
         self.ctx.pipe_to_self(self._try(adapt), lambda tried: tried)
 
-    async def _try(self, adapt: Adapt) -> Tried:
+    async def _try(self, adapt: ChangeStack) -> Tried:
         """Ask the person, then have it done. It touches nothing of ours: what came of it is told."""
         watch = self._watch
         try:
@@ -448,7 +448,7 @@ class MonitoringEngine(Actor):
             return Tried(adapt.number, f"{type(error).__name__}: {error}".rstrip(": "))
         return Tried(adapt.number)
 
-    async def _vetoed(self, adapt: Adapt) -> str:
+    async def _vetoed(self, adapt: ChangeStack) -> str:
         veto = self._watch.veto
         if veto is None:
             return ""

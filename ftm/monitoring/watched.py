@@ -12,7 +12,7 @@ from ..model.application import Application
 from ..model.composition import layers_of
 from ..model.mechanism import compose
 from .judge import Judge, Settings
-from .monitor import Adapt, Watch
+from .monitor import ChangeStack, MechanismWatch
 
 if TYPE_CHECKING:
     from ...actors.kernel.ref import ActorRef
@@ -36,7 +36,7 @@ def watch_of(
     resources: Resources | None = None,
     known: dict[str, Any] | None = None,
     **options: Any,
-) -> Watch:
+) -> MechanismWatch:
     """What a `MonitoringEngine` needs to look after an actor: it changes its mechanism by transactions.
 
     Args:
@@ -47,7 +47,7 @@ def watch_of(
             actor has now are among them in any case.
         resources: what there is; measured, if it is left out.
         known: what is known of the application and its class does not say: `{"rate": 100.0}`.
-        options: those of `Watch`: `probe`, `veto`, `degrade`, `signs`, `patience`.
+        options: those of `MechanismWatch`: `probe`, `veto`, `degrade`, `signs`, `patience`.
 
     Raises:
         SpecError: no spec says what protects it: nobody supervises it. MechanismRefused: there is no such mechanism.
@@ -62,7 +62,7 @@ def watch_of(
     present = () if spec.mechanism is None else compose(spec.mechanism)
     made.update((layer.name, layer) for layer in present)
 
-    async def change(adapt: Adapt) -> None:
+    async def change(adapt: ChangeStack) -> None:
         there = system.node.find(adapt.address)
         protected = there is not None and there.spec.mechanism is not None
         layers = tuple(made[name] for name in adapt.target)
@@ -78,6 +78,6 @@ def watch_of(
     versions = sum(len(getattr(one, name, ())) for one in made.values() for name in BRINGS)
     application = Application.of(kind, **{"assertions": assertions, "versions": 1 + versions, **(known or {})})
     judge = Judge(settings, application, tuple(one.name for one in present), list(made.values()), resources)
-    watch = Watch(ref.path, judge, change, **options)
+    watch = MechanismWatch(ref.path, judge, change, **options)
     watch.kind = kind
     return watch

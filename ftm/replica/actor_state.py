@@ -11,7 +11,7 @@ from ...actors.values import decode_value, state_digest
 from ...checkpoint.life.recorded_inbox import Fed
 from ...checkpoint.protocol import Feed, Snapshot, pieces
 from ...checkpoint.snapshot.key_variables import key_names, put_back, save_state, state_of, variables
-from ..bricks.brick_messages import State
+from ..bricks.brick_messages import ServerState
 
 if TYPE_CHECKING:
     from ..bricks.state_images import Image
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from .rewind_points import RewindPoints
 
 
-def point_of(life: ServerLife, data: Image, deltas: list[bytes]) -> State:
+def point_of(life: ServerLife, data: Image, deltas: list[bytes]) -> ServerState:
     """Put a state together with what else belongs to the life."""
     stash = [fed.feed for fed in life.stash]
     ids = () if life.is_live else sorted(life.restored.stash_ids)
-    return State(
+    return ServerState(
         life.turn, data, deltas, stash, [fed.feed for fed in life.returned.values()], life.is_live,
         [key for key in ids if all(feed.id != key for feed in stash)], life.cell.extra().trap_exits,
     )  # fmt: skip
@@ -36,7 +36,7 @@ def names_of_state(actor: Any) -> set[str] | None:
     return None
 
 
-def take_up(life: ServerLife, point: State, *, has_deltas: bool) -> None:
+def take_up(life: ServerLife, point: ServerState, *, has_deltas: bool) -> None:
     """Bring a life that has begun with the whole state of a point to that point."""
     actor: Any = life.cell.actor
     life.cell.extra().trap_exits = point.traps
@@ -47,7 +47,7 @@ def take_up(life: ServerLife, point: State, *, has_deltas: bool) -> None:
     life.returned |= _returned(life, point)
 
 
-def rewind_to(life: ServerLife, point: State, names: set[str] | None, *, has_deltas: bool) -> None:
+def rewind_to(life: ServerLife, point: ServerState, names: set[str] | None, *, has_deltas: bool) -> None:
     """Put the state of a point back, in place: the actor's object goes on.
 
     What is no state (attributes with a leading underscore) stays as it is.
@@ -81,7 +81,7 @@ def _fed(life: ServerLife, feeds: Iterable[Feed]) -> list[Fed]:
     return [Fed(life, feed, None, None if feed.sender is None else node.cell_at(feed.sender)) for feed in feeds]
 
 
-def _returned(life: ServerLife, point: State) -> dict[int, Fed]:
+def _returned(life: ServerLife, point: ServerState) -> dict[int, Fed]:
     return {fed.feed.id: fed for fed in _fed(life, point.returned)}
 
 

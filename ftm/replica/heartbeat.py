@@ -9,7 +9,7 @@ from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.bindings import Binding
 from ...actors.kernel.message import Message
 from ...checkpoint.protocol import START
-from ..bricks.replica_orders import Beat, Stalled
+from ..bricks.replica_orders import ReplicaBeat, Stalled
 from ..bricks.sealed_frames import tell_over
 from ..model.mechanism import detection_in
 from .replica_life import ServerLife
@@ -60,7 +60,7 @@ class Heart(Actor):
             self._timer.cancel()
             self._timer = self.ctx.every(self._interval, HeartbeatDue())
         try:
-            self.detector.tell(Beat(self._name, standing.epoch))
+            self.detector.tell(ReplicaBeat(self._name, standing.epoch))
             if self._longest:
                 self._watch_turns()
         except HoldfastError:

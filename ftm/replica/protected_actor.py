@@ -47,9 +47,8 @@ from ...checkpoint.protocol import (
 )
 from ...checkpoint.snapshot.key_variables import variables
 from ..alarms import ProtectionCostly, ProtectionLost
-from ..bricks.brick_messages import Beside, Request, State, WorkLost
+from ..bricks.brick_messages import Beside, Request, ServerState, WorkLost
 from ..bricks.state_images import Images
-from ..model.mechanism import has_state_access
 from .actor_state import digest_of_life, names_of_state, point_of, rewind_to, snapshot_of, take_up
 from .replica_life import (
     ABANDONED,
@@ -70,7 +69,7 @@ from .replica_state import (
     PART,
     REWIND,
     Attempts,
-    Part,
+    BatchPart,
     ReplicaState,
     Reports,
     Traces,
@@ -129,7 +128,7 @@ class Server(lifecycle.HerePlace):
         self.cell: Cell | None = None
         self.life: ServerLife | None = None
         self.state, self.points = ReplicaState(), RewindPoints()
-        self.part, self.attempts = Part(deque()), Attempts()
+        self.part, self.attempts = BatchPart(deque()), Attempts()
         self.traces, self.reports = Traces(), Reports()
         self.hooks: list[TurnHook] = []  # see each end while the actor is as the turn has left it; the innermost first
         self.shadows: set[Server] = set()  # more lives of it, which only compute
@@ -155,7 +154,7 @@ class Server(lifecycle.HerePlace):
         kind: Any = start.kind
         cell.table = table = kind._table
         state = self.state
-        state.has_access = has_state_access(kind)
+        state.has_access = kind.state_access
         state.has_deltas = state.has_access and gives_deltas(kind)
         state.waiting = frozenset(
             message_name(one) for one in kind._declared if inspect.iscoroutinefunction(table[one])
@@ -194,7 +193,7 @@ class Server(lifecycle.HerePlace):
 
     # -- lives ------------------------------------------------------------------------------------------------------
 
-    def install(self, point: State | None) -> None:
+    def install(self, point: ServerState | None) -> None:
         """The state to begin with, whenever a life is wanted; a life that runs is not touched."""
         self.points.install(point)
         self.state.confirmed = self.state.handed
@@ -361,7 +360,7 @@ class Server(lifecycle.HerePlace):
 
     # -- points -----------------------------------------------------------------------------------------------------
 
-    def capture(self) -> State:
+    def capture(self) -> ServerState:
         """The state after the last turn, as bytes. Only between two turns.
 
         Raises:
@@ -406,7 +405,7 @@ class Server(lifecycle.HerePlace):
         if self.life is not None and self.state.has_access:
             self.capture()
 
-    def rewind(self, point: State) -> None:
+    def rewind(self, point: ServerState) -> None:
         """Put the state of a point back, in place: the actor's object goes on. Only between two turns."""
         life = self.life
         assert life is not None
@@ -422,7 +421,7 @@ class Server(lifecycle.HerePlace):
             self._is_costly, standing = True, self.standing
             standing.node.emit(ProtectionCostly(standing.address, standing.path, seconds, size))
 
-    async def _go_back_to(self, point: State) -> None:
+    async def _go_back_to(self, point: ServerState) -> None:
         """Have the life stand at a point: the one that there is, or one that begins there."""
         if self.life is None:
             self.points.go_back_to(point)
@@ -436,7 +435,7 @@ class Server(lifecycle.HerePlace):
             self.life.turn = turn
             self.points.skip_to(turn)
 
-    async def adopt(self, state: State) -> None:
+    async def adopt(self, state: ServerState) -> None:
         """Go on from this state, with a life of its own; what led to it has happened elsewhere."""
         live = state.live or (self.life is not None and self.life.is_live)
         self.state.is_work_lost = (
@@ -457,7 +456,7 @@ class Server(lifecycle.HerePlace):
     async def run_part(self, pending: deque[Request]) -> list[TurnEnd]:
         """Run requests until enough are done; returns their ends. What has not been run is left in `pending`."""
         begin, state, attempts = time.perf_counter(), self.state, self.attempts
-        part = self.part = Part(pending)
+        part = self.part = BatchPart(pending)
         while pending and not state.is_over:
             await self.ensure()
             if self.life is None:  # It was dropped again: another state is put here.
@@ -724,7 +723,7 @@ class Server(lifecycle.HerePlace):
 
     # -- the last part once more -----------------------------------------------------------------------------------
 
-    async def run_again(self, before: State, requests: list[Request]) -> list[TurnEnd]:
+    async def run_again(self, before: ServerState, requests: list[Request]) -> list[TurnEnd]:
         """Rewind to an earlier state, and run requests from there again; returns their ends.
 
         Nothing is handed over. Asks get the outcomes that they had.

@@ -29,8 +29,8 @@ from ...supervision.children import STOPPED, UP, Child, new_cell
 from ...supervision.spec import Flags, Plan, child
 from ...supervision.supervisor import Supervisor
 from ..bricks.brick_messages import FORWARDED, Work
-from ..bricks.bricks import FOREVER, After, Before, Brick, Flush, Proceed, Settle
-from ..bricks.replica_orders import Abort, Broken, Commit, Prepare, Setting
+from ..bricks.bricks import FOREVER, After, AwaitHandled, Before, Brick, Flush, Proceed
+from ..bricks.replica_orders import Abort, Broken, Commit, PrepareStack, Setting
 from ..bricks.request_protocol import InnerProtocol, RequestProtocol
 from ..bricks.sealed_frames import Opened, Refused
 from ..bricks.standing import Standing
@@ -49,8 +49,8 @@ class EndBricks(Message):
     names: list[str]
 
 
-Order = Assume | Prepare | Commit | Abort | EndBricks | Play
-ORDERS = (Assume, Prepare, Commit, Abort, Play)
+Order = Assume | PrepareStack | Commit | Abort | EndBricks | Play
+ORDERS = (Assume, PrepareStack, Commit, Abort, Play)
 """What a replica obeys."""
 
 STARTED_WITHIN = 10.0
@@ -317,7 +317,7 @@ class Replica(Supervisor):
         Raises:
             HoldfastError: one has crashed, which is the end of all of us.
         """
-        asked = {name: self._cell(name).ref.ask(Settle(), timeout=FOREVER) for name in names}
+        asked = {name: self._cell(name).ref.ask(AwaitHandled(), timeout=FOREVER) for name in names}
         ended = {name: self._cell(name).ended() for name in names}
         end, held = self.ctx.cell.node.loop.time() + SETTLED_WITHIN, list[Work]()
         for name in names:
@@ -480,7 +480,7 @@ class Replica(Supervisor):
         if isinstance(order, (Assume, Abort)) and self._preparing is not None:
             self._preparing.cancel()  # Nobody who has to lead waits for a change.
         task = self._obey(order, handle)  # type: ignore[arg-type]  # one of `ORDERS`
-        if isinstance(order, Prepare):
+        if isinstance(order, PrepareStack):
             self._preparing = task
         return handle
 
@@ -513,7 +513,7 @@ class Replica(Supervisor):
         match order:
             case Assume():
                 return await self._assume(order)
-            case Prepare():
+            case PrepareStack():
                 return await self._prepare(order)
             case Commit():
                 return await self._commit(order)
@@ -553,7 +553,7 @@ class Replica(Supervisor):
         standing.paths = {slot: self._cell(name).path for slot, name in woven.names.items()}
         self._bind_all(woven)
 
-    async def _prepare(self, message: Prepare) -> Any:
+    async def _prepare(self, message: PrepareStack) -> Any:
         try:
             if self._prepared is not None:
                 await self._drop_prepared()
@@ -601,7 +601,7 @@ class Replica(Supervisor):
         """Nothing is inside the one that leads, but a follower may be behind it."""
         names = self._woven.names
         for slot in (*(slot for slot in names if slot.endswith(".before")), "proceed"):
-            await self._cell(names[slot]).ref.ask(Settle(), timeout=FOREVER)
+            await self._cell(names[slot]).ref.ask(AwaitHandled(), timeout=FOREVER)
         await self._cell(names["proceed"]).ref.ask(Flush(), timeout=FOREVER)
 
     async def _end(self, message: EndBricks) -> None:

@@ -46,7 +46,7 @@ class ReplicaState:
 
 
 @dataclasses.dataclass(slots=True)
-class Part:
+class BatchPart:
     """The part of a batch that is in hand: what was given to the life, and how it has ended."""
 
     pending: deque[Request]
@@ -143,7 +143,7 @@ def known_outcomes(traces: Traces, turn: int, outs: Iterable[Out]) -> list[Outco
     return known if len(known) == len(found) else None
 
 
-def is_front(state: ReplicaState, part: Part, *, leads: bool) -> bool:
+def is_front(state: ReplicaState, part: BatchPart, *, leads: bool) -> bool:
     """Whether home has the ends of all turns before the one in hand: it may let something out before its end."""
     return leads and not part.ends and state.confirmed >= state.handed
 
@@ -157,7 +157,7 @@ def runs_alone(state: ReplicaState, feed: Feed, *, leads: bool) -> bool:
     return not state.has_access and feed.name in state.waiting
 
 
-def next_requests(state: ReplicaState, part: Part, attempts: Attempts, *, leads: bool) -> list[Request]:
+def next_requests(state: ReplicaState, part: BatchPart, attempts: Attempts, *, leads: bool) -> list[Request]:
     """Take the next few pending requests that can be given to the life at once; none if they have to wait."""
     pending = part.pending
     if runs_alone(state, pending[0].feed, leads=leads):
@@ -181,7 +181,7 @@ def size_after(size: int, count: int, seconds: float) -> int:
     return max(1, size // 2) if seconds > PART else size
 
 
-def after_end(state: ReplicaState, part: Part, failed: int | None, why: str, *, has_point: bool) -> str:
+def after_end(state: ReplicaState, part: BatchPart, failed: int | None, why: str, *, has_point: bool) -> str:
     """Decide what follows when the life has ended, or was left, in the middle of a part.
 
     Args:

@@ -15,7 +15,7 @@ from typing import Final
 import msgspec
 
 from ...checkpoint.protocol import FAILED, TurnEnd
-from ..bricks.brick_messages import Change, Request, State
+from ..bricks.brick_messages import Request, ServerState, StateDelta
 from ..bricks.state_images import BLOCK, Misfit
 from ..bricks.state_images import patch as make_patch
 
@@ -33,31 +33,31 @@ UNKNOWN: Final = -3
 class RewindPoints:
     """The point that the replica can begin again at, the one before it, and what was handed over since."""
 
-    point: State | None = None
+    point: ServerState | None = None
     marks: list[int] = dataclasses.field(default_factory=list)  # the turns that the point's deltas begin after
     delta_bytes: int = 0  # of the point's deltas
     names: set[str] | None = None  # the actor's variables at the point, if the state consists of them
     tail: list[tuple[Request, TurnEnd | None]] = dataclasses.field(default_factory=list)  # with the end if it failed
-    previous: tuple[State, list[Request]] | None = None  # before the last part, and that part
-    given: State | None = None  # the point that another replica was told last
+    previous: tuple[ServerState, list[Request]] | None = None  # before the last part, and that part
+    given: ServerState | None = None  # the point that another replica was told last
 
     @property
     def turn(self) -> int:
         """The turn of the point; -1 without one."""
         return -1 if self.point is None else self.point.turn
 
-    def install(self, point: State | None) -> None:
+    def install(self, point: ServerState | None) -> None:
         """Have another state as the only point: nothing that is known leads to it."""
         self.go_back_to(point)
         self.previous = self.names = None
 
-    def go_back_to(self, point: State | None) -> None:
+    def go_back_to(self, point: ServerState | None) -> None:
         """Have this point again; what was handed over since it has not happened."""
         self.point, self.tail = point, []
         deltas = [] if point is None else point.deltas
         self.marks, self.delta_bytes = [UNKNOWN] * len(deltas), sum(map(len, deltas))
 
-    def go_on_to(self, point: State) -> None:
+    def go_on_to(self, point: ServerState) -> None:
         """Have the state behind what was handed over: a whole one, or the last one with one more delta."""
         if point.deltas:
             self.marks.append(self.turn)
@@ -86,7 +86,7 @@ def checksum(parts: Iterable[bytes]) -> int:
     return found
 
 
-def is_blank(point: State) -> bool:
+def is_blank(point: ServerState) -> bool:
     """Whether a point only says how far turns were counted before this life: there is no state to go back to."""
     return not point.data.size
 
@@ -115,7 +115,7 @@ def takes_delta(points: RewindPoints) -> bool:
     return len(point.deltas) < MOST_DELTAS and points.delta_bytes <= max(COMPACT_BYTES, point.data.size)
 
 
-def before_turn(points: RewindPoints, number: int, turn: int) -> tuple[State, list[Request]] | None:
+def before_turn(points: RewindPoints, number: int, turn: int) -> tuple[ServerState, list[Request]] | None:
     """Find a state before this turn, and the requests from there up to this one; None if that is not known any more."""
     kept = [(points.point, [one for one, _ in points.tail])]
     if points.previous is not None:
@@ -127,7 +127,7 @@ def before_turn(points: RewindPoints, number: int, turn: int) -> tuple[State, li
     return None
 
 
-def change_since(points: RewindPoints, turn: int) -> Change | None:
+def change_since(points: RewindPoints, turn: int) -> StateDelta | None:
     """Find what leads to the point from the one after an earlier turn; None if all of the point is no more than that.
 
     It leads on from the point that another replica was given last, or from the one before the last part.
@@ -149,13 +149,13 @@ def change_since(points: RewindPoints, turn: int) -> Change | None:
             return None
         else:
             patch = make_patch(base.data, point.data)
-    return Change(
+    return StateDelta(
         point.turn, turn, patch, deltas, checksum(deltas), point.stash, point.returned, point.live, point.stash_ids,
         point.traps, point.absent,
     )  # fmt: skip
 
 
-def _place_of(points: RewindPoints, turn: int, point: State) -> int | None:
+def _place_of(points: RewindPoints, turn: int, point: ServerState) -> int | None:
     """Find the first of the point's deltas that this turn has not got, if only deltas are missing there."""
     marks = points.marks
     if turn == point.turn:
@@ -169,13 +169,13 @@ def _begins_with(parts: list[bytes], first: list[bytes]) -> bool:
     return len(first) <= len(parts) and all(map(is_, first, parts))
 
 
-def led_to(point: State | None, state: State | Change) -> State:
+def led_to(point: ServerState | None, state: ServerState | StateDelta) -> ServerState:
     """Work out the state that another replica has said; the point that is here stays as it is.
 
     Raises:
         Misfit, DamagedValue: these are differences to something that is not here, or it has come damaged.
     """
-    if isinstance(state, State):
+    if isinstance(state, ServerState):
         state.data.check()
         return state
     if point is None or point.turn != state.base:
@@ -185,6 +185,6 @@ def led_to(point: State | None, state: State | Change) -> State:
     data, deltas = point.data, [*point.deltas, *state.deltas]
     if state.patch is not None:
         data, deltas = state.patch.applied(point.data), state.deltas
-    return State(
+    return ServerState(
         state.turn, data, deltas, state.stash, state.returned, state.live, state.stash_ids, state.traps, state.absent
     )

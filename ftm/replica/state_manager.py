@@ -10,7 +10,7 @@ from ...actors.errors import DamagedValue
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.bindings import Binding
 from ...actors.kernel.message import Message
-from ..bricks.brick_messages import Change, State
+from ..bricks.brick_messages import ServerState, StateDelta
 from ..bricks.state_images import Misfit
 from .rewind_points import change_since, led_to
 
@@ -24,8 +24,8 @@ MISFIT: Final = -3
 class Captured(msgspec.Struct):
     """A state, and what leads to it from an earlier one, if that is known and less."""
 
-    state: State
-    change: Change | None
+    state: ServerState
+    change: StateDelta | None
 
 
 class Capture(Message[Captured]):
@@ -40,7 +40,7 @@ class Apply(Message[int]):
     The reply is its turn; `MISFIT` if these are differences to something else, or damaged: then nothing has changed.
     """
 
-    state: State | Change
+    state: ServerState | StateDelta
 
 
 class StateManager(Actor):

@@ -8,7 +8,7 @@ from typing import Any
 
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.envelope import ReplyHandle
-from ...actors.kernel.message import Message, Order
+from ...actors.kernel.message import Message, RuntimeOrder
 from .certificates import (
     HEARTBEAT,
     LIFETIME,
@@ -29,7 +29,7 @@ class GetRoot(Message[bytes]):
     """Asks for the authority's own certificate."""
 
 
-class Enrol(Order[bytes]):
+class Enrol(RuntimeOrder[bytes]):
     """Issue a certificate: `request` is from `make_request`. The reply is the certificate.
 
     The root's code may say so, and from another process only who was granted the authority's address: who has no key
@@ -45,7 +45,7 @@ class GetCertificate(Message[bytes]):
     name: str
 
 
-class Revoke(Order[int]):
+class Revoke(RuntimeOrder[int]):
     """Revoke all certificates of a participant; the reply is how many that were. Its name is free for another key.
 
     Who may enrol may revoke.

@@ -44,7 +44,7 @@ _UNREADABLE: Final = (
 """What reading rubbish raises: parts are read only when they are looked at. Warnings, where these are errors."""
 
 
-class Peer(msgspec.Struct, frozen=True):
+class CertifiedPeer(msgspec.Struct, frozen=True):
     """Whom a certificate is about, after it was verified. `until` is Unix time in seconds."""
 
     name: str
@@ -219,7 +219,7 @@ class Trust:
         """Whether a certificate was revoked, as far as is known."""
         return serial in self._revoked
 
-    def verify(self, data: bytes, now: float, name: str | None = None) -> Peer:
+    def verify(self, data: bytes, now: float, name: str | None = None) -> CertifiedPeer:
         """Whom a certificate is about.
 
         Args:
@@ -254,7 +254,7 @@ class Trust:
         if name is not None and subject != name:
             raise Rejected(WRONG_PEER, what)
         public = key.public_bytes(serialization.Encoding.Raw, serialization.PublicFormat.Raw)
-        return Peer(subject, public, certificate.serial_number, certificate.not_valid_after_utc.timestamp())
+        return CertifiedPeer(subject, public, certificate.serial_number, certificate.not_valid_after_utc.timestamp())
 
     def _check_time(self, certificate: x509.Certificate, now: float, what: str) -> None:
         for one in (certificate, self._root):

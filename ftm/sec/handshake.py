@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from .certificates import Peer, Trust
+from .certificates import CertifiedPeer, Trust
 from .keys import Secret, SigningKey, is_signed
 from .sec_errors import CLOSED, FORGED, MALFORMED, REVOKED, STALE_EPOCH, STALE_LIFE, VERSION, WRONG_PEER, Rejected
 from .session import SUITES, Session, SessionLimits, expand
@@ -134,7 +134,7 @@ class Participant(Secret):
             self.rejected[error.reason] += 1
             raise
 
-    def verify(self, certificate: bytes, name: str | None = None) -> Peer:
+    def verify(self, certificate: bytes, name: str | None = None) -> CertifiedPeer:
         """Whose certificate this is, now."""
         return self.trust.verify(certificate, self._wall(), name)
 
@@ -162,7 +162,15 @@ class Participant(Secret):
         return self._key.sign(_signed_text(role, transcript))
 
     def establish(
-        self, peer: Peer, incarnation: int, epoch: int, secret: bytes, transcript: bytes, suite: str, *, began: bool
+        self,
+        peer: CertifiedPeer,
+        incarnation: int,
+        epoch: int,
+        secret: bytes,
+        transcript: bytes,
+        suite: str,
+        *,
+        began: bool,
     ) -> Session:
         """The peer has proved itself: raise the fence, and put the new session in the place of the old one."""
         self.check_fence(peer.name, incarnation, epoch)  # It may have risen since the hand-shake began.
@@ -302,7 +310,7 @@ class Response(Secret):
         self.answer = msgspec.msgpack.encode(Signed(body, me.sign(b"responder", self._transcript)))
 
     @property
-    def peer(self) -> Peer:
+    def peer(self) -> CertifiedPeer:
         """Who the other says it is; true only when the hand-shake is complete."""
         return self._peer
 

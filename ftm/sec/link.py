@@ -26,6 +26,7 @@ from ..bricks.sealed_frames import (
     Greet,
     Handle,
     LinkLost,
+    OpenNumbers,
     Part,
     Reach,
     Refused,
@@ -66,14 +67,13 @@ MOST_RESPONSES = 32
 
 
 class Stream:
-    """Numbered calls of one kind, to or from one partner."""
+    """Numbered calls of one kind that one partner has sent."""
 
-    __slots__ = ("answers", "floor", "next", "open")
+    __slots__ = ("answers", "floor", "next")
 
     def __init__(self) -> None:
         self.next = self.floor = 0
-        self.open: set[int] = set()  # outward: those without an answer
-        self.answers: dict[int, asyncio.Future[Back]] = {}  # inward
+        self.answers: dict[int, asyncio.Future[Back]] = {}
 
 
 class Partner(Secret):
@@ -85,7 +85,7 @@ class Partner(Secret):
         self.name = certified(path)
         self.session: Session | None = None
         self.lock = asyncio.Lock()
-        self.outward: dict[str, Stream] = {}
+        self.outward: dict[str, OpenNumbers] = {}
         self.inward: dict[str, Stream] = {}
         self.life = -1  # whose calls those are
         self.queue: deque[tuple[Part, Reach, Still]] = deque()
@@ -282,16 +282,15 @@ class Link(Identity):
         epoch: int = -1,
         config: int = -1,
     ) -> Back:
-        stream = partner.outward.setdefault(name, Stream())
-        number, stream.next = stream.next, stream.next + 1
-        stream.open.add(number)
+        numbers = partner.outward.setdefault(name, OpenNumbers())
+        number = numbers.open()
         wait, pause = FIRST_WAIT, FIRST_PAUSE
         try:
             while still() and not self._is_closed:
                 session: Session | None = None
                 try:
                     session = await self._session(partner, path, reach)
-                    text = msgspec.msgpack.encode(Call(name, number, min(stream.open), parts, epoch, config))
+                    text = msgspec.msgpack.encode(Call(name, number, numbers.floor, parts, epoch, config))
                     reply = await reach(Sealed(session.seal(text, CALL)), wait)
                     opened = session.open(reply, BACK + number.to_bytes(8, "big"))
                     return msgspec.msgpack.decode(opened, type=Back)
@@ -309,7 +308,7 @@ class Link(Identity):
                 pause = min(2 * pause, LONGEST_PAUSE)
             raise LinkLost(path)
         finally:
-            stream.open.discard(number)
+            numbers.close(number)
 
     # -- in ---------------------------------------------------------------------------------------------------------
 

@@ -54,20 +54,14 @@ class UnsafeKeyFile(HoldfastError, text="the key file {path} is not used: {probl
     problem: str
 
 
-class EnrolmentRefused(Refusal):
+class EnrolmentRefused(Refusal, text="no certificate for {name!r}: {problem}"):
     """The authority issues no certificate for this."""
 
     name: str
     problem: str
 
-    def __str__(self) -> str:
-        return f"no certificate for {self.name!r}: {self.problem}"
 
-
-class NoCertificate(Refusal):
+class NoCertificate(Refusal, text="there is no valid certificate of {name!r}"):
     """The authority has issued none, or only revoked ones."""
 
     name: str
-
-    def __str__(self) -> str:
-        return f"there is no valid certificate of {self.name!r}"

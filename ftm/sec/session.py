@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
 
-from .certificates import Peer
+from .certificates import CertifiedPeer
 from .keys import Secret
 from .sec_errors import (
     EXHAUSTED,
@@ -149,7 +149,7 @@ class Session(Secret):
 
     def __init__(
         self,
-        peer: Peer,
+        peer: CertifiedPeer,
         number: bytes,
         sending: bytes,
         receiving: bytes,

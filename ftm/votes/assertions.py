@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable
-from importlib import import_module
 from typing import Any
 
 from ...actors.errors import HoldfastError, type_name
+from ...actors.process.wire.start_codec import imported
 from ...checkpoint.protocol import FAILED, MESSAGE, OK, REPLY, TurnEnd
-from ..model.mechanism import FILES, SCRIPTS
+from ..model.mechanism import FILES, SCRIPTS, MechanismRefused
 from ..replica.protected_actor import Server
 
 PARAMETERS = frozenset({"reply", "message", "state"})
@@ -51,17 +51,18 @@ def names_of(values: Any) -> tuple[str, ...]:
     return tuple(map(name_of, values))
 
 
-def imported(name: str) -> Any:
-    """What has this name.
+def check_assertions(names: Iterable[str], mechanism: str, what: str) -> None:
+    """Whether these can be asked.
 
     Raises:
-        ImportError, AttributeError: there is none. What importing raises.
+        MechanismRefused: one cannot; `what` is what the mechanism calls it.
     """
-    module, _, path = name.partition(":")
-    found: Any = import_module(module)
-    for part in path.split("."):
-        found = getattr(found, part)
-    return found
+    for name in names:
+        try:
+            Assertion(name)
+        except Exception as error:  # Importing runs the module: anything may be raised.
+            why = f"the {what} {name} cannot be used: {type_name(type(error))}: {error}"
+            raise MechanismRefused(mechanism, why) from error
 
 
 class Assertion:

@@ -6,8 +6,8 @@ from typing import Any
 
 from ...actors.errors import type_name
 from ...actors.kernel.actor import Actor, handled_by
-from ..model.mechanism import MechanismRefused, has_state_access
-from .assertions import imported
+from ...actors.process.wire.start_codec import imported
+from ..model.mechanism import MechanismRefused
 
 
 def version(kind: type[Actor], name: str, mechanism: str) -> type[Actor]:
@@ -26,7 +26,7 @@ def version(kind: type[Actor], name: str, mechanism: str) -> type[Actor]:
     missing = sorted(type_name(one) for one in set(kind._declared) - set(made._declared))
     if missing:
         raise MechanismRefused(mechanism, f"{name} has no handler for {', '.join(missing)}")
-    if not has_state_access(made):
+    if not made.state_access:
         raise MechanismRefused(mechanism, f"{name} says state_access = False, and has to begin from the same state")
     return made
 

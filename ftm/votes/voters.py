@@ -15,13 +15,13 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Iterator, Sequence
-from importlib import import_module
 from itertools import combinations
 from typing import Any, Final, Generic, Protocol, TypeVar, runtime_checkable
 
 import msgspec
 
 from ...actors.errors import HoldfastError
+from ...actors.process.wire.start_codec import imported
 from .canonical import ABSENT, canonical, close
 
 T = TypeVar("T")
@@ -179,11 +179,7 @@ class Custom(msgspec.Struct, frozen=True, tag="custom"):
     function: str
 
     def vote(self, ballots: Sequence[object]) -> tuple[int, ...] | Made | Undecided:
-        module, _, name = self.function.partition(":")
-        found: Any = import_module(module)
-        for part in name.split("."):
-            found = getattr(found, part)
-        return found(ballots)  # type: ignore[no-any-return] # checked by `decide`
+        return imported(self.function)(ballots)  # type: ignore[no-any-return] # checked by `decide`
 
 
 AnyVoter = Exact | Majority | Tolerance | Median | Custom

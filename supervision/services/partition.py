@@ -6,13 +6,13 @@ import asyncio
 import dataclasses
 import os
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 from ...actors.errors import HoldfastError, SpecError
 from ...actors.exit_reasons import SHUTDOWN
 from ...actors.kernel.actor import Start, on
 from ...actors.kernel.envelope import ReplyHandle
-from ...actors.kernel.message import Message, Order
+from ...actors.kernel.message import Message, RuntimeOrder
 from ...actors.kernel.ref import ActorRef
 from ...actors.process.resource_limits import Limits
 from ...actors.values import state_digest
@@ -33,7 +33,7 @@ class CountPartitions(Message[int]):
     """How many partitions there are now."""
 
 
-class ResizePartitions(Order[int]):
+class ResizePartitions(RuntimeOrder[int]):
     """Have this many partitions, at most as many as at the start; the reply is how many there were."""
 
     count: int
@@ -57,8 +57,34 @@ def partition_of(key: object, count: int) -> int:
     return int.from_bytes(state_digest(key)[:8], "big") % count
 
 
-class PartitionSupervisor(Supervisor):
+class UniformSupervisor(Supervisor):
+    """Base of supervisors whose children are all alike: none of them is started or removed alone."""
+
+    instead: ClassVar[str]
+    """What to do instead."""
+
+    @on(StartChild)
+    def _start_child(self, message: StartChild) -> Any:
+        """Refuse, because all are alike."""
+        raise NotSupported(self.instead)
+
+    @on(RemoveChild)
+    def _remove_child(self, message: RemoveChild) -> ReplyHandle[Any]:
+        """Refuse to remove one alone, if there is such a one."""
+        self._child(message.id)
+        raise NotSupported(self.instead)
+
+    @on(DeleteChild)
+    def _delete_child(self, message: DeleteChild) -> Any:
+        """Refuse to delete the spec of one alone, if there is such a one."""
+        self._child(message.id)
+        raise NotSupported(self.instead)
+
+
+class PartitionSupervisor(UniformSupervisor):
     """Keeps several copies of one child alive, each at the address of its number. Built by `partitions(...)`."""
+
+    instead = "the children of a partition supervisor are its partitions: use ResizePartitions"
 
     _now: int
     _all: tuple[ChildSpec, ...]
@@ -126,23 +152,6 @@ class PartitionSupervisor(Supervisor):
         """A partition; a temporary one that was stopped is made anew."""
         name = str(number)
         return self._children.setdefault(name, Child(self._all[number]))
-
-    @on(StartChild)
-    def _start_child(self, message: StartChild) -> Any:
-        """Refuse, because all partitions are alike."""
-        raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
-
-    @on(RemoveChild)
-    def _remove_child(self, message: RemoveChild) -> ReplyHandle[Any]:
-        """Its members are all alike: none of them is removed alone."""
-        self._child(message.id)
-        raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
-
-    @on(DeleteChild)
-    def _delete_child(self, message: DeleteChild) -> Any:
-        """Refuse, because all partitions are alike."""
-        self._child(message.id)
-        raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
 
 
 def partitions(

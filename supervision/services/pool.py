@@ -18,16 +18,15 @@ from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Actor, Start, on, start
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.mailbox import Bounded
-from ...actors.kernel.message import Message, Order
+from ...actors.kernel.message import Message, RuntimeOrder
 from ...actors.kernel.node import Node
 from ...actors.kernel.ref import ActorRef
 from ...actors.persistence import child_key
-from ..admin import DeleteChild, NotSupported, RemoveChild, StartChild
 from ..children import Child
 from ..rules import Rule
 from ..spec import ChildSpec, Isolation, Plan, Restart, Shutdown, check_spec, child
-from ..supervisor import Supervisor
 from ..tree import supervisor
+from .partition import UniformSupervisor
 from .readiness import by_name
 from .router import Key, Restarting, Router, Routing
 
@@ -52,7 +51,7 @@ class PoolInfo(Message[PoolStatus]):
     """Asks a pool how it is."""
 
 
-class ResizePool(Order[int]):
+class ResizePool(RuntimeOrder[int]):
     """Have this many workers; the reply is how many there were, and comes when it is done.
 
     New ones are started. Those that go get nothing new, handle what they have for up to `deadline` seconds, and are
@@ -63,12 +62,14 @@ class ResizePool(Order[int]):
     deadline: float = DRAIN_SECONDS
 
 
-class PoolSupervisor(Supervisor):
+class PoolSupervisor(UniformSupervisor):
     """Keeps a pool's workers and its router alive. Built by `pool(...)`.
 
     When it is itself restarted the pool has its first size again. What was sent to recorded workers waits for them in
     their journals, so those that were added come back too.
     """
+
+    instead = "the children of a pool are its workers: use ResizePool"
 
     _crew: list[Child]  # who gets messages, in the router's order; not those that are on their way out
     _template: ChildSpec
@@ -182,23 +183,6 @@ class PoolSupervisor(Supervisor):
         self._forget(one)
         self._leaving.discard(one.spec.id)
         gone.set_result(None)
-
-    @on(StartChild)
-    def _start_child(self, message: StartChild) -> Any:
-        """Refuse, because all workers are alike."""
-        raise NotSupported("the children of a pool are its workers: use ResizePool")
-
-    @on(RemoveChild)
-    def _remove_child(self, message: RemoveChild) -> ReplyHandle[Any]:
-        """Its members are all alike: none of them is removed alone."""
-        self._child(message.id)
-        raise NotSupported("the children of a pool are its workers: use ResizePool")
-
-    @on(DeleteChild)
-    def _delete_child(self, message: DeleteChild) -> Any:
-        """Refuse, because all workers are alike."""
-        self._child(message.id)
-        raise NotSupported("the children of a pool are its workers: use ResizePool")
 
 
 def pool(

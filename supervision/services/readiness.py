@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from ...actors.errors import SpecError
-from ...actors.kernel.blocking_handlers import Threads, is_async
+from ...actors.kernel.blocking_handlers import HandlerThreads, is_async
 from ...actors.streams import Address, connect
 
 FIRST_LOOK, LAST_LOOK = 0.01, 0.2
@@ -126,7 +126,7 @@ class Sign:
         self._pattern = None
 
 
-async def reached(sign: Sign, threads: Threads) -> None:
+async def reached(sign: Sign, threads: HandlerThreads) -> None:
     """Wait until the sign is there; a function that may block is asked in a thread."""
     match sign.ready.kind:
         case "line":
@@ -140,7 +140,7 @@ async def reached(sign: Sign, threads: Threads) -> None:
                 pause = min(LAST_LOOK, pause * 1.5)
 
 
-async def _there(sign: Sign, threads: Threads) -> bool:
+async def _there(sign: Sign, threads: HandlerThreads) -> bool:
     value = sign.ready.value
     if sign.ready.kind == "port":
         return await _answers(value)

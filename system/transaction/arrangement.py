@@ -20,7 +20,7 @@ from ...supervision.admin import ChangeSupervisor
 from ...supervision.children import Child, new_cell
 from ...supervision.spec import ChildSpec, Flags
 from ...supervision.supervisor import Supervisor
-from .draft import START_TIMEOUT, Place, is_elsewhere
+from .draft import START_TIMEOUT, DraftPlace, is_elsewhere
 from .lasting import Renamed, Specs, keep, recipe_flags, recipe_specs
 from .operation import Operation, wrong
 
@@ -35,14 +35,16 @@ class Arrangement:
     """The supervisors and names that change, and the steps that say so."""
 
     def __init__(self) -> None:
-        self._steps: dict[Place, Operation] = {}  # the first one about each
-        self._rearranged: set[Place] = set()  # whose children, as they live now, change too
-        self._told: set[Place] = set()  # to be told, if they live in another process
-        self._names: dict[str, tuple[Operation, Place | None, Place | None]] = {}  # the step; who had it, who has it
+        self._steps: dict[DraftPlace, Operation] = {}  # the first one about each
+        self._rearranged: set[DraftPlace] = set()  # whose children, as they live now, change too
+        self._told: set[DraftPlace] = set()  # to be told, if they live in another process
+        self._names: dict[
+            str, tuple[Operation, DraftPlace | None, DraftPlace | None]
+        ] = {}  # the step; who had it, who has it
         self.step = ""
         """The step that is in the way, or has failed."""
 
-    def touch(self, place: Place, step: Operation, *, only_recipe: bool = False, is_told: bool = False) -> None:
+    def touch(self, place: DraftPlace, step: Operation, *, only_recipe: bool = False, is_told: bool = False) -> None:
         """A step is about this supervisor."""
         self._steps.setdefault(place, step)
         if not only_recipe:
@@ -50,12 +52,12 @@ class Arrangement:
         if is_told:
             self._told.add(place)
 
-    def name(self, name: str, step: Operation, before: Place | None, after: Place | None) -> None:
+    def name(self, name: str, step: Operation, before: DraftPlace | None, after: DraftPlace | None) -> None:
         """A step gives this name to somebody, or to nobody any more."""
         self._names[name] = (step, before, after)
 
     @property
-    def _places(self) -> list[Place]:
+    def _places(self) -> list[DraftPlace]:
         """Those that change, from above. What is added begins as its spec says, but others may come there."""
         there = [place for place in self._steps if not place.is_planned or place.is_moved_to]
         return sorted(there, key=lambda one: one.path.count("/"))
@@ -186,7 +188,7 @@ def tell_bindings(root: Cell | None, was: dict[str, str]) -> None:
                 cell.node.tell_binding(cell, port, old)
 
 
-def planned_spec(place: Place, *, in_force: bool) -> ChildSpec:
+def planned_spec(place: DraftPlace, *, in_force: bool) -> ChildSpec:
     """The spec of a child that is added, with all that the transaction says of it and of those below it.
 
     Its bindings are those that its start finds, or those that are in force with the transaction.
@@ -208,19 +210,19 @@ def planned_spec(place: Place, *, in_force: bool) -> ChildSpec:
     return dataclasses.replace(spec, **changes)
 
 
-def _below(place: Place) -> Place:
+def _below(place: DraftPlace) -> DraftPlace:
     """Whose child it is now."""
     assert place.parent is not None
     return place.parent
 
 
-def _left(place: Place) -> Place:
+def _left(place: DraftPlace) -> DraftPlace:
     """Whose child it was before the transaction."""
     assert place.was.below is not None
     return place.was.below
 
 
-def _arrange(place: Place, supervisor: Supervisor, taken: dict[Place, Child]) -> None:
+def _arrange(place: DraftPlace, supervisor: Supervisor, taken: dict[DraftPlace, Child]) -> None:
     """The children in the order of the draft; those that came meanwhile, and are not known there, behind them."""
     known, children = supervisor._children, dict[str, Child]()
     for name, child in place.children.items():
@@ -233,9 +235,9 @@ def _arrange(place: Place, supervisor: Supervisor, taken: dict[Place, Child]) ->
     supervisor._flags = dataclasses.replace(supervisor._flags, **place.wanted)
 
 
-def _readdress(here: dict[Place, Supervisor], taken: dict[Place, Child]) -> None:
+def _readdress(here: dict[DraftPlace, Supervisor], taken: dict[DraftPlace, Child]) -> None:
     """Each cell below the supervisor that has it now, in the order of the children."""
-    cells: dict[Place, Cell] = {}
+    cells: dict[DraftPlace, Cell] = {}
     for child, one in taken.items():
         if one.cell is not None and one.cell.state is not GONE and one.cell.parent is not None:
             (one.cell.parent.children or {}).pop(child.name, None)
@@ -251,7 +253,7 @@ def _readdress(here: dict[Place, Supervisor], taken: dict[Place, Child]) -> None
         cell.children = {**first, **below}
 
 
-def _respecify(place: Place, supervisor: Supervisor) -> None:
+def _respecify(place: DraftPlace, supervisor: Supervisor) -> None:
     """What the specs say from now on; who comes now has an address, at which messages wait for its start."""
     for name, child in place.children.items():
         one = supervisor._children.get(name)
@@ -272,7 +274,7 @@ def _respecify(place: Place, supervisor: Supervisor) -> None:
             one.cell.spec, one.cell.extra().start = one.spec, one.spec.start
 
 
-def _edited(place: Place, flags: Flags, specs: Specs, taken: dict[Place, Child]) -> tuple[Flags, Specs]:
+def _edited(place: DraftPlace, flags: Flags, specs: Specs, taken: dict[DraftPlace, Child]) -> tuple[Flags, Specs]:
     """A supervisor's recipe as it is from now on."""
     known = {spec.id: spec for spec in specs}
     left = place.was.children - place.children.keys()

@@ -13,11 +13,11 @@ from ...supervision.spec import ChildSpec, Isolation, Strategy
 from . import living
 from .draft import Target
 from .mechanisms import Attach, Compose, Detach, DetachLayer, Isolate, OnProtection, Protect, Transition, Update
-from .operation import Operation, Step
-from .reparenting import Move
+from .operation import Operation, Step, text_of
+from .reparenting import Reparent
 from .running import StartAgain, StopChild
-from .structure import Add, Remove, Reorder, SetFlags, named_spec, text_of
-from .wiring import Bind, Register, Unbind, Unregister
+from .structure import AddChild, RemoveActor, Reorder, SetFlags, named_spec
+from .wiring import Bind, RegisterName, Unbind, UnregisterName
 
 if TYPE_CHECKING:
     from ...ftm.events import MechanismSettled
@@ -41,12 +41,12 @@ class Change:
         spec = named_spec(supervisor, spec, self._added, self._system)
         path = f"{text_of(supervisor)}/{spec.id}"
         self._added.add(path)
-        self.step(Add(supervisor, spec))
+        self.step(AddChild(supervisor, spec))
         return path
 
     def remove(self, target: Target) -> None:
         """Stop an actor for good. Its address is free when the transaction is over."""
-        self.step(Remove(target))
+        self.step(RemoveActor(target))
 
     def stop(self, target: Target) -> None:
         """Stop a child, and keep its spec: it can be started again. What was recorded of it stays."""
@@ -59,7 +59,7 @@ class Change:
 
     def move(self, target: Target, to_supervisor: Target) -> None:
         """Put a child under another supervisor: it lives on, its refs stay good, its address changes."""
-        self.step(Move(target, to_supervisor))
+        self.step(Reparent(target, to_supervisor))
 
     def reorder(self, supervisor: Target, ids: Iterable[str]) -> None:
         """Give children another start order; those that are not named come behind."""
@@ -89,29 +89,29 @@ class Change:
 
     def register(self, name: str, target: Target) -> None:
         """Give an actor a name beside its address."""
-        self.step(Register(name, target))
+        self.step(RegisterName(name, target))
 
     def unregister(self, name: str) -> None:
         """Free a name."""
-        self.step(Unregister(name))
+        self.step(UnregisterName(name))
 
     # -- live actors --------------------------------------------------------------------------------------------------
 
     def suspend(self, target: Target) -> None:
         """Have an actor handle no message until it is resumed."""
-        self.step(living.Suspend(target))
+        self.step(living.SuspendActor(target))
 
     def resume(self, target: Target) -> None:
         """Have it handle messages again."""
-        self.step(living.Resume(target))
+        self.step(living.ResumeActor(target))
 
     def replace_state(self, target: Target, change: StateChange) -> None:
         """Put `change(state)` in the place of an actor's state; its messages wait until the transaction is over."""
-        self.step(living.ReplaceState(target, change))
+        self.step(living.ReplaceActorState(target, change))
 
     def replace_code(self, target: Target, new: type[Actor] | Start[Any], migrate: Migrate | None = None) -> None:
         """Go on as another class; its messages wait until the transaction is over."""
-        self.step(living.ReplaceCode(target, new, migrate))
+        self.step(living.ReplaceActorCode(target, new, migrate))
 
     # -- fault tolerance ----------------------------------------------------------------------------------------------
 

@@ -37,20 +37,20 @@ Target = ActorRef[Any] | str
 
 
 @dataclass(slots=True)
-class Before:
+class PlaceBefore:
     """What a place was before the transaction."""
 
-    below: Place | None
+    below: DraftPlace | None
     """Its supervisor."""
     children: frozenset[str] = frozenset()
     """The names of those that were below it."""
     brought_back: bool = False
     """Whether its supervisor starts it when that is restarted itself: its recipe says so."""
-    bound: dict[str, Place] = field(default_factory=dict[str, "Place"])
+    bound: dict[str, DraftPlace] = field(default_factory=dict[str, "DraftPlace"])
     """To whom its spec binds its ports."""
 
 
-class Place:
+class DraftPlace:
     """One address in the draft. `cell` is None while nobody has lived there: it is to be added."""
 
     __slots__ = (
@@ -76,9 +76,9 @@ class Place:
         "was",
     )
 
-    def __init__(self, name: str, parent: Place | None, cell: Cell | None, spec: ChildSpec | None) -> None:
+    def __init__(self, name: str, parent: DraftPlace | None, cell: Cell | None, spec: ChildSpec | None) -> None:
         self.name, self.parent, self.cell, self.spec = name, parent, cell, spec
-        self.children: dict[str, Place] = {}
+        self.children: dict[str, DraftPlace] = {}
         self.flags: Flags | None = None
         self.kind: type[Actor] | None = spec.start.kind if spec is not None else None
         self.is_leaving = False  # removed by an earlier step; it goes when all is done
@@ -86,9 +86,9 @@ class Place:
         self.is_planned = False  # added by an earlier step
         self.is_stopped = cell is None or cell.is_dead  # a child whose spec stays, and which does not run
         self.is_suspended = cell is not None and cell.more is not None and cell.more.suspended
-        self.bindings: dict[str, Place] = {}
+        self.bindings: dict[str, DraftPlace] = {}
         self.names: list[str] = []
-        self.was = Before(parent)
+        self.was = PlaceBefore(parent)
         self.is_switched = False  # its spec says otherwise whether it is started with the others
         self.candidate = 0  # as which it is started, if it is added
         self.wanted: dict[str, Any] = {}  # flags that change
@@ -116,7 +116,7 @@ class Place:
 
         So is who is added with a binding to such a one.
         """
-        waiting, seen = [self], set[Place]()
+        waiting, seen = [self], set[DraftPlace]()
         while waiting:
             place = waiting.pop()
             if not place.is_planned or place in seen:
@@ -162,20 +162,20 @@ class Place:
         assert self.rework is not None
         return self.rework
 
-    def walk(self) -> Iterator[Place]:
+    def walk(self) -> Iterator[DraftPlace]:
         """This place, and all below it."""
         yield self
         for child in self.children.values():
             yield from child.walk()
 
-    def upwards(self) -> Iterator[Place]:
+    def upwards(self) -> Iterator[DraftPlace]:
         """This place, and all above it."""
-        at: Place | None = self
+        at: DraftPlace | None = self
         while at is not None:
             yield at
             at = at.parent
 
-    def comes_back_with(self, supervisor: Place) -> bool:
+    def comes_back_with(self, supervisor: DraftPlace) -> bool:
         """Whether it is started when a supervisor above it is."""
         one = self
         while one is not supervisor and one.parent is not None:
@@ -252,8 +252,8 @@ class Draft:
         root = node.root
         assert root is not None
         self.node = node
-        self.by_cell: dict[Cell, Place] = {}
-        self._asked: set[Place] = set()  # supervisors of other processes that have told us whom they have
+        self.by_cell: dict[Cell, DraftPlace] = {}
+        self._asked: set[DraftPlace] = set()  # supervisors of other processes that have told us whom they have
         self.arrangement = arrangement
         self.root = self._survey(root, root.path, None, None)
         for cell, place in list(self.by_cell.items()):
@@ -265,7 +265,7 @@ class Draft:
                 lives = node.find(path)
                 if lives is not None and lives in self.by_cell:
                     place.was.bound[port] = self.by_cell[lives]
-        self.named: dict[str, Place] = {}
+        self.named: dict[str, DraftPlace] = {}
         """Who has which name before the transaction."""
         for name, cell in node.names.items():
             if cell in self.by_cell:
@@ -273,8 +273,8 @@ class Draft:
                 self.named[name] = self.by_cell[cell]
         self._early = self._started_too_early()
 
-    def _survey(self, cell: Cell | None, name: str, parent: Place | None, spec: ChildSpec | None) -> Place:
-        place = Place(name, parent, cell, spec)
+    def _survey(self, cell: Cell | None, name: str, parent: DraftPlace | None, spec: ChildSpec | None) -> DraftPlace:
+        place = DraftPlace(name, parent, cell, spec)
         if cell is None:
             return place
         self.by_cell[cell] = place
@@ -298,7 +298,7 @@ class Draft:
         place.was.children = frozenset(place.children)
         return place
 
-    def find(self, target: Target, *, parts: bool = False) -> Place:
+    def find(self, target: Target, *, parts: bool = False) -> DraftPlace:
         """The place a step is about.
 
         Args:
@@ -320,20 +320,20 @@ class Draft:
             self._check_no_part(place.path, place.parent)
         return place
 
-    def _of(self, cell: Cell) -> Place | None:
+    def _of(self, cell: Cell) -> DraftPlace | None:
         """Where an actor is at this point, whose life may be over: then it is who has followed it before all steps."""
         if cell not in self.by_cell and cell.state is GONE:
             cell = self.node.successor(cell) or cell
         return self.by_cell.get(cell)
 
-    def _check_no_part(self, path: str, above: Place | None) -> None:
+    def _check_no_part(self, path: str, above: DraftPlace | None) -> None:
         """Whether what is below `above` is nobody's mechanism. Raises SpecError."""
         while above is not None:
             if above.spec is not None and above.spec.mechanism is not None:
                 raise wrong(path, part_of(above.path))
             above = above.parent
 
-    def _at(self, path: str) -> Place:
+    def _at(self, path: str) -> DraftPlace:
         top = self.root.path
         if path != top and not path.startswith(f"{top}/"):
             raise NoSuchActor(path)
@@ -348,7 +348,7 @@ class Draft:
             place = place.children[name]
         return place
 
-    async def supervisor(self, target: Target) -> Place:
+    async def supervisor(self, target: Target) -> DraftPlace:
         """The supervisor a step is about, its children known.
 
         Raises:
@@ -370,7 +370,7 @@ class Draft:
                 ref: ActorRef[Supervisor] = ActorRef(cell)
                 known = place.children
                 below = [info.id for info in await ref.ask(WhichChildren())]
-                told = {name: known.get(name) or Place(name, place, None, None) for name in below}
+                told = {name: known.get(name) or DraftPlace(name, place, None, None) for name in below}
                 place.children = {**told, **{name: one for name, one in known.items() if name not in told}}
                 place.was.children = frozenset(place.children)
         return place
@@ -392,10 +392,10 @@ class Draft:
                 if any(above.is_leaving for above in target.upwards()):
                     raise wrong(place.path, f"its binding {port!r} would point at {target.path}, which is removed")
 
-    def _started_too_early(self) -> set[tuple[Place, str]]:
+    def _started_too_early(self) -> set[tuple[DraftPlace, str]]:
         """Whose spec binds a port to somebody whom a supervisor of both, below the root, starts later."""
-        found: set[tuple[Place, str]] = set()
-        seen: set[Place] = set()
+        found: set[tuple[DraftPlace, str]] = set()
+        seen: set[DraftPlace] = set()
         for place in self.staying():
             seen.add(place)
             for port in place.spec.bindings if place.spec is not None else ():
@@ -406,7 +406,7 @@ class Draft:
                         found.add((place, port))
         return found
 
-    def staying(self) -> Iterator[Place]:
+    def staying(self) -> Iterator[DraftPlace]:
         """All that is there when all is done, parents first."""
         waiting = [self.root]
         while waiting:
@@ -434,7 +434,7 @@ class Draft:
         return [line for place in self.staying() for line in (place.line(), *place.brick_lines())]
 
 
-def check_awake(place: Place) -> None:
+def check_awake(place: DraftPlace) -> None:
     """Whether a supervisor takes requests. Raises SpecError: it is suspended."""
     if place.is_suspended:
         raise wrong(place.path, "it is suspended, and starts and stops nobody: resume it first")

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ...actors.control.orders import Change, Migrate, next_start
-from ...actors.control.orders import ReplaceCode as CodeOrder
-from ...actors.control.orders import ReplaceState as StateOrder
+from ...actors.control.orders import Change, Migrate, ReplaceCode, ReplaceState, next_start
 from ...actors.errors import SpecError, type_name
 from ...actors.kernel.actor import Actor, Start
-from .draft import Draft, Place, Target, is_elsewhere
-from .operation import Operation, wrong
+from .draft import Draft, DraftPlace, Target, is_elsewhere
+from .operation import Operation, StagedWork, wrong
 from .rework import Rework
-from .structure import text_of
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
@@ -25,55 +22,52 @@ class OnLiving(Operation):
     on_parts: ClassVar[bool] = False
     """Whether it may be a part of a mechanism."""
 
-    def __init__(self, target: Target) -> None:
-        super().__init__(text_of(target))
-        self._at = target
-        self._place: Place | None = None
-
     async def check(self, system: ActorSystem, draft: Draft) -> None:
-        place = self._place = draft.find(self._at, parts=self.on_parts)
+        place = self._found = draft.find(self._at, parts=self.on_parts)
         self.target, self.between_turns_of = place.path, (place,)
         place.check_lived_in(system.node)
 
     def cell(self, system: ActorSystem) -> Cell:
         """Who lives there now. Raises NoSuchActor."""
-        assert self._place is not None
         return self._place.living(system.node)
 
 
-class OnRework(OnLiving):
-    """Base of operations that hold an actor until the transaction is over; the first one does it for the others too."""
+class OnSharedWork(OnLiving):
+    """Base of operations on one actor that are carried out together: the first one has the work for the others too."""
 
-    _rework: Rework | None = None  # that of the first such step, which carries it out
+    _work: StagedWork | None = None
+
+    async def prepare(self, system: ActorSystem) -> None:
+        if self._work is not None:
+            await self._work.prepare(system)
+
+    def ready(self, system: ActorSystem) -> str:
+        return "" if self._work is None else self._work.ready(system)
+
+    def commit(self, system: ActorSystem) -> None:
+        if self._work is not None:
+            self._work.commit(system)
+
+    async def finish(self, system: ActorSystem) -> None:
+        if self._work is not None:
+            await self._work.finish(system)
+
+    async def release(self, system: ActorSystem) -> None:
+        if self._work is not None:
+            await self._work.release(system)
+
+
+class OnRework(OnSharedWork):
+    """Base of operations that hold an actor until the transaction is over."""
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
-        assert place is not None
         if place.rework is None:
-            place.rework = self._rework = Rework(place)
-
-    async def prepare(self, system: ActorSystem) -> None:
-        if self._rework is not None:
-            await self._rework.prepare(system)
-
-    def ready(self, system: ActorSystem) -> str:
-        return "" if self._rework is None else self._rework.ready(system)
-
-    def commit(self, system: ActorSystem) -> None:
-        if self._rework is not None:
-            self._rework.commit(system)
-
-    async def finish(self, system: ActorSystem) -> None:
-        if self._rework is not None:
-            await self._rework.finish(system)
-
-    async def release(self, system: ActorSystem) -> None:
-        if self._rework is not None:
-            await self._rework.release(system)
+            place.rework = self._work = Rework(place)
 
 
-class Suspend(OnRework):
+class SuspendActor(OnRework):
     """Have an actor handle no message until it is resumed."""
 
     verb: ClassVar[str] = "suspend"
@@ -81,12 +75,11 @@ class Suspend(OnRework):
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
-        assert self._place is not None
         assert self._place.rework is not None
         self._place.is_suspended = self._place.rework.suspended = True
 
 
-class Resume(OnRework):
+class ResumeActor(OnRework):
     """Have it handle messages again."""
 
     verb: ClassVar[str] = "resume"
@@ -94,12 +87,11 @@ class Resume(OnRework):
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
-        assert self._place is not None
         assert self._place.rework is not None
         self._place.is_suspended = self._place.rework.suspended = False
 
 
-class ReplaceState(OnRework):
+class ReplaceActorState(OnRework):
     """Put another state in the place of an actor's."""
 
     verb: ClassVar[str] = "replace state of"
@@ -110,11 +102,10 @@ class ReplaceState(OnRework):
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
-        assert self._place is not None
-        self._place.rework_of().add(StateOrder(self._change))
+        self._place.rework_of().add(ReplaceState(self._change))
 
 
-class ReplaceCode(OnRework):
+class ReplaceActorCode(OnRework):
     """Have an actor go on as another class, now and after restarts."""
 
     verb: ClassVar[str] = "replace code of"
@@ -135,15 +126,14 @@ class ReplaceCode(OnRework):
         if start is None:
             raise SpecError(self.target, f"replace_code takes an Actor class or start(Class, ...), not {new!r}")
         place = self._place
-        assert place is not None
         cell, keeps = place.cell, not isinstance(new, Start)
         if cell is not None and not is_elsewhere(cell):
             next_start(cell, start, keeps_arguments=keeps)
-        place.rework_of().add(CodeOrder(start, keeps, self._migrate))
+        place.rework_of().add(ReplaceCode(start, keeps, self._migrate))
         place.kind = start.kind
 
 
-def check_unprotected(place: Place) -> None:
+def check_unprotected(place: DraftPlace) -> None:
     """Refuse what would change one replica of a protected actor, and not the others. Raises SpecError."""
     if place.spec is not None and place.spec.mechanism is not None:
         raise wrong(place.path, "it is protected by a mechanism: detach that, and attach it again after")

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from ...actors.errors import SpecError
 from ...supervision.arbiter import Hand, arbiter_of
-from ...supervision.respec import recipe_spec
+from ...supervision.respec import NO_RECIPE, recipe_spec
 from ...supervision.spec import Isolation
-from .draft import Draft, Place, Target, is_elsewhere, rules
-from .living import OnLiving
+from .draft import Draft, DraftPlace, Target, is_elsewhere, rules
+from .living import OnSharedWork
 from .operation import wrong
 from .relocation import Relocation, described
 
@@ -19,50 +19,23 @@ if TYPE_CHECKING:
     from ..system import ActorSystem
 
 
-class OnPlace(OnLiving):
-    """Base of operations on where an actor lives, and behind which mechanisms; the first one does it for the others."""
+class OnPlace(OnSharedWork):
+    """Base of operations on where an actor lives, and behind which mechanisms."""
 
-    def __init__(self, target: Target) -> None:
-        super().__init__(target)
-        self._relocation: Relocation | None = None  # that of the first such step, which carries it out
+    unsupervised: ClassVar[str] = "nobody supervises it, so nobody would start it again"
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
-        assert place is not None
         above = place.parent
         if place.spec is None and above is not None and above.cell is not None and is_elsewhere(above.cell):
             place.spec = recipe_spec(place.cell) if place.cell is not None else None
             if place.spec is None:
-                why = (
-                    "its supervisor lives in another process, and no recipe here has its spec: add it by a transaction"
-                )
-                raise wrong(self.target, why)
+                raise wrong(self.target, NO_RECIPE)
         if place.spec is None:
             raise wrong(self.target, self.unsupervised)
         if place.relocation is None:
-            place.relocation = self._relocation = Relocation(place, self.text)
-
-    unsupervised: ClassVar[str] = "nobody supervises it, so nobody would start it again"
-
-    async def prepare(self, system: ActorSystem) -> None:
-        if self._relocation is not None:
-            await self._relocation.prepare(system)
-
-    def ready(self, system: ActorSystem) -> str:
-        return "" if self._relocation is None else self._relocation.ready(system)
-
-    def commit(self, system: ActorSystem) -> None:
-        if self._relocation is not None:
-            self._relocation.commit(system)
-
-    async def finish(self, system: ActorSystem) -> None:
-        if self._relocation is not None:
-            await self._relocation.finish(system)
-
-    async def release(self, system: ActorSystem) -> None:
-        if self._relocation is not None:
-            await self._relocation.release(system)
+            place.relocation = self._work = Relocation(place, self.text)
 
 
 class Isolate(OnPlace):
@@ -82,7 +55,6 @@ class Isolate(OnPlace):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
-        assert place is not None
         assert place.spec is not None
         if self._to not in ("task", "process"):
             raise SpecError(self.target, f"isolation must be one of task, process, not {self._to!r}")
@@ -90,17 +62,43 @@ class Isolate(OnPlace):
 
 
 class OnProtection(OnPlace):
-    """Base of operations on the mechanisms of an actor."""
+    """Base of operations that give an actor another stack of mechanisms, or none."""
+
+    lacks: ClassVar[str] = ""
+    """What is wrong with an actor without mechanisms; "" if nothing is."""
+
+    def __init__(self, target: Target) -> None:
+        super().__init__(target)
+        self._was: Any = None  # the mechanism there was
+        self._after: Any = None  # and that there is to be
+
+    def _wanted(self, before: Any) -> tuple[Any, ...] | None:
+        """The whole new stack; None: no mechanism.
+
+        Raises:
+            SpecError, MechanismRefused: there is none.
+        """
+        raise NotImplementedError
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         if (busy := arbiter_of(system.node).in_the_way(self.target, Hand.ADAPTATION)) is not None:
             raise busy
+        place = self._place
+        assert place.spec is not None
+        self._was = place.spec.mechanism
+        if self._was is None and self.lacks:
+            raise wrong(self.target, self.lacks)
+        layers = self._wanted(self._was)
+        if layers is not None:
+            self._after = layers[0] if len(layers) == 1 else layers
+            check_layers(place, self._after)
+        place.spec = dataclasses.replace(place.spec, mechanism=self._after)
 
     @property
     def probation(self) -> Probation | None:
         """Whether it stays is known when this is over; None: at once."""
-        return self._relocation.probation if self._relocation is not None else None
+        return self._work.probation if isinstance(self._work, Relocation) else None
 
 
 class Protect(OnProtection):
@@ -111,7 +109,6 @@ class Protect(OnProtection):
     def __init__(self, target: Target, mechanism: Any) -> None:
         super().__init__(target)
         self._mechanism = mechanism
-        self._after: Any = None
 
     @property
     def text(self) -> str:
@@ -119,24 +116,19 @@ class Protect(OnProtection):
             return f"protect {self.target} by no mechanism"
         return f"protect {self.target} by {mechanism_text(self._after or self._mechanism)}"
 
+    def _wanted(self, before: Any) -> tuple[Any, ...] | None:
+        if self._mechanism is None:
+            return None
+        layers: tuple[Any, ...] = rules().layers_of(self._mechanism)
+        return layers
+
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
-        assert place is not None
-        assert place.spec is not None
-        self.refuse(place.spec.mechanism)
-        if self._mechanism is not None:
-            layers = rules().layers_of(self._mechanism)
-            self._after = layers[0] if len(layers) == 1 else layers
-            check_layers(place, self._after)
-            begins = place.is_planned or place.spec.mechanism is not None
-            if not begins and not getattr(place.kind, "state_access", True):
-                why = "its class says state_access = False, so its state cannot go along"
-                raise wrong(self.target, f"{why}: name the mechanism in its spec, and it begins with it")
-        place.spec = dataclasses.replace(place.spec, mechanism=self._after)
-
-    def refuse(self, before: Any) -> None:
-        """Refuse what this verb does not do of an actor that has these mechanisms. Raises SpecError."""
+        begins = place.is_planned or self._was is not None or self._after is None
+        if not begins and place.kind is not None and not place.kind.state_access:
+            why = "its class says state_access = False, so its state cannot go along"
+            raise wrong(self.target, f"{why}: name the mechanism in its spec, and it begins with it")
 
 
 class Attach(Protect):
@@ -148,60 +140,35 @@ class Attach(Protect):
     def text(self) -> str:
         return f"attach {mechanism_text(self._after or self._mechanism)} to {self.target}"
 
-    def refuse(self, before: Any) -> None:
+    def _wanted(self, before: Any) -> tuple[Any, ...] | None:
         if before is not None:
             raise wrong(self.target, f"it has {mechanism_text(before)} already: detach that first, or use `protect`")
+        return super()._wanted(before)
 
 
 class Detach(OnProtection):
     """Have a protected actor live without a mechanism."""
 
     verb: ClassVar[str] = "detach"
+    lacks: ClassVar[str] = "it has no mechanism"
 
     @property
     def text(self) -> str:
         return f"detach the mechanism of {self.target}"
 
-    async def check(self, system: ActorSystem, draft: Draft) -> None:
-        await super().check(system, draft)
-        place = self._place
-        assert place is not None
-        assert place.spec is not None
-        if place.spec.mechanism is None:
-            raise wrong(self.target, "it has no mechanism")
-        place.spec = dataclasses.replace(place.spec, mechanism=None)
+    def _wanted(self, before: Any) -> None:
+        return None
 
 
 class Adapt(OnProtection):
     """Base: a protected actor goes on with another stack of mechanisms; its replicas live on."""
 
-    def __init__(self, target: Target) -> None:
-        super().__init__(target)
-        self._was: Any = None  # the mechanism there was
-        self._after: Any = None  # and that there is to be
-
-    def _wanted(self, before: Any) -> tuple[Any, ...]:
-        """The whole new stack.
-
-        Raises:
-            MechanismRefused: there is none.
-        """
-        raise NotImplementedError
+    lacks: ClassVar[str] = "it has no mechanism yet: attach one"
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
-        place = self._place
-        assert place is not None
-        assert place.spec is not None
-        self._was = place.spec.mechanism
-        if self._was is None:
-            raise wrong(self.target, "it has no mechanism yet: attach one")
-        layers = self._wanted(self._was)
-        self._after = layers[0] if len(layers) == 1 else layers
-        check_layers(place, self._after)
         if described(self._after) == described(self._was):
             raise wrong(self.target, f"it has just that already: {mechanism_text(self._was)}")
-        place.spec = dataclasses.replace(place.spec, mechanism=self._after)
 
     @property
     def _from_to(self) -> str:
@@ -285,7 +252,7 @@ class Update(Adapt):
         return layers
 
 
-def check_layers(place: Place, mechanism: Any) -> None:
+def check_layers(place: DraftPlace, mechanism: Any) -> None:
     """Whether these go together, and with the actor. Raises MechanismRefused."""
     layers = mechanism if isinstance(mechanism, tuple) else (mechanism,)
     rules().check_stack(layers, place.kind, place.path)

@@ -9,7 +9,7 @@ from ...actors.errors import SpecError
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
-    from .draft import Draft, Place
+    from .draft import Draft, DraftPlace, Target
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -26,40 +26,8 @@ class Step:
     """The step in words."""
 
 
-class Operation:
-    """Base of all operations. A transaction calls, in this order:
-
-    1. `check` of all, each against the draft: the tree as it will be at that point.
-    2. `prepare` of all: what the commit needs is made beside what runs. Nothing that exists changes.
-    3. `ready` of all, until nobody names anything that is in the way.
-    4. `commit` of all, in the same step of the event loop as the last look: from here on the change is in force.
-    5. `finish` of all: what runs follows what is in force.
-
-    If something fails, is cancelled or takes too long before the commit: `release` of all whose `prepare` was begun,
-    last one first, instead of the rest.
-    """
-
-    verb: ClassVar[str] = ""
-
-    def __init__(self, target: str) -> None:
-        self.target = target
-        self.waiting = ""
-        """What the transaction waits for because of this step, told when the time is up."""
-        self.between_turns_of: tuple[Place, ...] = ()
-        """Whose turns have to be over for this; known after the check."""
-
-    @property
-    def text(self) -> str:
-        """The step in words."""
-        return f"{self.verb} {self.target}"
-
-    async def check(self, system: ActorSystem, draft: Draft) -> None:
-        """See whether it can be done at this point, and change the draft as the commit will change the tree.
-
-        Raises:
-            HoldfastError: why not.
-        """
-        raise NotImplementedError
+class StagedWork:
+    """What a transaction has done step by step: `prepare`, `ready`, `commit`, `finish`; or `prepare`, `release`."""
 
     async def prepare(self, system: ActorSystem) -> None:
         """Make what the commit needs beside what runs; called again when what was made is not good any more.
@@ -86,6 +54,56 @@ class Operation:
 
     async def release(self, system: ActorSystem) -> None:
         """Let go of what was prepared; nothing if that is nothing."""
+
+
+class Operation(StagedWork):
+    """Base of all operations. A transaction calls, in this order:
+
+    1. `check` of all, each against the draft: the tree as it will be at that point.
+    2. `prepare` of all: what the commit needs is made beside what runs. Nothing that exists changes.
+    3. `ready` of all, until nobody names anything that is in the way.
+    4. `commit` of all, in the same step of the event loop as the last look: from here on the change is in force.
+    5. `finish` of all: what runs follows what is in force.
+
+    If something fails, is cancelled or takes too long before the commit: `release` of all whose `prepare` was begun,
+    last one first, instead of the rest.
+    """
+
+    verb: ClassVar[str] = ""
+
+    def __init__(self, at: Target, child: str = "") -> None:
+        self._at = at
+        self.target = f"{text_of(at)}/{child}" if child else text_of(at)
+        self.waiting = ""
+        """What the transaction waits for because of this step, told when the time is up."""
+        self.between_turns_of: tuple[DraftPlace, ...] = ()
+        """Whose turns have to be over for this; known after the check."""
+
+    _found: DraftPlace | None = None
+
+    @property
+    def _place(self) -> DraftPlace:
+        """The place that it is about; known after the check."""
+        assert self._found is not None
+        return self._found
+
+    @property
+    def text(self) -> str:
+        """The step in words."""
+        return f"{self.verb} {self.target}"
+
+    async def check(self, system: ActorSystem, draft: Draft) -> None:
+        """See whether it can be done at this point, and change the draft as the commit will change the tree.
+
+        Raises:
+            HoldfastError: why not.
+        """
+        raise NotImplementedError
+
+
+def text_of(target: Target) -> str:
+    """A target as text."""
+    return target if isinstance(target, str) else target.path
 
 
 def wrong(where: str, problem: str) -> SpecError:

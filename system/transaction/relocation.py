@@ -18,11 +18,12 @@ from ...supervision.respec import recipe_spec, replace_mechanism, replace_place
 from ...supervision.spec import ChildSpec
 from ..live_moves import to_its_end
 from .draft import rules
+from .operation import StagedWork
 
 if TYPE_CHECKING:
     from ...ftm.group.probation import Probation
     from ..system import ActorSystem
-    from .draft import Place
+    from .draft import DraftPlace
 
 MOVED_WITHIN = 60.0
 """Seconds that a life may take to move; the transaction's own time limit is shorter."""
@@ -31,7 +32,7 @@ MOVED_WITHIN = 60.0
 class Gated:
     """A change of one live actor that waits, when all is ready, for the commit; until then it can be given up."""
 
-    def __init__(self, place: Place, text: str) -> None:
+    def __init__(self, place: DraftPlace, text: str) -> None:
         self._place, self._text = place, text
         self.task: asyncio.Task[None] | None = None
         self._gate: Gate | None = None
@@ -85,10 +86,10 @@ class Gated:
         self.task = self._gate = None
 
 
-class Relocation:
+class Relocation(StagedWork):
     """One actor that is to live elsewhere, or behind other mechanisms: the way from its spec to that of the draft."""
 
-    def __init__(self, place: Place, text: str) -> None:
+    def __init__(self, place: DraftPlace, text: str) -> None:
         self._place, self._text = place, text
         assert place.spec is not None
         self.before: ChildSpec = place.spec
@@ -122,7 +123,7 @@ class Relocation:
     @property
     def _comes_last(self) -> bool:
         """Its state, its code or its address is changed too: it is where it is until that is done."""
-        at: Place | None = self._place
+        at: DraftPlace | None = self._place
         while at is not None and not at.is_moved:
             at = at.parent
         return self._place.rework is not None or at is not None
@@ -246,7 +247,9 @@ def _seen(done: asyncio.Future[Any]) -> None:
 
 def mechanism_of(cell: Cell) -> Any:
     """The mechanism that a live child has; None if it has none."""
-    return getattr(cell.spec, "mechanism", None)  # One that lives elsewhere has no spec here.
+    return (
+        cell.spec.mechanism if isinstance(cell.spec, ChildSpec) else None
+    )  # One that lives elsewhere has no spec here.
 
 
 def described(mechanism: Any) -> Any:

@@ -12,32 +12,30 @@ from ...actors.errors import HoldfastError
 from ...checkpoint.home.recorded_home import switch_of
 from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import SnapshotNow
-from ...supervision.admin import NotSupported
 from ...supervision.children import STOPPED, UP
 from .arrangement import busy, child_of
-from .draft import Draft, Place, Target, is_elsewhere
-from .operation import Operation, wrong
+from .draft import Draft, DraftPlace, Target, is_elsewhere
+from .operation import Operation, text_of, wrong
 from .relocation import MOVED_WITHIN, Gated
-from .structure import check_child, text_of
+from .structure import check_child, check_not_uniform
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
 
 
-class Move(Operation):
+class Reparent(Operation):
     """Put a child under another supervisor of this process."""
 
     verb: ClassVar[str] = "move"
 
     def __init__(self, target: Target, supervisor: Target) -> None:
-        super().__init__(text_of(target))
-        self._at, self._to = target, supervisor
-        self._place: Place | None = None
-        self._above: Place | None = None  # the new supervisor, at this point
-        self._root: Place | None = None
+        super().__init__(target)
+        self._to = supervisor
+        self._above: DraftPlace | None = None  # the new supervisor, at this point
+        self._root: DraftPlace | None = None
         self._leads = False  # it is the first step that moves this actor: it brings it to where the last one wants it
         self._asked: dict[Switch, int] = {}  # who was asked for a snapshot, behind which turn
-        self._rests: dict[Place, Gated] = {}
+        self._rests: dict[DraftPlace, Gated] = {}
 
     @property
     def text(self) -> str:
@@ -51,8 +49,7 @@ class Move(Operation):
             raise wrong(place.path, "no supervisor looks after it, so it cannot be moved to another")
         if new in place.walk():
             raise wrong(place.path, f"it cannot be moved below itself, to {new.path}")
-        if old.is_partitioned:
-            raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
+        check_not_uniform(old)
         for above in (old, new):
             if above.cell is not None and is_elsewhere(above.cell):
                 raise wrong(above.path, "it lives in another process, which a life cannot enter or leave")
@@ -68,7 +65,7 @@ class Move(Operation):
         check_child(new, place.spec)
         del old.children[place.name]
         new.children[place.name], place.parent = place, new
-        self._place, self._above, self._root = place, new, draft.root
+        self._found, self._above, self._root = place, new, draft.root
         self._leads = not (place.is_moved or place.is_planned)  # Who is added is started where it is to be.
         place.is_moved = True
         self.between_turns_of = (old, new)
@@ -77,7 +74,7 @@ class Move(Operation):
 
     async def prepare(self, system: ActorSystem) -> None:
         """Have recorded actors rest, with a snapshot: no turn of theirs is to be repeated under another address."""
-        if self._place is None or not (self._leads and self._place.has_moved):
+        if self._found is None or not (self._leads and self._place.has_moved):
             return
         waits = bool(self._others_settle(system))
         for one, rest in self._resting(system):
@@ -86,9 +83,8 @@ class Move(Operation):
             else:
                 await rest.reach(system, functools.partial(system._moves.pause, one.living(system.node), MOVED_WITHIN))
 
-    def _resting(self, system: ActorSystem) -> list[tuple[Place, Gated]]:
+    def _resting(self, system: ActorSystem) -> list[tuple[DraftPlace, Gated]]:
         """Those that replay turns, of the actor and all below it, and how each comes to rest."""
-        assert self._place is not None
         for one in self._place.walk():
             cell = one.now(system.node) if not (one.is_planned or one.rework is not None) else None
             switch = switch_of(cell) if cell is not None else None  # Who is reworked rests for that, and is saved.
@@ -108,7 +104,6 @@ class Move(Operation):
 
     def ready(self, system: ActorSystem) -> str:
         place = self._place
-        assert place is not None
         if not (self._leads and place.has_moved):
             return ""
         assert place.was.below is not None
@@ -145,7 +140,7 @@ class Move(Operation):
             await rest.give_up(system)
 
 
-def check_movable(place: Place) -> None:
+def check_movable(place: DraftPlace) -> None:
     """Whether an actor can have another address.
 
     Raises:

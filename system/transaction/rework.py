@@ -23,11 +23,11 @@ from ...checkpoint.home.recorded_home import switch_of
 from ...checkpoint.protocol import Snapshot
 from ...supervision.respec import respec
 from .arrangement import busy
-from .operation import wrong
+from .operation import StagedWork, wrong
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
-    from .draft import Place
+    from .draft import DraftPlace
 
 SNAPSHOT: msgspec.msgpack.Decoder[Snapshot] = msgspec.msgpack.Decoder(Snapshot)
 PREPARED_WITHIN = 3600.0
@@ -38,10 +38,10 @@ CONCLUDED_WITHIN = 60.0
 """Seconds that an actor in another process may take to hear that the transaction is over."""
 
 
-class Rework:
+class Rework(StagedWork):
     """One actor that is held, all that is wanted of it, and what it has prepared."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: DraftPlace) -> None:
         self._place = place
         self._wanted: list[ReplaceState | ReplaceCode] = []
         self.suspended: bool | None = None

@@ -11,9 +11,8 @@ from ...actors.kernel.ref import ActorRef
 from ...supervision.admin import ChildBusy, NoSuchChild, NotSupported, RestartChild, TerminateChild
 from ...supervision.supervisor import Supervisor
 from .arrangement import child_of
-from .draft import START_TIMEOUT, Draft, Place, Target, check_awake, is_elsewhere
+from .draft import START_TIMEOUT, Draft, DraftPlace, Target, check_awake, is_elsewhere
 from .operation import Operation, wrong
-from .structure import text_of
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
@@ -22,15 +21,12 @@ if TYPE_CHECKING:
 class OnChild(Operation):
     """Base: a child of a supervisor of this process, by its name."""
 
-    def __init__(self, target: str) -> None:
-        super().__init__(target)
-        self._place: Place | None = None
-        self._name = ""
+    _name = ""
 
-    def _take(self, draft: Draft, place: Place, *, starts: bool) -> None:
+    def _take(self, draft: Draft, place: DraftPlace, *, starts: bool) -> None:
         above = place.parent
         assert above is not None
-        self._place, self._name = place, place.name
+        self._found, self._name = place, place.name
         self.target, self.between_turns_of = place.path, (above,)
         if above.is_dynamic or above.is_partitioned:
             raise NotSupported("a child without a place of its own cannot be stopped for a while: remove it")
@@ -47,10 +43,6 @@ class StopChild(OnChild):
     """Stop a child; its spec stays, and says that it is not started until it is started by order."""
 
     verb: ClassVar[str] = "stop"
-
-    def __init__(self, target: Target) -> None:
-        super().__init__(text_of(target))
-        self._at = target
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = draft.find(self._at)
@@ -72,7 +64,6 @@ class StopChild(OnChild):
 
     def ready(self, system: ActorSystem) -> str:
         place = self._place
-        assert place is not None
         assert place.was.below is not None
         if child_of(place.was.below.living(system.node), self._name) is None:
             raise NoSuchActor(self.target)
@@ -80,7 +71,6 @@ class StopChild(OnChild):
 
     async def finish(self, system: ActorSystem) -> None:
         place = self._place
-        assert place is not None
         assert place.parent is not None
         await stop_child(place.parent.living(system.node), self._name)
 
@@ -97,8 +87,8 @@ class StartAgain(OnChild):
     verb: ClassVar[str] = "start"
 
     def __init__(self, supervisor: Target, name: str) -> None:
-        super().__init__(f"{text_of(supervisor)}/{name}")
-        self._at, self._name = supervisor, name
+        super().__init__(supervisor, name)
+        self._name = name
         self._asked: Cell | None = None  # the supervisor that was asked
         self._is_asked = False
         self._life = 0
@@ -119,7 +109,6 @@ class StartAgain(OnChild):
 
     def _supervisor(self, system: ActorSystem) -> Cell:
         """Who has it until the transaction is in force: there it is started, and goes from there if it is moved."""
-        assert self._place is not None
         assert self._place.was.below is not None
         return self._place.was.below.living(system.node)
 
@@ -136,7 +125,6 @@ class StartAgain(OnChild):
             if not is_asked_again:
                 raise
             return  # A life of its supervisor has ended before it answered; the next one has heard it too.
-        assert self._place is not None
         if ref is None:
             self._is_over = True
         else:

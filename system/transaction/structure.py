@@ -20,22 +20,18 @@ from ...supervision.admin import (
     RemoveChild,
     StartChild,
 )
-from ...supervision.dynamic import check_dynamic
+from ...supervision.dynamic import DynamicSupervisor, check_dynamic
+from ...supervision.services.partition import UniformSupervisor
 from ...supervision.spec import NAMELESS, ChildSpec, Flags, Plan, check_spec, child
 from ...supervision.supervisor import Supervisor
 from ...supervision.supervisor_changes import check_subtree
 from .arrangement import planned_spec
-from .draft import START_TIMEOUT, Draft, Place, Target, check_awake, is_elsewhere
+from .draft import START_TIMEOUT, Draft, DraftPlace, Target, check_awake, is_elsewhere
 from .lasting import recipe_specs
-from .operation import Operation, wrong
+from .operation import Operation, text_of, wrong
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
-
-
-def text_of(target: Target) -> str:
-    """A target as text."""
-    return target if isinstance(target, str) else target.path
 
 
 CANDIDATES = itertools.count(1)
@@ -48,7 +44,7 @@ class Newcomer:
     If that supervisor is added too it begins with it; where somebody lives until the commit it is started behind it.
     """
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: DraftPlace) -> None:
         self.place = place
         place.candidate = next(CANDIDATES)
         self._asked: Cell | None = None  # the supervisor that was asked
@@ -56,7 +52,7 @@ class Newcomer:
         self._is_over = False  # it has been up, and has ended by itself as it may
 
     @property
-    def _above(self) -> Place | None:
+    def _above(self) -> DraftPlace | None:
         """Its supervisor; None if that one is not asked to start it before the commit."""
         place, above = self.place, self.place.parent
         assert above is not None
@@ -130,14 +126,14 @@ class Newcomer:
             pass  # The same.
 
 
-class Add(Operation):
+class AddChild(Operation):
     """Start one more child of a supervisor, and those that come with it."""
 
     verb: ClassVar[str] = "add"
 
     def __init__(self, supervisor: Target, spec: ChildSpec) -> None:
-        super().__init__(f"{text_of(supervisor)}/{spec.id}")
-        self._at, self.spec = supervisor, spec
+        super().__init__(supervisor, spec.id)
+        self.spec = spec
         self._newcomers: list[Newcomer] = []
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
@@ -168,16 +164,21 @@ class Add(Operation):
             await one.release()
 
 
-def check_child(above: Place, spec: ChildSpec) -> None:
+def check_not_uniform(above: DraftPlace) -> None:
+    """Raises NotSupported: the children of this supervisor are all alike, and none of them comes or goes alone."""
+    if above.kind is not None and issubclass(above.kind, UniformSupervisor):
+        raise NotSupported(above.kind.instead)
+
+
+def check_child(above: DraftPlace, spec: ChildSpec) -> None:
     """Whether a supervisor in the draft can take this child.
 
     Raises:
         SpecError, NotSupported, AlreadyPresent, MaxChildren: why not.
     """
-    if above.is_partitioned:
-        raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
+    check_not_uniform(above)
     actor = above.actor
-    if getattr(actor, "_template", None) is not None:
+    if isinstance(actor, DynamicSupervisor) and actor._template is not None:
         raise wrong(above.path, "it has a template: ask it with StartChild(args=...)")
     check_spec(above.path, spec, above.flags.auto_shutdown if above.flags is not None else None)
     if spec.id in above.children:
@@ -187,9 +188,9 @@ def check_child(above: Place, spec: ChildSpec) -> None:
         raise MaxChildren(most)
 
 
-def _planned(draft: Draft, above: Place, spec: ChildSpec) -> Place:
+def _planned(draft: Draft, above: DraftPlace, spec: ChildSpec) -> DraftPlace:
     """The place of a child to be, and of those that come with it."""
-    place = above.children[spec.id] = Place(spec.id, above, None, spec)
+    place = above.children[spec.id] = DraftPlace(spec.id, above, None, spec)
     place.is_planned, place.is_stopped = True, False
     for port, path in spec.bindings.items():
         place.bindings[port] = draft.find(path)
@@ -201,7 +202,7 @@ def _planned(draft: Draft, above: Place, spec: ChildSpec) -> Place:
     return place
 
 
-def _fill(place: Place, cell: Cell) -> None:
+def _fill(place: DraftPlace, cell: Cell) -> None:
     """The place is lived in now: later steps find who does."""
     place.cell = cell
     for name, below in (cell.children or {}).items():
@@ -209,7 +210,7 @@ def _fill(place: Place, cell: Cell) -> None:
             _fill(place.children[name], below)
 
 
-def _grant(place: Place) -> None:
+def _grant(place: DraftPlace) -> None:
     """Who is started in another process is bound, there, to what its spec names: it is the root that says so."""
     for one in place.walk():
         if one.cell is not None and one.spec is not None:
@@ -217,23 +218,17 @@ def _grant(place: Place) -> None:
                 one.cell.node.bind(one.cell, port, one.cell.node.cell_at(path))
 
 
-class Remove(Operation):
+class RemoveActor(Operation):
     """Stop an actor for good, when all else is in force."""
 
     verb: ClassVar[str] = "remove"
 
-    def __init__(self, target: Target) -> None:
-        super().__init__(text_of(target))
-        self._at = target
-        self._place: Place | None = None
-
     async def check(self, system: ActorSystem, draft: Draft) -> None:
-        place = self._place = draft.find(self._at)
+        place = self._found = draft.find(self._at)
         above = place.parent
         if above is None:
             raise wrong(place.path, "the root is not removed: leave the system")
-        if above.is_partitioned:
-            raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
+        check_not_uniform(above)
         if place.is_planned:
             raise wrong(place.path, "it is added by this very transaction")
         self.target = place.path
@@ -243,7 +238,6 @@ class Remove(Operation):
 
     async def finish(self, system: ActorSystem) -> None:
         place = self._place
-        assert place is not None
         cell, above = place.now(system.node), place.parent
         if cell is not None:
             await system.stop(cell.ref)
@@ -260,13 +254,8 @@ class OnSupervisor(Operation):
 
     verb: ClassVar[str] = "set"
 
-    def __init__(self, supervisor: Target) -> None:
-        super().__init__(text_of(supervisor))
-        self._at = supervisor
-        self._place: Place | None = None
-
     async def check(self, system: ActorSystem, draft: Draft) -> None:
-        place = self._place = await draft.supervisor(self._at)
+        place = self._found = await draft.supervisor(self._at)
         self.target, self.between_turns_of = place.path, (place,)
         draft.arrangement.touch(place, self, is_told=True)
 
@@ -287,7 +276,6 @@ class Reorder(OnSupervisor):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
-        assert place is not None
         if place.is_dynamic or place.is_partitioned:
             raise NotSupported("its children have no order of their own")
         missing = [name for name in self._ids if name not in place.children]
@@ -317,7 +305,6 @@ class SetFlags(OnSupervisor):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
-        assert place is not None
         if place.flags is None:
             raise NotSupported(
                 "it lives in another process and its class has an init of its own: only it knows its flags"

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.errors import ActorStopped, NameTaken, NoSuchActor, type_name
 from ...actors.kernel.cell import RUNNING
-from .draft import Draft, Place, Target
-from .operation import Operation, wrong
-from .structure import text_of
+from .draft import Draft, DraftPlace, Target
+from .operation import Operation, text_of, wrong
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
@@ -20,10 +19,10 @@ class Bind(Operation):
     verb: ClassVar[str] = "bind"
 
     def __init__(self, owner: Target, port: str, target: Target) -> None:
-        super().__init__(text_of(owner))
-        self._at, self._port, self._to = owner, port, target
-        self._owner: Place | None = None
-        self._bound: Place | None = None
+        super().__init__(owner)
+        self._port, self._to = port, target
+        self._owner: DraftPlace | None = None
+        self._bound: DraftPlace | None = None
 
     @property
     def text(self) -> str:
@@ -62,9 +61,9 @@ class Unbind(Operation):
     verb: ClassVar[str] = "unbind"
 
     def __init__(self, owner: Target, port: str) -> None:
-        super().__init__(text_of(owner))
-        self._at, self._port = owner, port
-        self._owner: Place | None = None
+        super().__init__(owner)
+        self._port = port
+        self._owner: DraftPlace | None = None
 
     @property
     def text(self) -> str:
@@ -95,14 +94,14 @@ class Unbind(Operation):
             more.turn.rebinds.pop(self._port, None)
 
 
-class Register(Operation):
+class RegisterName(Operation):
     """Give an actor a name beside its address."""
 
     verb: ClassVar[str] = "register"
 
     def __init__(self, name: str, target: Target) -> None:
-        super().__init__(text_of(target))
-        self._name, self._at = name, target
+        super().__init__(target)
+        self._name = name
 
     @property
     def text(self) -> str:
@@ -122,7 +121,7 @@ class Register(Operation):
         draft.arrangement.name(self._name, self, draft.named.get(self._name), place)
 
 
-class Unregister(Operation):
+class UnregisterName(Operation):
     """Free a name."""
 
     verb: ClassVar[str] = "unregister"
@@ -139,6 +138,6 @@ class Unregister(Operation):
         draft.arrangement.name(self._name, self, draft.named.get(self._name), None)
 
 
-def holder_of(name: str, draft: Draft) -> Place | None:
+def holder_of(name: str, draft: Draft) -> DraftPlace | None:
     """Who has a name at this point."""
     return next((place for place in draft.root.walk() if name in place.names), None)

@@ -14,7 +14,7 @@ import msgspec
 from ...actors.kernel.codec import encode_special
 
 
-class Images:
+class ValueBytes:
     """Makes the bytes of values. What the codec does not take is in them by its type and identity."""
 
     def __init__(self) -> None:

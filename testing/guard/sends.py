@@ -27,7 +27,7 @@ from ...actors.kernel.ref import ActorRef, current
 from ..probes import ProbeActor
 from ..swaps import Swaps
 from ..turns import TurnWatcher, watch_turns
-from .changes import Images, changes
+from .changes import ValueBytes, changes
 from .declared import is_fixed, may_change, wrong_field
 from .holders import holders
 
@@ -68,7 +68,7 @@ class SendChecks(TurnWatcher):
         self.node = node
         self.is_expected = self.are_replies_expected = self.are_types_expected = False
         self.asks: weakref.WeakKeyDictionary[asyncio.Future[Any], tuple[str, object]] = weakref.WeakKeyDictionary()
-        self._images = Images()
+        self._images = ValueBytes()
         self._kept: dict[int, Handed] = {}
         self._bytes = 0
         self._near: defaultdict[str, deque[Handed]] = defaultdict(lambda: deque(maxlen=NEAR))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from hypothesis import strategies as st
 
-from ..schedules.choices import ROUNDS, Held
+from ..schedules.choices import ROUNDS, RepeatHolds
 
 if TYPE_CHECKING:
     from hypothesis.internal.conjecture.data import ConjectureData
@@ -23,7 +23,7 @@ GAPS: Final = st.integers(0, 24)
 RANKS: Final = st.integers(1, 3)
 
 
-class Drawn(Held):
+class Drawn(RepeatHolds):
     """Draws who is held up, and when, and how long each step lasts. The simplest schedule is production's.
 
     Args:

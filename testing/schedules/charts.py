@@ -27,7 +27,7 @@ svg text{font:12px ui-monospace,monospace}.life{stroke:#bbb}.sent{stroke:#555;ma
 .turn{fill:#3b6ea5}.crash{fill:#b03030}.name{font-weight:bold}.state{fill:#666}.time{fill:#999}"""
 
 
-class Row(NamedTuple):
+class ChartRow(NamedTuple):
     """One turn: when on the virtual clock, whose, what it handled, who sent that, and what it changed."""
 
     at: float
@@ -42,7 +42,7 @@ class Recorder(TurnWatcher):
     """Draws up the rows of a run as its turns happen."""
 
     def __init__(self) -> None:
-        self.rows: list[Row] = []
+        self.rows: list[ChartRow] = []
         self._open: dict[Cell, tuple[int, int, dict[str, str]]] = {}
 
     def begins(self, cell: Cell, item: Any) -> Substitute | None:
@@ -50,7 +50,7 @@ class Recorder(TurnWatcher):
         what = told(cell, item) if message is None else BRIEF.repr(message)
         sender: Cell | None = item.sender if isinstance(item, Item) else None
         self._open[cell] = len(self.rows), cell.life, _state(cell)
-        self.rows.append(Row(cell.node.loop.time(), cell.path, "" if sender is None else sender.path, what, ""))
+        self.rows.append(ChartRow(cell.node.loop.time(), cell.path, "" if sender is None else sender.path, what, ""))
         return None
 
     def ended(self, cell: Cell, item: Any) -> None:
@@ -80,7 +80,7 @@ def _state(cell: Cell) -> dict[str, str]:
     return found
 
 
-def columns(rows: Sequence[Row]) -> list[str]:
+def columns(rows: Sequence[ChartRow]) -> list[str]:
     """Who takes part, in order of appearance."""
     found: dict[str, None] = {}
     for row in rows:
@@ -95,7 +95,7 @@ def short(path: str) -> str:
     return path.rsplit("/", 1)[-1] or path
 
 
-def as_text(rows: Sequence[Row]) -> str:
+def as_text(rows: Sequence[ChartRow]) -> str:
     """The last turns as a chart of characters: `*` is the turn, an arrow leads there from the sender's column."""
     shown = rows[-SHOWN:]
     if not shown:
@@ -124,11 +124,11 @@ def as_text(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def _change(row: Row) -> str:
+def _change(row: ChartRow) -> str:
     return f"   [{row.change}]" if row.change else ""
 
 
-def as_html(rows: Sequence[Row], title: str, note: str) -> str:
+def as_html(rows: Sequence[ChartRow], title: str, note: str) -> str:
     """The whole run as a page of its own."""
     names = columns(rows)
     place = {name: 110 + 150 * index for index, name in enumerate(names)}

@@ -134,7 +134,7 @@ class Replay(Choices):
         return min(self._given.get(kind, {}).get(number, 0), count - 1)
 
 
-class Held(Choices):
+class RepeatHolds(Choices):
     """Repeats a run by who was held up in it: a bug that shows when one actor is slow takes one choice, not many."""
 
     def __init__(self, seed: int, taken: Mapping[str, Mapping[int, int]]) -> None:
@@ -173,7 +173,7 @@ class Held(Choices):
         return {kind: chosen for kind, chosen in found.items() if chosen}
 
 
-class Translated(Held):
+class Translated(RepeatHolds):
     """Repeats a run by its turns, and keeps who was held up."""
 
     def rank(self, order: Sequence[int]) -> int:
@@ -183,7 +183,7 @@ class Translated(Held):
 
 def repeated(seed: int, taken: Mapping[str, Mapping[int, int]]) -> Choices:
     """What repeats a run by what was kept of it."""
-    return Replay(seed, taken) if TURN in taken else Held(seed, taken)
+    return Replay(seed, taken) if TURN in taken else RepeatHolds(seed, taken)
 
 
 class Walk(Choices):

@@ -24,11 +24,11 @@ from ...actors.kernel.node import Node
 from ..clock import TICKS, VirtualClockLoop
 from ..swaps import Swaps
 from .disk import simulated
-from .due import Due, Option
+from .due import DueQueue, Option
 from .footprints import Footprints
 from .livelock import Rounds
 from .numbered import NumberedFuture, NumberedTask
-from .places import Place, inside, is_dead, never, no_more
+from .places import SimulatedPlace, inside, is_dead, never, no_more
 from .strategies import Explored
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class ControlledLoop(VirtualClockLoop):
     def __init__(self, *, ticks: int = TICKS) -> None:
         self.control: Control | None = None
         super().__init__(ticks=ticks)
-        self.due = Due()
+        self.due = DueQueue()
         self._ready: Any = self.due
         self._own_thread = threading.get_ident()
         self._numbers = itertools.count()  # of its tasks and futures
@@ -203,12 +203,12 @@ class ControlledLoop(VirtualClockLoop):
         self.call_later(self.sync_seconds(), _do, done, work)
         return done
 
-    def add(self, place: Place) -> None:
+    def add(self, place: SimulatedPlace) -> None:
         """A place begins to run in this loop."""
         if self.control is not None:
             self.control.add(place.node)
 
-    def drop(self, place: Place) -> None:
+    def drop(self, place: SimulatedPlace) -> None:
         """Nothing of this place runs any more."""
         place.is_dead = self.due.has_dead = True
         timers: Any = self._scheduled
@@ -402,7 +402,7 @@ class Control:
             self._now += 1.0  # The slice is over.
         return self._now
 
-    def choose_callback(self, due: Due) -> Option:
+    def choose_callback(self, due: DueQueue) -> Option:
         """The callback that is called next; if it is that of a node, a cell of it is chosen, too."""
         chosen, self._next = self._next, None
         if chosen is None or chosen not in due.options:
@@ -413,7 +413,7 @@ class Control:
                 self._footprints.touch(None)
         return chosen
 
-    def _chosen(self, due: Due) -> Option:
+    def _chosen(self, due: DueQueue) -> Option:
         options = due.next_options()
         if not options:  # All are cancelled.
             return due.options[0]

@@ -46,7 +46,7 @@ class Latency:
         return least + (longest - least) * level / (LEVELS - 1)
 
 
-class Kept(NamedTuple):
+class KeptSnapshot(NamedTuple):
     """A snapshot, with the positions of all entries that it contains."""
 
     data: bytes
@@ -65,7 +65,7 @@ class Contents:
     def __init__(self) -> None:
         self.last = 0
         self.entries: dict[str, dict[int, Entry]] = {}
-        self.snapshots: dict[str, list[Kept]] = {}
+        self.snapshots: dict[str, list[KeptSnapshot]] = {}
         self.blocks: dict[tuple[str, int], dict[tuple[int, int], bytes]] = {}
         self.notes: dict[str, bytes] = {}
 
@@ -79,7 +79,7 @@ class Contents:
         """Add a snapshot, and forget what the oldest one that is kept contains."""
         kept, entries = self.snapshots.setdefault(address, []), self.entries.get(address, {})
         before = kept[-1].contains if kept else frozenset[int]()
-        kept.append(Kept(snapshot, turn, frozenset(p for p in entries if p in before or p in drop)))
+        kept.append(KeptSnapshot(snapshot, turn, frozenset(p for p in entries if p in before or p in drop)))
         del kept[:-keep]
         for position in kept[0].contains:
             entries.pop(position, None)
@@ -318,7 +318,7 @@ def _check_entry(part: object) -> None:
         raise TypeError(f"an entry cannot hold {part!r}")
 
 
-class Work:
+class DiskWork:
     """Work for a simulated store, which needs no thread: it begins now, and is done when its seconds are over."""
 
     def __init__(self, journal: SimulatedJournal, call: Callable[[], Any]) -> None:
@@ -331,12 +331,12 @@ class Work:
             return self._call()
 
 
-def simulated(call: Callable[..., Any], args: tuple[Any, ...]) -> Work | None:
+def simulated(call: Callable[..., Any], args: tuple[Any, ...]) -> DiskWork | None:
     """The work that this call is, if it is one for a simulated store."""
     function = call.args[0] if isinstance(call, functools.partial) and call.args else call  # of `asyncio.to_thread`
     owner = getattr(function, "__self__", None)
     journal = getattr(owner, "_engine", owner)
-    return Work(journal, functools.partial(call, *args)) if isinstance(journal, SimulatedJournal) else None
+    return DiskWork(journal, functools.partial(call, *args)) if isinstance(journal, SimulatedJournal) else None
 
 
 class NoRootToKill(HoldfastError, text="the root cannot be killed: {why}"):

@@ -23,7 +23,7 @@ STEPS = (None, "task_wakeup", "__step", "__wakeup")
 class Chooser(Protocol):
     """Decides which callback is called next."""
 
-    def choose_callback(self, due: Due) -> Option:
+    def choose_callback(self, due: DueQueue) -> Option:
         """One of those that are due."""
         ...
 
@@ -32,7 +32,7 @@ class Chooser(Protocol):
         ...
 
 
-class Due:
+class DueQueue:
     """Stands in for the queue of an asyncio loop: who takes the next callback gets the one that was chosen.
 
     Attributes:

@@ -17,7 +17,7 @@ LOOP: Final = "the loop"
 """The lane of the test and of the root."""
 
 
-class Place:
+class SimulatedPlace:
     """Where code of a simulated run runs: the root, or a process. Of a dead one nothing runs any more.
 
     Attributes:
@@ -35,7 +35,7 @@ class Place:
         self.is_dead = False
 
 
-class Root(Place):
+class Root(SimulatedPlace):
     """The process in which a system of the run lives. The test lives there, too, and outlives it.
 
     Attributes:
@@ -48,7 +48,7 @@ class Root(Place):
         self.lane = LOOP
 
 
-inside: ContextVar[Place | None] = ContextVar("holdfast simulated place", default=None)
+inside: ContextVar[SimulatedPlace | None] = ContextVar("holdfast simulated place", default=None)
 """The place whose code runs; None: the test's."""
 
 

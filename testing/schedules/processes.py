@@ -29,7 +29,7 @@ from ...system.worker_main import WorkerComposition
 from ..swaps import Swaps
 from .choices import Choices
 from .disk import Latency
-from .places import Place, inside
+from .places import SimulatedPlace, inside
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node
@@ -163,7 +163,7 @@ class Pipe(asyncio.Transport):
             self._pool.loop.call_soon(self.protocol.resume_writing, context=self.context)
 
 
-class SimulatedProcess(Place):
+class SimulatedProcess(SimulatedPlace):
     """One process: a guest with a node of its own, all of whose callbacks are marked as its own.
 
     Attributes:

@@ -80,7 +80,7 @@ def strategy(name: str, depth: int = DEPTH) -> Strategy:
         case "exhaustive":
             return Exhaustive()
         case "coverage":
-            return Coverage()
+            return CoverageGuided()
         case _:
             raise SpecError("simulate", f"strategy must be one of {', '.join(NAMES)}, not {name!r}")
 
@@ -143,7 +143,7 @@ class Pct:
         self._length = max(self._length, choices.steps, 1)
 
 
-class Coverage:
+class CoverageGuided:
     """Changes at random what has brought something new: two messages next to each other at an actor in a new order."""
 
     def __init__(self) -> None:
@@ -192,7 +192,7 @@ class Changed(Replay):
         return proposed if self._draw.random() < 0.5 else super().redrawn(kind, number, count, proposed)
 
 
-class Point:
+class ChoicePoint:
     """One choice of the search tree, with what has been explored below it."""
 
     def __init__(self, options: tuple[Hashable, ...], asleep: dict[Hashable, Footprint]) -> None:
@@ -220,7 +220,7 @@ class Exhaustive:
     """Depth first through all schedules, with sleep sets."""
 
     def __init__(self) -> None:
-        self.path: list[Point] = []
+        self.path: list[ChoicePoint] = []
         self._is_over = False
 
     def choices(self, seed: int) -> Choices | None:
@@ -237,7 +237,7 @@ class Exhaustive:
 class Explored(Choices):
     """One path of the search: repeated as far as it is known, then the first that does not sleep."""
 
-    def __init__(self, seed: int, path: list[Point]) -> None:
+    def __init__(self, seed: int, path: list[ChoicePoint]) -> None:
         super().__init__(seed)
         self.footprints: Footprints | None = None  # tells what a step has touched
         self._path = path
@@ -269,7 +269,7 @@ class Explored(Choices):
             for key, touched in slept.items()
             if key in options and touched is not ALL and not step & touched
         }
-        point = Point(options, asleep)
+        point = ChoicePoint(options, asleep)
         if point.is_redundant:
             self._is_redundant = True
             return 0

@@ -11,11 +11,11 @@ from typing import Any, Final
 
 from ...actors.errors import StoreError
 from ...checkpoint.journal import Entry, Journal
-from ..threads import Threads
-from .bench import Bench, Opened
-from .comparing import Broken, refused
+from ..threads import NewThreads
+from .bench import Bench, OpenEngine
+from .comparing import PromiseBroken, refused
 from .contents import check_twice
-from .model import Model, settle
+from .model import StoreModel, settle
 from .samples import make_small_blocks
 from .watching import FileFault, is_sync, is_write, watched
 from .writes import A, B, Write, all_writes, append, cut, do_failing, do_killed, erase, fill, note
@@ -31,7 +31,7 @@ PATIENCE: Final = 500
 
 def what_was_acknowledged_outlives_a_kill(bench: Bench) -> None:
     """After each kind of write in turn, kill upon kill, all of it is there, and the store can be used on."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     fill(opened.journal, model)
     opened.kill()
     model.check(opened.journal)
@@ -40,8 +40,8 @@ def what_was_acknowledged_outlives_a_kill(bench: Bench) -> None:
         opened.kill()
         try:
             model.check(opened.journal)
-        except (Broken, StoreError) as error:
-            raise Broken(f"after {write.what} and a kill: {error}") from error
+        except (PromiseBroken, StoreError) as error:
+            raise PromiseBroken(f"after {write.what} and a kill: {error}") from error
     opened.kill()
     fill(opened.journal, model)
     check_twice(opened, model)
@@ -49,7 +49,7 @@ def what_was_acknowledged_outlives_a_kill(bench: Bench) -> None:
 
 def a_kill_before_the_first_write_is_survived(bench: Bench) -> None:
     """The epoch rises over kills, too, and positions do, when nothing else was written."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     for _ in range(3):
         opened.kill()
         model.check(opened.journal)
@@ -66,7 +66,7 @@ def a_kill_before_the_first_write_is_survived(bench: Bench) -> None:
 
 def a_kill_inside_a_write_leaves_all_of_it_or_nothing(bench: Bench) -> None:
     """At each change of the files within each kind of write, with the newest write to a file whole and torn."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     fill(opened.journal, model)
     draw = random.Random(5)
     for write in all_writes():
@@ -76,7 +76,7 @@ def a_kill_inside_a_write_leaves_all_of_it_or_nothing(bench: Bench) -> None:
 
 def a_kill_inside_an_opening_or_a_closing_is_survived(bench: Bench) -> None:
     """At each change of the files: everything that was acknowledged is there, and the epoch rises."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     fill(opened.journal, model)
     draw = random.Random(6)
     opened.kill()
@@ -91,14 +91,14 @@ def a_kill_inside_an_opening_or_a_closing_is_survived(bench: Bench) -> None:
                 again.reopen()
                 model.check(again.journal)
             except Exception as error:  # An opening may raise anything.
-                raise Broken(f"a kill inside a reopening, at change {number} of the files: {error}") from error
+                raise PromiseBroken(f"a kill inside a reopening, at change {number} of the files: {error}") from error
             again.journal.close()
 
 
 # ---- failures
 
 
-def _failing(bench: Bench, opened: Opened, number: int) -> AbstractContextManager[None]:
+def _failing(bench: Bench, opened: OpenEngine, number: int) -> AbstractContextManager[None]:
     return bench.fail(opened.folder) if number < 0 else FileFault(number, errno.ENOSPC).installed()
 
 
@@ -108,7 +108,7 @@ def a_write_that_fails_leaves_everything_as_it_was(bench: Bench) -> None:
     Afterwards the store goes on, or refuses everything until it is opened again.
     """
     for number in (-1, *range(12)):
-        opened, model = bench.open(), Model()
+        opened, model = bench.open(), StoreModel()
         fill(opened.journal, model)
         for write in all_writes():
             if write.kind == "sync":
@@ -116,15 +116,15 @@ def a_write_that_fails_leaves_everything_as_it_was(bench: Bench) -> None:
             fault = _failing(bench, opened, number)
             try:
                 model = do_failing(opened, model, write, fault)
-            except (Broken, StoreError) as error:
+            except (PromiseBroken, StoreError) as error:
                 disk = "on a full disk" if number < 0 else f"when file operation {number} of it fails"
-                raise Broken(f"{write.what} {disk}: {error}") from error
+                raise PromiseBroken(f"{write.what} {disk}: {error}") from error
         opened.journal.close()
 
 
 def after_a_failed_sync_everything_is_refused(bench: Bench) -> None:
     """Until the store is opened again: nobody knows what the disk has."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     append(opened.journal, model, (A, ("in", 1)))
     fault = FileFault(0, which=is_sync)
     problem: Exception | None = None
@@ -136,7 +136,7 @@ def after_a_failed_sync_everything_is_refused(bench: Bench) -> None:
     if not fault.struck:
         return  # Its syncs are not made by Python code.
     if not isinstance(problem, StoreError):
-        raise Broken(f"sync raised {problem!r} when {fault.struck} had failed, which is no StoreError")
+        raise PromiseBroken(f"sync raised {problem!r} when {fault.struck} had failed, which is no StoreError")
     blocks = make_small_blocks(random.Random(1))
     for what, write in (
         ("append", lambda: opened.journal.append([(A, ("in", 2))])),
@@ -165,7 +165,9 @@ def what_was_written_is_synced(bench: Bench) -> None:
             opened.journal.append([(A, ("in", number))])
             opened.journal.sync()
         if "write" in seen and "sync" not in seen:
-            raise Broken("append wrote to a file, and sync returned without fsync or fdatasync: nothing is synced")
+            raise PromiseBroken(
+                "append wrote to a file, and sync returned without fsync or fdatasync: nothing is synced"
+            )
 
 
 # ---- owners and threads
@@ -173,7 +175,7 @@ def what_was_written_is_synced(bench: Bench) -> None:
 
 def of_two_openings_one_acknowledges(bench: Bench) -> None:
     """The second is refused, or the first is: never do both go on, nor is anything lost that was acknowledged."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     fill(opened.journal, model)
     first = opened.journal
     try:
@@ -187,7 +189,7 @@ def of_two_openings_one_acknowledges(bench: Bench) -> None:
     try:
         blocks = make_small_blocks(random.Random(1))
         if second.epoch <= first.epoch:
-            raise Broken(f"the second opening has epoch {second.epoch} after epoch {first.epoch}")
+            raise PromiseBroken(f"the second opening has epoch {second.epoch} after epoch {first.epoch}")
         append(second, model, (A, ("in", "second")))
         for what, write in (
             ("append", lambda: first.append([(A, ("in", "first"))])),
@@ -208,7 +210,7 @@ def of_two_openings_one_acknowledges(bench: Bench) -> None:
 
 def appends_go_on_in_other_threads(bench: Bench) -> None:
     """An append at each moment of a cut, a load and an erase of other addresses, in a thread of its own."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     fill(opened.journal, model)
     writes = [write for write in all_writes() if write.what in ("cut", "note", "keep_blocks", "sync", "erase")]
     for write in (*writes, Write("load", "load", A, lambda journal, _: journal.load(A))):
@@ -249,26 +251,28 @@ class _Guest:
         if self._left >= 0 or self._has_begun:
             return
         self._has_begun = True
-        threads = Threads()
+        threads = NewThreads()
         self._thread.start()
         for _ in range(PATIENCE):
             self._thread.join(0.001)
             if not self._thread.is_alive() or not threads.at_work():
                 break
 
-    def finish(self, model: Model, what: str) -> None:
+    def finish(self, model: StoreModel, what: str) -> None:
         """Wait for it, and have the model know of it."""
         if not self._has_begun:
             return
         self._thread.join()
         if self._problem is not None:
             problem = f"{type(self._problem).__name__}: {self._problem}"
-            raise Broken(f"an append in another thread while {what} ran raised {problem}") from self._problem
+            raise PromiseBroken(f"an append in another thread while {what} ran raised {problem}") from self._problem
         if type(self._positions) is not list or len(self._positions) != 1:
-            raise Broken(f"an append in another thread while {what} ran returned {self._positions!r}")
+            raise PromiseBroken(f"an append in another thread while {what} ran returned {self._positions!r}")
         (position,) = self._positions
         if any(position in place.entries for place in model.places.values()):
-            raise Broken(f"an append in another thread while {what} ran has position {position}, which is another's")
+            raise PromiseBroken(
+                f"an append in another thread while {what} ran has position {position}, which is another's"
+            )
         model.last = max(model.last, position)
         model.place(self._entry[0]).entries[position] = self._entry[1]
 
@@ -278,7 +282,7 @@ class _Guest:
 
 def what_is_written_together_is_kept_together(bench: Bench) -> None:
     """For engines that have `together`: a kill inside leaves all of it or nothing."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     together: Callable[[], AbstractContextManager[None]] | None = getattr(opened.journal, "together", None)
     if together is None:
         return
@@ -295,8 +299,8 @@ def what_is_written_together_is_kept_together(bench: Bench) -> None:
             try:
                 with opened.surviving(folder) as journal:
                     settle(journal, broken)
-            except (Broken, StoreError) as error:
-                raise Broken(f"a kill within together(), at change {number} of the files: {error}") from error
+            except (PromiseBroken, StoreError) as error:
+                raise PromiseBroken(f"a kill within together(), at change {number} of the files: {error}") from error
     check_twice(opened, model)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from ...actors.errors import StoreError
 from ...checkpoint.journal import Journal
-from .comparing import Broken
+from .comparing import PromiseBroken
 from .watching import full_disk, grown, signature, watched
 
 Factory = Callable[[Path], Journal]
@@ -33,7 +33,7 @@ class Bench:
     def __init__(self, factory: Factory, crash: Crash | None, path: Path, fail: Fail = full_disk) -> None:
         self.factory, self.crash, self.fail = factory, crash, fail
         self._path, self._count = path, 0
-        self._opened: list[Opened] = []
+        self._opened: list[OpenEngine] = []
 
     def fresh(self) -> Path:
         """A new folder; the one beside it, `1`, is free for a crash hook to make."""
@@ -42,9 +42,9 @@ class Bench:
         folder.mkdir(parents=True)
         return folder
 
-    def open(self, folder: Path | None = None) -> Opened:
+    def open(self, folder: Path | None = None) -> OpenEngine:
         """Open the engine, in a new folder if none is given."""
-        made = Opened(self, folder or self.fresh())
+        made = OpenEngine(self, folder or self.fresh())
         self._opened.append(made)
         return made
 
@@ -71,7 +71,7 @@ class Bench:
         shutil.rmtree(self._path, ignore_errors=True)
 
 
-class Opened:
+class OpenEngine:
     """An open engine, and where it is.
 
     Attributes:
@@ -90,7 +90,9 @@ class Opened:
         epoch = journal.epoch
         if type(epoch) is not int or epoch <= self.epoch:
             journal.close()
-            raise Broken(f"an opening has epoch {epoch!r} after epoch {self.epoch}: it must rise with each of them")
+            raise PromiseBroken(
+                f"an opening has epoch {epoch!r} after epoch {self.epoch}: it must rise with each of them"
+            )
         self.epoch = epoch
         return journal
 

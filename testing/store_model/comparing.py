@@ -10,7 +10,7 @@ from ...actors.errors import StoreError
 from ...checkpoint.snapshot.shared_blocks import Segment
 
 
-class Broken(AssertionError):
+class PromiseBroken(AssertionError):
     """An engine does not keep a promise of the journal protocol: the text says which, and what was found instead."""
 
 
@@ -38,7 +38,7 @@ def expect(found: object, wanted: object, what: str) -> None:
         Broken: they differ.
     """
     if not same(found, wanted):
-        raise Broken(f"{what}: found {short(found)} instead of {short(wanted)}")
+        raise PromiseBroken(f"{what}: found {short(found)} instead of {short(wanted)}")
 
 
 def refused(call: Callable[[], object], what: str, kind: type[Exception] = StoreError) -> None:
@@ -52,10 +52,10 @@ def refused(call: Callable[[], object], what: str, kind: type[Exception] = Store
     except kind:
         return
     except Exception as error:
-        raise Broken(f"{what}: raised {type(error).__name__} ({error}) instead of {kind.__name__}") from error
+        raise PromiseBroken(f"{what}: raised {type(error).__name__} ({error}) instead of {kind.__name__}") from error
     if isinstance(result, Segment):
         result.close()
-    raise Broken(f"{what}: was accepted, with {short(result)}, instead of being refused with {kind.__name__}")
+    raise PromiseBroken(f"{what}: was accepted, with {short(result)}, instead of being refused with {kind.__name__}")
 
 
 def short(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""Promises about what a store holds: each function tries one of them on a bench, and raises `Broken` if it fails."""
+"""Promises about what a store holds: each function tries one on a bench, and raises `PromiseBroken` if it fails."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any, Final
 
 from ...checkpoint.journal import DamagedStore, Entry, Saved
 from ...checkpoint.snapshot.shared_blocks import PAGE
-from .bench import Bench, Opened
-from .comparing import Broken, expect, refused, same
-from .model import Model, check_pack
+from .bench import Bench, OpenEngine
+from .comparing import PromiseBroken, expect, refused, same
+from .model import StoreModel, check_pack
 from .samples import ADDRESSES, KEYS, NO_ENTRIES, STRANGE, SUBCLASSES, make_blocks, make_small_blocks
 from .writes import A, B, append, cut, erase, fill, forget_blocks, keep_blocks, note
 
@@ -25,7 +25,7 @@ MANY_ADDRESSES: Final = 2000
 MANY_NOTES: Final = 300
 
 
-def check_twice(opened: Opened, model: Model, **more: Sequence[str]) -> None:
+def check_twice(opened: OpenEngine, model: StoreModel, **more: Sequence[str]) -> None:
     """Compare now, and after another opening."""
     model.check(opened.journal, **more)
     opened.reopen()
@@ -38,17 +38,17 @@ def check_twice(opened: Opened, model: Model, **more: Sequence[str]) -> None:
 def a_new_store_is_empty(bench: Bench) -> None:
     """It knows no address and no note, and has nothing of an unknown one."""
     opened = bench.open()
-    Model().check(opened.journal, others=[A, ""], prefixes=["key"])
+    StoreModel().check(opened.journal, others=[A, ""], prefixes=["key"])
     if opened.journal.durable is not True:
-        raise Broken(f"durable is {opened.journal.durable!r}, not True")
+        raise PromiseBroken(f"durable is {opened.journal.durable!r}, not True")
     expect(opened.journal.append([]), [], "append of nothing")
     refused(lambda: opened.journal.read_blocks(A, 1, [(0, PAGE)]), "read_blocks of nothing", DamagedStore)
-    check_twice(opened, Model(), others=[A])
+    check_twice(opened, StoreModel(), others=[A])
 
 
 def positions_rise_over_everything(bench: Bench) -> None:
     """Over all addresses, cuts, erasures and openings: no position is ever handed out twice."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     for _ in range(3):
         journal = opened.journal
         append(journal, model, (A, ("in", 1)), (B, ("in", 2)), (A, ("in", 3)))
@@ -67,7 +67,7 @@ def positions_rise_over_everything(bench: Bench) -> None:
 
 def entries_come_back_as_they_were(bench: Bench) -> None:
     """In order and with their types: each alone, and all together."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     for number, entry in enumerate(STRANGE):
         append(opened.journal, model, (f"/app/{number}", entry))
     append(opened.journal, model, *((A, entry) for entry in STRANGE))
@@ -78,7 +78,7 @@ def entries_come_back_as_they_were(bench: Bench) -> None:
 
 def equal_entries_are_kept_each(bench: Bench) -> None:
     """An entry that is equal to one before it is no repetition of it."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     for _ in range(3):
         append(opened.journal, model, (A, ("in", 1)), (A, ("in", 1)), (B, ("in", 1)))
     check_twice(opened, model)
@@ -95,12 +95,12 @@ def entries_of_another_type_are_refused_or_come_back_with_it(bench: Bench) -> No
         opened.reopen()
         found = opened.journal.load(A).entries
         if not found or not same(found[-1][1], entry):
-            raise Broken(f"{entry!r} was accepted, and came back as {found[-1:]!r}, of other types")
+            raise PromiseBroken(f"{entry!r} was accepted, and came back as {found[-1:]!r}, of other types")
 
 
 def what_is_no_entry_is_refused_with_its_whole_batch(bench: Bench) -> None:
     """TypeError, and nothing of the batch is there, wherever in it the wrong one stands."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     append(opened.journal, model, (A, ("in", 1)))
     for wrong in NO_ENTRIES:
         for at in range(3):
@@ -114,7 +114,7 @@ def what_is_no_entry_is_refused_with_its_whole_batch(bench: Bench) -> None:
 
 def large_batches_are_kept_whole(bench: Bench) -> None:
     """More than a thousand entries at once, and many at once for one address."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     append(opened.journal, model, *((f"/app/{n % 3}", ("in", n)) for n in range(MANY_ENTRIES)))
     append(opened.journal, model, *((A, ("in", n)) for n in range(MANY_ENTRIES)))
     check_twice(opened, model)
@@ -126,7 +126,7 @@ def large_batches_are_kept_whole(bench: Bench) -> None:
 
 def large_values_are_kept(bench: Bench) -> None:
     """Entries, snapshots and notes of megabytes."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     data = random.Random(1).randbytes(LARGE)
     append(opened.journal, model, (A, ("in", data, "x" * LARGE)), (A, ("in", 1)))
     note(opened.journal, model, "large", data)
@@ -140,7 +140,7 @@ def large_values_are_kept(bench: Bench) -> None:
 
 def thousands_of_addresses_are_kept(bench: Bench) -> None:
     """Each with its entry, of one batch and of batches of their own."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     append(opened.journal, model, *((f"/app/{n}", ("in", n)) for n in range(MANY_ADDRESSES)))
     for n in range(0, MANY_ADDRESSES, MANY_ADDRESSES // 8):
         cut(opened.journal, model, f"/app/{n}", b"%d" % n, [], turn=n)
@@ -157,7 +157,7 @@ def thousands_of_addresses_are_kept(bench: Bench) -> None:
 
 def a_cut_drops_what_its_address_has_of_drop_and_nothing_else(bench: Bench) -> None:
     """Whatever kind of sequence that is, in any order, with others' positions, and with some that are yet to come."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     for turn, form in enumerate(FORMS):
         positions = append(opened.journal, model, *((address, ("in", n)) for n in range(6) for address in (A, B)))
         drop = form(positions[2:8:2])
@@ -208,7 +208,7 @@ FORMS: Final[tuple[Callable[[list[int]], Sequence[int]], ...]] = (
 def so_many_snapshots_are_kept_as_were_asked_for(bench: Bench) -> None:
     """With all entries since each of them; `keep` may differ from cut to cut."""
     for keeps in ([1] * 4, [2] * 5, [3] * 5, [5] * 7, [1, 2, 3, 4, 2, 3, 1, 2], [4, 4, 4, 4, 2, 4], [9, 9, 9, 3, 2]):
-        opened, model = bench.open(), Model()
+        opened, model = bench.open(), StoreModel()
         for turn, keep in enumerate(keeps, start=1):
             positions = append(opened.journal, model, *((A, ("in", turn, n)) for n in range(3)), (B, ("in", turn)))
             late = list(model.places[A].entries)[:1] if turn % 2 else []
@@ -223,7 +223,7 @@ def so_many_snapshots_are_kept_as_were_asked_for(bench: Bench) -> None:
 
 def snapshots_and_turns_come_back_as_they_were(bench: Bench) -> None:
     """Of any size, with any turn, and the same bytes twice."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     turns = (0, 1, 1, 2**31, 2**32 + 1, 2**53 + 1, 7)
     for turn, size in zip(turns, (0, 1, 1, 1000, 0, (1 << 20) + 1, 5), strict=True):
         cut(opened.journal, model, A, random.Random(size).randbytes(size), [], turn=turn, keep=3)
@@ -237,7 +237,7 @@ def snapshots_and_turns_come_back_as_they_were(bench: Bench) -> None:
 
 def notes_are_kept_in_the_order_they_were_written(bench: Bench) -> None:
     """Also those that were written again, and those whose value is empty; what is forgotten is gone."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     for key, value in (("child b", b"1"), ("child a", b""), ("other", b"3"), ("child b", b"4"), ("never", None)):
         note(opened.journal, model, key, value)
         model.check(opened.journal, prefixes=["child ", "never"])
@@ -251,7 +251,7 @@ def notes_are_kept_in_the_order_they_were_written(bench: Bench) -> None:
 
 def keys_of_notes_are_not_taken_for_each_other(bench: Bench) -> None:
     """Prefixes, case, NUL, characters that mean something elsewhere, long ones: each key is a prefix, too."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     for number, key in enumerate(KEYS):
         note(opened.journal, model, key, b"%d" % number)
     check_twice(opened, model, prefixes=[*KEYS, "child", "c", "zzz", "childx", "/app"])
@@ -262,7 +262,7 @@ def keys_of_notes_are_not_taken_for_each_other(bench: Bench) -> None:
 
 def many_notes_are_kept(bench: Bench) -> None:
     """Some hundreds."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     for number in range(MANY_NOTES):
         note(opened.journal, model, f"child {number}", b"%d" % number)
     for number in range(0, MANY_NOTES, 17):
@@ -272,7 +272,7 @@ def many_notes_are_kept(bench: Bench) -> None:
 
 def notes_stay_through_all_else(bench: Bench) -> None:
     """Entries, cuts, erasures and packs of any address leave them alone, also if a key is an address."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     for key in (A, B, f"{A}/note", "child"):
         note(opened.journal, model, key, key.encode())
     fill(opened.journal, model)
@@ -290,7 +290,7 @@ def blocks_come_back_at_their_places(bench: Bench) -> None:
     blocks = make_blocks(random.Random(1))
     places = [(offset, len(block)) for offset, block in blocks]
     for compress in _compressions():
-        opened, model = bench.open(), Model()
+        opened, model = bench.open(), StoreModel()
         keep_blocks(opened.journal, model, A, 7, blocks, compress)
         keep_blocks(opened.journal, model, B, 7, make_small_blocks(random.Random(2)), compress)
         keep_blocks(opened.journal, model, A, 1 << 55, make_small_blocks(random.Random(3)), compress)
@@ -306,7 +306,7 @@ def _compressions() -> list[bool | int]:
 
 def blocks_that_are_not_there_are_refused(bench: Bench) -> None:
     """Of another pack, another address, at another place, of another length: DamagedStore."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     blocks = make_blocks(random.Random(1))
     keep_blocks(opened.journal, model, A, 7, blocks)
     offset, length = blocks[1][0], len(blocks[1][1])
@@ -327,7 +327,7 @@ def blocks_that_are_not_there_are_refused(bench: Bench) -> None:
 
 def packs_that_are_not_needed_are_forgotten_and_no_others(bench: Bench) -> None:
     """Of this address alone; those of others stay, under the same numbers."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     for address in (A, B, f"{A}/b"):
         for number in (1, 2, 3, 1 << 55):
             keep_blocks(opened.journal, model, address, number, make_small_blocks(random.Random(number)))
@@ -345,7 +345,7 @@ def packs_that_are_not_needed_are_forgotten_and_no_others(bench: Bench) -> None:
 
 def what_is_erased_is_gone_and_nothing_else_is(bench: Bench) -> None:
     """Entries, snapshots and packs; what is written to the address later is all it has then."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     fill(opened.journal, model)
     keep_blocks(opened.journal, model, "/app/c", 5, make_small_blocks(random.Random(1)))
     for address in (A, "/unknown", "/app/c"):
@@ -363,7 +363,7 @@ def what_is_erased_is_gone_and_nothing_else_is(bench: Bench) -> None:
 
 def addresses_are_not_taken_for_each_other(bench: Bench) -> None:
     """Prefixes, case, NUL, long ones, and characters that mean something in files and databases."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     for number, address in enumerate(ADDRESSES):
         first = append(opened.journal, model, (address, ("in", number)), (address, ("in", number, 2)))
         cut(opened.journal, model, address, b"%d" % number, first[:1], turn=number)
@@ -377,7 +377,7 @@ def addresses_are_not_taken_for_each_other(bench: Bench) -> None:
 
 def nothing_is_shared_with_the_caller(bench: Bench) -> None:
     """What was given may be changed afterwards, and so may what was returned: the store stays as it was."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     journal = opened.journal
     batch: list[tuple[str, Entry]] = [(A, ("in", n)) for n in range(4)]
     positions = journal.append(batch)
@@ -408,7 +408,7 @@ def nothing_is_shared_with_the_caller(bench: Bench) -> None:
 
 def what_is_closed_refuses_to_write(bench: Bench) -> None:
     """With a StoreError, and a second close does nothing; what was there is there when it is opened again."""
-    opened, model = bench.open(), Model()
+    opened, model = bench.open(), StoreModel()
     fill(opened.journal, model)
     journal = opened.journal
     journal.close()

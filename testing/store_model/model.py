@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 from ...actors.errors import StoreError
 from ...checkpoint.journal import DamagedStore, Entry, Journal, Saved
-from .comparing import Broken, expect, same, short
+from .comparing import PromiseBroken, expect, same, short
 
 Pack = dict[tuple[int, int], bytes]
 """Blocks by (offset, length)."""
 
 
-class Snapshot(NamedTuple):
+class SnapshotModel(NamedTuple):
     """One snapshot that is kept.
 
     Attributes:
@@ -29,16 +29,16 @@ class Snapshot(NamedTuple):
 
 
 @dataclass
-class Place:
+class AddressModel:
     """What a store has of one address; snapshots with the oldest first."""
 
     entries: dict[int, Entry] = field(default_factory=dict)
-    snapshots: list[Snapshot] = field(default_factory=list)
+    snapshots: list[SnapshotModel] = field(default_factory=list)
     packs: dict[int, Pack] = field(default_factory=dict)
 
-    def copy(self) -> Place:
+    def copy(self) -> AddressModel:
         """The same, to be changed on its own."""
-        return Place(dict(self.entries), list(self.snapshots), dict(self.packs))
+        return AddressModel(dict(self.entries), list(self.snapshots), dict(self.packs))
 
     def keep(self, count: int) -> None:
         """Forget all snapshots but so many of the newest, and the entries that none of these needs."""
@@ -54,7 +54,7 @@ class Place:
         return Saved(data, turn, [pair for pair in self.entries.items() if pair[0] not in contained])
 
 
-class Model:
+class StoreModel:
     """A store as it must be after everything that was acknowledged.
 
     Attributes:
@@ -66,23 +66,23 @@ class Model:
     """
 
     def __init__(self) -> None:
-        self.places: dict[str, Place] = {}
+        self.places: dict[str, AddressModel] = {}
         self.notes: dict[str, bytes] = {}
         self.last = 0
         self.gone: dict[tuple[str, int], Pack] = {}
         self.unsettled: dict[tuple[str, int], Pack] = {}
 
-    def copy(self) -> Model:
+    def copy(self) -> StoreModel:
         """The same, to be changed on its own."""
-        made = Model()
+        made = StoreModel()
         made.places = {address: place.copy() for address, place in self.places.items()}
         made.notes, made.last = dict(self.notes), self.last
         made.gone, made.unsettled = dict(self.gone), dict(self.unsettled)
         return made
 
-    def place(self, address: str) -> Place:
+    def place(self, address: str) -> AddressModel:
         """The place of an address, made if there is none."""
-        return self.places.setdefault(address, Place())
+        return self.places.setdefault(address, AddressModel())
 
     # ---- what is acknowledged
 
@@ -93,12 +93,12 @@ class Model:
             Broken: its positions are none, or do not rise.
         """
         if type(positions) is not list or any(type(position) is not int for position in positions):
-            raise Broken(f"the positions of an append must be a list of ints, not {short(positions)}")
+            raise PromiseBroken(f"the positions of an append must be a list of ints, not {short(positions)}")
         if len(positions) != len(entries):
-            raise Broken(f"an append of {len(entries)} entries returned {len(positions)} positions")
+            raise PromiseBroken(f"an append of {len(entries)} entries returned {len(positions)} positions")
         for (address, entry), position in zip(entries, positions, strict=True):
             if position <= self.last:
-                raise Broken(f"position {position} was handed out after position {self.last}: they must rise")
+                raise PromiseBroken(f"position {position} was handed out after position {self.last}: they must rise")
             self.last = position
             self.place(address).entries[position] = entry
 
@@ -107,12 +107,12 @@ class Model:
         place = self.place(address)
         before = place.snapshots[-1].contained if place.snapshots else frozenset[int]()
         contained = before | place.entries.keys() & set(drop)
-        place.snapshots.append(Snapshot(snapshot, turn, contained))
+        place.snapshots.append(SnapshotModel(snapshot, turn, contained))
         place.keep(keep)
 
     def erase(self, address: str) -> None:
         """Forget an address."""
-        place = self.places.pop(address, Place())
+        place = self.places.pop(address, AddressModel())
         self.gone |= {(address, number): pack for number, pack in place.packs.items()}
 
     def keep_blocks(self, address: str, number: int, pack: Pack) -> None:
@@ -122,7 +122,7 @@ class Model:
 
     def forget_blocks(self, address: str, needed: Collection[int]) -> None:
         """Forget the packs of an address but these."""
-        place = self.places.get(address, Place())
+        place = self.places.get(address, AddressModel())
         for number in [number for number in place.packs if number not in needed]:
             self.gone[address, number] = place.packs.pop(number)
         self._tidy(address)
@@ -134,23 +134,23 @@ class Model:
             self.notes[key] = value
 
     def _tidy(self, address: str) -> None:
-        if address in self.places and self.places[address] == Place():
+        if address in self.places and self.places[address] == AddressModel():
             del self.places[address]
 
     # ---- what may be there when a call was broken off
 
-    def after_broken_cut(self, before: Model, address: str) -> Iterator[Model]:
+    def after_broken_cut(self, before: StoreModel, address: str) -> Iterator[StoreModel]:
         """What else may be there when a cut was broken off: its snapshot is kept, older ones are not yet removed."""
         place = self.places[address]
-        old = before.places.get(address, Place())
+        old = before.places.get(address, AddressModel())
         for extra in range(1, len(old.snapshots) + 2 - len(place.snapshots)):
             made = self.copy()
             kept = [*old.snapshots, place.snapshots[-1]][-len(place.snapshots) - extra :]
-            made.places[address] = Place(dict(old.entries), kept, dict(place.packs))
+            made.places[address] = AddressModel(dict(old.entries), kept, dict(place.packs))
             made.places[address].keep(len(kept))
             yield made
 
-    def unsettle(self, before: Model) -> Model:
+    def unsettle(self, before: StoreModel) -> StoreModel:
         """The same, with each pack that was there before and is no more either there or not."""
         made = self.copy()
         for address, place in before.places.items():
@@ -176,15 +176,15 @@ class Model:
         """
         self._check_addresses(journal)
         for address in {*self.places, *others}:
-            place = self.places.get(address, Place())
+            place = self.places.get(address, AddressModel())
             for older in sorted({0, 1, 2, len(place.snapshots), len(place.snapshots) + 3}):
                 saved = journal.load(address, older=older)
                 what = f"load({address!r:.80}, older={older})"
                 if not isinstance(saved, Saved):
-                    raise Broken(f"{what} returned {short(saved)}, which is no Saved")
+                    raise PromiseBroken(f"{what} returned {short(saved)}, which is no Saved")
                 expect(tuple(saved)[:3], tuple(place.load(older))[:3], what)
                 if saved.passed_over:
-                    raise Broken(f"{what} passed over a snapshot: {saved.passed_over}")
+                    raise PromiseBroken(f"{what} passed over a snapshot: {saved.passed_over}")
             expect(tuple(journal.load(address))[:3], tuple(place.load())[:3], f"load({address!r:.80})")
         self._check_notes(journal, prefixes)
         self._check_packs(journal)
@@ -192,7 +192,7 @@ class Model:
     def _check_addresses(self, journal: Journal) -> None:
         found = journal.addresses()
         if found != sorted(set(found)):
-            raise Broken(f"the addresses must be sorted, each once, not {short(found)}")
+            raise PromiseBroken(f"the addresses must be sorted, each once, not {short(found)}")
         blocks_only = {address for address, place in self.places.items() if not place.entries and not place.snapshots}
         blocks_only |= {address for address, _ in self.unsettled if address not in self.places}
         wanted = {*self.places} - blocks_only  # Whether a pack alone makes an address known is left to the engine.
@@ -215,7 +215,7 @@ class Model:
                 journal.read_blocks(address, number, list(pack)[:1]).close()
             except DamagedStore:
                 continue
-            raise Broken(f"pack {number:x} of {address!r:.80}, which was forgotten, is there again")
+            raise PromiseBroken(f"pack {number:x} of {address!r:.80}, which was forgotten, is there again")
         for (address, number), pack in self.unsettled.items():
             try:
                 check_pack(journal, address, number, pack)
@@ -236,12 +236,12 @@ def check_pack(journal: Journal, address: str, number: int, pack: Pack) -> None:
         for (offset, length), data in with_data.items():
             found = bytes(segment.block(offset, length))
             if not same(found, data):
-                raise Broken(f"block ({offset}, {length}) of pack {number:x} of {address!r:.80} has other bytes")
+                raise PromiseBroken(f"block ({offset}, {length}) of pack {number:x} of {address!r:.80} has other bytes")
     finally:
         segment.close()
 
 
-def settle(journal: Journal, candidates: Sequence[Model], *, others: Collection[str] = ()) -> Model:
+def settle(journal: Journal, candidates: Sequence[StoreModel], *, others: Collection[str] = ()) -> StoreModel:
     """Find which of several states a store is in; returns a copy of it.
 
     Raises:
@@ -251,10 +251,10 @@ def settle(journal: Journal, candidates: Sequence[Model], *, others: Collection[
     for candidate in candidates:
         try:
             candidate.check(journal, others=others)
-        except (Broken, StoreError) as error:
-            text = f"{error}" if isinstance(error, Broken) else f"{type(error).__name__}: {error}"
+        except (PromiseBroken, StoreError) as error:
+            text = f"{error}" if isinstance(error, PromiseBroken) else f"{type(error).__name__}: {error}"
             if text not in problems:
                 problems.append(text)
         else:
             return candidate.copy()
-    raise Broken("; and it is not the other state it may be in, for ".join(problems))
+    raise PromiseBroken("; and it is not the other state it may be in, for ".join(problems))

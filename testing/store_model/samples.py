@@ -39,7 +39,7 @@ NO_ENTRIES: Final[list[Any]] = [
 """What no engine may take."""
 
 
-class Word(str):
+class OtherText(str):
     """A `str` of another type."""
 
     __slots__ = ()
@@ -49,7 +49,12 @@ class Number(int):
     """An `int` of another type."""
 
 
-SUBCLASSES: Final[list[Entry]] = [("in", Word("x")), ("in", Number(1)), (Word("in"), 1), ("in", (1, Number(2)))]
+SUBCLASSES: Final[list[Entry]] = [
+    ("in", OtherText("x")),
+    ("in", Number(1)),
+    (OtherText("in"), 1),
+    ("in", (1, Number(2))),
+]
 """What is either refused, or comes back with its types."""
 
 ADDRESSES: Final = (

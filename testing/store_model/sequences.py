@@ -16,8 +16,8 @@ from typing import Final, NamedTuple
 from ...actors.errors import StoreError
 from ...checkpoint.journal import Entry, Journal
 from .bench import Bench
-from .comparing import Broken
-from .model import Model
+from .comparing import PromiseBroken
+from .model import StoreModel
 from .samples import make_entry, make_small_blocks
 from .watching import FileFault
 from .writes import Write, append, cut, do_failing, do_killed, keep_blocks, make_erase, make_forget, note
@@ -36,21 +36,21 @@ KINDS: Final = {
 WRITES: Final = frozenset(("append", "cut", "note", "erase", "keep_blocks", "forget_blocks"))
 
 
-class Operation(NamedTuple):
+class StoreOperation(NamedTuple):
     """One operation; everything else about it follows from the number, and from what the store has."""
 
     kind: str
     number: int
 
 
-def draw_operations(seed: int, length: int = LENGTH) -> list[Operation]:
+def draw_operations(seed: int, length: int = LENGTH) -> list[StoreOperation]:
     """The sequence of a seed."""
     draw = random.Random(seed)
     kinds, weights = list(KINDS), list(KINDS.values())
-    return [Operation(kind, draw.randrange(1 << 30)) for kind in draw.choices(kinds, weights, k=length)]
+    return [StoreOperation(kind, draw.randrange(1 << 30)) for kind in draw.choices(kinds, weights, k=length)]
 
 
-class Run:
+class SequenceRun:
     """One run of a sequence.
 
     Attributes:
@@ -60,23 +60,23 @@ class Run:
     def __init__(self, bench: Bench) -> None:
         self.log: list[str] = []
         self._bench = bench
-        self._model = Model()
+        self._model = StoreModel()
         self._opened = bench.open()
 
-    def do(self, operations: Sequence[Operation]) -> None:
+    def do(self, operations: Sequence[StoreOperation]) -> None:
         """Run them all, and compare everything at the end.
 
         Raises:
             Broken: the engine and the model differ. StoreError: the engine refuses what it must not.
         """
-        for operation in (*operations, Operation("look", 0), Operation("reopen", 0)):
+        for operation in (*operations, StoreOperation("look", 0), StoreOperation("reopen", 0)):
             self._do(operation, random.Random(operation.number))
 
     @property
     def _journal(self) -> Journal:
         return self._opened.journal
 
-    def _do(self, operation: Operation, draw: random.Random) -> None:
+    def _do(self, operation: StoreOperation, draw: random.Random) -> None:
         kind = operation.kind
         if kind in WRITES:
             self._write(self._drawn(kind, draw), draw)
@@ -159,7 +159,7 @@ class Run:
         turn, keep = draw.randrange(1000), draw.choice([1, 2, 2, 2, 3, 5])
         what = f"cut {address}, {len(snapshot)} bytes, drop={drop}, turn={turn}, keep={keep}"
 
-        def do(journal: Journal, model: Model) -> None:
+        def do(journal: Journal, model: StoreModel) -> None:
             cut(journal, model, address, snapshot, drop, turn=turn, keep=keep)
 
         return Write(what, "cut", address, do)
@@ -182,19 +182,19 @@ class Run:
             return
         if second.epoch <= first.epoch:
             second.close()
-            raise Broken(f"a second opening has epoch {second.epoch} after epoch {first.epoch}")
+            raise PromiseBroken(f"a second opening has epoch {second.epoch} after epoch {first.epoch}")
         self._opened.journal, self._opened.epoch = second, second.epoch
         try:
             first.append([(PLACES[0], ("in", "by the first"))])
         except StoreError:
             first.close()
             return
-        raise Broken("two openings acknowledge appends at the same time")
+        raise PromiseBroken("two openings acknowledge appends at the same time")
 
 
-def problem_with(bench: Bench, operations: Sequence[Operation]) -> tuple[Exception, list[str]] | None:
+def problem_with(bench: Bench, operations: Sequence[StoreOperation]) -> tuple[Exception, list[str]] | None:
     """Run a sequence on a new store; returns what was wrong, and what was done until then."""
-    run = Run(bench)
+    run = SequenceRun(bench)
     try:
         run.do(operations)
     except Exception as error:
@@ -205,8 +205,8 @@ def problem_with(bench: Bench, operations: Sequence[Operation]) -> tuple[Excepti
 
 
 def shrink(
-    operations: list[Operation], fails: Callable[[list[Operation]], bool], seconds: float = SECONDS
-) -> list[Operation]:
+    operations: list[StoreOperation], fails: Callable[[list[StoreOperation]], bool], seconds: float = SECONDS
+) -> list[StoreOperation]:
     """The shortest sequence found that still fails: halves, quarters and single operations are left out.
 
     Args:
@@ -250,5 +250,5 @@ def agrees_with_the_model(bench: Bench, seed: int, *, shrinking: float = SECONDS
         shortest = shrink(operations, lambda shorter: problem_with(bench, shorter) is not None, shrinking)
         found = problem_with(bench, shortest) or found
     error, log = found
-    text = error if isinstance(error, Broken) else f"{type(error).__name__}: {error}"
-    raise Broken(f"seed {seed}: {text}\nafter:\n  " + "\n  ".join(log)) from error
+    text = error if isinstance(error, PromiseBroken) else f"{type(error).__name__}: {error}"
+    raise PromiseBroken(f"seed {seed}: {text}\nafter:\n  " + "\n  ".join(log)) from error

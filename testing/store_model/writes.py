@@ -9,15 +9,15 @@ from dataclasses import dataclass
 
 from ...actors.errors import StoreError
 from ...checkpoint.journal import Entry, Journal
-from .bench import Opened
-from .comparing import Broken
-from .model import Model, settle
+from .bench import OpenEngine
+from .comparing import PromiseBroken
+from .model import StoreModel, settle
 from .samples import make_small_blocks
 
 A, B = "/app/a", "/app/b"
 
 
-def append(journal: Journal, model: Model, *entries: tuple[str, Entry]) -> list[int]:
+def append(journal: Journal, model: StoreModel, *entries: tuple[str, Entry]) -> list[int]:
     """Append to both."""
     positions = journal.append(list(entries))
     model.append(entries, positions)
@@ -26,7 +26,7 @@ def append(journal: Journal, model: Model, *entries: tuple[str, Entry]) -> list[
 
 def cut(
     journal: Journal,
-    model: Model,
+    model: StoreModel,
     address: str,
     snapshot: bytes,
     drop: Sequence[int] | range,
@@ -39,7 +39,7 @@ def cut(
     model.cut(address, snapshot, drop, turn, keep)
 
 
-def note(journal: Journal, model: Model, key: str, value: bytes | None) -> None:
+def note(journal: Journal, model: StoreModel, key: str, value: bytes | None) -> None:
     """Write a note to both."""
     journal.note(key, value)
     model.note(key, value)
@@ -47,7 +47,7 @@ def note(journal: Journal, model: Model, key: str, value: bytes | None) -> None:
 
 def keep_blocks(
     journal: Journal,
-    model: Model,
+    model: StoreModel,
     address: str,
     number: int,
     blocks: Sequence[tuple[int, memoryview]],
@@ -59,19 +59,19 @@ def keep_blocks(
     model.keep_blocks(address, number, pack)
 
 
-def erase(journal: Journal, model: Model, address: str) -> None:
+def erase(journal: Journal, model: StoreModel, address: str) -> None:
     """Erase an address of both."""
     journal.erase(address)
     model.erase(address)
 
 
-def forget_blocks(journal: Journal, model: Model, address: str, needed: Collection[int]) -> None:
+def forget_blocks(journal: Journal, model: StoreModel, address: str, needed: Collection[int]) -> None:
     """Forget packs in both."""
     journal.forget_blocks(address, needed)
     model.forget_blocks(address, needed)
 
 
-def fill(journal: Journal, model: Model) -> None:
+def fill(journal: Journal, model: StoreModel) -> None:
     """Put something of every kind into both."""
     draw = random.Random(1)
     for address in (A, B):
@@ -103,10 +103,10 @@ class Write:
     what: str
     kind: str
     address: str
-    do: Callable[[Journal, Model], object]
-    remove: Callable[[Model], None] | None = None
+    do: Callable[[Journal, StoreModel], object]
+    remove: Callable[[StoreModel], None] | None = None
 
-    def left(self, before: Model, after: Model) -> list[Model]:
+    def left(self, before: StoreModel, after: StoreModel) -> list[StoreModel]:
         """The states that may be there when it was broken off by a kill.
 
         A cut keeps its snapshot first and removes older ones later; packs are removed one by one.
@@ -117,7 +117,7 @@ class Write:
             return [before, after.unsettle(before)]
         return [after.unsettle(before)] if self.kind == "forget_blocks" else [before, after]
 
-    def after_error(self, before: Model) -> list[Model]:
+    def after_error(self, before: StoreModel) -> list[StoreModel]:
         """The states that may be there when it has raised: as it was, but what only removes may have removed."""
         if self.remove is None:
             return [before]
@@ -125,12 +125,12 @@ class Write:
         self.remove(after)
         return self.left(before, after)
 
-    def after_success(self, before: Model, after: Model) -> list[Model]:
+    def after_success(self, before: StoreModel, after: StoreModel) -> list[StoreModel]:
         """The states that may be there when it has not raised, though the disk failed."""
         return self.left(before, after)[1:] if self.kind == "cut" else [after]
 
 
-def do_failing(opened: Opened, model: Model, write: Write, fault: AbstractContextManager[None]) -> Model:
+def do_failing(opened: OpenEngine, model: StoreModel, write: Write, fault: AbstractContextManager[None]) -> StoreModel:
     """Write while the disk fails, and open the store again; returns what it has then.
 
     Raises:
@@ -142,16 +142,16 @@ def do_failing(opened: Opened, model: Model, write: Write, fault: AbstractContex
             write.do(opened.journal, after)
     except StoreError:
         allowed = write.after_error(model)
-    except Broken:
+    except PromiseBroken:
         raise
     except Exception as error:
         problem = f"{type(error).__name__} ({error})"
-        raise Broken(f"{write.what} raised {problem} for a failing disk, which is no StoreError") from error
+        raise PromiseBroken(f"{write.what} raised {problem} for a failing disk, which is no StoreError") from error
     else:
         allowed = write.after_success(model, after)
     try:
         settle(opened.journal, allowed)
-    except Broken:
+    except PromiseBroken:
         if not _refuses_everything(opened.journal):
             raise
     opened.reopen()
@@ -166,14 +166,16 @@ def _refuses_everything(journal: Journal) -> bool:
     return False
 
 
-def do_killed(opened: Opened, model: Model, write: Write, draw: random.Random, most: int, share: float = 1.0) -> Model:
+def do_killed(
+    opened: OpenEngine, model: StoreModel, write: Write, draw: random.Random, most: int, share: float = 1.0
+) -> StoreModel:
     """Write, and look at what kills meanwhile would have left; returns what the store has then.
 
     Args:
         opened: the store.
         model: what it has before.
         write: what to write.
-        draw: see `Opened.killing`, with `most` and `share`.
+        draw: see `OpenEngine.killing`, with `most` and `share`.
 
     Raises:
         Broken: a kill leaves half of it, or something else than before.
@@ -188,7 +190,7 @@ def do_killed(opened: Opened, model: Model, write: Write, draw: random.Random, m
                 append(journal, left, (A, ("in", "later")), (B, ("in", "later")))
                 left.check(journal)
         except Exception as error:  # An opening may raise anything.
-            raise Broken(f"a kill inside {write.what}, at change {number} of the files: {error}") from error
+            raise PromiseBroken(f"a kill inside {write.what}, at change {number} of the files: {error}") from error
     return after
 
 
@@ -197,13 +199,13 @@ def all_writes() -> list[Write]:
     blocks = make_small_blocks(random.Random(3))
     batch: list[tuple[str, Entry]] = [(f"/app/{n}", ("in", n, "x" * 300)) for n in (0, 1, 0, 2, 1)]
 
-    def shorten(journal: Journal, model: Model) -> None:
+    def shorten(journal: Journal, model: StoreModel) -> None:
         cut(journal, model, A, b"cut", list(model.places[A].entries)[:2], turn=3)
 
-    def cut_off(journal: Journal, model: Model) -> None:
+    def cut_off(journal: Journal, model: StoreModel) -> None:
         cut(journal, model, A, b"one" * 4000, list(model.places[A].entries)[:-1], turn=4, keep=1)
 
-    def cut_large(journal: Journal, model: Model) -> None:
+    def cut_large(journal: Journal, model: StoreModel) -> None:
         cut(journal, model, B, b"large" * 300_000, list(model.places[B].entries)[1:], turn=5)
 
     mixed = [*batch, (A, ("in", 9)), (B, ("in", 9))]
@@ -226,7 +228,7 @@ def all_writes() -> list[Write]:
 def make_erase(address: str) -> Write:
     """An erasure."""
 
-    def do(journal: Journal, model: Model) -> None:
+    def do(journal: Journal, model: StoreModel) -> None:
         erase(journal, model, address)
 
     return Write("erase", "erase", address, do, lambda model: model.erase(address))
@@ -235,7 +237,7 @@ def make_erase(address: str) -> Write:
 def make_forget(address: str, needed: Collection[int]) -> Write:
     """A removal of packs."""
 
-    def do(journal: Journal, model: Model) -> None:
+    def do(journal: Journal, model: StoreModel) -> None:
         forget_blocks(journal, model, address, needed)
 
     return Write("forget_blocks", "forget_blocks", address, do, lambda model: model.forget_blocks(address, needed))

@@ -1,11 +1,11 @@
 """The control endpoint: whom it serves, what it refuses, and that nobody is hurt by what another sends (DESIGN 9)."""
 
 import asyncio
+import contextlib
 import inspect
 import os
 import socket
 import stat
-import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -15,12 +15,13 @@ import msgspec
 import pytest
 
 import holdfast as hf
+from holdfast.actors.kernel.codec import MAX_BYTES
+from holdfast.actors.process.wire.frame_buffer import LENGTH
 from holdfast.actors.values import encode_value
 from holdfast.console import endpoint as endpoint_module
 from holdfast.console.endpoint import Endpoint, EndpointInUse, claimed, control_endpoint
-from holdfast.console.remote import NotReached, RemoteRef, RemoteSystem
+from holdfast.console.remote import Client, NotReached, RemoteRef, RemoteSystem
 from holdfast.console.wire import (
-    LARGEST,
     RESPONSE,
     BadRequest,
     ControlActor,
@@ -52,7 +53,7 @@ async def raw(path: Path, data: bytes) -> tuple[Any, bytes]:
     try:
         writer.write(data)
         await writer.drain()
-        (size,) = struct.unpack(">I", await reader.readexactly(4))
+        (size,) = LENGTH.unpack(await reader.readexactly(LENGTH.size))
         response = RESPONSE.decode(await reader.readexactly(size))
         return response, await reader.read()
     finally:
@@ -171,16 +172,15 @@ async def test_another_user_is_not_served(system: hf.ActorSystem, tmp_path: Path
 
 # -- what is sent -----------------------------------------------------------------------------------------------------
 
-HEAD = struct.Struct(">I")
 BAD = {
-    "no MessagePack": HEAD.pack(3) + b"\xc1\xc1\xc1",
-    "no request": HEAD.pack(1) + b"\x01",
-    "unknown request": HEAD.pack(20) + msgspec.msgpack.encode({"ask": "shutdown all"})[:20].ljust(20, b"\0"),
-    "too large": HEAD.pack(LARGEST + 1),
-    "unknown field": (lambda body: HEAD.pack(len(body)) + body)(msgspec.msgpack.encode({"ask": "tree", "all": True})),
-    "no UTF-8": (lambda body: HEAD.pack(len(body)) + body)(b"\x82\xa3ask\xa7whereis\xa4name\xa2\xff\xfe"),
-    "nesting without end": (lambda body: HEAD.pack(len(body)) + body)(b"\x81\xa3ask" * 300_000),
-    "wrong type": (lambda body: HEAD.pack(len(body)) + body)(msgspec.msgpack.encode({"ask": "whereis", "name": 5})),
+    "no MessagePack": LENGTH.pack(3) + b"\xc1\xc1\xc1",
+    "no request": LENGTH.pack(1) + b"\x01",
+    "unknown request": LENGTH.pack(20) + msgspec.msgpack.encode({"ask": "shutdown all"})[:20].ljust(20, b"\0"),
+    "too large": LENGTH.pack(MAX_BYTES + 1),
+    "unknown field": (lambda body: LENGTH.pack(len(body)) + body)(msgspec.msgpack.encode({"ask": "tree", "all": True})),
+    "no UTF-8": (lambda body: LENGTH.pack(len(body)) + body)(b"\x82\xa3ask\xa7whereis\xa4name\xa2\xff\xfe"),
+    "nesting without end": (lambda body: LENGTH.pack(len(body)) + body)(b"\x81\xa3ask" * 300_000),
+    "wrong type": (lambda body: LENGTH.pack(len(body)) + body)(msgspec.msgpack.encode({"ask": "whereis", "name": 5})),
 }
 
 
@@ -201,7 +201,7 @@ async def test_a_request_that_cannot_be_read_is_answered(
 ) -> None:
     reader, writer = await asyncio.open_unix_connection(path)
     writer.write(frame(request_))
-    (size,) = HEAD.unpack(await reader.readexactly(4))
+    (size,) = LENGTH.unpack(await reader.readexactly(LENGTH.size))
     with pytest.raises(hf.HoldfastError, match=problem):
         outcome(RESPONSE.decode(await reader.readexactly(size)))
     writer.close()
@@ -215,7 +215,7 @@ async def test_what_is_no_request_ends_its_own_connection_only(system: hf.ActorS
         outcome(response)
     assert rest == b""
     writer.write(frame(Tree()))
-    (size,) = HEAD.unpack(await reader.readexactly(4))
+    (size,) = LENGTH.unpack(await reader.readexactly(LENGTH.size))
     assert outcome(RESPONSE.decode(await reader.readexactly(size))) == system.tree()
     writer.close()
     await writer.wait_closed()
@@ -265,7 +265,7 @@ async def test_clients_at_work_are_not_sent_away(
     with pytest.raises(BadRequest, match="1 connections already"):
         outcome(response)
     finish.set()
-    (size,) = HEAD.unpack(await reader.readexactly(4))
+    (size,) = LENGTH.unpack(await reader.readexactly(LENGTH.size))
     assert outcome(RESPONSE.decode(await reader.readexactly(size))) == system.tree()
     writer.close()
     await writer.wait_closed()
@@ -475,3 +475,15 @@ async def test_what_is_no_mechanism_is_refused_over_the_socket_too(
     with pytest.raises(error, match=problem):
         await far(path, work)
     assert picture(system) == before
+
+
+async def test_an_answer_beyond_the_limit_is_not_read(tmp_path: Path) -> None:
+    """Whoever listens in place of the system cannot have the client take any amount of memory."""
+    path = tmp_path / "app.sock"
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(str(path))
+        listening.listen(1)
+        with contextlib.closing(Client(path)) as client, listening.accept()[0] as other:
+            other.sendall(LENGTH.pack(MAX_BYTES + 1))
+            with pytest.raises(BadRequest, match=f"it has {MAX_BYTES + 1} bytes"):
+                client.call(Tree(), 5.0)

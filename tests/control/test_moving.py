@@ -343,7 +343,9 @@ async def test_who_cannot_be_moved_is_told_so(system: hf.ActorSystem) -> None:
     top = await system.start(hf.supervisor("top", isolation="process"))
     spawned = system.spawn(hf.start(Account), "spawned")
     spawner = await system.start(hf.child("spawner", hf.start(Spawns)))
+    pool = await system.start(hf.dynamic("pool", template=hf.child("one", hf.start(Account)), isolation="process"))
     for ref, why in (
+        (await pool.ask(hf.StartChild()), "its supervisor lives in another process, and no recipe here has its spec"),
         (top, "it is a supervisor"),
         (spawned, "nobody restarts it"),
         (spawner, r"children of its own \(own\)"),

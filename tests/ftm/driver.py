@@ -24,8 +24,8 @@ from holdfast.checkpoint.protocol import (
     SnapshotNow,
     TurnEnd,
 )
-from holdfast.ftm.bricks.brick_messages import Done, Ended, Follow, Inward, Lead, Outward, Request, Strayed, Work
-from holdfast.ftm.bricks.replica_orders import Beat, Install, Join, Peer, Setting
+from holdfast.ftm.bricks.brick_messages import Done, Follow, Inward, Lead, Outward, PartEnded, Request, Strayed, Work
+from holdfast.ftm.bricks.replica_orders import Install, Join, ReplicaBeat, SetPeer, Setting
 from holdfast.ftm.model.mechanism import Mechanism
 from holdfast.ftm.replica.replica import Replica
 
@@ -61,8 +61,8 @@ class Detector(hf.Actor):
     def __init__(self) -> None:
         self.beats: dict[str, int] = {}
 
-    @hf.on(Beat)
-    def beat(self, message: Beat) -> None:
+    @hf.on(ReplicaBeat)
+    def beat(self, message: ReplicaBeat) -> None:
         self.beats[message.name] = self.beats.get(message.name, 0) + 1
 
 
@@ -221,7 +221,7 @@ class Driver:
                 self.waiting[end.id] = waiting
         self.more += done.more
         if done.wait and not self.holds_ended:
-            self.protocol(self.primary).tell(Ended(self.epoch, done.part))
+            self.protocol(self.primary).tell(PartEnded(self.epoch, done.part))
         if done.is_last and self.out_now is not None and done.number == self.out_now.number:
             self.out_now = None
             self._send()
@@ -282,4 +282,4 @@ class Driver:
         await gone
 
 
-__all__ = ["ADDRESS", "OK", "Answer", "Driver", "Install", "Peer", "PipeDone", "msgspec"]
+__all__ = ["ADDRESS", "OK", "Answer", "Driver", "Install", "PipeDone", "SetPeer", "msgspec"]

@@ -27,7 +27,7 @@ from holdfast.checkpoint.protocol import OK, REPLY, Answer, TurnEnd
 from holdfast.ftm.bricks.brick_messages import Done, Follow, Lead, Work
 from holdfast.ftm.bricks.bricks import Brick
 from holdfast.ftm.bricks.letters import Letter
-from holdfast.ftm.bricks.replica_orders import Peer
+from holdfast.ftm.bricks.replica_orders import SetPeer
 from holdfast.ftm.bricks.sealed_frames import Sealed
 from holdfast.ftm.group.detector import Detector
 from holdfast.ftm.group.failover import FailoverManager
@@ -360,7 +360,7 @@ def forge(actor: Any) -> None:
         standing = actor._standing
         epoch, config = standing.epoch, standing.config
         ref.tell(Work(epoch, config, 1 << 40, []))
-        asked += [Peer(epoch, None), Follow(epoch + 5, config), Lead(epoch + 5, config)]
+        asked += [SetPeer(epoch, None), Follow(epoch + 5, config), Lead(epoch + 5, config)]
     else:
         standing = actor._standing
         asked = [Letter(standing.epoch, standing.config, kind, os.urandom(100)) for kind in ("sealed", "x:Checkpoint")]

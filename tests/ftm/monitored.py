@@ -7,7 +7,7 @@ from typing import Any
 import holdfast as hf
 from holdfast.actors.events import Event
 from holdfast.ftm.model.application import Application
-from holdfast.ftm.model.change_model import Faults, Resources
+from holdfast.ftm.model.change_model import FaultClasses, Resources
 from holdfast.ftm.monitoring.adaptations import (
     AdaptationDecided,
     AdaptationDone,
@@ -18,12 +18,12 @@ from holdfast.ftm.monitoring.adaptations import (
     NothingValid,
 )
 from holdfast.ftm.monitoring.judge import Judge, Readings, Settings
-from holdfast.ftm.monitoring.monitor import Adapt, Monitored, MonitoringEngine, Report, Watch
+from holdfast.ftm.monitoring.monitor import ChangeStack, MechanismWatch, Monitored, MonitoringEngine, Report
 from tests.ftm.declarations import EIGHT
 
 APP = Application("Account", state_bytes=10_000, request_bytes=100, rate=100)
 WIDE, NARROW = Readings(bandwidth=1e9, units=2), Readings(bandwidth=1e5, units=2)
-SETTINGS = Settings(required=Faults.of("crash"), smoothing=1, confirm=3, dwell=60, urgent_dwell=10)
+SETTINGS = Settings(required=FaultClasses.of("crash"), smoothing=1, confirm=3, dwell=60, urgent_dwell=10)
 OURS = (
     AdaptationDecided,
     AdaptationDone,
@@ -38,7 +38,7 @@ OURS = (
 class World:
     """One monitored address in a running system."""
 
-    def __init__(self, system: hf.ActorSystem, watch: Watch, orders: list[Adapt]) -> None:
+    def __init__(self, system: hf.ActorSystem, watch: MechanismWatch, orders: list[ChangeStack]) -> None:
         self.system, self.watch, self.orders = system, watch, orders
         self.events = system.events()
         self.ref: hf.ActorRef[MonitoringEngine]
@@ -74,12 +74,12 @@ async def in_world(
     application: Application = APP,
     **options: Any,
 ) -> None:
-    orders: list[Adapt] = []
+    orders: list[ChangeStack] = []
     options.setdefault("trigger", orders.append)
     options.setdefault("probe", None)
     judged = Judge(settings, application, current, EIGHT, resources or Resources(units=2))
     async with hf.ActorSystem("app", log=False, intensity=100) as system:
-        watch = Watch("/app/alice", judged, **options)
+        watch = MechanismWatch("/app/alice", judged, **options)
         world = World(system, watch, orders)
         await world.begin()
         try:

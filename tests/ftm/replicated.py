@@ -9,7 +9,7 @@ from typing import Any
 
 import holdfast as hf
 from holdfast.checkpoint.protocol import OK, REPLY, Answer
-from holdfast.ftm.bricks.replica_orders import Peer
+from holdfast.ftm.bricks.replica_orders import SetPeer
 from holdfast.ftm.mechanisms.pbr import PBR
 from tests.ftm.driver import Driver
 
@@ -249,7 +249,7 @@ async def kills_of_two(driver: Driver, system: hf.ActorSystem, dice: random.Rand
             await driver.fail_over(backup)
         else:
             await driver.stop_replica(backup)
-            await driver.protocol(driver.primary).ask(Peer(driver.epoch, None))
+            await driver.protocol(driver.primary).ask(SetPeer(driver.epoch, None))
         await driver.join(new)
         backup = new
     await all_once(driver, system, sent)

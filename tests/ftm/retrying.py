@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from holdfast.actors.errors import HoldfastError
 from holdfast.ftm.alarms import Objected
-from holdfast.ftm.bricks.brick_messages import Request, State
+from holdfast.ftm.bricks.brick_messages import Request, ServerState
 from holdfast.ftm.bricks.runs import Deciding, Remembering, Run
 from holdfast.ftm.model.mechanism import Mechanism, Role
 from holdfast.ftm.votes.assertions import AssertionFailed, Inspector, names_of
@@ -24,7 +24,7 @@ class Checking(Deciding):
     def on_stop(self, reason: object) -> None:
         self._standing.server.hooks.remove(self._inspector)
 
-    async def choose(self, before: State, requests: list[Request], first: Run | None) -> Run | HoldfastError:
+    async def choose(self, before: ServerState, requests: list[Request], first: Run | None) -> Run | HoldfastError:
         standing = self._standing
         run = first or await self.run_here(before, requests)
         if run.objections:

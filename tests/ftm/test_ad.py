@@ -13,7 +13,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.alarms import Diverged, Objected
-from holdfast.ftm.bricks.replica_orders import Peer
+from holdfast.ftm.bricks.replica_orders import SetPeer
 from holdfast.ftm.mechanisms.ad import AD
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
@@ -107,7 +107,7 @@ async def test_alone_it_fails_what_it_cannot_mask(system: hf.ActorSystem) -> Non
     driver = await pair(system, Total, AD(CHECKS), PBR(), FAULTY(always=True, skip=1))
     assert await driver.ask(Add(1)) == 1
     await driver.stop_replica("r2")
-    await driver.protocol("r1").ask(Peer(driver.epoch, None))
+    await driver.protocol("r1").ask(SetPeer(driver.epoch, None))
     with pytest.raises(AssertionFailed, match="there is no other replica"):
         await driver.ask(Add(2))
     assert await driver.ask(Read()) == [1]

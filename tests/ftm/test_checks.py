@@ -13,7 +13,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.checkpoint.protocol import DROPPED, OK, REPLY, Answer, Outcome, TurnEnd
-from holdfast.ftm.bricks.brick_messages import Change, Done, NotFollowing, ReplyEvicted, Request, State, Work
+from holdfast.ftm.bricks.brick_messages import Done, NotFollowing, ReplyEvicted, Request, ServerState, StateDelta, Work
 from holdfast.ftm.bricks.letters import Letter
 from holdfast.ftm.bricks.replica_orders import Broken
 from holdfast.ftm.bricks.reply_log import ReplyLog
@@ -30,7 +30,7 @@ from tests.ftm.test_failover import group_of, pid_of, stop_process, two_again
 CHECKPOINT = "holdfast.ftm.mechanisms.pbr:Checkpoint"
 
 
-async def said(driver: Any, state: State | Change, *, epoch: int, log: Any = ()) -> int:
+async def said(driver: Any, state: ServerState | StateDelta, *, epoch: int, log: Any = ()) -> int:
     """What the backup answers to this state."""
     body = driver.system.node.codec.encoder.encode(Checkpoint(state, list(log)))
     after = driver.system.node.cell_at(driver.path("r2") + "/after").ref
@@ -64,7 +64,7 @@ async def test_what_has_changed_since_a_state_that_is_not_here_is_not_taken(syst
     """All of it is wanted instead."""
     driver = await pair(system)
     assert await driver.ask(Add(1)) == 1
-    change = Change(7, 5, None, [b"\x80"], checksum([b"\x80"]), [], [], True)
+    change = StateDelta(7, 5, None, [b"\x80"], checksum([b"\x80"]), [], [], True)
     assert await system.node.cell_at(driver.path("r2") + "/state").ref.ask(Apply(change)) == MISFIT
     assert driver.standing("r2").server.turn == 1
     await driver.stop_replica("r1")
@@ -77,7 +77,7 @@ async def test_outcomes_without_their_state_are_not_known(system: hf.ActorSystem
     driver = await pair(system)
     (key,) = driver.send(Add(1))
     assert await driver.reply(key) == 1
-    change = Change(7, 5, None, [b"\x80"], checksum([b"\x80"]), [], [], True)
+    change = StateDelta(7, 5, None, [b"\x80"], checksum([b"\x80"]), [], [], True)
     log = [("", 0, 77, TurnEnd(7, 77, OK, [], Answer(REPLY, "", b"\x63")))]
     assert await said(driver, change, epoch=driver.epoch, log=log) == MISFIT
     assert driver.standing("r2").log.find(77) is None

@@ -9,7 +9,7 @@ import pytest
 import holdfast as hf
 from holdfast.actors.values import encode_value
 from holdfast.ftm.alarms import ProtectionCostly
-from holdfast.ftm.bricks.brick_messages import State
+from holdfast.ftm.bricks.brick_messages import ServerState
 from holdfast.ftm.bricks.runs import Digests, digest_of_state
 from holdfast.ftm.bricks.state_images import image_from
 from tests.ftm.replicated import Add
@@ -49,8 +49,8 @@ async def test_a_small_state_is_not_worth_a_word(system: hf.ActorSystem) -> None
         assert not [one for one in events.take() if isinstance(one, ProtectionCostly) and one.size < 10_000]
 
 
-def state(turn: int, data: Any, *deltas: object) -> State:
-    return State(turn, data, [encode_value(one) for one in deltas], [], [], True)
+def state(turn: int, data: Any, *deltas: object) -> ServerState:
+    return ServerState(turn, data, [encode_value(one) for one in deltas], [], [], True)
 
 
 def test_of_a_state_that_was_known_only_new_deltas_are_looked_at() -> None:

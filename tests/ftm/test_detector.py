@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import holdfast as hf
 from holdfast.actors.kernel.actor import Start
 from holdfast.actors.observer_clock import OwnClock
-from holdfast.ftm.bricks.replica_orders import Beat
+from holdfast.ftm.bricks.replica_orders import ReplicaBeat
 from holdfast.ftm.group.detector import HIGHEST, Accrual, Detector
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tmr import TMR
@@ -141,7 +141,7 @@ class Voice(hf.Actor):
 
     @hf.on(Speak)
     def speak(self, message: Speak) -> None:
-        self._detector.tell(Beat(message.name, 1))
+        self._detector.tell(ReplicaBeat(message.name, 1))
 
 
 async def voices(system: hf.ActorSystem, detector: hf.ActorRef[Detector]) -> list[hf.ActorRef[Voice]]:
@@ -153,7 +153,7 @@ async def test_nobody_beats_for_another_one() -> None:
         watched = Watched()
         detector = system.spawn(Start(Detector, (watched,)))
         _, r2 = await voices(system, detector)
-        detector.tell(Beat("r1", 1))
+        detector.tell(ReplicaBeat("r1", 1))
         await r2.ask(Speak("r1"))
         await r2.ask(Speak("r2"))
         async with asyncio.timeout(10):

@@ -29,11 +29,11 @@ from holdfast.diagnosis.repair.executor import Executor, Result
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.model.application import Application
-from holdfast.ftm.model.change_model import Faults, Resources
+from holdfast.ftm.model.change_model import FaultClasses, Resources
 from holdfast.ftm.model.mechanism import find
 from holdfast.ftm.monitoring.adaptations import AdaptationDecided, AdaptationHeld
 from holdfast.ftm.monitoring.judge import Judge, Settings
-from holdfast.ftm.monitoring.monitor import MonitoringEngine, Observe, Watch
+from holdfast.ftm.monitoring.monitor import MechanismWatch, MonitoringEngine, Observe
 from holdfast.supervision.arbiter import Hand, InOtherHands, arbiter_of
 from tests.ftm.accounts import Add, Boom, Counter, Load, Tags
 from tests.ftm.test_adaptation import protected, stack, transition
@@ -322,13 +322,13 @@ async def test_monitoring_waits_while_somebody_else_has_the_actor(system: hf.Act
     """And says so, instead of having a change begun that would be refused."""
     decided = asyncio.Event()
     judge = Judge(
-        Settings(required=Faults.of("crash"), interval=0.02, confirm=0.0),
+        Settings(required=FaultClasses.of("crash"), interval=0.02, confirm=0.0),
         Application("Counter"),
         current=("pbr",),
         mechanisms=[find(name) for name in ("pbr", "lfr", "tr")],
         resources=Resources(units=2),
     )
-    watch = Watch(ALICE, judge, lambda order: decided.set(), probe=None)
+    watch = MechanismWatch(ALICE, judge, lambda order: decided.set(), probe=None)
     grant = arbiter_of(system.node).claim(ALICE, Hand.REPAIR, "it is slow")
     with system.events() as events:
         engine = await system.start(hf.child("monitoring", hf.start(MonitoringEngine, watch)))

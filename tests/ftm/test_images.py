@@ -14,7 +14,7 @@ import holdfast as hf
 from holdfast.actors.errors import DamagedValue
 from holdfast.actors.values import encode_value
 from holdfast.ftm.alarms import Masked
-from holdfast.ftm.bricks.brick_messages import Change, State
+from holdfast.ftm.bricks.brick_messages import ServerState, StateDelta
 from holdfast.ftm.bricks.entry_rows import Rows
 from holdfast.ftm.bricks.state_images import BLOCK, Image, Misfit, Patch, cut, image_from, patch
 from holdfast.ftm.mechanisms.pbr import Checkpoint
@@ -29,7 +29,7 @@ class Heard:
     """What a backup is told, before it takes it."""
 
     def __init__(self, driver: Any, name: str = "r2") -> None:
-        self.said: list[State | Change] = []
+        self.said: list[ServerState | StateDelta] = []
         self.spoil: Any = lambda state: None
         brick = driver.brick(name, "after")
         take = brick.from_peer
@@ -41,20 +41,20 @@ class Heard:
 
         brick.from_peer = from_peer
 
-    def take(self) -> list[State | Change]:
+    def take(self) -> list[ServerState | StateDelta]:
         """What was said since the last look."""
         said, self.said = self.said, []
         return said
 
 
-def point(driver: Any, name: str) -> State:
-    found: State = driver.standing(name).server.points.point
+def point(driver: Any, name: str) -> ServerState:
+    found: ServerState = driver.standing(name).server.points.point
     return found
 
 
-def blocks(change: State | Change) -> int:
+def blocks(change: ServerState | StateDelta) -> int:
     """How many blocks were sent."""
-    assert isinstance(change, Change)
+    assert isinstance(change, StateDelta)
     assert change.patch is not None
     return sum(len(piece.blocks) for piece in change.patch.pieces)
 
@@ -87,7 +87,7 @@ async def test_variables_appear_and_disappear_grow_and_shrink(system: hf.ActorSy
     driver, heard = await warehouse(system, "list", "array")
     for what, entries in (("dict", 2000), ("dict", 0), ("array", 10), ("array", 5000), ("list", 0), ("bytes", 4000)):
         await driver.ask(Resize(what, entries))
-        assert [type(one) for one in heard.take()] == [Change]
+        assert [type(one) for one in heard.take()] == [StateDelta]
         assert point(driver, "r2").data == point(driver, "r1").data
     seen = await driver.ask(Sum())
     await driver.stop_replica("r1")
@@ -135,17 +135,17 @@ async def test_a_damaged_difference_changes_nothing_and_all_of_it_is_sent(system
     """Without the checksum the backup would keep a state that never was."""
     driver, heard = await warehouse(system, "list")
 
-    def spoil(state: State | Change) -> None:
-        if isinstance(state, Change) and state.patch is not None:
+    def spoil(state: ServerState | StateDelta) -> None:
+        if isinstance(state, StateDelta) and state.patch is not None:
             piece = next(one for one in state.patch.pieces if one.blocks)
             piece.blocks[0] = piece.blocks[0][:-1] + bytes([piece.blocks[0][-1] ^ 1])
 
     heard.spoil = spoil
     assert await driver.ask(Touch("list", 9)) == 2
-    assert [type(one) for one in heard.take()] == [Change, State]
+    assert [type(one) for one in heard.take()] == [StateDelta, ServerState]
     heard.spoil = lambda state: None
     assert await driver.ask(Touch("list", 10)) == 3
-    assert [type(one) for one in heard.take()] == [Change]
+    assert [type(one) for one in heard.take()] == [StateDelta]
     seen = await driver.ask(Sum())
     await driver.stop_replica("r1")
     await driver.fail_over("r2")
@@ -158,10 +158,10 @@ async def test_differences_to_another_state_than_the_one_that_is_here_are_not_ap
     old = point(driver, "r2")
     await driver.ask(Touch("array", 1))
     now = point(driver, "r2")
-    driver.standing("r2").server.install(State(now.turn, old.data, [], [], [], True))  # It has slept, say.
+    driver.standing("r2").server.install(ServerState(now.turn, old.data, [], [], [], True))  # It has slept, say.
     heard.take()
     await driver.ask(Touch("dict", 1))
-    assert [type(one) for one in heard.take()] == [Change, State]
+    assert [type(one) for one in heard.take()] == [StateDelta, ServerState]
     assert point(driver, "r2").data == point(driver, "r1").data
 
 
@@ -180,14 +180,14 @@ async def test_damaged_deltas_are_not_applied(system: hf.ActorSystem) -> None:
     heard = Heard(driver)
     await driver.ask(Touch("", 1))
 
-    def spoil(state: State | Change) -> None:
-        if isinstance(state, Change):
+    def spoil(state: ServerState | StateDelta) -> None:
+        if isinstance(state, StateDelta):
             state.deltas[:] = [state.deltas[0].replace(b"\x01", b"\x02")]
 
     heard.spoil = spoil
     heard.take()
     await driver.ask(Touch("", 1))
-    assert [type(one) for one in heard.take()] == [Change, State]
+    assert [type(one) for one in heard.take()] == [StateDelta, ServerState]
     seen = await driver.ask(Sum())
     await driver.stop_replica("r1")
     await driver.fail_over("r2")
@@ -203,10 +203,10 @@ async def test_many_deltas_become_a_state_of_which_only_what_differs_is_sent(
     for at in range(16):
         await driver.ask(Touch("", at))
     said = heard.take()
-    patched = [one for one in said if isinstance(one, Change) and one.patch is not None]
+    patched = [one for one in said if isinstance(one, StateDelta) and one.patch is not None]
     assert len(patched) >= 3
     assert all(blocks(one) <= 2 for one in patched[1:]), "the first one is in another form than what came before"
-    assert all(isinstance(one, Change) for one in said[1:])
+    assert all(isinstance(one, StateDelta) for one in said[1:])
     assert len(point(driver, "r2").deltas) <= 4
     seen = await driver.ask(Sum())
     await driver.stop_replica("r1")
@@ -359,7 +359,7 @@ async def test_after_a_turn_that_was_taken_back_only_new_deltas_are_sent(system:
     heard.take()
     await driver.ask(Touch("", 9))
     (said,) = heard.take()
-    assert isinstance(said, Change)
+    assert isinstance(said, StateDelta)
     assert len(said.deltas) == 1
     seen = await driver.ask(Sum())
     await driver.stop_replica("r1")

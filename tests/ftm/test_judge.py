@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.ftm.model.application import Application
-from holdfast.ftm.model.change_model import Faults, Resources, response_price
+from holdfast.ftm.model.change_model import FaultClasses, Resources, response_price
 from holdfast.ftm.monitoring.judge import (
     ADAPT,
     HOLD,
@@ -28,7 +28,7 @@ from tests.ftm.declarations import EIGHT
 
 APP = Application("Account", state_bytes=10_000, request_bytes=100, rate=100)
 NEED_OF_PBR = 100 * (10_000 + 100)  # bytes per second
-CRASH = Faults.of("crash")
+CRASH = FaultClasses.of("crash")
 QUICK = Settings(required=CRASH, confirm=0, dwell=0, urgent_dwell=0, transition_cost=0, smoothing=1)
 
 

@@ -11,7 +11,7 @@ import pytest
 import holdfast as hf
 from holdfast.ftm.alarms import Diverged
 from holdfast.ftm.bricks.brick_messages import CannotJoin, CannotLead
-from holdfast.ftm.bricks.replica_orders import Peer
+from holdfast.ftm.bricks.replica_orders import SetPeer
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.ftm.model.mechanism import MechanismRefused
@@ -113,7 +113,7 @@ async def test_a_follower_that_cannot_take_the_state_ends(system: hf.ActorSystem
     await driver.reply(key)
     async with asyncio.timeout(5):
         await gone
-    await driver.protocol("r1").ask(Peer(driver.epoch, None))
+    await driver.protocol("r1").ask(SetPeer(driver.epoch, None))
     await driver.ask(Add(1))
     await driver.add("r2")
     with pytest.raises(CannotJoin):

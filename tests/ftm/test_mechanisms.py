@@ -11,7 +11,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.bricks.bricks import After
-from holdfast.ftm.bricks.replica_orders import Abort, Commit, Prepare
+from holdfast.ftm.bricks.replica_orders import Abort, Commit, PrepareStack
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
@@ -159,7 +159,7 @@ async def exchange(driver: Driver, *layers: Mechanism, names: tuple[str, ...] = 
     refs = [driver.protocol(name) for name in names]
     described = [one.describe() for one in layers]
     for ref in refs:
-        await ref.ask(Prepare(driver.config, described))
+        await ref.ask(PrepareStack(driver.config, described))
     for ref in reversed(refs):
         await ref.ask(Commit(driver.config))
         await ref.ask(Commit(driver.config))  # Twice is once.
@@ -219,11 +219,11 @@ async def test_what_was_prepared_can_be_dropped_and_what_cannot_be_had_is_refuse
     driver = await pair(system, Closed, LFR())
     replica = driver.protocol("r1")
     before = lives(driver, "r1")
-    await replica.ask(Prepare(1, [LFR().describe(), *()]))
+    await replica.ask(PrepareStack(1, [LFR().describe(), *()]))
     await replica.ask(Abort(1))
     assert lives(driver, "r1") == before
     with pytest.raises(MechanismRefused, match="state_access = False"):
-        await replica.ask(Prepare(2, [PBR().describe()]))
+        await replica.ask(PrepareStack(2, [PBR().describe()]))
     with pytest.raises(MechanismRefused, match="was not prepared"):
         await replica.ask(Commit(2))
     assert lives(driver, "r1") == before

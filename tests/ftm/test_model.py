@@ -13,7 +13,7 @@ import holdfast as hf
 from holdfast.ftm.model.application import Application
 from holdfast.ftm.model.change_model import (
     Choice,
-    Faults,
+    FaultClasses,
     Resources,
     check,
     choice_of,
@@ -32,7 +32,7 @@ PLENTY = Resources(units=6, certificates=True)
 
 
 def best(*faults: str, application: Application = GOOD, resources: Resources = PLENTY, **options: Any) -> str:
-    chosen = select(Faults.of(*faults), application, resources, EIGHT, **options).best
+    chosen = select(FaultClasses.of(*faults), application, resources, EIGHT, **options).best
     return "none" if chosen is None else str(chosen)
 
 
@@ -125,8 +125,8 @@ def test_a_low_battery_refuses_what_says_so() -> None:
         least_energy = 0.3
 
     app = Application("Account", has_state_access=False)
-    full = select(Faults.of("crash"), app, Resources(units=2, energy=0.9), (Hungry,))
-    low = select(Faults.of("crash"), app, Resources(units=2, energy=0.1), (Hungry,))
+    full = select(FaultClasses.of("crash"), app, Resources(units=2, energy=0.9), (Hungry,))
+    low = select(FaultClasses.of("crash"), app, Resources(units=2, energy=0.1), (Hungry,))
     assert str(full.best) == "hungry"
     assert low.best is None
     assert "needs 30% of the battery, 10% is left" in low.explain()
@@ -141,7 +141,7 @@ def test_what_is_cheap_can_be_said() -> None:
 
 
 def test_choices_come_cheapest_first_and_none_has_a_layer_too_many() -> None:
-    chosen = select(Faults.of("crash"), GOOD, PLENTY, EIGHT)
+    chosen = select(FaultClasses.of("crash"), GOOD, PLENTY, EIGHT)
     assert [str(one) for one in chosen.valid] == ["pbr", "lfr", "tmr"]
     assert [one.price for one in chosen.valid] == sorted(one.price for one in chosen.valid)
 
@@ -151,7 +151,7 @@ def test_choices_come_cheapest_first_and_none_has_a_layer_too_many() -> None:
 
 def test_when_nothing_is_valid_the_reasons_are_the_answer() -> None:
     closed = Application("Account", has_state_access=False, is_deterministic=False, why_no_state="it is a socket")
-    selection = select(Faults.of("crash"), closed, Resources(units=2), EIGHT)
+    selection = select(FaultClasses.of("crash"), closed, Resources(units=2), EIGHT)
     assert selection.best is None
     reasons = {refusal.layers: refusal for refusal in selection.refused}
     assert reasons["pbr",].stage == "A"
@@ -163,27 +163,27 @@ def test_when_nothing_is_valid_the_reasons_are_the_answer() -> None:
 
 
 def test_what_could_still_be_covered_is_told_and_not_taken() -> None:
-    selection = select(Faults.of("crash", "transient_value"), GOOD, Resources(units=1), EIGHT)
+    selection = select(FaultClasses.of("crash", "transient_value"), GOOD, Resources(units=1), EIGHT)
     assert selection.best is None
     assert [(str(one), sorted(one.uncovered)) for one in selection.degraded] == [
         ("tr", ["crash"]),
         ("unprotected", ["crash", "transient_value"]),
     ]
     assert "degraded: tr, without crash" in selection.explain()
-    assert select(Faults.of("crash"), GOOD, PLENTY, EIGHT).degraded == ()
+    assert select(FaultClasses.of("crash"), GOOD, PLENTY, EIGHT).degraded == ()
 
 
 def test_without_mechanisms_only_no_fault_can_be_tolerated() -> None:
-    assert select(Faults(), GOOD, PLENTY, ()).best is not None
-    assert select(Faults.of("crash"), GOOD, PLENTY, ()).best is None
+    assert select(FaultClasses(), GOOD, PLENTY, ()).best is not None
+    assert select(FaultClasses.of("crash"), GOOD, PLENTY, ()).best is None
 
 
 def test_check_tells_all_reasons_in_the_order_in_which_they_count() -> None:
     closed = Application("Account", is_deterministic=False)
-    reasons = check((TR, PBR), Faults.of("crash", "development"), closed, Resources(units=1))
+    reasons = check((TR, PBR), FaultClasses.of("crash", "development"), closed, Resources(units=1))
     assert [reason.stage for reason in reasons] == ["nesting", "F", "A", "R"]
-    assert check((PBR, TR), Faults.of("crash"), GOOD, Resources(units=2)) == ()
-    assert "certification authority" in str(check((SEC,), Faults(), GOOD, Resources())[0])
+    assert check((PBR, TR), FaultClasses.of("crash"), GOOD, Resources(units=2)) == ()
+    assert "certification authority" in str(check((SEC,), FaultClasses(), GOOD, Resources())[0])
 
 
 fault_sets = st.frozensets(st.sampled_from(FAULTS))
@@ -212,7 +212,7 @@ resource_sets = st.builds(
 def test_what_is_valid_is_right_and_what_is_not_has_a_reason(
     classes: frozenset[str], application: Application, resources: Resources
 ) -> None:
-    faults = Faults(classes)
+    faults = FaultClasses(classes)
     selection = select(faults, application, resources, EIGHT)
     by_name = {kind.name: kind for kind in EIGHT}
     for choice in selection.valid:
@@ -231,8 +231,8 @@ def test_what_is_valid_is_right_and_what_is_not_has_a_reason(
 def test_more_faults_never_make_it_cheaper(
     classes: frozenset[str], application: Application, resources: Resources, more: frozenset[str]
 ) -> None:
-    few = select(Faults(classes), application, resources, EIGHT).best
-    many = select(Faults(classes | more), application, resources, EIGHT).best
+    few = select(FaultClasses(classes), application, resources, EIGHT).best
+    many = select(FaultClasses(classes | more), application, resources, EIGHT).best
     assert many is None or (few is not None and few.price <= many.price)
 
 
@@ -246,7 +246,7 @@ def test_more_resources_never_make_it_dearer(
         min(some.cpu, other.cpu),
         certificates=some.certificates and other.certificates,
     )
-    before, after = (select(Faults(classes), application, what, EIGHT).best for what in (less, some))
+    before, after = (select(FaultClasses(classes), application, what, EIGHT).best for what in (less, some))
     assert before is None or (after is not None and after.price <= before.price)
 
 
@@ -296,19 +296,19 @@ def test_an_order_is_right_exactly_when_no_layer_stands_outside_an_outer_one(
 
 def test_computations_multiply_and_what_is_sent_adds_up() -> None:
     app = Application("Account", state_bytes=1000, request_bytes=10, rate=10, turn_seconds=0.01)
-    choice = choice_of((LFR, TR), Faults.of("crash"), app)
+    choice = choice_of((LFR, TR), FaultClasses.of("crash"), app)
     assert choice.cost == Cost(runs=2, latency=2, total=4, states=0, requests=1, recovery=0.01)
     assert choice.bytes_per_second == 100
     assert choice.load == pytest.approx(0.2)
     assert (choice.units, choice.bandwidth, choice.layers) == (2, "low", ("lfr", "tr"))
-    assert choice_of((PBR,), Faults(), app).bytes_per_second == 10 * (1000 + 10)
-    assert choice_of((), Faults.of("crash"), app).uncovered == {"crash"}
+    assert choice_of((PBR,), FaultClasses(), app).bytes_per_second == 10 * (1000 + 10)
+    assert choice_of((), FaultClasses.of("crash"), app).uncovered == {"crash"}
 
 
 def test_layers_share_replicas_but_versions_want_their_own_units() -> None:
-    assert choice_of((AD, PBR), Faults(), GOOD).units == 2
-    assert choice_of((PBR, NVP), Faults(), GOOD).units == 6
-    assert choice_of((), Faults(), GOOD).units == 1
+    assert choice_of((AD, PBR), FaultClasses(), GOOD).units == 2
+    assert choice_of((PBR, NVP), FaultClasses(), GOOD).units == 6
+    assert choice_of((), FaultClasses(), GOOD).units == 1
 
 
 # -- declarations ---------------------------------------------------------------------------------------------------
@@ -337,12 +337,12 @@ def test_a_declaration_of_what_there_is_not_is_refused(changes: dict[str, Any], 
 
 def test_faults_that_there_are_not_are_refused() -> None:
     with pytest.raises(ValueError, match="unknown faults rain"):
-        Faults.of("rain")
-    assert str(Faults.of("replay", "crash") | Faults.of("forgery")) == "crash, forgery, replay"
+        FaultClasses.of("rain")
+    assert str(FaultClasses.of("replay", "crash") | FaultClasses.of("forgery")) == "crash, forgery, replay"
 
 
 def test_choices_and_resources_can_be_sent() -> None:
-    selection = select(Faults.of("crash"), GOOD, Resources(units=2, bandwidth=1e9), EIGHT)
+    selection = select(FaultClasses.of("crash"), GOOD, Resources(units=2, bandwidth=1e9), EIGHT)
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(selection), type=type(selection)) == selection
     assert isinstance(selection.best, Choice)
     assert Resources(bandwidth=10, cpu=0.5).scaled(0.5) == Resources(bandwidth=5, cpu=0.25, energy=0.5)
@@ -465,7 +465,7 @@ def test_the_built_in_mechanisms_are_the_default() -> None:
     pytest.importorskip("holdfast.ftm.model.mechanism")
     names = [entry.name for entry in coverage().entries]
     assert {"pbr", "lfr", "tr"} <= set(names)
-    assert select(Faults.of("crash"), GOOD, Resources(units=2)).best is not None
+    assert select(FaultClasses.of("crash"), GOOD, Resources(units=2)).best is not None
 
 
 def test_infinite_bandwidth_is_enough_for_everything() -> None:

@@ -10,7 +10,7 @@ from holdfast.ftm.alarms import Diverged, NondeterminismFound
 from holdfast.ftm.bricks.sealed_frames import FrameRefused
 from holdfast.ftm.events import MechanismAttached, MechanismChanged, MechanismDetached, ReplicaFaulty
 from holdfast.ftm.model.application import Application
-from holdfast.ftm.model.change_model import Faults, Resources
+from holdfast.ftm.model.change_model import FaultClasses, Resources
 from holdfast.ftm.monitoring.adaptations import (
     AdaptationDecided,
     AdaptationDone,
@@ -22,9 +22,9 @@ from holdfast.ftm.monitoring.adaptations import (
 )
 from holdfast.ftm.monitoring.judge import Readings
 from holdfast.ftm.monitoring.monitor import (
-    Adapt,
     Allow,
     ApplicationIs,
+    ChangeStack,
     Forbid,
     Measured,
     MechanismIs,
@@ -49,11 +49,11 @@ class Account(hf.Actor):
 class Engine(hf.Actor):
     """An adaptation engine that is an actor; it keeps what it was told."""
 
-    def __init__(self, told: list[Adapt]) -> None:
+    def __init__(self, told: list[ChangeStack]) -> None:
         self.told = told
 
-    @hf.on(Adapt)
-    def adapt(self, message: Adapt) -> None:
+    @hf.on(ChangeStack)
+    def adapt(self, message: ChangeStack) -> None:
         self.told.append(message)
 
 
@@ -109,17 +109,17 @@ async def test_what_cannot_be_measured_is_told_and_stays_as_it_was() -> None:
 
 
 async def test_crashes_at_the_address_and_below_it_are_seen_and_no_others() -> None:
-    settings = msgspec.structs.replace(SETTINGS, required=Faults())
+    settings = msgspec.structs.replace(SETTINGS, required=FaultClasses())
 
     async def play(world: World) -> None:
         other = await world.system.start(hf.child("other", hf.start(Account)))
         other.tell(Boom())
         await advance(5)
-        assert (await world.report()).faults == Faults()
+        assert (await world.report()).faults == FaultClasses()
         alice = await world.system.start(hf.child("alice", hf.start(Account)))
         alice.tell(Boom())
         await advance(1.5)
-        assert (await world.report()).faults == Faults.of("crash")
+        assert (await world.report()).faults == FaultClasses.of("crash")
         await advance(5)
         assert [order.target for order in world.orders] == [("pbr",)]
 
@@ -211,7 +211,7 @@ async def test_when_nothing_is_valid_that_is_told_once_and_nothing_is_changed() 
 async def test_a_change_that_fails_leaves_the_old_mechanism_and_is_tried_again_later() -> None:
     tries: list[float] = []
 
-    async def trigger(order: Adapt) -> None:
+    async def trigger(order: ChangeStack) -> None:
         tries.append(asyncio.get_running_loop().time())
         if len(tries) == 1:
             raise RuntimeError("roll-back")
@@ -230,9 +230,9 @@ async def test_a_change_that_fails_leaves_the_old_mechanism_and_is_tried_again_l
 
 
 async def test_a_trigger_that_hangs_is_given_up_and_nothing_else_is_begun_meanwhile() -> None:
-    calls: list[Adapt] = []
+    calls: list[ChangeStack] = []
 
-    async def trigger(order: Adapt) -> None:
+    async def trigger(order: ChangeStack) -> None:
         calls.append(order)
         await asyncio.Event().wait()
 
@@ -248,7 +248,7 @@ async def test_a_trigger_that_hangs_is_given_up_and_nothing_else_is_begun_meanwh
 
 
 async def test_the_trigger_may_be_an_actor() -> None:
-    told: list[Adapt] = []
+    told: list[ChangeStack] = []
 
     async def play(world: World) -> None:
         world.watch.trigger = world.system.spawn(hf.start(Engine, told), name="engine")
@@ -265,9 +265,9 @@ async def test_the_trigger_may_be_an_actor() -> None:
 
 @pytest.mark.parametrize("answer", [True, "not during the show"])
 async def test_a_veto_keeps_the_old_mechanism(answer: bool | str) -> None:
-    asked: list[Adapt] = []
+    asked: list[ChangeStack] = []
 
-    async def veto(order: Adapt) -> bool | str:
+    async def veto(order: ChangeStack) -> bool | str:
         asked.append(order)
         return answer
 
@@ -292,7 +292,7 @@ async def test_a_veto_that_says_nothing_lets_it_pass_and_one_that_fails_does_not
 
     await in_world(passes, veto=lambda order: None)
 
-    def broken(order: Adapt) -> bool:
+    def broken(order: ChangeStack) -> bool:
         raise OSError("nobody is there")
 
     async def fails(world: World) -> None:

@@ -6,10 +6,10 @@ import msgspec
 import pytest
 
 from holdfast.ftm.model.application import Application
-from holdfast.ftm.model.change_model import Faults
+from holdfast.ftm.model.change_model import FaultClasses
 from holdfast.ftm.monitoring.adaptations import AdaptationWithdrawn
 from holdfast.ftm.monitoring.judge import Readings
-from holdfast.ftm.monitoring.monitor import Adapt, Measured, Observe, read_machine
+from holdfast.ftm.monitoring.monitor import ChangeStack, Measured, Observe, read_machine
 from holdfast.testing import advance
 from tests.ftm.monitored import NARROW, SETTINGS, World, in_world
 
@@ -21,7 +21,7 @@ async def test_what_it_knows_survives_its_death() -> None:
         world.ref.tell(Observe("mismatch", 3))
         await advance(1.5)
         await world.kill()
-        assert (await world.report()).faults == Faults.of("crash", "transient_value")
+        assert (await world.report()).faults == FaultClasses.of("crash", "transient_value")
         await advance(10)
         assert [order.target for order in world.orders] == [("pbr", "tr")]
 
@@ -29,9 +29,9 @@ async def test_what_it_knows_survives_its_death() -> None:
 
 
 async def test_a_decision_in_the_middle_of_which_it_died_is_told_to_have_failed() -> None:
-    started: list[Adapt] = []
+    started: list[ChangeStack] = []
 
-    async def trigger(order: Adapt) -> None:
+    async def trigger(order: ChangeStack) -> None:
         started.append(order)
         if len(started) == 1:
             await asyncio.Event().wait()
@@ -68,7 +68,7 @@ async def test_an_announcement_does_not_outlive_the_one_who_made_it() -> None:
 async def test_its_own_load_is_no_reason_to_change() -> None:
     """What the present mechanism computes makes the CPU busy; another one could have that time, too."""
     app = Application("Account", rate=100, turn_seconds=0.004)  # 40 % of a unit for each run
-    settings = msgspec.structs.replace(SETTINGS, required=Faults.of("transient_value"))
+    settings = msgspec.structs.replace(SETTINGS, required=FaultClasses.of("transient_value"))
 
     async def play(world: World) -> None:
         await advance(200)

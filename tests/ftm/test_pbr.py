@@ -13,9 +13,18 @@ from holdfast.actors.exit_reasons import SHUTDOWN, pack_exit
 from holdfast.checkpoint.protocol import OK, STASHED, TurnEnd
 from holdfast.checkpoint.protocol import Closed as LifeClosed
 from holdfast.ftm.alarms import ProtectionLost
-from holdfast.ftm.bricks.brick_messages import ConfigMismatch, Done, Follow, Lead, Request, StaleEpoch, State, Work
+from holdfast.ftm.bricks.brick_messages import (
+    ConfigMismatch,
+    Done,
+    Follow,
+    Lead,
+    Request,
+    ServerState,
+    StaleLeader,
+    Work,
+)
 from holdfast.ftm.bricks.letters import Letter
-from holdfast.ftm.bricks.replica_orders import Export, Finish, Install, Join, Peer
+from holdfast.ftm.bricks.replica_orders import Export, Finish, Install, Join, SetPeer
 from holdfast.ftm.bricks.reply_log import ReplyLog
 from holdfast.ftm.bricks.state_images import image_from
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
@@ -77,7 +86,7 @@ async def test_a_primary_whose_backup_is_gone_goes_on_alone_and_says_so(system: 
     await asyncio.sleep(0.05)
     assert key not in driver.ends, "nobody has said that it does not count any more"
     events = system.events()
-    await driver.protocol("r1").ask(Peer(driver.epoch, None))
+    await driver.protocol("r1").ask(SetPeer(driver.epoch, None))
     assert await driver.reply(key) == 1
     assert await driver.ask(Add(2)) == 3
     assert [one.replica for one in events.take() if isinstance(one, ProtectionLost)] == [driver.path("r1")]
@@ -278,12 +287,12 @@ async def test_lower_epochs_and_other_configurations_are_refused(system: hf.Acto
     state = driver.standing("r2").server.points.point
     body = system.node.codec.encoder.encode(Checkpoint(state, []))
     name = "holdfast.ftm.mechanisms.pbr:Checkpoint"
-    with pytest.raises(StaleEpoch):
+    with pytest.raises(StaleLeader):
         await after.ask(Letter(driver.epoch - 1, 0, name, body, size=len(body), stream=1, number=1))
     with pytest.raises(ConfigMismatch):
         await after.ask(Letter(driver.epoch, 7, name, body, size=len(body), stream=1, number=2))
     for order in (Lead(0, 0), Follow(0, 0), Join(0, driver.path("r2")), Export(0)):
-        with pytest.raises((StaleEpoch, hf.RemoteCrash)):
+        with pytest.raises((StaleLeader, hf.RemoteCrash)):
             await driver.protocol("r1").ask(order)
     old = Work(driver.epoch - 1, 0, 99, [Request("", 0, driver.feed(Add(2)))])
     driver.protocol("r1").tell(old)
@@ -373,5 +382,5 @@ async def test_kills_at_any_moment_lose_and_double_nothing(system: hf.ActorSyste
 
 def test_names_used_here_are_those_of_the_library() -> None:
     assert issubclass(Closed, Total)
-    assert State(0, image_from(b""), [], [], [], False).stash_ids == []
+    assert ServerState(0, image_from(b""), [], [], [], False).stash_ids == []
     assert Done(0, 0, 0, [], True).more == []

@@ -15,7 +15,7 @@ from holdfast.ftm.bricks.peer_channel import Inbox, Where
 from holdfast.ftm.bricks.request_protocol import RequestProtocol
 from holdfast.ftm.mechanisms.lfr import LFR, Comparing, Handling
 from holdfast.ftm.mechanisms.pbr import PBR, StateUpdate
-from holdfast.ftm.mechanisms.tmr import TMR, Computing
+from holdfast.ftm.mechanisms.tmr import TMR, ComputingAlong
 from tests.ftm.replicated import Add, Fetch, Read, Total, pair
 
 Handler = Callable[[Any, Any], Any]
@@ -102,7 +102,7 @@ async def test_a_vote_goes_on_when_an_order_to_compute_is_lost(
     system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     driver = await pair(system, Total, TMR(), others=("r2", "r3"))
-    struck = strike(monkeypatch, Computing, Letter, lose, each=2, most=4)
+    struck = strike(monkeypatch, ComputingAlong, Letter, lose, each=2, most=4)
     for n in range(5):
         await driver.ask(Add(n))
     assert await driver.ask(Read()) == [0, 1, 2, 3, 4]
@@ -112,7 +112,7 @@ async def test_a_vote_goes_on_when_an_order_to_compute_is_lost(
 async def test_a_large_letter_of_which_a_sheet_is_lost_is_sent_again(
     system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("holdfast.ftm.bricks.peer_channel.LETTER_BYTES", 10)
+    monkeypatch.setattr("holdfast.ftm.bricks.letters.LETTER_BYTES", 10)
     driver = await pair(system)
     struck = strike(monkeypatch, StateUpdate, Sheet, lambda handler, actor, item: None, each=3, most=3)
     for n in range(9):

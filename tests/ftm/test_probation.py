@@ -19,7 +19,7 @@ from holdfast.ftm.events import MechanismSettled
 from holdfast.ftm.group import probation
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
-from holdfast.ftm.mechanisms.tmr import TMR, Computing, Voting
+from holdfast.ftm.mechanisms.tmr import TMR, ComputingAlong, Voting
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.ftm.model.mechanism import Mechanism, Role
 from holdfast.system.mechanism_notes import AdaptationUndone
@@ -45,7 +45,7 @@ async def taken_back(change: Any) -> MechanismSettled:
     return outcome
 
 
-class EndsAtFirstCompute(Computing):
+class EndsAtFirstCompute(ComputingAlong):
     """Ends a replica that is asked to compute, when it has several requests behind it."""
 
     async def from_peer(self, message: hf.Message[Any]) -> Any:
@@ -70,7 +70,7 @@ class Doomed(TMR):
 
     name: ClassVar[str] = "tmr"
     roles: ClassVar[dict[str, Role]] = {
-        "leader": Role(before=Computing, after=EndsWithoutOthers),
+        "leader": Role(before=ComputingAlong, after=EndsWithoutOthers),
         "follower": Role(before=EndsAtFirstCompute, computes=False),
     }
 

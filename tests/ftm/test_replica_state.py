@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
 from holdfast.checkpoint.protocol import FAILED, MESSAGE, OK, START, Answer, Feed, TurnEnd
-from holdfast.ftm.bricks.brick_messages import Change, Request, State
+from holdfast.ftm.bricks.brick_messages import Request, ServerState, StateDelta
 from holdfast.ftm.bricks.state_images import Image, Misfit, image_from
 from holdfast.ftm.replica.replica_life import ABANDONED, ENDED
 from holdfast.ftm.replica.replica_state import (
@@ -22,7 +22,7 @@ from holdfast.ftm.replica.replica_state import (
     REWIND,
     STOP,
     Attempts,
-    Part,
+    BatchPart,
     ReplicaState,
     after_end,
     next_requests,
@@ -47,7 +47,7 @@ def end(number: int, turn: int, status: str = OK) -> TurnEnd:
     return TurnEnd(turn, number, status, [], Answer())
 
 
-def value_of(state: State) -> list[int]:
+def value_of(state: ServerState) -> list[int]:
     """What a state stands for: the numbers in its data, and in its deltas."""
     return [*state.data.whole(), *(number for delta in state.deltas for number in delta)]
 
@@ -58,15 +58,17 @@ class Replicating(RuleBasedStateMachine):
     @initialize()
     def begin(self) -> None:
         self.points, self.value, self.turn = RewindPoints(), list[int](), -1
-        self.follower: State | None = None
-        self.past: list[tuple[State, list[int]]] = []  # the model: every point of this life, with what it stands for
+        self.follower: ServerState | None = None
+        self.past: list[
+            tuple[ServerState, list[int]]
+        ] = []  # the model: every point of this life, with what it stands for
         self.number = 0
         self.compact()
 
-    def _made(self, data: Image, deltas: list[bytes]) -> State:
-        return State(self.turn, data, deltas, [], [], True)
+    def _made(self, data: Image, deltas: list[bytes]) -> ServerState:
+        return ServerState(self.turn, data, deltas, [], [], True)
 
-    def _point(self, made: State) -> None:
+    def _point(self, made: ServerState) -> None:
         self.points.go_on_to(made)
         self.past.append((made, list(self.value)))
         assert stands_at(self.points, self.turn, live=True)
@@ -130,11 +132,11 @@ def test_a_point_that_is_gone_back_to_leads_on_without_what_was_undone() -> None
     """Whatever was done in between, what the other replica is told has all that it lacks."""
     points = RewindPoints()
     data = image_from(b"\x01")
-    first = State(1, data, [b"a"], [], [], True)
+    first = ServerState(1, data, [b"a"], [], [], True)
     points.install(first)
-    points.go_on_to(State(2, data, [b"a", b"b"], [], [], True))
+    points.go_on_to(ServerState(2, data, [b"a", b"b"], [], [], True))
     points.go_back_to(first)
-    points.go_on_to(State(2, data, [b"a", b"c"], [], [], True))
+    points.go_on_to(ServerState(2, data, [b"a", b"c"], [], [], True))
     change = change_since(points, 1)
     assert change is not None
     assert change.deltas == [b"c"]
@@ -142,8 +144,8 @@ def test_a_point_that_is_gone_back_to_leads_on_without_what_was_undone() -> None
 
 @given(base=st.integers(-1, 3), here=st.integers(-1, 3))
 def test_a_change_is_put_upon_the_state_that_it_belongs_to(base: int, here: int) -> None:
-    point = State(here, image_from(b"\x01"), [], [], [], True) if here >= 0 else None
-    change = Change(9, base, None, [], 0, [], [], True)
+    point = ServerState(here, image_from(b"\x01"), [], [], [], True) if here >= 0 else None
+    change = StateDelta(9, base, None, [], 0, [], [], True)
     if point is not None and base == here:
         assert led_to(point, change).turn == 9
         with pytest.raises(Misfit):
@@ -155,13 +157,13 @@ def test_a_change_is_put_upon_the_state_that_it_belongs_to(base: int, here: int)
 
 @given(st.booleans(), st.booleans(), st.integers(0, 300), st.booleans())
 def test_where_nobody_looks_at_the_state_points_are_far_apart(lazy: bool, has: bool, tail: int, live: bool) -> None:
-    points = RewindPoints(State(0, image_from(b"x"), [], [], [], True) if has else None)
+    points = RewindPoints(ServerState(0, image_from(b"x"), [], [], [], True) if has else None)
     points.keep_tail([request(n) for n in range(tail)], [])
     assert needs_point(points, is_lazy=lazy, live=live) == (not (lazy and has and live) or tail >= 256)
 
 
 def test_what_has_happened_since_an_earlier_turn() -> None:
-    first, second = (State(turn, image_from(b"x"), [], [], [], True) for turn in (0, 2))
+    first, second = (ServerState(turn, image_from(b"x"), [], [], [], True) for turn in (0, 2))
     points = RewindPoints(second, previous=(first, [request(1), request(2)]))
     points.keep_tail([request(3)], [end(3, 3, FAILED)])
     assert before_turn(points, 3, 3) == (second, [request(3)])
@@ -185,7 +187,7 @@ def test_a_batch_is_run_whole_and_in_order(
     state = ReplicaState(is_again=is_again, handed=2, confirmed=confirmed, alone={(MESSAGE, "Ask")})
     attempts, done = Attempts(size, singles), list[Request]()
     requests = [request(number, name) for number, name in enumerate(names)]
-    part = Part(deque(requests))
+    part = BatchPart(deque(requests))
     for _ in range(4 * len(requests)):
         if not part.pending:
             break
@@ -193,7 +195,7 @@ def test_a_batch_is_run_whole_and_in_order(
         if not chunk:
             assert part.begun or (leads and state.confirmed < state.handed)
             state.confirmed = state.handed  # Home has what came before,
-            part = Part(part.pending)  # and the next part begins.
+            part = BatchPart(part.pending)  # and the next part begins.
             continue
         assert len(chunk) <= size
         if not is_again and chunk[0].feed.name == "Ask":
@@ -210,7 +212,7 @@ def test_what_is_taken_back_is_pending_again_in_its_order(numbers: list[int], da
     given_to = data.draw(st.integers(0, len(numbers)))
     ended = data.draw(st.integers(0, given_to))
     requests = [request(number) for number in numbers]
-    part = Part(deque(requests[given_to:]), requests[:given_to], [end(one.feed.id, 0) for one in requests[:ended]])
+    part = BatchPart(deque(requests[given_to:]), requests[:given_to], [end(one.feed.id, 0) for one in requests[:ended]])
     handed, ends = part.hand_out()
     assert handed == requests[:ended]
     assert [one.id for one in ends] == numbers[:ended]
@@ -236,7 +238,7 @@ def test_what_follows_when_a_life_has_ended(
     is_over: bool, is_stopping: bool, has_access: bool, has_point: bool, failed: int | None, why: str
 ) -> None:
     state = ReplicaState(is_over=is_over, is_stopping=is_stopping, has_access=has_access)
-    part = Part(deque(), [request(1, "", START), request(2)])
+    part = BatchPart(deque(), [request(1, "", START), request(2)])
     then = after_end(state, part, failed, why, has_point=has_point)
     if why is ABANDONED:
         assert then is GIVE_UP

@@ -22,7 +22,7 @@ from holdfast.actors.kernel.envelope import Envelope
 from holdfast.actors.process.stand_ins import Inner
 from holdfast.checkpoint.protocol import Closed
 from holdfast.ftm.bricks.brick_messages import Done, Follow, Lead, Work
-from holdfast.ftm.bricks.replica_orders import Export, Join, Peer
+from holdfast.ftm.bricks.replica_orders import Export, Join, SetPeer
 from holdfast.ftm.bricks.sealed_frames import TELLS, Agree, Back, Call, Greet, LinkLost, Opened, Part, Refused, Sealed
 from holdfast.ftm.mechanisms.sec import SEC
 from holdfast.ftm.mechanisms.tmr import TMR
@@ -265,7 +265,7 @@ async def test_what_is_forged_is_refused(secured: hf.ActorSystem) -> None:
         for order in (
             Lead(99, group.adaptation.config),
             Follow(99, group.adaptation.config),
-            Peer(99, None),
+            SetPeer(99, None),
             Export(group.membership.epoch),
         ):
             with pytest.raises(Refused, match="plain"):

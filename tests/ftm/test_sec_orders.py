@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.bricks.replica_orders import Abort, Commit, Prepare, Stalled
+from holdfast.ftm.bricks.replica_orders import Abort, Commit, PrepareStack, Stalled
 from holdfast.ftm.bricks.sealed_frames import Opened, Refused, Sealed
 from holdfast.ftm.bricks.state_transfer import Assume
 from holdfast.ftm.mechanisms.lfr import LFR
@@ -56,7 +56,7 @@ async def test_a_change_is_made_though_its_orders_are_held_back_altered_and_repl
     assert names(ref) == ["sec", "lfr", "tr"]
     assert {path for path, _ in held} == {"/app/c/ftm/r1/protocol", "/app/c/ftm/r2/protocol"}
     said = list(tap.seen)
-    assert not [one for _, one in said if isinstance(one, (Prepare, Commit, Abort))]
+    assert not [one for _, one in said if isinstance(one, (PrepareStack, Commit, Abort))]
     sealed = [(path, one.frame) for path, one in said if isinstance(one, Sealed) and "/r" in path]
     again = [*held, *(one for one in sealed if one[1] in arrived)]  # What never came as it was sent is new there.
     assert len(again) > len(held)
@@ -98,7 +98,7 @@ async def test_orders_that_are_forged_change_nothing(secured: hf.ActorSystem) ->
     replica, protocol = node.cell_at("/app/c/ftm/r1").ref, node.cell_at("/app/c/ftm/r1/protocol").ref
     bricks = sorted(secured.tree())
     with secured.events() as events:
-        for order in (Prepare(99, [hf.PBR().describe()]), Commit(99), Abort(group.adaptation.config)):
+        for order in (PrepareStack(99, [hf.PBR().describe()]), Commit(99), Abort(group.adaptation.config)):
             with pytest.raises(Refused, match="plain"):
                 await protocol.ask(order)
             with pytest.raises(hf.HoldfastError):

@@ -9,7 +9,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.model.application import Application
-from holdfast.ftm.model.change_model import Faults, Resources, choice_of, nesting_problems, select
+from holdfast.ftm.model.change_model import FaultClasses, Resources, choice_of, nesting_problems, select
 from holdfast.ftm.model.composition import check_stack
 from holdfast.ftm.model.coverage import coverage
 from holdfast.ftm.model.mechanism import BUILT_IN, MechanismRefused, find
@@ -99,7 +99,7 @@ def test_what_is_valid_is_what_the_table_says_first_by_faults_then_application_t
             assertions=0 if "assertions" in lacks else 1,
             versions=1 if "versions" in lacks else 3,
         )
-        found = select(Faults(faults), application, Resources(units=units, certificates=True))
+        found = select(FaultClasses(faults), application, Resources(units=units, certificates=True))
         expected = {
             names
             for names in STACKS
@@ -117,7 +117,7 @@ def test_what_is_valid_is_what_the_table_says_first_by_faults_then_application_t
 def test_a_duplex_costs_what_the_paper_says() -> None:
     """A28, A29, A31: PBR sends the state, LFR has both compute, TR takes time."""
     app = Application("It", state_bytes=10_000, request_bytes=100, rate=100, turn_seconds=0.001)
-    pbr, lfr, tr = (choice_of((find(name),), Faults(), app) for name in ("pbr", "lfr", "tr"))
+    pbr, lfr, tr = (choice_of((find(name),), FaultClasses(), app) for name in ("pbr", "lfr", "tr"))
     assert pbr.bytes_per_second >= 100 * 10_000 > lfr.bytes_per_second > tr.bytes_per_second == 0
     assert (pbr.cost.total, lfr.cost.total) == (1, 2)
     assert tr.cost.latency >= 2 > pbr.cost.latency
@@ -126,17 +126,17 @@ def test_a_duplex_costs_what_the_paper_says() -> None:
 
 def test_what_the_duplex_needs_is_what_assertions_over_it_need() -> None:
     """A26, A27, A32."""
-    over = {name: choice_of((find("ad"), find(name)), Faults.of("crash"), ALL) for name in ("pbr", "lfr")}
+    over = {name: choice_of((find("ad"), find(name)), FaultClasses.of("crash"), ALL) for name in ("pbr", "lfr")}
     assert {name: (one.bandwidth, one.units) for name, one in over.items()} == {"pbr": ("high", 2), "lfr": ("low", 2)}
     assert not over["pbr"].uncovered  # the crash is the duplex's
     two = Resources(units=2)
-    wanted = Faults.of("crash", "permanent_value")
+    wanted = FaultClasses.of("crash", "permanent_value")
     assert [one.layers for one in select(wanted, ALL, two).valid] == [("ad", "pbr"), ("ad", "lfr")]
     random = Application("It", is_deterministic=False, assertions=1)
     assert [one.layers for one in select(wanted, random, two).valid] == [("ad", "pbr")]
     unsure = Application("It")
     assert not select(wanted, unsure, two).valid
-    alone = select(Faults.of("permanent_value"), ALL, Resources(units=1))
+    alone = select(FaultClasses.of("permanent_value"), ALL, Resources(units=1))
     assert "ad stands over a mechanism of replication" not in alone.explain()
     assert alone.best is None
 
@@ -144,7 +144,7 @@ def test_what_the_duplex_needs_is_what_assertions_over_it_need() -> None:
 @pytest.mark.parametrize("name", ["rb", "nvp"])
 def test_development_faults_take_blocks_of_the_user(name: str) -> None:
     """A33."""
-    faults, units = Faults.of("development"), Resources(units=1)
+    faults, units = FaultClasses.of("development"), Resources(units=1)
     assert (name,) in [one.layers for one in select(faults, ALL, units).valid]
     without = select(faults, Application("It", assertions=1), units)
     assert not without.valid
@@ -154,9 +154,9 @@ def test_development_faults_take_blocks_of_the_user(name: str) -> None:
 
 def test_one_unit_is_no_answer_to_a_crash_and_a_duplex_none_to_a_value_fault() -> None:
     """A30: replicas are taken to be self-checking, which TR and A&D make true (A31, A32)."""
-    assert not select(Faults.of("crash"), ALL, Resources(units=1)).valid
-    crash_only = {one.layers for one in select(Faults.of("crash"), ALL, PLENTY).valid}
-    both = {one.layers for one in select(Faults.of("crash", "transient_value"), ALL, PLENTY).valid}
+    assert not select(FaultClasses.of("crash"), ALL, Resources(units=1)).valid
+    crash_only = {one.layers for one in select(FaultClasses.of("crash"), ALL, PLENTY).valid}
+    both = {one.layers for one in select(FaultClasses.of("crash", "transient_value"), ALL, PLENTY).valid}
     assert {("pbr",), ("lfr",)} <= crash_only
     assert not {("pbr",), ("lfr",)} & both
     assert {("pbr", "tr"), ("lfr", "tr"), ("ad", "pbr"), ("ad", "lfr"), ("tmr",)} <= both

@@ -11,7 +11,7 @@ import holdfast as hf
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.model.application import Application
-from holdfast.ftm.model.change_model import Faults, Resources
+from holdfast.ftm.model.change_model import FaultClasses, Resources
 from holdfast.ftm.model.mechanism import MechanismRefused
 from holdfast.ftm.monitoring.adaptations import AdaptationDone, AdaptationFailed
 from holdfast.ftm.monitoring.judge import Settings
@@ -23,7 +23,7 @@ from tests.ftm.versions import is_positive
 # Processes do not care which event loop the root has.
 pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
 
-CRASHES = Settings(required=Faults.of("crash"), interval=0.02, confirm=0.0, dwell=0.1, urgent_dwell=0.0)
+CRASHES = Settings(required=FaultClasses.of("crash"), interval=0.02, confirm=0.0, dwell=0.1, urgent_dwell=0.0)
 TWO = Resources(units=2)
 
 

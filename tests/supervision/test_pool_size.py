@@ -6,6 +6,7 @@ import asyncio
 import os
 import signal
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -196,6 +197,16 @@ async def test_children_cannot_be_added_or_taken_away_by_hand() -> None:
         for call in (hf.StartChild(hf.child("x", hf.start(Worker))), hf.DeleteChild("0")):
             with pytest.raises(hf.NotSupported, match="use ResizePool"):
                 await top.ask(call)
+        side = await system.start(hf.supervisor("side"))
+        changes: tuple[Callable[[hf.Change], object], ...] = (
+            lambda change: change.add(top, hf.child("x", hf.start(Worker))),
+            lambda change: change.remove(f"{top.path}/0"),
+            lambda change: change.move(f"{top.path}/0", side),
+        )
+        for collect in changes:
+            with pytest.raises(hf.TransactionRefused, match="use ResizePool"):
+                async with system.transaction() as change:
+                    collect(change)
         with pytest.raises(hf.SpecError, match="use ResizePool"):
             await top.ask(hf.ChangeSupervisor(children=[]))
         await top.ask(hf.ChangeSupervisor(flags=hf.Flags(intensity=7)))

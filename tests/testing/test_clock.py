@@ -10,7 +10,7 @@ import pytest
 
 from holdfast.testing.clock import NothingToWaitFor, RealTimeNeeded, VirtualClockLoop
 from holdfast.testing.clock import virtual as virtual_loop
-from holdfast.testing.threads import Threads, task_file, waits_for_a_lock
+from holdfast.testing.threads import NewThreads, task_file, waits_for_a_lock
 
 virtual = pytest.mark.asyncio(loop_factories=["virtual"])
 
@@ -125,7 +125,7 @@ def test_a_thread_that_the_loop_does_not_know_may_still_wake_it() -> None:
 
 
 def test_of_two_threads_that_wake_each_other_one_is_always_at_work() -> None:
-    others = Threads()
+    others = NewThreads()
     gates = (threading.Lock(), threading.Lock())
     ended = threading.Event()
 
@@ -172,7 +172,7 @@ def test_a_thread_that_was_woken_behind_the_first_look_is_at_work() -> None:
             assert spins_until(lambda: is_at_rest(second))
         return task_file(thread, file)
 
-    threads = Threads(told)
+    threads = NewThreads(told)
     gate.acquire()
     rest.acquire()
     first.start()

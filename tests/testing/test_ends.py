@@ -12,7 +12,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.testing import GuardedSystem, NotIdle, Probe, VirtualClockLoop, advance, idle, probe
-from holdfast.testing.threads import FUTEX, Threads, waits_for_a_lock
+from holdfast.testing.threads import FUTEX, NewThreads, waits_for_a_lock
 from tests.testing.players import Add, Counter, Total
 
 T = TypeVar("T")
@@ -204,7 +204,7 @@ def test_work_in_any_thread_holds_virtual_time_still(way: Callable[[Work], Await
 
 
 def test_a_thread_that_was_woken_is_at_work_before_it_runs() -> None:
-    threads, lock, runs = Threads(), threading.Lock(), 0
+    threads, lock, runs = NewThreads(), threading.Lock(), 0
     is_over = False
     lock.acquire()
 

@@ -29,8 +29,8 @@ from .frames import (
     Publish,
     Record,
     Reply,
-    Run,
     Tell,
+    TellRun,
     payload_of,
     tagged,
 )
@@ -45,11 +45,11 @@ HIGH_BYTES = 4 * 1024 * 1024
 
 RUN_BYTES = 32 * 1024
 """Payload after which a run of messages is closed; a single one larger than an eighth of this is no part of a run."""
-_RUN, _FORGET = tagged(Run), tagged(Forget)
+_RUN, _FORGET = tagged(TellRun), tagged(Forget)
 SMALL_BYTES = 1024 * 1024
 """The largest frame of a kind that carries no payload: what is in it may be anything, and takes many times the room."""
 _CARRIERS: frozenset[type[Frame]] = frozenset((Tell, Ask, Reply, Failure, Offer, Publish, Record, Migrate))
-_FROM_ROOT: frozenset[type[Frame]] = _CARRIERS | {Launch, Run, Command}
+_FROM_ROOT: frozenset[type[Frame]] = _CARRIERS | {Launch, TellRun, Command}
 _CARRIER_TAGS, _FROM_ROOT_TAGS = (frozenset(tagged(kind)[1] for kind in kinds) for kinds in (_CARRIERS, _FROM_ROOT))
 FRAMES_PER_TICK = 128
 """Frames of one guarded peer, each 4 KiB counting as one more, after which others come first."""

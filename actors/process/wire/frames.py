@@ -135,7 +135,7 @@ class Record(Frame, tag=12):
     body: Raw
 
 
-class Run(Frame, tag=15):
+class TellRun(Frame, tag=15):
     """Messages of one type to one address, numbered from `first` on: stands for that many `Tell`s."""
 
     to: int
@@ -158,7 +158,7 @@ class Offer(Frame, tag=13):
     sender: Name | None = None
 
 
-class Moved(Frame, tag=14):
+class PageChanged(Frame, tag=14):
     """The page has changed: told to a bounded mailbox only, at most once per loop tick."""
 
 
@@ -205,8 +205,8 @@ AnyFrame = (
     | Note
     | Record
     | Offer
-    | Moved
-    | Run
+    | PageChanged
+    | TellRun
     | Forget
     | Migrate
 )

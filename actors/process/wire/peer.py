@@ -26,7 +26,7 @@ from .frames import BadFrame
 from .pending_sends import Offered
 
 if TYPE_CHECKING:
-    from ...control.orders_lane import Call
+    from ...control.orders_lane import QueuedOrder
     from ...kernel.node import Node
 
 Coroutine_ = types.CoroutineType
@@ -435,7 +435,7 @@ class OutsidePlace(Place):
         self.peer.require_granted(cell.path, "kill")
         self.told(cell, "kill", {})
 
-    def control(self, cell: Cell, call: Call) -> None:
+    def control(self, cell: Cell, call: QueuedOrder) -> None:
         from ...control.orders_lane import send_call
 
         send_call(self.peer, cell.path, call)

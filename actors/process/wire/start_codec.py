@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import operator
 import sys
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar, TypeVar
@@ -135,6 +136,16 @@ def _raise_up(value: Any, *, imports: bool = True) -> Any:
     return value
 
 
+def imported(name: str) -> Any:
+    """The class or function "module:path"; its module is imported if it is not loaded.
+
+    Raises:
+        AttributeError: there is none. What importing raises, which may be anything.
+    """
+    module, _, path = name.partition(":")
+    return operator.attrgetter(path)(sys.modules.get(module) or importlib.import_module(module))
+
+
 def loaded(name: str, base: type[T]) -> type[T] | None:
     """The class with this name, if it is loaded here; nothing is imported."""
     module_name, _, path = name.partition(":")
@@ -156,11 +167,7 @@ def _find(name: str, base: type) -> type[Any]:
 
 def _named(name: str) -> Any:
     """Find the class or function that has this name."""
-    module_name, _, path = name.partition(":")
     try:
-        found: Any = sys.modules.get(module_name) or importlib.import_module(module_name)
-        for part in path.split("."):
-            found = getattr(found, part)
+        return imported(name)
     except BaseException as error:  # Importing a module runs it: it may raise anything.
         raise SpecError("recipe", f"{name} cannot be imported: {error}") from error
-    return found

@@ -20,7 +20,7 @@ from ...events import DeadLetter
 from ...exit_reasons import unpack_exit
 from ...kernel.bindings import unclaimed
 from ...kernel.cell import GONE, Cell
-from ...kernel.message import Order
+from ...kernel.message import RuntimeOrder
 from ...kernel.node import cell_kind
 from . import frames
 from .frames import BadFrame
@@ -297,7 +297,7 @@ def is_granted(path: str, own: Cell, cells: Iterable[Cell]) -> bool:
 
 def is_order(name: str) -> bool:
     """Whether a message type, by its name on the wire, is an order."""
-    return loaded(name, Order) is not None
+    return loaded(name, RuntimeOrder) is not None
 
 
 def text(frame: frames.Command, key: str) -> str:
@@ -396,14 +396,14 @@ RULES: Final[dict[type[frames.Frame], Rule]] = {
     frames.Failure: WorkerGate.outcome,
     frames.Launched: WorkerGate.outcome,
     frames.Beat: WorkerGate.outcome,
-    frames.Moved: WorkerGate.outcome,
+    frames.PageChanged: WorkerGate.outcome,
     frames.Ended: WorkerGate.ended,
     frames.Note: WorkerGate.note,
     frames.Record: WorkerGate.of_own,
     frames.Migrate: WorkerGate.of_own,
     frames.Command: WorkerGate.command,
 }
-"""What has no row (`Launch`, `Run`) only the root sends. `Forget` is the connection's own."""
+"""What has no row (`Launch`, `TellRun`) only the root sends. `Forget` is the connection's own."""
 
 COMMANDS: Final[dict[str, Callable[[WorkerGate, str, frames.Command], None]]] = {
     "readdressed": _knows,

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from holdfast.diagnosis.board import BadFrame, ChannelSpecification, Measurements, Reading, Specification
+from holdfast.diagnosis.board import BadBoardFrame, ChannelSpecification, Measurements, Reading, Specification
 from holdfast.diagnosis.board.board_frames import (
     CHANNELS,
     HEAD,
@@ -78,7 +78,7 @@ def test_one_flipped_bit_is_noticed(what: list[tuple[int, Frame]], data: st.Data
     decoder.feed(bytes(stream))
     try:
         found += heard(decoder)
-    except BadFrame:
+    except BadBoardFrame:
         pass
     # A length that has grown makes the decoder wait for more; what it hears before is what was said.
     assert len(found) < len(what)
@@ -91,7 +91,7 @@ def test_noise_is_refused_or_waited_out(noise: bytes) -> None:
     decoder.feed(noise)
     try:
         found = heard(decoder)
-    except BadFrame:
+    except BadBoardFrame:
         refused = True
     assert found == []
     # Only what may yet become a frame is waited for.
@@ -115,7 +115,7 @@ def test_a_whole_frame_is_heard_exactly_or_refused_and_the_next_one_is_heard(kin
     taken, refused = None, None
     try:
         taken = decoder.take()
-    except BadFrame as error:
+    except BadBoardFrame as error:
         refused = error
     assert (taken is None) is not (refused is None)
     assert refused is None or (refused.sequence, refused.is_fatal) == (7, False)
@@ -143,7 +143,7 @@ def test_a_whole_frame_is_heard_exactly_or_refused_and_the_next_one_is_heard(kin
 def test_a_bad_frame_is_refused_with_the_reason(data: bytes, why: str, is_fatal: bool) -> None:
     decoder = BoardDecoder()
     decoder.feed(data)
-    with pytest.raises(BadFrame) as raised:
+    with pytest.raises(BadBoardFrame) as raised:
         decoder.take()
     assert why in str(raised.value)
     assert raised.value.is_fatal is is_fatal
@@ -164,5 +164,5 @@ def test_a_bad_frame_is_refused_with_the_reason(data: bytes, why: str, is_fatal:
     ],
 )
 def test_what_cannot_be_is_not_said(frame: Frame) -> None:
-    with pytest.raises(BadFrame):
+    with pytest.raises(BadBoardFrame):
         encode(1, frame)

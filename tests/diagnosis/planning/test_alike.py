@@ -20,7 +20,7 @@ from holdfast.diagnosis.planning import (
 from holdfast.diagnosis.planning import stable as planner_module
 from holdfast.diagnosis.planning.alike import OneOfEach
 from holdfast.diagnosis.planning.grounding import GroundAction, Grounder
-from holdfast.diagnosis.planning.language import Literal
+from holdfast.diagnosis.planning.language import PlanLiteral
 
 DEARER = (
     (
@@ -60,7 +60,7 @@ class AsItIs(OneOfEach):
     def twins(self, action: GroundAction) -> list[GroundAction]:
         return [action]
 
-    def same(self, goals: Iterable[Literal]) -> tuple[Literal, ...]:
+    def same(self, goals: Iterable[PlanLiteral]) -> tuple[PlanLiteral, ...]:
         return tuple(goals)
 
 

@@ -24,7 +24,7 @@ from holdfast.diagnosis.planning import (
     relevance,
     repair_domain,
 )
-from holdfast.diagnosis.planning.language import Literal
+from holdfast.diagnosis.planning.language import PlanLiteral
 from tests.diagnosis.planning.robot import power_up, robot, told
 
 SWITCHES = """
@@ -81,7 +81,7 @@ def lamps(*goals: str) -> Problem:
 async def test_goals_that_exclude_each_other_are_proven_to() -> None:
     outcome = await find_plan(ClingoPlanner(), lamps("a", "b"))
     assert isinstance(outcome, Unsolvable)
-    assert (outcome.is_each, set(outcome.goals)) == (False, {Literal(("lit", "a")), Literal(("lit", "b"))})
+    assert (outcome.is_each, set(outcome.goals)) == (False, {PlanLiteral(("lit", "a")), PlanLiteral(("lit", "b"))})
 
 
 async def test_the_least_important_goals_are_given_up() -> None:
@@ -89,7 +89,7 @@ async def test_the_least_important_goals_are_given_up() -> None:
     outcome = await find_plan(ClingoPlanner(), lamps("b", "c", "a"), degrade=True)
     assert told(outcome) == [["light(b)"]]
     assert isinstance(outcome, Plan)
-    assert outcome.unmet == (Literal(("lit", "c")), Literal(("lit", "a")))
+    assert outcome.unmet == (PlanLiteral(("lit", "c")), PlanLiteral(("lit", "a")))
 
 
 async def test_what_cannot_be_told_in_time_is_no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -192,7 +192,7 @@ async def test_a_user_s_action_is_planned_with() -> None:
     plan = await find_plan(ClingoPlanner(), problem, degrade=True)
     assert told(plan) == [["reset_usb(imu)"]]
     assert isinstance(plan, Plan)
-    assert plan.unmet == (Literal(("good", "js")),)
+    assert plan.unmet == (PlanLiteral(("good", "js")),)
 
 
 async def test_the_cheaper_way_is_taken() -> None:

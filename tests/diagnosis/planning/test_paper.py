@@ -5,7 +5,7 @@ import importlib.util
 import pytest
 
 from holdfast.diagnosis.planning import ClingoPlanner, Plan, Planner, PlanningError, Unsolvable, check_plan, find_plan
-from holdfast.diagnosis.planning.language import Literal
+from holdfast.diagnosis.planning.language import PlanLiteral
 from holdfast.diagnosis.planning.unified import UnifiedPlanner
 from tests.diagnosis.planning.robot import HARDWARE, power_up, robot, told
 
@@ -59,7 +59,7 @@ async def test_a_device_without_a_switch_is_proven_to_be_beyond_repair(planner: 
     # T57, T66
     outcome = await find_plan(planner, robot(["imu", "jn"]), timeout=60)
     assert isinstance(outcome, Unsolvable)
-    assert (outcome.goals, outcome.is_each) == ((Literal(("good", "imu")),), True)
+    assert (outcome.goals, outcome.is_each) == ((PlanLiteral(("good", "imu")),), True)
 
 
 async def test_what_is_beyond_repair_does_not_hinder_the_rest(planner: Planner) -> None:
@@ -68,14 +68,14 @@ async def test_what_is_beyond_repair_does_not_hinder_the_rest(planner: Planner) 
     plan = await find_plan(planner, problem, timeout=60, degrade=True)
     assert told(plan) == [["stop_node(jn)"], ["start_node(jn)"]]
     assert isinstance(plan, Plan)
-    assert plan.unmet == (Literal(("good", "imu")),)
+    assert plan.unmet == (PlanLiteral(("good", "imu")),)
     assert check_plan(problem, plan).unmet() == plan.unmet
 
 
 async def test_no_plan_is_made_where_nothing_can_be_mended(planner: Planner) -> None:
     outcome = await find_plan(planner, robot(["imu"]), timeout=60, degrade=True)
     assert isinstance(outcome, Unsolvable)
-    assert outcome.goals == (Literal(("good", "imu")),)
+    assert outcome.goals == (PlanLiteral(("good", "imu")),)
 
 
 async def test_hardware_without_a_driver_is_powered_up_first_too() -> None:

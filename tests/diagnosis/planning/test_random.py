@@ -20,17 +20,17 @@ from holdfast.diagnosis.planning import (
     read_domain,
     read_problem,
 )
-from holdfast.diagnosis.planning.language import Action, And, Atom, Effect, Fact, Formula, Literal, Not, Or
+from holdfast.diagnosis.planning.language import Action, And, Atom, Effect, Fact, Formula, Not, Or, PlanLiteral
 from holdfast.diagnosis.planning.pddl_writer import Names, write_domain, write_problem
 
 ATOMS = [(f"p{i}",) for i in range(4)]
 
 
-def formula(literal: Literal) -> Formula:
+def formula(literal: PlanLiteral) -> Formula:
     return Fact(literal.atom) if literal.value else Not(Fact(literal.atom))
 
 
-literals = st.builds(Literal, st.sampled_from(ATOMS), st.booleans())
+literals = st.builds(PlanLiteral, st.sampled_from(ATOMS), st.booleans())
 clauses = st.lists(literals, min_size=1, max_size=2).map(lambda of: Or(tuple(map(formula, of))))
 conjunctions = st.lists(clauses, max_size=2).map(lambda of: And(tuple(of)))
 
@@ -109,29 +109,29 @@ def test_there_is_a_plan_exactly_where_the_goals_can_be_reached(problem: Problem
         assert not world.unmet()
 
 
-def read(formula: Formula) -> set[Literal]:
+def read(formula: Formula) -> set[PlanLiteral]:
     """The literals of a conjunction."""
     match formula:
         case And(of):
             return {literal for part in of for literal in read(part)}
         case Not(Fact(atom)):
-            return {Literal(atom, False)}
+            return {PlanLiteral(atom, False)}
         case Fact(atom):
-            return {Literal(atom)}
+            return {PlanLiteral(atom)}
         case _:
             raise AssertionError(formula)
 
 
-def written(action: Action) -> set[Literal]:
+def written(action: Action) -> set[PlanLiteral]:
     """What an action makes so; what it both adds and deletes is added."""
     made = {effect.literal for effect in action.effects}
-    return {literal for literal in made if literal.value or Literal(literal.atom) not in made}
+    return {literal for literal in made if literal.value or PlanLiteral(literal.atom) not in made}
 
 
 def disturb(a: Action, b: Action) -> bool:
     """Whether one takes away what the other needs or makes."""
     return any(
-        Literal(atom, not value) in read(other.precondition) | written(other)
+        PlanLiteral(atom, not value) in read(other.precondition) | written(other)
         for one, other in ((a, b), (b, a))
         for atom, value in written(one)
     )
@@ -162,12 +162,12 @@ def best(problem: Problem, most: int) -> tuple[int, int] | None:
     return None
 
 
-def plain(name: str, needs: list[Literal], makes: list[Literal]) -> Action:
+def plain(name: str, needs: list[PlanLiteral], makes: list[PlanLiteral]) -> Action:
     effects = tuple(Effect((), And(), literal) for literal in makes)
     return Action(name, (), And(tuple(map(formula, needs))), effects)
 
 
-P = [Literal(atom) for atom in ATOMS]
+P = [PlanLiteral(atom) for atom in ATOMS]
 MADE_SO_AGAIN = Problem(
     Domain(
         "again",
@@ -209,5 +209,5 @@ def test_what_is_written_is_read_as_the_same(problem: Problem) -> None:
 
 
 def test_outcomes_can_be_sent() -> None:
-    plan = Plan(((Step("power_up", ("ja",)),),), 1, True, (Literal(("good", "imu")),))
+    plan = Plan(((Step("power_up", ("ja",)),),), 1, True, (PlanLiteral(("good", "imu")),))
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(plan), type=Plan) == plan

@@ -16,7 +16,7 @@ from holdfast.diagnosis.planning import (
     repair_domain,
     repair_problem,
 )
-from holdfast.diagnosis.planning.language import Literal
+from holdfast.diagnosis.planning.language import PlanLiteral
 from holdfast.diagnosis.planning.repair import repair_text
 from tests.diagnosis.planning.robot import robot, told
 
@@ -64,7 +64,11 @@ def test_a_problem_is_read() -> None:
       (:goal (and (good JA) (running Jn) (not (bad Jn)))))
     """
     problem = read_problem(repair_domain(), text)
-    assert problem.goals == (Literal(("good", "JA")), Literal(("running", "Jn")), Literal(("bad", "Jn"), False))
+    assert problem.goals == (
+        PlanLiteral(("good", "JA")),
+        PlanLiteral(("running", "Jn")),
+        PlanLiteral(("bad", "Jn"), False),
+    )
     assert told(ClingoPlanner().solve(problem, Budget(60))) == [["power_up(JA)"], ["start_node(Jn)"]]
 
 
@@ -123,7 +127,7 @@ def test_too_many_ways_to_do_things_are_refused(monkeypatch: pytest.MonkeyPatch)
 def test_a_quantifier_over_what_is_static_looks_only_at_what_it_says() -> None:
     # All hardware that drives a node, and none else: a node without any can start at once.
     problem = robot(["jn", "hm"], on=(), running=())
-    problem = Problem(problem.domain, problem.objects, problem.init, (Literal(("running", "hm")),))
+    problem = Problem(problem.domain, problem.objects, problem.init, (PlanLiteral(("running", "hm")),))
     assert told(ClingoPlanner().solve(problem, Budget(60))) == [["start_node(hm)"]]
 
 

@@ -8,14 +8,14 @@ import threading
 from holdfast.testing import GuardedSystem
 from holdfast.testing.schedules.choices import Walk
 from holdfast.testing.schedules.control import ControlledLoop
-from holdfast.testing.schedules.due import Due, Option
+from holdfast.testing.schedules.due import DueQueue, Option
 from holdfast.testing.simulation import run_schedule
 
 
 class Last:
     """Takes the last of those that may be called."""
 
-    def choose_callback(self, due: Due) -> Option:
+    def choose_callback(self, due: DueQueue) -> Option:
         return due.next_options()[-1]
 
     def called(self, option: Option) -> None:

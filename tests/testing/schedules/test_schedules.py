@@ -37,7 +37,7 @@ from holdfast.testing.schedules.choices import (
 from holdfast.testing.schedules.shrinking import shrink
 from holdfast.testing.schedules.strategies import NAMES, Priorities, mixed, strategy
 from holdfast.testing.schedules.world import EPOCH, EscapesSimulation
-from holdfast.testing.simulation import NotExhausted, Search, Settings, run_schedule
+from holdfast.testing.simulation import NotExhausted, ScheduleSearch, SimulationSettings, run_schedule
 from tests.testing.schedules.planted import PLANTED, Go, Note, Planted, Step, Teller, order_of, restart_order
 
 OWN = {"system"}
@@ -117,7 +117,7 @@ def test_the_exhaustive_search_sees_each_order_and_ends() -> None:
         actor: Any = note._cell.actor
         orders[tuple(actor.got)] += 1
 
-    search = Search(tells, OWN, Settings(1000, strategy="exhaustive"))
+    search = ScheduleSearch(tells, OWN, SimulationSettings(1000, strategy="exhaustive"))
     search.run()
     assert search.is_complete
     assert set(orders) == set(itertools.permutations(range(3)))
@@ -138,7 +138,7 @@ def test_turns_that_have_nothing_to_do_with_each_other_are_not_tried_in_every_or
             system.spawn(hf.start(Teller, note, number), f"teller{number}").tell(Go())
         await idle(system)
 
-    search = Search(pairs, OWN, Settings(1000, strategy="exhaustive"))
+    search = ScheduleSearch(pairs, OWN, SimulationSettings(1000, strategy="exhaustive"))
     search.run()
     assert search.is_complete
     assert search.runs < 20

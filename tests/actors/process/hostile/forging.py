@@ -78,7 +78,7 @@ BREACHES: dict[str, Callable[[], bytes]] = {
     "text that is no UTF-8": lambda: framed(b"\x94\x08\xa2\xff\xfe\xa4kill\x80"),
     # frames that only the root sends
     "Launch": lambda: frame(f.Launch(1, EVIL, 1, b"", {})),
-    "Run": lambda: frame(f.Run(0, 0, 1, raw([]))),
+    "Run": lambda: frame(f.TellRun(0, 0, 1, raw([]))),
     # senders and addresses
     "a message of another": lambda: tell([1000], ADD, sender=OTHER),
     "an ask of another": lambda: frame(f.Ask(1, VICTIM, ADD, raw([1000]), 1e18, 0, OTHER)),
@@ -155,7 +155,7 @@ HARMLESS: dict[str, Callable[[], bytes]] = {
     "a failure for nobody": lambda: frame(*(f.Failure(key, "error", "x", raw([])) for key in range(10_000, 10_100))),
     "a start of nobody": lambda: frame(f.Launched(4711, "no")),
     "beats": lambda: frame(*[f.Beat()] * 5000),
-    "moves of nothing": lambda: frame(*[f.Moved()] * 5000),
+    "moves of nothing": lambda: frame(*[f.PageChanged()] * 5000),
     "an event of an unknown kind": lambda: note("NoSuchEvent", address=EVIL),
     "an event whose fields do not fit": lambda: note("ActorStarted", address=EVIL, life="x"),
     "a message to nobody": lambda: tell([], to="//") + tell([], to="") + tell([], to="/app/../..") + tell([], to="\0"),

@@ -53,7 +53,7 @@ async def test_a_number_on_the_page_that_cannot_be(place: int, number: int) -> N
         evil = await system.start(hf.child("evil", hf.start(Evil), **bounded))  # type: ignore[arg-type]
         victim = await system.start(hf.child("victim", hf.start(Victim)))
         with system.events() as events:
-            evil.tell(SetPage(place, number, frame(f.Moved())))
+            evil.tell(SetPage(place, number, frame(f.PageChanged())))
             assert (await next_event(events, hf.TrustBreached)).address == "/app/evil"
             await next_event(events, hf.ActorStarted, lambda event: event.address == "/app/evil")
         assert await victim.ask(Add()) == 1
