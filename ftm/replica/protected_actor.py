@@ -125,7 +125,6 @@ class Server(lifecycle.HerePlace):
 
     def __init__(self, standing: Standing, method: Method) -> None:
         self.standing, self.method = standing, method
-        self.address = standing.address
         self.cell: Cell | None = None
         self.life: ServerLife | None = None
         self.state, self.points = ReplicaState(), RewindPoints()
@@ -140,6 +139,11 @@ class Server(lifecycle.HerePlace):
         self._live: Live | None = None
         self._is_costly = False  # that was told
         self._work_waited_for: list[asyncio.Future[None]] = []
+
+    @property
+    def address(self) -> str:
+        """Where the actor is for all others, and for itself."""
+        return self.standing.address
 
     def report_to(self, driver: Driver) -> None:
         """Have this one drive the server from now on."""
@@ -405,6 +409,18 @@ class Server(lifecycle.HerePlace):
         points.point, points.tail, points.previous = None, [], None
         if self.life is not None and self.state.has_access:
             self.capture()
+
+    def readdress(self, cell: Cell, was: str, now: str) -> None:
+        """Take the state down anew: a ref to the actor itself reads otherwise in it from now on."""
+        life, points = self.life, self.points
+        self.standing.other.turn = -2  # What the other replica has reads as it was.
+        if life is None or life.feed is not None or not self.state.has_access:
+            return
+        before = points.point, points.tail, points.previous
+        try:
+            self.forget_point()
+        except Exception:  # It cannot be saved, which the next turn tells whoever is to hear it.
+            points.point, points.tail, points.previous = before
 
     def rewind(self, point: State) -> None:
         """Put the state of a point back, in place: the actor's object goes on. Only between two turns."""

@@ -24,7 +24,7 @@ TEXT = (Path(__file__).parents[2] / "docs" / "control.md").read_text("utf-8")
 TIMES = int(os.environ.get("HOLDFAST_MATRIX", "1"))
 # Each note: the actors it is about, what the refusal says.
 NOTES: dict[str, tuple[set[str], str]] = {
-    "¹": (set(KINDS), "its replicas know it|no supervisor looks after it|a life cannot enter or leave"),
+    "¹": (set(KINDS), "no supervisor looks after it|a life cannot enter or leave"),
 }
 
 

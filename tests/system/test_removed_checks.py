@@ -100,15 +100,15 @@ CHECKS = {
     ),
     "no turn is repeated under another address": Check(
         "system/transaction/reparenting.py",
-        "            if switch is not None and switch.method.replays and one not in self._rests:\n",
+        "            if switch is not None and (switch.method.replays or one.is_protected) and one not in self._rests:\n",
         "            if False:\n",
         MOVED,
         "test_what_is_recorded and task",
     ),
     "a process is told its address": Check(
         "system/transaction/arrangement.py",
-        "                    cell.host.place.readdress(cell)\n",
-        "                    pass\n",
+        "                cell.host.place.readdress(cell, was[child], now[was[child]])\n",
+        "                pass\n",
         MOVED,
         "test_what_a_process_says",
     ),
