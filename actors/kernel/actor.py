@@ -140,7 +140,7 @@ class Actor:
 
     @classmethod
     def _may_order(cls, start: Start[Any], path: str) -> tuple[str, ...]:
-        """Addresses to which an actor that begins so at `path` may give orders from its process, besides what it starts."""
+        """Addresses to which who begins so at `path` may give orders from its process, besides what it starts."""
         return ()
 
     @classmethod

@@ -91,10 +91,10 @@ class Place:
         """A link, monitor or binding at this cell has changed: whoever lives its life has to know."""
 
     def readdress(self, cell: Cell, was: str, now: str) -> None:
-        """The actor, or one above it, has moved to another supervisor: the address `was`, and all below it, is `now`."""
+        """The actor, or one above it, has moved to another supervisor: `was`, and all below it, is `now`."""
 
     def is_steady(self, cell: Cell) -> bool:
-        """Whether the address can change now: nothing is under way for which something was told it that can only end."""
+        """Whether the address may change now: nobody is being told of it in words that may come too late."""
         return True
 
     def running(self, cell: Cell) -> int:

@@ -161,7 +161,7 @@ class Worker(Peer):
             self._watch = ProcessWatch(self, limits)
 
     def readdress(self, was: str, now: str) -> None:
-        """An address at or above its actor's has become another; what is on its way from there still says the old one."""
+        """Its actor, or one above it, has moved; what is on its way from there still says the old address."""
         old, self.home = self.home, now + self.home[len(was) :]
         self.gate.readdressed(was, now)
         self.inner.readdressed(old, self.home)

@@ -319,7 +319,7 @@ class AtRest(FromRecordedGroup):
                 if self.move.given_up.done() or now() > end:
                     raise
                 await asyncio.wait((replicas.stirred(),), timeout=AGAIN_AFTER)
-                raise AskTimeout(replicas.place(name), SETTLED_WITHIN) from None  # It may have died: all is asked again.
+                raise AskTimeout(replicas.place(name), SETTLED_WITHIN) from None  # It may have died: ask all again.
         if self._switch.method.replays:
             await super().collect(epoch, end)
 

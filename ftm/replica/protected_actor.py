@@ -411,16 +411,14 @@ class Server(lifecycle.HerePlace):
             self.capture()
 
     def readdress(self, cell: Cell, was: str, now: str) -> None:
-        """Take the state down anew: a ref to the actor itself reads otherwise in it from now on."""
-        life, points = self.life, self.points
-        self.standing.other.turn = -2  # What the other replica has reads as it was.
-        if life is None or life.feed is not None or not self.state.has_access:
+        """Take the state down: what was handled before is not run again under another address."""
+        life = self.life
+        if life is None or life.feed is not None or not self.points.tail:
             return
-        before = points.point, points.tail, points.previous
         try:
-            self.forget_point()
-        except Exception:  # It cannot be saved, which the next turn tells whoever is to hear it.
-            points.point, points.tail, points.previous = before
+            self.capture()
+        except Exception:  # What the user's own values and methods raise: it is told that no replica can take it.
+            self._go_on_without_point([])
 
     def rewind(self, point: State) -> None:
         """Put the state of a point back, in place: the actor's object goes on. Only between two turns."""

@@ -94,7 +94,8 @@ class Move(Operation):
             rests = not one.is_planned and (one.rework is None or one.is_protected)
             cell = one.now(system.node) if rests else None
             switch = switch_of(cell) if cell is not None else None
-            if switch is not None and (switch.method.replays or one.is_protected) and one not in self._rests:
+            runs_again = switch is not None and (switch.method.replays or one.is_protected)
+            if runs_again and one not in self._rests:
                 self._rests[one] = Gated(one, f"pause of {one.path}")
         return list(self._rests.items())
 
@@ -169,7 +170,7 @@ def check_movable(place: Place) -> None:
     """
     cell, spec = place.cell, place.spec
     if place.is_protected and cell is not None and any(one.secures for one in rules().layers_of(cell.spec.mechanism)):
-        raise wrong(place.path, "its replicas are certified under its address: take the mechanism that secures them out")
+        raise wrong(place.path, "its replicas are certified under its address: detach the mechanism that secures them")
     if place.is_supervisor and (
         (spec is not None and spec.isolation == "process") or (cell is not None and is_elsewhere(cell))
     ):

@@ -100,7 +100,7 @@ CHECKS = {
     ),
     "no turn is repeated under another address": Check(
         "system/transaction/reparenting.py",
-        "            if switch is not None and (switch.method.replays or one.is_protected) and one not in self._rests:\n",
+        "            if runs_again and one not in self._rests:\n",
         "            if False:\n",
         MOVED,
         "test_what_is_recorded and task",
