@@ -6,6 +6,7 @@ import asyncio
 import os
 import signal
 import sys
+import time
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -47,6 +48,13 @@ class Wake(hf.Message[bool]):
 class Break(hf.Message[int]): ...
 
 
+class Dawdle(hf.Message[int]):
+    """Keep one of the replicas busy while a file is there."""
+
+    pid: int
+    file: str
+
+
 class Resident(hf.Actor):
     """Counts, and notes the address at which it did."""
 
@@ -72,6 +80,14 @@ class Resident(hf.Actor):
     @hf.on(Ring)
     def ring(self, message: Ring) -> None:
         self.rung += 1
+
+    @hf.on(Dawdle)
+    def dawdle(self, message: Dawdle) -> int:
+        if os.getpid() == message.pid:
+            Path(message.file).touch()
+            while Path(message.file).exists():
+                time.sleep(0.001)
+        return self.count
 
     @hf.on(Break)
     def fails(self, message: Break) -> int:
@@ -109,9 +125,8 @@ async def program(stack: str | None, kind: str, store: Path | None = None) -> As
     """`here` has `one`, which is protected; `there` is where it goes."""
     kept: dict[str, Any] = {} if store is None else {"store": f"sqlite:{store}", "durability": "os"}
     async with hf.ActorSystem("app", log=False, intensity=1000, **kept) as system:
-        one = hf.child(
-            "one", hf.start(Resident), mechanism=None if stack is None else STACKS[stack], recovery=KINDS[kind]
-        )
+        mechanism = None if stack is None else STACKS[stack]
+        one = hf.child("one", hf.start(Resident), mechanism=mechanism, recovery=KINDS[kind])
         await system.start(hf.supervisor("here", intensity=1000, children=[one]))
         await system.start(hf.supervisor("there", intensity=1000, children=[]))
         yield system
@@ -269,6 +284,29 @@ async def test_turns_are_run_again_as_they_were_when_one_of_them_crashes_the_lif
             await one.ask(Break(), IN_TIME)
         await fail_over(one)
         assert (await one.ask(Told(), IN_TIME))["at"] in ([HERE] * 3 + [THERE], [])
+
+
+@KIND
+async def test_a_follower_that_is_behind_runs_what_was_handled_as_it_was(tmp_path: Path, kind: str) -> None:
+    async with program("LFR", kind) as system:
+        one, file = resident(system), tmp_path / "busy"
+        await whole(one)
+        primary = group_of(one).membership.primary
+        (follower,) = (pid for name, pid in pids(one).items() if name != primary)
+        assert await one.ask(Dawdle(follower, str(file)), IN_TIME) == 0
+        for count in (1, 2, 3):
+            assert await one.ask(Add(), IN_TIME) == count
+        async with asyncio.timeout(IN_TIME):
+            while not file.exists():
+                await asyncio.sleep(0.005)
+        moving = asyncio.ensure_future(moved(system))
+        await asyncio.wait((moving,), timeout=0.3)
+        assert one.path == HERE
+        file.unlink()
+        await moving
+        os.kill(pids(one)[primary], signal.SIGKILL)
+        assert await one.ask(Add(), IN_TIME) == 4
+        assert (await one.ask(Told(), IN_TIME))["at"] == [HERE] * 3 + [THERE]
 
 
 async def test_a_supervisor_is_moved_with_those_that_are_protected_below_it() -> None:
