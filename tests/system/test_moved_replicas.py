@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import os
 import signal
 import sys
-import time
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
 import holdfast as hf
 from holdfast.ftm.alarms import StatesDiffer
+from holdfast.ftm.bricks.brick_messages import Work
+from holdfast.ftm.bricks.bricks import Before
 from holdfast.ftm.events import ReplicaLost
 from holdfast.ftm.group import probation
+from holdfast.ftm.model.mechanism import Mechanism, Role
 from tests.ftm.bad_bricks import Wrong
 from tests.system.test_moved_ties import Heard, Party, Tie, hears_once
 from tests.system.test_transaction_commit import Die
@@ -82,12 +85,12 @@ class Resident(hf.Actor):
         self.rung += 1
 
     @hf.on(Dawdle)
-    def dawdle(self, message: Dawdle) -> int:
+    async def dawdle(self, message: Dawdle) -> int:
         if os.getpid() == message.pid:
-            Path(message.file).touch()
+            Path(f"{message.file}.begun").touch()
             while Path(message.file).exists():
-                time.sleep(0.001)
-        return self.count
+                await asyncio.sleep(0.001)
+        return self.add(Add())
 
     @hf.on(Break)
     def fails(self, message: Break) -> int:
@@ -109,6 +112,29 @@ STACKS: dict[str, Any] = {
     "LFR+TR": (hf.LFR(), hf.TR()),
     "A&D": (hf.AD(assertions=(is_counted,)), hf.LFR()),
 }
+
+
+class HoldsBack(Before):
+    """Keeps what has come to a follower while a file is there."""
+
+    async def before(self, work: Work) -> Work:
+        assert isinstance(self.mechanism, Late)
+        while work.requests and Path(self.mechanism.file).exists():
+            await asyncio.sleep(0.001)
+        return work
+
+
+@dataclasses.dataclass(frozen=True)
+class Late(Mechanism):
+    """Its follower is late."""
+
+    name: ClassVar[str] = "late"
+    layer: ClassVar[str] = "assertion"
+    roles: ClassVar[dict[str, Role]] = {"leader": Role(), "follower": Role(before=HoldsBack)}
+
+    file: str = ""
+
+
 KINDS: dict[str, Any] = {
     "plain": None,
     "recorded": hf.hybrid(interval=900.0),
@@ -286,27 +312,50 @@ async def test_turns_are_run_again_as_they_were_when_one_of_them_crashes_the_lif
         assert (await one.ask(Told(), IN_TIME))["at"] in ([HERE] * 3 + [THERE], [])
 
 
-@KIND
-async def test_a_follower_that_is_behind_runs_what_was_handled_as_it_was(tmp_path: Path, kind: str) -> None:
-    async with program("LFR", kind) as system:
-        one, file = resident(system), tmp_path / "busy"
+@pytest.mark.parametrize("stack", ["LFR", "LFR+TR"])
+async def test_a_follower_that_is_behind_runs_what_was_handled_as_it_was(tmp_path: Path, stack: str) -> None:
+    async with program(stack, "plain") as system:
+        one, files = resident(system), [tmp_path / "first", tmp_path / "second"]
         await whole(one)
         primary = group_of(one).membership.primary
         (follower,) = (pid for name, pid in pids(one).items() if name != primary)
-        assert await one.ask(Dawdle(follower, str(file)), IN_TIME) == 0
-        for count in (1, 2, 3):
-            assert await one.ask(Add(), IN_TIME) == count
-        async with asyncio.timeout(IN_TIME):
-            while not file.exists():
-                await asyncio.sleep(0.005)
+        for count, file in enumerate(files, 1):
+            file.touch()
+            assert await one.ask(Dawdle(follower, str(file)), IN_TIME) == count
+        assert await one.ask(Add(), IN_TIME) == 3
         moving = asyncio.ensure_future(moved(system))
-        await asyncio.wait((moving,), timeout=0.3)
-        assert one.path == HERE
-        file.unlink()
+        for file in files:
+            async with asyncio.timeout(IN_TIME):
+                while not file.with_suffix(".begun").exists():
+                    await asyncio.sleep(0.005)
+            await asyncio.wait((moving,), timeout=0.3)
+            assert one.path == HERE
+            file.unlink()
         await moving
         os.kill(pids(one)[primary], signal.SIGKILL)
         assert await one.ask(Add(), IN_TIME) == 4
         assert (await one.ask(Told(), IN_TIME))["at"] == [HERE] * 3 + [THERE]
+
+
+async def test_a_follower_whose_bricks_are_behind_runs_what_was_handled_as_it_was(tmp_path: Path) -> None:
+    file = tmp_path / "busy"
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        child = hf.child("one", hf.start(Resident), mechanism=(Late(str(file)), hf.LFR()))
+        await system.start(hf.supervisor("here", children=[child], intensity=1000))
+        await system.start(hf.supervisor("there"))
+        one = resident(system)
+        await whole(one)
+        assert await one.ask(Add(), IN_TIME) == 1
+        file.touch()
+        assert await one.ask(Add(), IN_TIME) == 2
+        moving = asyncio.ensure_future(moved(system))
+        await asyncio.wait((moving,), timeout=0.5)
+        assert one.path == HERE
+        file.unlink()
+        await moving
+        await fail_over(one)
+        assert await one.ask(Add(), IN_TIME) == 3
+        assert (await one.ask(Told(), IN_TIME))["at"] == [HERE, HERE, THERE]
 
 
 async def test_a_supervisor_is_moved_with_those_that_are_protected_below_it() -> None:
