@@ -195,7 +195,7 @@ CHECKS = {
         "            system.mechanism_notes.moved(now)\n",
         "",
         REPLICAS,
-        "test_the_next_root and PBR",
+        "test_a_root_that_is_killed and trial and finish",
     ),
     "what comes of a mechanism on trial is noted where it is now": Check(
         "system/transaction/relocation.py",
