@@ -139,7 +139,8 @@ class Walk:
 
     def _kill_replica(self) -> None:
         """End one of the two, if the other one could go on alone."""
-        replicas = self.ref._cell.host.place.group.replicas
+        place: Any = self.ref._cell.host.place
+        replicas = place.group.replicas
         if replicas.whole_since()[0]:
             worker = replicas.worker_of(self._draw.choice(sorted(replicas.membership.names)))
             os.kill(worker.pid, signal.SIGKILL)

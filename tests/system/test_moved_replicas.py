@@ -90,7 +90,9 @@ class Resident(hf.Actor):
             Path(f"{message.file}.begun").touch()
             while Path(message.file).exists():
                 await asyncio.sleep(0.001)
-        return self.add(Add())
+        self.count += 1
+        self.at.append(self.ctx.path)
+        return self.count
 
     @hf.on(Break)
     def fails(self, message: Break) -> int:
@@ -170,7 +172,8 @@ async def moved(system: hf.ActorSystem, to: str = "/app/there", of: str = HERE, 
 
 
 def group_of(ref: hf.ActorRef[Any]) -> Any:
-    return ref._cell.host.place.group
+    place: Any = ref._cell.host.place
+    return place.group
 
 
 def pids(ref: hf.ActorRef[Any]) -> dict[str, int]:
