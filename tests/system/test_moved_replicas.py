@@ -361,6 +361,61 @@ async def test_a_follower_whose_bricks_are_behind_runs_what_was_handled_as_it_wa
         assert (await one.ask(Told(), IN_TIME))["at"] == [HERE, HERE, THERE]
 
 
+@pytest.mark.parametrize("kind", ["plain", "recorded"])
+async def test_two_that_are_protected_exchange_their_addresses(kind: str) -> None:
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        for above in ("here", "there"):
+            child = hf.child("one", hf.start(Resident), mechanism=hf.LFR(), recovery=KINDS[kind])
+            await system.start(hf.supervisor(above, children=[child], intensity=1000))
+        one, other = resident(system), resident(system, THERE)
+        assert await one.ask(Add(), IN_TIME) == 1
+        assert await other.ask(Add(10), IN_TIME) == 10
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.move(HERE, "/app")
+            change.move(THERE, "/app/here")
+            change.move("/app/one", "/app/there")
+        assert (one.path, other.path) == (THERE, HERE)
+        for _ in range(2):
+            assert [await ref.ask(Me(), IN_TIME) for ref in (one, other)] == [THERE, HERE]
+            await fail_over(one)
+            await fail_over(other)
+        assert [await ref.ask(Add(), IN_TIME) for ref in (one, other)] == [2, 11]
+
+
+async def test_one_that_is_suspended_is_moved_and_stays_so() -> None:
+    async with program("PBR", "recorded") as system:
+        one = resident(system)
+        await whole(one)
+        await system.suspend(one)
+        asked = one.ask(Add(), IN_TIME)
+        await moved(system)
+        await fail_over(one)
+        assert not asked.done()
+        await system.resume(one)
+        assert await asked == 1
+        assert (await one.ask(Told(), IN_TIME))["at"] == [THERE]
+
+
+@pytest.mark.parametrize("supervisor", [hf.supervisor, hf.dynamic])
+async def test_it_comes_back_with_its_new_supervisor(supervisor: Any) -> None:
+    async with program("PBR", "recorded") as system:
+        await system.start(supervisor("aside", intensity=1000))
+        one = resident(system)
+        assert await one.ask(Add(), IN_TIME) == 1
+        await moved(system, "/app/aside")
+        assert await one.ask(Add(), IN_TIME) == 2
+        one.kill()
+        assert await one.ask(Add(), IN_TIME) == 3
+        if supervisor is hf.supervisor:
+            system.ref("/app/aside", hf.Actor).kill()
+            async with asyncio.timeout(IN_TIME):
+                while (found := system.node.find("/app/aside/one")) is None or found is one._cell:
+                    await asyncio.sleep(0.005)
+            one = resident(system, "/app/aside/one")
+            assert await one.ask(Add(), IN_TIME) == 4
+        assert changes((await one.ask(Told(), IN_TIME))["at"]) == [HERE, "/app/aside/one"]
+
+
 async def test_a_supervisor_is_moved_with_those_that_are_protected_below_it() -> None:
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
         children = [hf.child(name, hf.start(Resident), mechanism=hf.PBR()) for name in ("one", "two")]
