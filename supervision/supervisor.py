@@ -74,13 +74,13 @@ class Supervisor(Inquiries):
         self._given = Plan.of(flags or Flags(), children)
 
     @classmethod
-    def _may_order(cls, start: Start[Any]) -> tuple[str, ...]:
+    def _may_order(cls, start: Start[Any], path: str) -> tuple[str, ...]:
         """What the bindings of those below it lead to, as far as its recipe names them."""
         found: list[str] = []
         for given in (*start.args, *start.kwargs.values()):
             for spec in given if isinstance(given, (tuple, list)) else (given,):
                 if isinstance(spec, ChildSpec):
-                    found += (*spec.bindings.values(), *spec.start.kind._may_order(spec.start))
+                    found += (*spec.bindings.values(), *spec.start.kind._may_order(spec.start, f"{path}/{spec.id}"))
         return tuple(found)
 
     def init(self) -> Plan:

@@ -249,12 +249,22 @@ class Moves:
             self._node.emit(MechanismChanged(cell.path, was, names, change.config, seconds))
 
     async def pause(self, cell: Cell, timeout: float, gate: Gate) -> None:
-        """Bring a recorded actor to rest where it lives, with a snapshot; it goes on when the gate opens.
+        """Bring a recorded or protected actor to rest where it lives; it goes on when the gate opens.
+
+        Who replays turns takes a snapshot.
 
         Raises:
             CannotMove, ActorStopped, AskTimeout: it was not at rest in time, or the gate was closed; it goes on.
         """
-        pausing = self._moved(cell, timeout, lambda: Pause(cell, leaving(cell), timeout), lambda: None, gate)
+
+        def made() -> Move:
+            if _spec_of(cell).mechanism is None:
+                return Pause(cell, leaving(cell), timeout)
+            from ..ftm.migration.protection import rest_of_group
+
+            return rest_of_group(cell, timeout)
+
+        pausing = self._moved(cell, timeout, made, lambda: None, gate)
         await self._alone(cell, pausing, f"pause of {cell.path}")
 
     async def _alone(self, cell: Cell, change: Coroutine[Any, Any, None], name: str) -> None:

@@ -14,10 +14,13 @@ import msgspec
 
 from ..actors.errors import SpecError
 from ..actors.events import Event
+from ..checkpoint.addresses import renamed
 from ..supervision.respec import rebuilt, spec_below
 from ..supervision.spec import ChildSpec
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from ..actors.kernel.cell import Cell
     from ..checkpoint.home.homes import Homes
 
@@ -131,6 +134,14 @@ class MechanismNotes:
             self._is_dirty = True
             self._loaded.discard(address)
             self.flush()
+
+    def moved(self, names: Mapping[str, str]) -> None:
+        """Actors have other addresses from now on, and all below them: where they live now, by where they did."""
+        kept = {renamed(names, address): said for address, said in self._kept.items()}
+        self._loaded = {renamed(names, address) for address in self._loaded}
+        self._is_dirty = self._is_dirty or kept.keys() != self._kept.keys()
+        self._kept = kept
+        self.flush()
 
     def flush(self) -> None:
         """Write what has changed to the store."""

@@ -139,13 +139,13 @@ class Actor:
     """Whether it is a part of the runtime: from another process only who was granted its address speaks to it."""
 
     @classmethod
-    def _may_order(cls, start: Start[Any]) -> tuple[str, ...]:
-        """Addresses to which an actor that begins so may give orders from its process, besides what it starts."""
+    def _may_order(cls, start: Start[Any], path: str) -> tuple[str, ...]:
+        """Addresses to which who begins so at `path` may give orders from its process, besides what it starts."""
         return ()
 
     @classmethod
-    def _speaks_for(cls, start: Start[Any]) -> tuple[str, ...]:
-        """Addresses besides its own of which an actor that begins so may tell events from its process."""
+    def _speaks_for(cls, path: str) -> tuple[str, ...]:
+        """Addresses besides its own of which an actor that lives at `path` may tell events from its process."""
         return ()
 
     def __init_subclass__(cls, **options: Any) -> None:

@@ -90,6 +90,13 @@ class Place:
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         """A link, monitor or binding at this cell has changed: whoever lives its life has to know."""
 
+    def readdress(self, cell: Cell, was: str, now: str) -> None:
+        """The actor, or one above it, has moved to another supervisor: `was`, and all below it, is `now`."""
+
+    def is_steady(self, cell: Cell) -> bool:
+        """Whether the address may change now: nobody is being told of it in words that may come too late."""
+        return True
+
     def running(self, cell: Cell) -> int:
         """The number of the input in hand, -1 if none is known."""
         return -1

@@ -381,11 +381,10 @@ class WorkerPlace(Place):
         self._stop_wanted: ExitReason | None = None
         self.stop_sent: ExitReason | None = None  # the life in the process has been told to stop
 
-    def readdress(self, cell: Cell) -> None:
-        """The actor has moved to another supervisor: its process is told its address."""
+    def readdress(self, cell: Cell, was: str, now: str) -> None:
         worker = self.process(cell)
         if worker is not None:
-            worker.readdress(cell.path)
+            worker.readdress(was, now)
         self.home.readdressed(cell)
 
     # -- beginning --------------------------------------------------------------------------------------------------

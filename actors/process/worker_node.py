@@ -417,7 +417,8 @@ class Guest(Peer):
 
     def _command(self, frame: frames.Command) -> None:
         if frame.verb == "readdress":
-            self._readdress(self.connection.names.from_wire(frame.to))
+            self.connection.names.from_wire(frame.to)  # The root uses its number from now on.
+            self._readdress(str(frame.data["was"]), str(frame.data["now"]))
             return
         cell = self._target(frame.to)
         if frame.verb == "bind":
@@ -429,15 +430,21 @@ class Guest(Peer):
         else:
             obey(self.node, cell, cell.path, frame, by_root=True)
 
-    def _readdress(self, path: str) -> None:
-        """Our own actor has moved to another supervisor."""
+    def _readdress(self, was: str, now: str) -> None:
+        """Our own actor, or one above it, has moved to another supervisor: so have all of them at or below `was`."""
         cell = self.node.root
         assert cell is not None
-        old, cell.name = cell.path, path
-        self._outside.pop(path, None)
-        self.moves.readdressed(old, path)
+        old, cell.name = cell.path, now + cell.path[len(was) :]
+        for path in [path for path in self._outside if is_at_or_below(path, was)]:
+            other = self._outside.pop(path)
+            other.name = now + path[len(was) :]
+            self._outside[other.name] = other
+        self._outside.pop(cell.path, None)
+        self.moves.readdressed(old, cell.path)
         if self.recovery is not None:
-            self.recovery.readdressed(old, path)
+            self.recovery.readdressed(old, cell.path)
+        for one in every_cell(cell):
+            one.host.place.readdress(one, was, now)
         self.command(cell, "readdressed", {})
 
     # -- the end ----------------------------------------------------------------------------------------------------

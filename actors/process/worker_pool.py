@@ -160,12 +160,13 @@ class Worker(Peer):
         if limits is not None:
             self._watch = ProcessWatch(self, limits)
 
-    def readdress(self, path: str) -> None:
-        """Its actor has another address from now on; what is on its way from there still says the old one."""
-        old, self.home = self.home, path
-        self.gate.readdressed(old, path)
-        self.inner.readdressed(old, path)
-        self.connection.send(frames.Command(self.connection.names.to_wire(path), "readdress", {}))
+    def readdress(self, was: str, now: str) -> None:
+        """Its actor, or one above it, has moved; what is on its way from there still says the old address."""
+        old, self.home = self.home, now + self.home[len(was) :]
+        self.gate.readdressed(was, now)
+        self.inner.readdressed(old, self.home)
+        to = self.connection.names.to_wire(self.home)
+        self.connection.send(frames.Command(to, "readdress", {"was": was, "now": now}))
 
     def give_back(self) -> None:
         """The actor is not moved into this process: it ends, and nobody is told."""

@@ -144,7 +144,7 @@ class Before(Brick):
         if self.leads:  # Elsewhere, nobody hears of outcomes.
             end = TurnEnd(-1, request.feed.id, DROPPED, [], answer if request.feed.is_ask else Answer())
             done = Done(standing.epoch, standing.config, -1, [end], False)
-            standing.node.cell_at(standing.paths["protocol"]).ref.tell(done)
+            standing.bricks["protocol"].ref.tell(done)
         return msgspec.structs.replace(work, requests=[one for one in work.requests if one is not request])
 
     @on(Work)

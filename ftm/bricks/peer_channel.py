@@ -193,19 +193,20 @@ class Posting(Letters):
         standing = self._standing
         codec = standing.node.codec
         body = codec.encoder.encode(message)
-        peer = standing.other.path
+        peer = standing.other.cell
         if standing.link is not None:
             if peer is None:
                 raise PeerLost("there is none")
-            return codec.decode_reply(type(message), await self._ask_peer_sealed(standing.link, peer, message, body))  # type: ignore[no-any-return]
+            sealed = self._ask_peer_sealed(standing.link, peer.path, message, body)
+            return codec.decode_reply(type(message), await sealed)  # type: ignore[no-any-return]
         while True:
-            if peer is None or standing.other.path != peer:
+            if peer is None or standing.other.cell is not peer:
                 raise PeerLost("there is none")
             try:
                 async with self._sending:  # In order: finding the peer takes the first one longer than the others.
-                    if standing.other.path != peer:
+                    if standing.other.cell is not peer:
                         continue
-                    posted = self._post(await self._find_peer(peer), message, body)
+                    posted = self._post(await self._find_peer(peer.path), message, body)
                 reply = await self._reply_to(posted)
             except (PeerLost, ConfigMismatch):
                 raise

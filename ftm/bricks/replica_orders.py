@@ -16,10 +16,11 @@ from ..model.mechanism import Description
 
 
 class Setting(msgspec.Struct, array_like=True, frozen=True):
-    """What a replica is made with, besides its layers and the recipe of the protected actor."""
+    """What a replica is made with, besides its layers and the recipe of the protected actor.
 
-    address: str
-    """That of the protected actor: the proxy is at `ftm/proxy` below it, the detector at `ftm/detector`."""
+    The address of that is not among it: a replica finds it by its own, `ftm/NAME` below it, wherever that is now.
+    """
+
     name: str
     """This replica's: "r1"."""
     config: int
@@ -74,10 +75,14 @@ class Stand(msgspec.Struct, array_like=True):
 
 
 class Quiesce(Message[Stand]):
-    """Answered when nothing is inside, and the other replica has all that it was sent. Nothing new may be sent in."""
+    """Answered when nothing is inside, and the other replica has all that it was sent. Nothing new may be sent in.
+
+    `settles`: and when all that has come here has been handled here. One that follows may be behind the one that leads.
+    """
 
     epoch: int
     config: int
+    settles: bool = False
 
 
 class PrepareStack(Message[None]):

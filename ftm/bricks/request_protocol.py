@@ -64,6 +64,7 @@ from .state_transfer import Assume, Play, Transfer
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
+    from ...actors.kernel.cell import Cell
     from ..model.mechanism import Mechanism
     from .standing import Standing
 
@@ -109,7 +110,6 @@ class RequestProtocol(Transfer):
         self._came_out = 0  # turns of it that have come out of the bricks
         self._copies = False  # home gets the state behind it
         self._behind: tuple[list[TurnEnd], list[Any]] = [], []  # what goes home with that
-        self.paths: dict[str, str] = {}
 
     # -- requests ---------------------------------------------------------------------------------------------------
 
@@ -390,10 +390,10 @@ class RequestProtocol(Transfer):
     @on(Where)
     def _where(self, message: Where) -> str:
         self._standing.check(self._standing.epoch, message.config)
-        path = self._standing.paths.get(message.slot)
-        if path is None:
+        brick = self._standing.bricks.get(message.slot)
+        if brick is None:
             raise ConfigMismatch(self._standing.path, self._standing.config, message.config)
-        return path
+        return brick.path
 
     @on(EndTurn)
     def _end_turn(self, message: EndTurn) -> None:
@@ -416,6 +416,10 @@ class RequestProtocol(Transfer):
         self._holds += 1
         try:
             await self._quiet()
+            if message.settles:
+                for brick in self._befores():
+                    await brick.ref.ask(AwaitHandled(), timeout=FOREVER)
+                await self.proceed.ask(AwaitHandled(), timeout=FOREVER)
             await self.proceed.ask(Flush(), timeout=FOREVER)
             await self._drain_bricks()
             handle.reply(Stand(standing.epoch, standing.config, standing.server.turn, standing.leads))
@@ -424,6 +428,10 @@ class RequestProtocol(Transfer):
         finally:
             self._holds -= 1
             self._go_on()
+
+    def _befores(self) -> list[Cell]:
+        """What a batch passes on its way to Proceed, outermost first."""
+        return [one for slot, one in self._standing.bricks.items() if slot.endswith(".before")]
 
     @on(Computes)
     def _computes(self, message: Computes) -> Any:
@@ -435,9 +443,8 @@ class RequestProtocol(Transfer):
 
     async def _follows(self, handle: ReplyHandle[Any], message: Computes) -> None:
         """Bricks of one that does not lead wait for nobody: what has come to them is handled soon."""
-        node, paths = self._standing.node, self._standing.paths
-        bricks = [path for slot, path in paths.items() if slot.endswith((".before", ".after"))]
-        asked = [node.cell_at(path).ref.ask(AwaitHandled(), timeout=message.seconds) for path in bricks]
+        bricks = [one for slot, one in self._standing.bricks.items() if slot.endswith((".before", ".after"))]
+        asked = [one.ref.ask(AwaitHandled(), timeout=message.seconds) for one in bricks]
         found = await asyncio.gather(*asked, return_exceptions=True)
         passes = not any(isinstance(one, AskTimeout) for one in found)
         handle.reply(msgspec.structs.replace(self._doing(message), passes=passes))

@@ -13,6 +13,7 @@ from .reply_log import ReplyLog
 from .state_comparison import Looking
 
 if TYPE_CHECKING:
+    from ...actors.kernel.cell import Cell
     from ...actors.kernel.message import Message
     from ...actors.kernel.node import Node
     from ..model.mechanism import Mechanism
@@ -32,18 +33,24 @@ class PeerLost(HoldfastError, text="{why}"):
 class OtherReplica:
     """What is known of the replica that this one speaks with, and who waits for an answer from there."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop = loop
-        self.path: str | None = None
+    def __init__(self, node: Node) -> None:
+        self._node, self._loop = node, node.loop
+        self.cell: Cell | None = None  # where it is
         self.state: PeerState = "none"
         self.turn = -2  # the last turn whose state it has acknowledged, -2 if that is not known
         self.forwarded: list[asyncio.Task[bool]] = []  # batches on their way to it
         self._bricks: dict[str, Outbox] = {}  # by slot
         self._waiting: set[asyncio.Future[Any]] = set()
 
+    @property
+    def path(self) -> str | None:
+        """Its address; None: there is no other replica."""
+        return None if self.cell is None else self.cell.path
+
     def replace(self, path: str | None, state: PeerState, turn: int = -2) -> None:
         """The other replica is this one from now on; nobody waits any longer for another."""
-        self.path, self.state, self.turn = path, state if path is not None else "none", turn
+        self.cell = None if path is None else self._node.cell_at(path)
+        self.state, self.turn = state if path is not None else "none", turn
         self._bricks.clear()
         self.forwarded = []
         waiting, self._waiting = self._waiting, set()
@@ -156,8 +163,8 @@ class OpenedMessages:
 class Standing:
     """A replica's address, role, epoch and configuration, and its other half."""
 
-    def __init__(self, node: Node, address: str, path: str, config: int, layers: tuple[Mechanism, ...]) -> None:
-        self.node, self.address, self.path = node, address, path
+    def __init__(self, replica: Cell, config: int, layers: tuple[Mechanism, ...]) -> None:
+        self.node, self._replica = replica.node, replica
         self.epoch, self.config, self.layers = -1, config, layers
         self.leads = False
         self.leading = -1  # the epoch in which it has begun to lead
@@ -165,12 +172,26 @@ class Standing:
         self.computes = False  # whether the protected actor lives here
         self.log = ReplyLog()
         self.inside: dict[int, Request] = {}  # requests that are being handled
-        self.other, self.following, self.opened = OtherReplica(node.loop), Following(node.loop), OpenedMessages()
-        self.paths: dict[str, str] = {}  # of its bricks, by slot
+        self.other, self.following, self.opened = OtherReplica(self.node), Following(self.node.loop), OpenedMessages()
+        self.bricks: dict[str, Cell] = {}  # by slot
         self.looking = Looking()
         self.refused = 0  # messages of other epochs or configurations
         self.server: Server = None  # type: ignore[assignment]  # made with it, by the replica
         self.link: SecuredLink | None = None  # what comes and goes has to be sealed
+
+    @property
+    def path(self) -> str:
+        """The address of the replica."""
+        return self._replica.path
+
+    @property
+    def address(self) -> str:
+        """The address of the protected actor, by which it knows itself on every replica."""
+        return protected_at(self.path)
+
+    def part(self, name: str) -> Cell:
+        """The cell of an actor of the mechanism in the root: of its proxy, of its detector."""
+        return self.node.cell_at(f"{self.address}/ftm/{name}")
 
     def check(self, epoch: int, config: int | None = None) -> None:
         """Refuse what an earlier epoch, or another stack of mechanisms, says.
@@ -198,3 +219,8 @@ class Standing:
         """A higher epoch was seen elsewhere: whatever is still said here does not count."""
         self.is_fenced = True
         self.other.replace(None, "none")
+
+
+def protected_at(replica: str) -> str:
+    """The address of the protected actor whose replica has this one."""
+    return replica.rsplit("/", 2)[0]

@@ -141,9 +141,8 @@ class Transfer(SealedGate):
         return turn
 
     async def _drain_bricks(self) -> None:
-        for path in list(self._standing.paths.values()):
-            cell = self._standing.node.find(path)
-            if cell is not None and isinstance(cell.actor, Brick):
+        for cell in list(self._standing.bricks.values()):
+            if isinstance(cell.actor, Brick):
                 await cell.actor.drain()  # No ask: one of them may be waiting for us.
 
     async def _offer(self, take: TakeState) -> int | HoldfastError:

@@ -196,7 +196,7 @@ class GroupPlace(Place):
         bindings = {port: target.path for port, target in more.bindings.items()}
         usual, method = Detection(), self.home.method.data()
         interval, watch_turns = usual.interval, usual.watch_turns or 0.0
-        setting = Setting(cell.path, name, config, method, bindings, interval, watch_turns, more.claimed)
+        setting = Setting(name, config, method, bindings, interval, watch_turns, more.claimed)
         return self.replica(
             setting, self.parent.recipe(cell), tuple(layer.for_replicas().describe() for layer in layers)
         )
@@ -568,6 +568,13 @@ class GroupPlace(Place):
         if verb == "bind" and self.group is not None:
             for name in self.group.membership.names:
                 bind(self.group.replicas, name, data)
+
+    def is_steady(self, cell: Cell) -> bool:
+        group = self.group
+        if group is None or not group.is_steady():
+            return False
+        known, replicas = group.membership, group.replicas
+        return all(replicas.life_of(name) == known.up.get(name) for name in known.names)
 
     def is_up(self, cell: Cell) -> bool:
         return self.group is not None and not self.group.membership.is_over

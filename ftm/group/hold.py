@@ -10,7 +10,7 @@ from ...supervision.arbiter import Grant, Hand, InOtherHands, arbiter_of
 if TYPE_CHECKING:
     from collections.abc import Generator
 
-    from ...actors.kernel.node import Node
+    from ...actors.kernel.cell import Cell
 
 
 class FailoverHold:
@@ -19,14 +19,14 @@ class FailoverHold:
     It outlives the failover manager, as all does that is known of a group: its next life goes on with what it holds.
     """
 
-    def __init__(self, node: Node, path: str) -> None:
-        self._node, self._path = node, path
+    def __init__(self, cell: Cell) -> None:
+        self._node, self._cell = cell.node, cell
         self._grant: Grant | None = None
 
     def take(self, why: str) -> bool:
         """Have the actor, until it is given back. False: another failover has it, of something above."""
         if self._grant is None:
-            self._grant = self._claim(self._path, why)
+            self._grant = self._claim(self._cell.path, why)
         return self._grant is not None
 
     def give_back(self) -> None:

@@ -107,15 +107,20 @@ class Replicas:
     def __init__(
         self, cell: Cell, membership: Membership, detection: Detection, on_fault: Callable[[str, str], None]
     ) -> None:
-        self.node, self.cell, self.path = cell.node, cell, cell.path
+        self.node, self.cell = cell.node, cell
         self.membership, self.detection, self._on_fault = membership, detection, on_fault
         self.link: SecuredLink | None = None
-        self.hold = FailoverHold(self.node, self.path)
+        self.hold = FailoverHold(cell)
         self.wrong = 0  # suspicions
         self._stirred: list[asyncio.Future[None]] = []
         self._was_whole, self._whole_since = False, time.time()
 
     # -- where they are ---------------------------------------------------------------------------------------------
+
+    @property
+    def path(self) -> str:
+        """The address of the protected actor."""
+        return self.cell.path
 
     def place(self, name: str) -> str:
         """The address of an actor of the mechanism."""

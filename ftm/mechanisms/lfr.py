@@ -279,7 +279,7 @@ class Comparing(After):
         begin = before_turn(standing.server.points, number, turn)
         if begin is not None:
             self.ctx.create_task(self._compute_again(*begin, number, name, known))
-        self.ctx.cell.node.cell_at(standing.paths["protocol"]).ref.tell(GoneAstray())
+        standing.bricks["protocol"].ref.tell(GoneAstray())
 
     async def _compute_again(
         self, before: ServerState, requests: list[Request], number: int, name: str, known: set[int] | None

@@ -27,7 +27,7 @@ from ...checkpoint.home.journal_home import JournalHome
 from ...checkpoint.places.recorded_moves import Detached, refuse_unsaved
 from ...checkpoint.protocol import DOWN, EXIT, MESSAGE, PIPE, START, TICK, Live
 from ...checkpoint.snapshot.snapshot_record import meta_now
-from ..bricks.replica_orders import EXPORTED_WITHIN, Export
+from ..bricks.replica_orders import EXPORTED_WITHIN, Export, Quiesce
 from ..group.group import Group
 from ..group.group_place import GroupPlace
 from ..group.membership import LookAgain
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 MADE_WITHIN = 60.0
 """Seconds that the processes of the replicas may take to come up; the old life works on meanwhile."""
 FAILED_OVER_WITHIN = 1.0
+SETTLED_WITHIN = 5.0
+"""Seconds after which a replica is asked again whether it has come to rest: it may have died with the question."""
 
 
 class ToGroup(Entering):
@@ -295,6 +297,34 @@ class FromRecordedGroup(Leaving):
         """What had been given away."""
         if self._detached is not None:
             self._detached.attach_again(transit)
+
+
+class AtRest(FromRecordedGroup):
+    """A group comes to rest where it is: all replicas stand behind the same turn, and its home has all of it.
+
+    Failover goes on meanwhile.
+    """
+
+    def __init__(self, cell: Cell) -> None:
+        super().__init__(cell, is_below=False)
+
+    async def collect(self, epoch: int, end: float) -> None:
+        group = self._group
+        replicas, order = group.replicas, Quiesce(epoch, group.adaptation.config, True)
+        for name in sorted(replicas.well(), key=lambda one: one != group.membership.primary):
+            try:
+                asked = replicas.ask(name, order, SETTLED_WITHIN)
+                await self.move.within(asked, end - now(), lambda: "its replicas have not come to rest")
+            except HoldfastError:
+                if self.move.given_up.done() or now() > end:
+                    raise
+                await asyncio.wait((replicas.stirred(),), timeout=AGAIN_AFTER)
+                raise AskTimeout(replicas.place(name), SETTLED_WITHIN) from None  # It may have died: ask all again.
+        if self._switch.method.replays:
+            await super().collect(epoch, end)
+
+    def detach(self) -> None:
+        """It stays with its home, from which nothing new goes in."""
 
 
 class FromGroup(FromRecordedGroup):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import CannotMove
 from ...actors.kernel.lifecycle import LOCAL
-from ...actors.migration.move import Move
+from ...actors.migration.move import Move, Pause
 from ...actors.process.wire.peer import OutsideHost
 from ...checkpoint.home.journal_home import JournalHome
 from ...checkpoint.places.far_parent import FarParent, SlotPlace
@@ -14,7 +14,7 @@ from ...checkpoint.places.recorded_moves import ToRecordedWorker, leaving
 from ...supervision.respec import recipe_spec
 from ..group.group_place import protected_host
 from ..group.transient_homes import UNKEPT, TransientHome
-from .group_moves import FromGroup, FromRecordedGroup, ToGroup
+from .group_moves import AtRest, FromGroup, FromRecordedGroup, ToGroup
 from .subtree_moves import (
     FromRecordedSubtree,
     FromSubtree,
@@ -75,6 +75,15 @@ def out_of_group(cell: Cell, entering: Entering, timeout: float) -> Move:
             return Move(cell, from_group(cell, is_below=True), into, timeout)
         return Move(cell, from_group(cell, is_below=True), to_subtree(cell, parent), timeout)
     return Move(cell, from_group(cell, is_below=False), entering, timeout)
+
+
+def rest_of_group(cell: Cell, timeout: float) -> Move:
+    """The move in which a group only comes to rest, and goes on where it is.
+
+    Raises:
+        CannotMove: it is being recovered.
+    """
+    return Pause(cell, AtRest(cell), timeout)
 
 
 def is_plain(cell: Cell) -> bool:

@@ -231,6 +231,10 @@ class MechanismWatch:
             self._events.close()
             self._events = None
 
+    def follow(self, address: str) -> None:
+        """The actor has moved to another supervisor: it is the protected one there."""
+        self.address = address
+
     def take_signs(self) -> list[str]:
         """The kinds of the signs that came since the last time; what mechanisms there are now is noted."""
         events = self._events.take() if self._events is not None else []
@@ -289,6 +293,9 @@ class MonitoringEngine(Actor):
     @on(MonitorLook)
     def _look(self, message: MonitorLook) -> None:
         watch = self._watch
+        there = self.ctx.cell.node.find(watch.address)
+        if there is not None:
+            watch.follow(there.path)
         for kind in watch.take_signs():
             self._sign(kind, 1)
         self._see_address()

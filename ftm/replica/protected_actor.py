@@ -124,7 +124,6 @@ class Server(lifecycle.HerePlace):
 
     def __init__(self, standing: Standing, method: Method) -> None:
         self.standing, self.method = standing, method
-        self.address = standing.address
         self.cell: Cell | None = None
         self.life: ServerLife | None = None
         self.state, self.points = ReplicaState(), RewindPoints()
@@ -139,6 +138,11 @@ class Server(lifecycle.HerePlace):
         self._live: Live | None = None
         self._is_costly = False  # that was told
         self._work_waited_for: list[asyncio.Future[None]] = []
+
+    @property
+    def address(self) -> str:
+        """Where the actor is for all others, and for itself."""
+        return self.standing.address
 
     def report_to(self, driver: Driver) -> None:
         """Have this one drive the server from now on."""
@@ -404,6 +408,16 @@ class Server(lifecycle.HerePlace):
         points.point, points.tail, points.previous = None, [], None
         if self.life is not None and self.state.has_access:
             self.capture()
+
+    def readdress(self, cell: Cell, was: str, now: str) -> None:
+        """Take the state down: what was handled before is not run again under another address."""
+        life = self.life
+        if life is None or life.feed is not None or not self.points.tail:
+            return
+        try:
+            self.capture()
+        except Exception:  # What the user's own values and methods raise: it is told that no replica can take it.
+            self._go_on_without_point([])
 
     def rewind(self, point: ServerState) -> None:
         """Put the state of a point back, in place: the actor's object goes on. Only between two turns."""

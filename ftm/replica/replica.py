@@ -33,7 +33,7 @@ from ..bricks.bricks import FOREVER, After, AwaitHandled, Before, Brick, Flush, 
 from ..bricks.replica_orders import Abort, Broken, Commit, PrepareStack, Setting
 from ..bricks.request_protocol import InnerProtocol, RequestProtocol
 from ..bricks.sealed_frames import Opened, Refused
-from ..bricks.standing import Standing
+from ..bricks.standing import Standing, protected_at
 from ..bricks.state_transfer import Assume, Play
 from ..model.mechanism import Description, Mechanism, MechanismRefused, detection_in, revive
 from .heartbeat import Heart, HeartbeatDue
@@ -157,27 +157,24 @@ class Replica(Supervisor):
         self._setting, self._recipe = setting, start
         made = tuple(one if isinstance(one, Mechanism) else revive(one) for one in layers)
         for one in made:
-            one.check(start.kind, setting.address)
+            one.check(start.kind, protected_at(self.ctx.path))
         self._made = nested(made)
         self._one_order = asyncio.Lock()
         self._orders: set[asyncio.Task[None]] = set()
         self._preparing: asyncio.Task[None] | None = None
 
     @classmethod
-    def _may_order(cls, start: Start[Any]) -> tuple[str, ...]:
-        setting: Setting = start.args[0]
-        return (f"{setting.address}/ftm",)  # And what the protected actor is bound to, for which it speaks.
+    def _may_order(cls, start: Start[Any], path: str) -> tuple[str, ...]:
+        return (path.rpartition("/")[0],)  # And what the protected actor is bound to, for which it speaks.
 
     @classmethod
-    def _speaks_for(cls, start: Start[Any]) -> tuple[str, ...]:
-        setting: Setting = start.args[0]
-        return (setting.address,)
+    def _speaks_for(cls, path: str) -> tuple[str, ...]:
+        return (protected_at(path),)
 
     def init(self) -> Plan:
         """The protected actor and its state manager; the bricks follow."""
         setting, cell = self._setting, self.ctx.cell
-        node = cell.node
-        self._standing = standing = Standing(node, setting.address, self.ctx.path, setting.config, self._made)
+        self._standing = standing = Standing(cell, setting.config, self._made)
         self._server = standing.server = Server(standing, Method.of(setting.method))
         self._woven = Woven(setting.config, self._made, {}, {}, [])
         self._prepared: Woven | None = None
@@ -200,7 +197,7 @@ class Replica(Supervisor):
         one = Child(child(BEAT, start(Heart, self._standing, setting.name, setting.beat, setting.watch_turns)))
         one.cell = cell = new_cell(self.ctx.cell, one)
         for port in ("detector", "proxy"):
-            node.bind(cell, port, node.cell_at(f"{setting.address}/ftm/{port}"))
+            node.bind(cell, port, self._standing.part(port))
         self._enlist(one)
         await self._start(one)
 
@@ -224,7 +221,7 @@ class Replica(Supervisor):
         why, setting, cell = f"its {one.spec.id} has ended: {reason}", self._setting, self.ctx.cell
         super()._give_up(one, reason, Shutdown(why))
         with suppress(HoldfastError):  # It is between two lives: then it hears of our end.
-            self.ctx.tell(cell.node.cell_at(f"{setting.address}/ftm/detector"), Broken(setting.name, cell.life, why))
+            self.ctx.tell(self._standing.part("detector"), Broken(setting.name, cell.life, why))
 
     def _cell(self, name: str) -> Cell:
         cell = self._children[name].cell
@@ -357,7 +354,7 @@ class Replica(Supervisor):
         server.state.is_lazy = not any("state_access" in one.needs for one in woven.layers)
         if not server.state.is_lazy and server.points.tail and server.life is not None and server.life.feed is None:
             server.capture()  # From here on, the last part is what was handled since the last point.
-        standing.paths = {slot: self._cell(name).path for slot, name in woven.names.items()}
+        standing.bricks = {slot: self._cell(name) for slot, name in woven.names.items()}
         standing.other.forget_bricks()
         self._bind_all(woven)
         self._pass_on(held)
@@ -426,9 +423,9 @@ class Replica(Supervisor):
 
     def _wiring(self, woven: Woven) -> list[tuple[Cell, str, Cell]]:
         """All bindings of a stack: owner, port, target."""
-        node, names, layers = self.ctx.cell.node, woven.names, woven.layers
+        names, layers = woven.names, woven.layers
         found: list[tuple[Cell, str, Cell]] = []
-        proxy = node.cell_at(f"{self._setting.address}/ftm/proxy")
+        proxy = self._standing.part("proxy")
         state, server = self._cell(STATE), self._cell(SERVER)
         cell = {slot: self._cell(name) for slot, name in names.items()}
         # A mechanism that secures the links stands around the protocol, all others stand behind it.
@@ -550,7 +547,7 @@ class Replica(Supervisor):
                 await self._end_bricks([old.names.pop(slot)])
                 del old.places[slot]
         woven = self._woven = await self._start_bricks(old.config, old.layers, leads=message.leads)
-        standing.paths = {slot: self._cell(name).path for slot, name in woven.names.items()}
+        standing.bricks = {slot: self._cell(name) for slot, name in woven.names.items()}
         self._bind_all(woven)
 
     async def _prepare(self, message: PrepareStack) -> Any:
@@ -559,7 +556,7 @@ class Replica(Supervisor):
                 await self._drop_prepared()
             layers = nested(tuple(revive(one) for one in message.layers))
             for one in layers:
-                one.check(self._recipe.kind, self._setting.address)
+                one.check(self._recipe.kind, self._standing.address)
             leads = self._standing.leads
             self._prepared = await self._start_bricks(message.config, layers, leads=leads)
             self._check_wiring(self._prepared)

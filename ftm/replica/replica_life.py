@@ -80,19 +80,19 @@ class Rest:
 class ServerContext(RecordedContext):
     """`self.ctx` of the protected actor: it knows itself by the address that is protected, on every replica."""
 
-    __slots__ = ("_address",)
+    __slots__ = ("_server",)
 
-    def __init__(self, cell: Cell, address: str) -> None:
+    def __init__(self, cell: Cell, server: Server) -> None:
         super().__init__(cell)
-        self._address = address
+        self._server = server
 
     @property
     def path(self) -> str:
-        return self._address
+        return self._server.address
 
     @property
     def ref(self) -> ActorRef[Any]:
-        return self.cell.node.cell_at(self._address).ref
+        return self.cell.node.cell_at(self.path).ref
 
     def waits_for_room(self, topic: str) -> bool:
         """What is published leaves when the turn's result has been compared, voted on or copied, and not before."""
@@ -110,7 +110,7 @@ class ServerLife(Life):
         self.saving.is_needed = server.state.has_access
 
     def _context(self, cell: Cell) -> RecordedContext:
-        made = self._context_made = ServerContext(cell, self.server.address)
+        made = self._context_made = ServerContext(cell, self.server)
         made.recorded = self
         return made
 

@@ -14,7 +14,6 @@ from ...actors.errors import HoldfastError, NameTaken
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import GONE, RUNNING, Cell
 from ...actors.kernel.ref import ActorRef
-from ...actors.process.process_host import WorkerPlace
 from ...checkpoint.addresses import renamed
 from ...supervision.admin import ChangeSupervisor
 from ...supervision.children import Child, new_cell
@@ -127,10 +126,10 @@ class Arrangement:
             keep(cell, lambda flags, specs, place=place: _edited(place, flags, specs, taken))  # type: ignore[misc]
         if moved:
             system.homes.move(now)
+            system.mechanism_notes.moved(now)
         for child in moved:  # Before anything else is said to their processes.
             for cell in every_cell(taken[child].cell):
-                if isinstance(cell.host.place, WorkerPlace):
-                    cell.host.place.readdress(cell)
+                cell.host.place.readdress(cell, was[child], now[was[child]])
         if moved:
             tell_bindings(system.node.root, {new: old for old, new in now.items()})
 

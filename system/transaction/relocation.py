@@ -209,10 +209,11 @@ class Relocation(StagedWork):
         notes.over(path)
 
         def over(is_kept: bool) -> None:
+            at = path if cell is None else cell.path  # It may have moved meanwhile.
             if is_kept:
-                notes.settled(path, after)
+                notes.settled(at, after)
             else:
-                notes.put(path, after, before, is_trusted=False)
+                notes.put(at, after, before, is_trusted=False)
             notes.flush()
 
         if probation is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.errors import HoldfastError
@@ -14,7 +14,7 @@ from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import SnapshotNow
 from ...supervision.children import STOPPED, UP
 from .arrangement import busy, child_of
-from .draft import Draft, DraftPlace, Target, is_elsewhere
+from .draft import Draft, DraftPlace, Target, is_elsewhere, rules
 from .operation import Operation, text_of, wrong
 from .relocation import MOVED_WITHIN, Gated
 from .structure import check_child, check_not_uniform
@@ -60,7 +60,7 @@ class Reparent(Operation):
                 )
         if new.is_dynamic and place.is_stopped:
             raise wrong(place.path, f"it is stopped, and {new.path} is dynamic: it keeps nobody who does not run")
-        for one in place.walk():
+        for one in addressed(place):
             check_movable(one)
         check_child(new, place.spec)
         del old.children[place.name]
@@ -73,10 +73,10 @@ class Reparent(Operation):
             draft.arrangement.touch(holder, self)
 
     async def prepare(self, system: ActorSystem) -> None:
-        """Have recorded actors rest, with a snapshot: no turn of theirs is to be repeated under another address."""
+        """Have recorded and protected actors rest: no turn of theirs is to be repeated under another address."""
         if self._found is None or not (self._leads and self._place.has_moved):
             return
-        waits = bool(self._others_settle(system))
+        waits = bool(self._others_settle(system)) or bool(self._unsteady(system))
         for one, rest in self._resting(system):
             if waits:  # Perhaps for what those here have to answer.
                 await rest.give_up(system)
@@ -84,13 +84,22 @@ class Reparent(Operation):
                 await rest.reach(system, functools.partial(system._moves.pause, one.living(system.node), MOVED_WITHIN))
 
     def _resting(self, system: ActorSystem) -> list[tuple[DraftPlace, Gated]]:
-        """Those that replay turns, of the actor and all below it, and how each comes to rest."""
-        for one in self._place.walk():
-            cell = one.now(system.node) if not (one.is_planned or one.rework is not None) else None
-            switch = switch_of(cell) if cell is not None else None  # Who is reworked rests for that, and is saved.
-            if switch is not None and switch.method.replays and one not in self._rests:
+        """Those that run turns again, of the actor and all below it, and how each comes to rest."""
+        for one in addressed(self._place):
+            # Who is reworked rests for that, and is saved; replicas are only told.
+            rests = not one.is_planned and (one.rework is None or one.is_protected)
+            cell = one.now(system.node) if rests else None
+            switch = switch_of(cell) if cell is not None else None
+            runs_again = switch is not None and (switch.method.replays or one.is_protected)
+            if runs_again and one not in self._rests:
                 self._rests[one] = Gated(one, f"pause of {one.path}")
         return list(self._rests.items())
+
+    def _unsteady(self, system: ActorSystem) -> str:
+        """Why replicas that are to rest cannot hear of another address just now."""
+        cells = [one.now(system.node) for one, _ in self._resting(system)]
+        found = [cell.path for cell in cells if cell is not None and not cell.host.place.is_steady(cell)]
+        return f"a replica of {found[0]} is being replaced" if found else ""
 
     def _others_settle(self, system: ActorSystem) -> str:
         """Why the others are not so far that addresses can change; they are asked for what is missing."""
@@ -115,13 +124,13 @@ class Reparent(Operation):
             raise wrong(old.path, f"it has no child {place.name!r} any more")
         if one.state not in (UP, STOPPED) or one.row is not None or one.up is not None:
             return f"{self.target} is being restarted"
-        if why := self._others_settle(system):
+        if why := self._others_settle(system) or self._unsteady(system):
             return why
         for resting, rest in self._resting(system):
             switch = switch_of(resting.living(system.node))
             if not rest.is_waiting:
                 return f"{resting.path} is not at rest"
-            if switch is not None and not is_saved(switch):
+            if switch is not None and switch.method.replays and not is_saved(switch):
                 return f"the last snapshot of {resting.path} is not in the store yet"
         return ""
 
@@ -140,6 +149,14 @@ class Reparent(Operation):
             await rest.give_up(system)
 
 
+def addressed(place: DraftPlace) -> Iterator[DraftPlace]:
+    """An actor and all below it, but the parts of mechanisms: these go with whom they protect."""
+    yield place
+    if not place.is_protected:
+        for child in place.children.values():
+            yield from addressed(child)
+
+
 def check_movable(place: DraftPlace) -> None:
     """Whether an actor can have another address.
 
@@ -147,8 +164,8 @@ def check_movable(place: DraftPlace) -> None:
         SpecError: something that cannot be told knows it by its address.
     """
     cell, spec = place.cell, place.spec
-    if place.is_protected:
-        raise wrong(place.path, "its replicas know it by its address: detach its mechanism first")
+    if place.is_protected and cell is not None and any(one.secures for one in rules().layers_of(cell.spec.mechanism)):
+        raise wrong(place.path, "its replicas are certified under its address: detach the mechanism that secures them")
     if place.is_supervisor and (
         (spec is not None and spec.isolation == "process") or (cell is not None and is_elsewhere(cell))
     ):

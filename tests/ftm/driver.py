@@ -103,7 +103,7 @@ class Driver:
 
     async def add(self, name: str) -> None:
         """One more replica; nobody restarts it."""
-        setting = Setting(ADDRESS, name, *(self.setting[key] for key in ("config", "method", "bindings", "beat")))
+        setting = Setting(name, *(self.setting[key] for key in ("config", "method", "bindings", "beat")))
         layers = tuple(one.describe() for one in self.layers)
         spec = hf.child(
             name,

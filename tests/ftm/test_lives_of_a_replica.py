@@ -42,7 +42,7 @@ async def server(system: hf.ActorSystem) -> Any:
     """A server as a replica has it, in this process, with a state to begin from."""
     GATE[:] = [asyncio.Event()]
     node = system.node
-    standing = Standing(node, "/app/x", "/app/x/ftm/r1", 1, (LFR(),))
+    standing = Standing(node.nowhere("/app/x/ftm/r1"), 1, (LFR(),))
     made = standing.server = Server(standing, hf.hybrid())
     cell = node.cell_below(node.root, "x", AddressHost(FED, made, NEAR))
     cell.spec, cell.extra().start = hf.child("x", hf.start(Slow)), hf.start(Slow)

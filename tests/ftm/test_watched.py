@@ -75,6 +75,31 @@ async def test_what_has_no_mechanism_gets_one_and_loses_it_when_none_is_needed(s
     assert await ref.ask(Add(1)) == 1
 
 
+async def test_what_is_moved_to_another_supervisor_is_watched_there(system: hf.ActorSystem) -> None:
+    child = hf.child("alice", hf.start(Counter), mechanism=PBR())
+    await system.start(hf.supervisor("here", children=[child]))
+    await system.start(hf.supervisor("there"))
+    ref = system.ref("/app/here/alice", Counter)
+    watch = watch_of(system, ref, CRASHES, resources=TWO, probe=None)
+    with system.events() as events:
+        monitor = await engine(system, watch)
+        async with system.transaction(timeout=30) as change:
+            change.move(ref, "/app/there")
+        async with asyncio.timeout(30):
+            while watch.address != ref.path:
+                await asyncio.sleep(0.01)
+        async with system.transaction(timeout=30) as change:
+            change.add("/app/here", hf.child("alice", hf.start(Counter)))
+            change.transition(ref, LFR())
+        async with asyncio.timeout(30):
+            while (await monitor.ask(Report())).current != ("lfr",):
+                await asyncio.sleep(0.01)
+        monitor.tell(Observe("mismatch", 3))
+        assert (await done(events)).address == ref.path == "/app/there/alice"
+    assert len(stack(ref)) == 2
+    assert stack(system.ref("/app/here/alice", Counter)) is None
+
+
 async def test_what_mechanisms_bring_along_counts(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter)))
     asserting = hf.AD(assertions=(is_positive,))

@@ -24,7 +24,7 @@ TEXT = (Path(__file__).parents[2] / "docs" / "control.md").read_text("utf-8")
 TIMES = int(os.environ.get("HOLDFAST_MATRIX", "1"))
 # Each note: the actors it is about, what the refusal says.
 NOTES: dict[str, tuple[set[str], str]] = {
-    "¹": (set(KINDS), "its replicas know it|no supervisor looks after it|a life cannot enter or leave"),
+    "¹": (set(KINDS), "no supervisor looks after it|a life cannot enter or leave"),
 }
 
 
@@ -102,6 +102,7 @@ class Walk:
             step
             for place, kind, step, note in (cell.values for cell in cells())
             if (place, kind) == (self.place, self._kind) and not refusal(kind, note)
+            if step != "move" or not self._is_below  # Nor is it moved when it is protected there.
         ]
         step = self._draw.choice(options)
         fault = self._draw.choice(("none", "given up", "killed"))
@@ -110,9 +111,11 @@ class Walk:
             self._faults.give_up = True
         taking = asyncio.ensure_future(take(self._system, self.ref, step))
         if fault == "killed" and self._kind == "recorded" and self.place in ("a process", OWN_BELOW):
-            for _ in range(self._draw.randrange(40)):
-                await asyncio.sleep(0)
+            await self._at_some_instant()
             self._kill()
+        elif fault == "killed" and self.place == "replicas" and step == "move":
+            await self._at_some_instant()
+            self._kill_replica()
         try:
             await taking
         except (hf.CannotMove, hf.TransactionFailed):
@@ -129,6 +132,18 @@ class Walk:
     @property
     def _is_below(self) -> bool:
         return self._home in (BELOW, OWN_BELOW)
+
+    async def _at_some_instant(self) -> None:
+        for _ in range(self._draw.randrange(40)):
+            await asyncio.sleep(0)
+
+    def _kill_replica(self) -> None:
+        """End one of the two, if the other one could go on alone."""
+        place: Any = self.ref._cell.host.place
+        replicas = place.group.replicas
+        if replicas.whole_since()[0]:
+            worker = replicas.worker_of(self._draw.choice(sorted(replicas.membership.names)))
+            os.kill(worker.pid, signal.SIGKILL)
 
     def _kill(self) -> None:
         try:
@@ -166,7 +181,7 @@ def faults(monkeypatch: pytest.MonkeyPatch) -> Faults:
 @pytest.mark.parametrize("seed", range(6 * TIMES))
 async def test_random_walks_lose_double_and_reorder_nothing(system: hf.ActorSystem, faults: Faults, seed: int) -> None:
     draw = random.Random(seed)
-    kind, place = draw.choice(list(KINDS)), draw.choice(["a task", "a process", BELOW, OWN_BELOW])
+    kind, place = draw.choice(list(KINDS)), draw.choice(["a task", "a process", "replicas", BELOW, OWN_BELOW])
     await system.start(tree(place, kind))
     walk = Walk(system, kind, place, draw, faults)
     luggage, stream = Luggage(system, walk.ref), Stream(walk.ref)

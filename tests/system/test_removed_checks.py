@@ -12,6 +12,7 @@ COMMIT = "tests/system/test_transaction_commit.py"
 KEPT = "tests/system/test_specification.py"
 MOVED = "tests/system/test_readdressed.py"
 TIES = "tests/system/test_moved_ties.py"
+REPLICAS = "tests/system/test_moved_replicas.py"
 
 CHECKS = {
     "the states are in the store together": Check(
@@ -100,15 +101,15 @@ CHECKS = {
     ),
     "no turn is repeated under another address": Check(
         "system/transaction/reparenting.py",
-        "            if switch is not None and switch.method.replays and one not in self._rests:\n",
+        "            if runs_again and one not in self._rests:\n",
         "            if False:\n",
         MOVED,
         "test_what_is_recorded and task",
     ),
     "a process is told its address": Check(
         "system/transaction/arrangement.py",
-        "                    cell.host.place.readdress(cell)\n",
-        "                    pass\n",
+        "                cell.host.place.readdress(cell, was[child], now[was[child]])\n",
+        "                pass\n",
         MOVED,
         "test_what_a_process_says",
     ),
@@ -188,6 +189,62 @@ CHECKS = {
         "    if False:",
         TIES,
         "test_who_is_bound_to_it and replicas",
+    ),
+    "the mechanism of an actor is noted where it is now": Check(
+        "system/transaction/arrangement.py",
+        "            system.mechanism_notes.moved(now)\n",
+        "",
+        REPLICAS,
+        "test_a_root_that_is_killed and trial and finish",
+    ),
+    "what comes of a mechanism on trial is noted where it is now": Check(
+        "system/transaction/relocation.py",
+        "            at = path if cell is None else cell.path",
+        "            at = path",
+        REPLICAS,
+        "test_the_next_root and PBR",
+    ),
+    "who is protected rests before it is moved": Check(
+        "system/transaction/reparenting.py",
+        "(switch.method.replays or one.is_protected)",
+        "switch.method.replays",
+        REPLICAS,
+        "test_a_follower_that_is_behind",
+    ),
+    "the bricks of a follower have passed on what has come": Check(
+        "ftm/bricks/request_protocol.py",
+        "            if message.settles:\n",
+        "            if False:\n",
+        REPLICAS,
+        "test_a_follower_whose_bricks_are_behind",
+    ),
+    "what was handled is not run again under another address": Check(
+        "ftm/replica/protected_actor.py",
+        "        if life is None or life.feed is not None or not self.points.tail:\n",
+        "        if True:\n",
+        REPLICAS,
+        "test_turns_are_run_again",
+    ),
+    "the others of a process have the addresses that they have now": Check(
+        "actors/process/worker_node.py",
+        "            other.name = now + path[len(was) :]\n",
+        "",
+        REPLICAS,
+        "test_who_comes_to_live and PBR",
+    ),
+    "an address does not change while a replica is being replaced": Check(
+        "system/transaction/reparenting.py",
+        "self._others_settle(system) or self._unsteady(system)",
+        "self._others_settle(system)",
+        REPLICAS,
+        "test_replicas_that_are_killed_at_a_step and prepare and follower",
+    ),
+    "certified replicas are not moved": Check(
+        "system/transaction/reparenting.py",
+        "    if place.is_protected and cell is not None and any(",
+        "    if False and any(",
+        REPLICAS,
+        "test_certified",
     ),
     "two looks at threads are alike": Check(
         "testing/threads.py",

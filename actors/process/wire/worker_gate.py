@@ -53,9 +53,9 @@ class WorkerGate:
         self._chars = 0
         self._left: deque[tuple[str, str]] = deque()  # addresses it had, and has not heard yet that it has others
 
-    def readdressed(self, old: str, new: str) -> None:
-        """Its actor has another address: what it says until it knows that is meant so."""
-        self._left.append((old, new))
+    def readdressed(self, was: str, now: str) -> None:
+        """An address has become another, with all below it: what it says until it knows that is meant so."""
+        self._left.append((was, now))
         self._worker.connection.names.rename_got(self._now)
 
     def _now(self, path: str) -> str:
@@ -238,7 +238,7 @@ class WorkerGate:
     def _voices(self) -> tuple[str, ...]:
         cell = self._worker.cell
         start = None if cell is None or cell.more is None else cell.more.start
-        return () if start is None else start.kind._speaks_for(start)
+        return () if cell is None or start is None else start.kind._speaks_for(cell.path)
 
     def of_own(self, frame: frames.Record | frames.Migrate) -> None:
         """It is of one of its actors."""
@@ -290,7 +290,7 @@ def is_granted(path: str, own: Cell, cells: Iterable[Cell]) -> bool:
         cells: whose bindings count, as far as the root has made them.
     """
     start = None if own.more is None else own.more.start
-    named = () if start is None else start.kind._may_order(start)
+    named = () if start is None else start.kind._may_order(start, own.path)
     bound = (target.path for cell in cells for target in unclaimed(cell).values())
     return any(is_at_or_below(path, one) for one in (*named, *bound))
 
