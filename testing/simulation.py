@@ -37,6 +37,7 @@ from .faults import Faults
 from .guard.leaks import Leaks
 from .guard.loop_leaks import LoopLeaks
 from .guarded import GuardedSystem, UnexpectedEnd
+from .library_code import is_file_of_library
 from .schedules.charts import Recorder
 from .schedules.charts import as_html as chart_as_html
 from .schedules.charts import as_text as chart_as_text
@@ -689,7 +690,7 @@ def _kind(error: BaseException) -> tuple[object, ...]:
     trace, last = error.__traceback__, ("", 0)
     while trace is not None:
         file = trace.tb_frame.f_code.co_filename
-        if not file.startswith(_LIBRARY) or f"{os.sep}tests{os.sep}" in file:
+        if not is_file_of_library(file):
             last = file, trace.tb_lineno
         trace = trace.tb_next
     return type(error), *last
@@ -700,14 +701,13 @@ def _of_the_test(error: BaseException) -> TracebackType | None:
     trace = error.__traceback__
     while trace is not None:
         file = trace.tb_frame.f_code.co_filename
-        if not file.startswith((_LIBRARY, _ASYNCIO)) or f"{os.sep}tests{os.sep}" in file:
+        if not file.startswith(_ASYNCIO) and not is_file_of_library(file):
             return trace
         trace = trace.tb_next
     return None if isinstance(error, HoldfastError) else error.__traceback__
 
 
-_ASYNCIO = str(Path(asyncio.__file__).parent)
-_LIBRARY = str(Path(__file__).resolve().parents[1])
+_ASYNCIO = os.path.join(os.path.dirname(asyncio.__file__), "")
 
 
 def _difference(first: Simulation, again: Simulation) -> NotRepeatable | None:

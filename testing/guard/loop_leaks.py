@@ -7,11 +7,11 @@ import weakref
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
+from ..library_code import is_module_of_library
 from ..swaps import Swaps
 
 TASK_GRACE = 10
 """Turns of the loop that a cancelled task may take to end."""
-LIBRARY = __name__.partition(".")[0] + "."
 MANY = 1000
 """Timers, and futures, that are noted before those that are over are forgotten."""
 
@@ -128,7 +128,7 @@ class LoopLeaks:
             if not of_tasks and name == "_set_result_unless_cancelled":
                 continue
             module = getattr(callback, "__module__", None) or ""
-            if not module.startswith(LIBRARY):  # What our own systems have yet to do is no fault of the test's.
+            if not is_module_of_library(module):  # What our own systems have yet to do is no fault of the test's.
                 found[id(handle)] = f"{module}.{name}".removeprefix(".") + f", due in {when - self._loop.time():.3g} s"
         return list(found.values())
 

@@ -24,6 +24,7 @@ from ...actors.kernel.envelope import Ask, ReplyHandle
 from ...actors.kernel.message import Message, message_of, reply_type
 from ...actors.kernel.node import Node
 from ...actors.kernel.ref import ActorRef, current
+from ..library_code import is_module_of_library
 from ..probes import ProbeActor
 from ..swaps import Swaps
 from ..turns import TurnWatcher, watch_turns
@@ -42,7 +43,6 @@ SMALL = 4096
 SHOWN = 20
 """Problems of one kind that are told in full."""
 TEST = "the test"
-LIBRARY = __name__.partition(".")[0] + "."
 
 
 class Handed:
@@ -283,7 +283,7 @@ class SendChecks(TurnWatcher):
 
 def _is_of_library(kind: type) -> bool:
     """Whether messages of this class are the runtime's own orders: these are no business of the test's."""
-    return kind.__module__.startswith(LIBRARY)
+    return is_module_of_library(kind.__module__)
 
 
 is_of_library: Callable[[type], bool] = functools.cache(_is_of_library)

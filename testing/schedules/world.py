@@ -19,12 +19,12 @@ import time
 import uuid
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from anyio._backends._asyncio import CancelScope, WorkerThread
 
+from ..library_code import is_file_of_library
 from ..swaps import Swaps
 from ..threads import Onlooker
 from .numbered import as_completed, numbering, scope_in_order
@@ -36,9 +36,6 @@ EPOCH = 1_700_000_000.0
 """Unix time at which each simulated run begins."""
 NODE = 0x010000000001
 """The machine in a UUID of version 1."""
-_PACKAGE = Path(__file__).resolve().parents[2]
-OURS = tuple(f"{_PACKAGE}/{room}/" for room in ("actors", "checkpoint", "ftm", "supervision", "system", "testing"))
-"""Threads of this library are waited for, and no news."""
 
 
 class EscapesSimulation(UserWarning):
@@ -241,8 +238,9 @@ def _in_ns(made: Callable[[], float]) -> Callable[[], int]:
 
 
 def _is_ours(function: Any) -> bool:
+    """Whether a function is of this library, whose threads are waited for, and no news."""
     code = getattr(getattr(function, "__func__", function), "__code__", None)
-    return code is not None and code.co_filename.startswith(OURS)
+    return code is not None and is_file_of_library(code.co_filename)
 
 
 def _kind_of_file(fd: Any) -> str:
