@@ -51,6 +51,7 @@ from .schedules.choices import (
     as_text,
     from_text,
     repeated,
+    require_fit,
     size,
 )
 from .schedules.control import Control, ControlledLoop
@@ -462,7 +463,8 @@ def simulate(
 
     Raises:
         whatever the test raises, with a note that shows the run and says how to repeat it. NotRepeatable: two runs with
-        the same choices differ. SpecError, ValueError, TypeError: the arguments are wrong.
+        the same choices differ. UnfitSchedule: a run that was to be repeated passes, and is another. SpecError,
+        ValueError, TypeError: the arguments are wrong.
     """
     settings = Settings(seeds, seed, replay, strategy, depth, latency, sync, ticks, options)
     return settings.decorate if test is None else settings.decorate(test)
@@ -504,8 +506,9 @@ class Search:
         said = self._settings.said(self._wanted)
         if isinstance(said, str):
             number, taken = from_text(said)
-            self._try(repeated(number, taken))
+            simulation = self._try(repeated(number, taken))
             self._forget(said)
+            require_fit(said, simulation.choices)
             return
         if self._settings.seed is None and self._failures is not None and len(said) > 1:
             for text in self._failures.texts():

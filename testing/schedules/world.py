@@ -1,12 +1,14 @@
 """What a program asks the world for: random numbers and the time. In a simulated run both are the seed's.
 
-`random`, `uuid`, `secrets`, `os.urandom`, numpy's global generator and the functions of `time` are exchanged for the
-thread of the run. What cannot be exchanged is told: threads, sockets and processes of the program's own.
+`random`, `uuid`, `secrets`, `os.urandom`, numpy's global generator, the functions of `time` and the clocks of
+`datetime` are exchanged for the thread of the run. What cannot be exchanged is told: threads, sockets and processes of
+the program's own.
 """
 
 from __future__ import annotations
 
 import asyncio
+import datetime
 import functools
 import os
 import random
@@ -156,6 +158,9 @@ class World:
         for name, count in (("strftime", 1), ("asctime", 0)):
             real = getattr(time, name)
             put(time, name, self._own(real, _given(real, count, time.localtime)))
+        # `today`, of both of its classes, asks `time.time`.
+        for name, made in (("now", functools.partial(_now, wall)), ("utcnow", functools.partial(_utcnow, wall))):
+            put(datetime.datetime, name, self._own_of_class(vars(datetime.datetime)[name], made))
 
     def _drawn(self, size: int = 16, flags: int = 0) -> bytes:
         """In place of `os.urandom` and `os.getrandom`."""
@@ -190,6 +195,16 @@ class World:
             return (simulated if threading.get_ident() == self._thread else real)(*args, **options)
 
         return chosen
+
+    def _own_of_class(self, real: Any, simulated: Callable[..., Any]) -> Any:
+        """As `_own`, of a class method."""
+
+        def chosen(kind: type, *args: Any, **options: Any) -> Any:
+            if threading.get_ident() == self._thread:
+                return simulated(kind, *args, **options)
+            return real.__get__(None, kind)(*args, **options)
+
+        return classmethod(chosen)
 
     def _look_at_thread(self, thread: threading.Thread) -> None:
         if isinstance(thread, threading.Timer):
@@ -227,6 +242,21 @@ def _given(real: Callable[..., Any], count: int, made: Callable[[], object]) -> 
         return real(*args[:count], made() if args[count:] in ((), (None,)) else args[count])
 
     return called
+
+
+def _now(
+    wall: Callable[[], float], kind: type[datetime.datetime], tz: datetime.tzinfo | None = None
+) -> datetime.datetime:
+    """In place of `datetime.now`."""
+    return kind.fromtimestamp(wall(), tz)
+
+
+def _utcnow(wall: Callable[[], float], kind: type[datetime.datetime]) -> datetime.datetime:
+    """In place of `datetime.utcnow`, which Python advises against from 3.12 on."""
+    if sys.version_info >= (3, 12):
+        text = "datetime.datetime.utcnow() is deprecated: use datetime.datetime.now(datetime.UTC)"
+        warnings.warn(text, DeprecationWarning, stacklevel=3)
+    return kind.fromtimestamp(wall(), datetime.UTC).replace(tzinfo=None)
 
 
 def _nothing() -> None:

@@ -126,10 +126,14 @@ async def test_does_not_wait(actor_system):
             "import subprocess; kept.append(subprocess.Popen(['sleep', '3600']))",
             "a process was left running: * sleep 3600*",
         ),
+        (  # It would end within the time that the library's own processes have.
+            "import subprocess; kept.append(subprocess.Popen(['sleep', '3']))",
+            "a process was left running: * sleep 3*",
+        ),
     ],
 )
 def test_a_leak_fails_the_test(suite, leak: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("holdfast.testing.guard.leaks.GRACE", 0.1)
+    monkeypatch.setattr("holdfast.testing.guard.leaks.SHORT_GRACE", 0.1)
     result = suite(f"""
 kept = []
 
@@ -143,6 +147,32 @@ def test_cleans_up():
 """)
     result.assert_outcomes(passed=2, errors=1)
     result.stdout.fnmatch_lines([f"*{text}*"])
+
+
+def test_processes_that_are_about_to_end_are_no_leak(suite) -> None:
+    """One that the test has told to end, and the library's own, which have longer."""
+    suite("""
+import subprocess, sys
+from holdfast.actors.process.fork import boot
+
+@pytest.fixture(scope="module")
+def kept():
+    kept = []
+    yield kept
+    for process in kept:
+        process.wait()
+
+async def test_told_to_end(actor_system, kept):
+    kept.append(subprocess.Popen(["sleep", "3600"]))
+    kept[-1].terminate()
+
+async def test_own(actor_system, kept, monkeypatch):
+    monkeypatch.setattr("holdfast.testing.guard.leaks.SHORT_GRACE", 0.0)
+    program = "import sys; sys.stdin.read()"
+    kept.append(subprocess.Popen([sys.executable, "-c", program, boot.__file__], stdin=subprocess.PIPE))
+    asyncio.get_running_loop().call_later(0.0, kept[-1].stdin.close)
+    await asyncio.sleep(0.01)
+""").assert_outcomes(passed=2)
 
 
 def test_leaks_can_be_expected(suite) -> None:
