@@ -168,16 +168,21 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, Any, Any]
 
 
 GUARD = pytest.StashKey["Guard"]()
+READY = pytest.StashKey[bool]()
 
 
 @contextlib.asynccontextmanager
 async def _guarded(item: pytest.Item) -> AsyncGenerator[Guard]:
     """The guard of a test, which looks at what is left when the fixture ends that was the first to ask for it."""
+    from .guard.sends import stay_ready
     from .guarded import Guard
 
     if GUARD in item.stash:
         yield item.stash[GUARD]
         return
+    if READY not in item.config.stash:
+        item.config.stash[READY] = True
+        item.config.add_cleanup(stay_ready())
     wanted = _wanted(item)
     guard = item.stash[GUARD] = Guard(allowed=wanted.leaks, exceptions=not wanted.exceptions)
     try:

@@ -57,7 +57,8 @@ class Swaps:
     'red'
     """
 
-    _standing: ClassVar[list[Swap]] = []  # of the whole process, as the classes are whose attributes these are
+    # Of the whole process, as the classes are whose attributes these are: by owner and name, oldest first.
+    _standing: ClassVar[dict[tuple[int, str], list[Swap]]] = {}
 
     def __init__(self) -> None:
         self._made: list[Swap] = []
@@ -67,15 +68,18 @@ class Swaps:
         swap = Swap(owner, name, value)
         write(owner, name, value)
         self._made.append(swap)
-        self._standing.append(swap)
+        self._standing.setdefault((id(owner), name), []).append(swap)
 
     def undo(self) -> None:
         """Put everything back; a second call changes nothing."""
         while self._made:
             swap = self._made.pop()
-            self._standing.remove(swap)
-            for other in self._standing:
-                if other.owner is swap.owner and other.name == swap.name and other.old is swap.value:
+            same = self._standing[id(swap.owner), swap.name]  # The swap keeps its owner, and so the owner's id.
+            same.remove(swap)
+            if not same:
+                del self._standing[id(swap.owner), swap.name]
+            for other in same:
+                if other.old is swap.value:
                     other.old, other.had = swap.old, swap.had
                     break
             else:

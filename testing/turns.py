@@ -120,6 +120,7 @@ class Turns:
     def __init__(self) -> None:
         self._original: Callable[[Cell, int], int] = run_loop.run_turns
         self._nodes: dict[RunLoop, Watched] = {}
+        self._holds = 0
         self._swaps = Swaps()
         self._swaps.put(run_loop, "run_turns", self.run_turns)
 
@@ -144,13 +145,26 @@ class Turns:
         if not watched.watchers:
             watched.swaps.undo()
             del self._nodes[node]
-        if not self._nodes:
+        self._close()
+
+    def hold(self, change: int) -> None:
+        """Stay while anybody holds this, also where no node is watched."""
+        self._holds += change
+        self._close()
+
+    def _close(self) -> None:
+        if not self._nodes and not self._holds:
             self._swaps.undo()
+
+    @staticmethod
+    def installed() -> Turns:
+        """What stands in already, or a new one."""
+        standing = getattr(run_loop.run_turns, "__self__", None)
+        return standing if isinstance(standing, Turns) else Turns()
 
 
 def watch_turns(node: RunLoop, watcher: TurnWatcher) -> Callable[[], None]:
     """Let `watcher` hear of the turns of a node. Returns what ends that."""
-    standing = getattr(run_loop.run_turns, "__self__", None)
-    turns = standing if isinstance(standing, Turns) else Turns()
+    turns = Turns.installed()
     turns.add(node, watcher)
     return lambda: turns.remove(node, watcher)

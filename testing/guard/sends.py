@@ -27,7 +27,7 @@ from ...actors.kernel.ref import ActorRef, current
 from ..library_code import is_module_of_library
 from ..probes import ProbeActor
 from ..swaps import Swaps
-from ..turns import TurnWatcher, watch_turns
+from ..turns import Turns, TurnWatcher, watch_turns
 from .changes import Images, changes
 from .declared import PLAIN, is_all_looked_at, is_fixed, may_change, plain_look, wrong_field
 from .holders import holders
@@ -303,11 +303,29 @@ def _listed(head: str, lines: list[str]) -> str:
     return "\n".join([head, *lines[:SHOWN], *more])
 
 
+def stay_ready() -> Callable[[], None]:
+    """Leave what the checks exchange in its place between one test and the next. Returns what ends that.
+
+    Nobody is checked by that. To exchange it anew for each test has the interpreter forget, twice, what it knows of the
+    classes of refs and contexts, which takes as long as the checks themselves.
+    """
+    doors, turns = Doors.opened(), Turns.installed()
+    doors.hold(1)
+    turns.hold(1)
+
+    def end() -> None:
+        doors.hold(-1)
+        turns.hold(-1)
+
+    return end
+
+
 class Doors:
     """The ways in which values are handed on, exchanged for ones that check, while any node wants that."""
 
     def __init__(self) -> None:
         self.checks: dict[Node, SendChecks] = {}
+        self._holds = 0
         self._swaps = Swaps()
         for name in ("tell", "send"):
             self._swaps.put(ActorRef, name, self._through_ref(getattr(ActorRef, name)))
@@ -324,7 +342,12 @@ class Doors:
     def close(self, node: Node) -> None:
         """This node needs them no more."""
         self.checks.pop(node, None)
-        if not self.checks:
+        self.hold(0)
+
+    def hold(self, change: int) -> None:
+        """Stay open while anybody holds this, also where no node wants it."""
+        self._holds += change
+        if not self.checks and not self._holds:
             self._swaps.undo()
 
     def _through_ref(self, send: Any) -> Any:
