@@ -250,14 +250,19 @@ def is_of_library(child: psutil.Process) -> bool:
         return False
 
 
-def end_processes(find: Callable[[], Iterable[psutil.Process]]) -> list[str]:
-    """Give the processes that `find` finds time to end, kill the rest, and say which those were."""
+def end_processes(find: Callable[[], Iterable[psutil.Process]], grace: float | None = None) -> list[str]:
+    """Give the processes that `find` finds time to end, kill the rest, and say which those were.
+
+    Args:
+        grace: seconds for those that are not the library's own; SHORT_GRACE if it is not said.
+    """
+    short = SHORT_GRACE if grace is None else grace
     began = monotonic()
     described: list[str] = []
     killed: list[psutil.Process] = []
     while left := [process for process in find() if process not in killed]:
         passed = monotonic() - began
-        late = [one for one in left if passed >= GRACE or (passed >= SHORT_GRACE and not is_of_library(one))]
+        late = [one for one in left if passed >= GRACE or (passed >= short and not is_of_library(one))]
         for process in late:
             try:
                 described.append(f"{process.pid} {process.status()} {' '.join(process.cmdline())}")
