@@ -42,8 +42,9 @@ class LoopLeaks:
             return
         self._tasks = asyncio.all_tasks()
         self._handler = self._loop.get_exception_handler()
-        for name, time in (("call_at", lambda: 0.0), ("call_later", self._loop.time)):
-            self._swaps.put(self._loop, name, self._noting_timers(getattr(self._loop, name), time))
+        self._swaps.put(self._loop, "call_at", self._noting_timers(self._loop.call_at, lambda: 0.0))
+        if getattr(type(self._loop), "call_later", None) is not asyncio.BaseEventLoop.call_later:  # It calls `call_at`.
+            self._swaps.put(self._loop, "call_later", self._noting_timers(self._loop.call_later, self._loop.time))
         self._swaps.put(self._loop, "create_future", self._noting_futures(self._loop.create_future))
         self._swaps.put(self._loop, "create_task", self._noting_tasks(self._loop.create_task))
         self._swaps.put(self._loop, "call_exception_handler", self._noting(self._loop.call_exception_handler))

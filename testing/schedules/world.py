@@ -159,8 +159,8 @@ class World:
             real = getattr(time, name)
             put(time, name, self._own(real, _given(real, count, time.localtime)))
         # `today`, of both of its classes, asks `time.time`.
-        for name, made in (("now", functools.partial(_now, wall)), ("utcnow", functools.partial(_utcnow, wall))):
-            put(datetime.datetime, name, self._own_of_class(vars(datetime.datetime)[name], made))
+        for name, dated in (("now", functools.partial(_now, wall)), ("utcnow", functools.partial(_utcnow, wall))):
+            put(datetime.datetime, name, self._own_of_class(vars(datetime.datetime)[name], dated))
 
     def _drawn(self, size: int = 16, flags: int = 0) -> bytes:
         """In place of `os.urandom` and `os.getrandom`."""

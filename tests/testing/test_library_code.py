@@ -4,6 +4,7 @@ import os
 import sys
 import traceback
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,7 +26,7 @@ def fail():
 @pytest.mark.parametrize("file", ["bank.py", "shop/bank.py", "examples/bank.py", f"../{CHECKOUT.name}-bank/bank.py"])
 def test_the_traceback_of_a_test_in_a_checkout_begins_at_the_test(file) -> None:
     name = os.path.normpath(CHECKOUT / file)
-    of_user: dict[str, object] = {}
+    of_user: dict[str, Any] = {}
     exec(compile(SIMULATED, name, "exec"), of_user)
     with pytest.raises(ValueError, match="a bug") as raised:
         simulate(of_user["test_bank"], seeds=1)()

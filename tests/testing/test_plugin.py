@@ -149,6 +149,42 @@ def test_cleans_up():
     result.stdout.fnmatch_lines([f"*{text}*"])
 
 
+def test_what_is_exchanged_stays_between_two_tests_and_goes_with_the_session(pytester: pytest.Pytester) -> None:
+    """Meanwhile nobody is checked who does not ask for it."""
+    pytester.makeconftest(
+        CONFTEST
+        + """
+from holdfast.actors.kernel import loop
+from holdfast.actors.kernel.ref import ActorRef
+
+def exchanged():
+    return ActorRef.tell, loop.run_turns
+
+REAL = exchanged()
+
+def pytest_configure(config):
+    config.add_cleanup(lambda: print("all is back:", exchanged() == REAL))
+"""
+    )
+    pytester.makeini("[pytest]\nasyncio_mode = auto\nasyncio_default_fixture_loop_scope = function\n")
+    tests = """
+from conftest import REAL, exchanged
+
+async def test_guarded(actor_system):
+    with pytest.raises(hf.BadMessage):
+        actor_system.spawn(hf.start(Counter)).tell(Add("one"))
+
+async def test_plain():
+    assert all(now != real for now, real in zip(exchanged(), REAL, strict=True))
+    async with hf.ActorSystem(log=False) as system:
+        system.spawn(hf.start(Counter)).tell(Add("one"))
+"""
+    pytester.makepyfile(HEAD + tests)
+    result = pytester.runpytest_subprocess("-p", "no:cacheprovider", "-p", "no:randomly")
+    result.assert_outcomes(passed=2)
+    result.stdout.fnmatch_lines(["*all is back: True*"])
+
+
 def test_processes_that_are_about_to_end_are_no_leak(suite) -> None:
     """One that the test has told to end, and the library's own, which have longer."""
     suite("""

@@ -84,8 +84,17 @@ def test_what_was_cancelled_while_it_was_due_is_no_option_any_more() -> None:
         called: list[str] = []
         over = loop.create_future()
         first = loop.call_at(1.0, called.append, "first")
-        loop.call_at(1.0, lambda: (called.append("second"), over.set_result(None)))
-        loop.call_at(1.0, lambda: (called.append("third"), first.cancel()))
+
+        def second() -> None:
+            called.append("second")
+            over.set_result(None)
+
+        def third() -> None:
+            called.append("third")
+            first.cancel()
+
+        loop.call_at(1.0, second)
+        loop.call_at(1.0, third)
         loop.due.chooser = counting
         await over
         loop.due.chooser = None
