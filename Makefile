@@ -7,7 +7,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 BESIDE := $(patsubst %/,%,$(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py))))
 
 .DEFAULT_GOAL := check
-.PHONY: demo test campaign soak loaded lint check bench build clean
+.PHONY: demo test campaign soak loaded alarms lint check bench build clean
 
 demo: $(VENV)/.demo
 	$(BIN)/holdfast demo
@@ -49,6 +49,10 @@ soak: $(VENV)/.dev
 RUNS ?= 10
 loaded: $(VENV)/.dev
 	$(BIN)/python -m tests.loaded $(RUNS) $(PYTEST_ARGS)
+
+# The tests that the guard watches, in random order, so many times: it tells of none.
+alarms: $(VENV)/.dev
+	$(BIN)/python -m tests.alarms $(RUNS) $(SEED) $(PYTEST_ARGS)
 
 # The static part of `check`, cheapest first.
 lint: $(VENV)/.dev .link/holdfast

@@ -41,7 +41,7 @@ def async_fixture(function: Callable[..., Any], *, name: str) -> tuple[Any, Make
         return pytest.fixture(_missing, name=name), {}
     made: dict[str, Any] = {}
     for scope in LOOP_SCOPES:  # Each a function of its own: pytest-asyncio keeps the scope at the function.
-        own = types.FunctionType(function.__code__, function.__globals__, name, None, function.__closure__)
+        own = types.FunctionType(function.__code__, function.__globals__, name, (None,), function.__closure__)
         made[scope] = own, fixture(own, name=name, loop_scope=scope)
     return made["function"][1], {scope: own for scope, (own, _) in made.items()}
 
@@ -168,16 +168,21 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, Any, Any]
 
 
 GUARD = pytest.StashKey["Guard"]()
+READY = pytest.StashKey[bool]()
 
 
 @contextlib.asynccontextmanager
 async def _guarded(item: pytest.Item) -> AsyncGenerator[Guard]:
     """The guard of a test, which looks at what is left when the fixture ends that was the first to ask for it."""
+    from .guard.sends import stay_ready
     from .guarded import Guard
 
     if GUARD in item.stash:
         yield item.stash[GUARD]
         return
+    if READY not in item.config.stash:
+        item.config.stash[READY] = True
+        item.config.add_cleanup(stay_ready())
     wanted = _wanted(item)
     guard = item.stash[GUARD] = Guard(allowed=wanted.leaks, exceptions=not wanted.exceptions)
     try:
@@ -187,23 +192,25 @@ async def _guarded(item: pytest.Item) -> AsyncGenerator[Guard]:
         await guard.close()
 
 
-async def system_of_the_test(request: pytest.FixtureRequest) -> AsyncIterator[GuardedSystem]:
+async def system_of_the_test(item: pytest.Item | None = None) -> AsyncIterator[GuardedSystem]:
     """A running system of the test's own, on the test's loop; it ends with the test."""
     from .guarded import GuardedSystem
 
-    wanted = _wanted(request.node)
-    async with _guarded(request.node) as guard:
+    assert item is not None, "the test is given by `pytest_fixture_setup`"
+    wanted = _wanted(item)
+    async with _guarded(item) as guard:
         system = await guard.start(GuardedSystem(**wanted.options))
         wanted.tell(system)
         yield system
 
 
-async def systems_of_the_test(request: pytest.FixtureRequest) -> AsyncIterator[ActorSystems]:
+async def systems_of_the_test(item: pytest.Item | None = None) -> AsyncIterator[ActorSystems]:
     """Start a system: `system = await actor_systems("name", store=...)`, as often as the test likes."""
     from .guarded import GuardedSystem
 
-    wanted = _wanted(request.node)
-    async with _guarded(request.node) as guard:
+    assert item is not None, "the test is given by `pytest_fixture_setup`"
+    wanted = _wanted(item)
+    async with _guarded(item) as guard:
 
         async def start(name: str = "app", **options: Any) -> GuardedSystem:
             system = await guard.start(GuardedSystem(name, **{**wanted.options, **options}))
@@ -223,16 +230,26 @@ MAKERS = {makers["function"]: makers for makers in (_makers, _more_makers) if ma
 def pytest_fixture_setup(
     fixturedef: pytest.FixtureDef[Any], request: pytest.FixtureRequest
 ) -> Generator[None, object, object]:
-    """Have the systems of a test made in its loop: a fixture of pytest-asyncio has one scope, and so has a test."""
+    """Have the systems of a test made in its loop: a fixture of pytest-asyncio has one scope, and so has a test.
+
+    The test is given as a default of the function: to ask pytest for `request` costs as much as half of the guard.
+    """
     makers, function = MAKERS.get(fixturedef.func), fixturedef.func
     if makers is None:
         return (yield)
     put: Any = fixturedef  # as pytest-asyncio does, which exchanges the function, too
-    put.func = makers[_loop_scope_of(request)]
+    put.func = _of_test(makers[_loop_scope_of(request)], request.node)
     try:
         return (yield)
     finally:
         put.func = function
+
+
+def _of_test(maker: Any, item: pytest.Item) -> Any:
+    """The same function, whose one parameter is the test by default."""
+    own = types.FunctionType(maker.__code__, maker.__globals__, maker.__name__, (item,), maker.__closure__)
+    own.__dict__.update(maker.__dict__)  # what pytest-asyncio keeps there
+    return own
 
 
 def _loop_scope_of(request: pytest.FixtureRequest) -> str:

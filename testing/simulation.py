@@ -37,6 +37,7 @@ from .faults import Faults
 from .guard.leaks import Leaks
 from .guard.loop_leaks import LoopLeaks
 from .guarded import GuardedSystem, UnexpectedEnd
+from .library_code import is_file_of_library
 from .schedules.charts import Recorder
 from .schedules.charts import as_html as chart_as_html
 from .schedules.charts import as_text as chart_as_text
@@ -50,6 +51,7 @@ from .schedules.choices import (
     as_text,
     from_text,
     repeated,
+    require_fit,
     size,
 )
 from .schedules.control import Control, ControlledLoop
@@ -461,7 +463,8 @@ def simulate(
 
     Raises:
         whatever the test raises, with a note that shows the run and says how to repeat it. NotRepeatable: two runs with
-        the same choices differ. SpecError, ValueError, TypeError: the arguments are wrong.
+        the same choices differ. UnfitSchedule: a run that was to be repeated passes, and is another. SpecError,
+        ValueError, TypeError: the arguments are wrong.
     """
     settings = SimulationSettings(seeds, seed, replay, strategy, depth, latency, sync, ticks, options)
     return settings.decorate if test is None else settings.decorate(test)
@@ -503,8 +506,9 @@ class ScheduleSearch:
         said = self._settings.said(self._wanted)
         if isinstance(said, str):
             number, taken = from_text(said)
-            self._try(repeated(number, taken))
+            simulation = self._try(repeated(number, taken))
             self._forget(said)
+            require_fit(said, simulation.choices)
             return
         if self._settings.seed is None and self._failures is not None and len(said) > 1:
             for text in self._failures.texts():
@@ -689,7 +693,7 @@ def _kind(error: BaseException) -> tuple[object, ...]:
     trace, last = error.__traceback__, ("", 0)
     while trace is not None:
         file = trace.tb_frame.f_code.co_filename
-        if not file.startswith(_LIBRARY) or f"{os.sep}tests{os.sep}" in file:
+        if not is_file_of_library(file):
             last = file, trace.tb_lineno
         trace = trace.tb_next
     return type(error), *last
@@ -700,14 +704,13 @@ def _of_the_test(error: BaseException) -> TracebackType | None:
     trace = error.__traceback__
     while trace is not None:
         file = trace.tb_frame.f_code.co_filename
-        if not file.startswith((_LIBRARY, _ASYNCIO)) or f"{os.sep}tests{os.sep}" in file:
+        if not file.startswith(_ASYNCIO) and not is_file_of_library(file):
             return trace
         trace = trace.tb_next
     return None if isinstance(error, HoldfastError) else error.__traceback__
 
 
-_ASYNCIO = str(Path(asyncio.__file__).parent)
-_LIBRARY = str(Path(__file__).resolve().parents[1])
+_ASYNCIO = os.path.join(os.path.dirname(asyncio.__file__), "")
 
 
 def _difference(first: Simulation, again: Simulation) -> NotRepeatable | None:

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 from types import TracebackType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
+
+SEALED: Final = 1 << 8
+"""The flag of a class in C whose attributes cannot be set (Py_TPFLAGS_IMMUTABLETYPE)."""
 
 
 class Swap:
@@ -14,7 +19,27 @@ class Swap:
     def __init__(self, owner: Any, name: str, value: Any) -> None:
         own = getattr(owner, "__dict__", None)
         self.had = own is None or name in own  # Slots always have it; what comes from the class is deleted again.
-        self.owner, self.name, self.value, self.old = owner, name, value, getattr(owner, name)
+        self.owner, self.name, self.value, self.old = owner, name, value, read(owner, name)
+
+
+def is_sealed(owner: Any) -> bool:
+    """Whether it is a class that refuses to have an attribute set."""
+    return isinstance(owner, type) and bool(owner.__flags__ & SEALED)
+
+
+def read(owner: Any, name: str) -> Any:
+    """What stands at an attribute; of a sealed class the descriptor itself, which is what has to go back."""
+    return vars(owner)[name] if is_sealed(owner) else getattr(owner, name)
+
+
+def write(owner: Any, name: str, value: Any) -> None:
+    """Set an attribute, of a sealed class in its dictionary: whoever has imported the class sees it, too."""
+    if not is_sealed(owner):
+        setattr(owner, name, value)
+        return
+    (attributes,) = gc.get_referents(vars(owner))  # behind the read-only view
+    attributes[name] = value
+    ctypes.pythonapi.PyType_Modified(ctypes.py_object(owner))  # Else what has been looked up before stays.
 
 
 class Swaps:
@@ -32,7 +57,8 @@ class Swaps:
     'red'
     """
 
-    _standing: ClassVar[list[Swap]] = []  # of the whole process, as the classes are whose attributes these are
+    # Of the whole process, as the classes are whose attributes these are: by owner and name, oldest first.
+    _standing: ClassVar[dict[tuple[int, str], list[Swap]]] = {}
 
     def __init__(self) -> None:
         self._made: list[Swap] = []
@@ -40,24 +66,27 @@ class Swaps:
     def put(self, owner: Any, name: str, value: Any) -> None:
         """Set an attribute of an object, class or module until `undo`."""
         swap = Swap(owner, name, value)
-        setattr(owner, name, value)
+        write(owner, name, value)
         self._made.append(swap)
-        self._standing.append(swap)
+        self._standing.setdefault((id(owner), name), []).append(swap)
 
     def undo(self) -> None:
         """Put everything back; a second call changes nothing."""
         while self._made:
             swap = self._made.pop()
-            self._standing.remove(swap)
-            for other in self._standing:
-                if other.owner is swap.owner and other.name == swap.name and other.old is swap.value:
+            same = self._standing[id(swap.owner), swap.name]  # The swap keeps its owner, and so the owner's id.
+            same.remove(swap)
+            if not same:
+                del self._standing[id(swap.owner), swap.name]
+            for other in same:
+                if other.old is swap.value:
                     other.old, other.had = swap.old, swap.had
                     break
             else:
-                if getattr(swap.owner, swap.name) is not swap.value:
+                if read(swap.owner, swap.name) is not swap.value:
                     continue
                 if swap.had:
-                    setattr(swap.owner, swap.name, swap.old)
+                    write(swap.owner, swap.name, swap.old)
                 else:
                     delattr(swap.owner, swap.name)
 

@@ -48,6 +48,7 @@ class Watched:
     def __init__(self, node: RunLoop) -> None:
         self.node = node
         self.watchers: list[TurnWatcher] = []
+        self.substituting: list[TurnWatcher] = []  # those of them that want to hear before a turn
         self.swaps = Swaps()
         self._over = node.turn_over
         self.swaps.put(node, "turn_over", self._turn_over)
@@ -59,35 +60,37 @@ class Watched:
             return original(cell, most)
         for _ in range(min(len(queue), most)):
             item = queue[0] if queue else None
-            if not self._run_one(original, cell, item):
+            goes_on = self._run_substituted(original, cell, item) if self.substituting else original(cell, 1)
+            turn = cell.more.turn if cell.more is not None else None
+            if turn is None or turn.item is not item:  # Else it waits for something, and is over later.
+                for watcher in self.watchers:
+                    watcher.ended(cell, item)
+            if not goes_on:
                 return 0
         return 1
 
-    def _run_one(self, original: Callable[[Cell, int], int], cell: Cell, item: Any) -> int:
-        made = [made for watcher in self.watchers if (made := watcher.begins(cell, item)) is not None]
-        if made:
-            with Swaps() as swaps:
-                # A bare message is looked up in its cell's table; what carries one looks it up in its actor's.
-                owner: Any = cell if isinstance(item, Message) else cell.actor
-                name = "table" if owner is cell else "_table"
-                swaps.put(owner, name, SubstituteTable(getattr(owner, name), made))
-                goes_on = original(cell, 1)
-        else:
-            goes_on = original(cell, 1)
-        turn = cell.more.turn if cell.more is not None else None
-        if turn is None or turn.item is not item:  # Else it waits for something, and is over later.
-            self._ended(cell, item)
-        return goes_on
+    def _run_substituted(self, original: Callable[[Cell, int], int], cell: Cell, item: Any) -> int:
+        made = [made for watcher in self.substituting if (made := watcher.begins(cell, item)) is not None]
+        if not made:
+            return original(cell, 1)
+        with Swaps() as swaps:
+            # A bare message is looked up in its cell's table; what carries one looks it up in its actor's.
+            owner: Any = cell if isinstance(item, Message) else cell.actor
+            name = "table" if owner is cell else "_table"
+            swaps.put(owner, name, SubstituteTable(getattr(owner, name), made))
+            return original(cell, 1)
+
+    def watch(self, watchers: list[TurnWatcher]) -> None:
+        """Let these hear of the turns, and no others."""
+        self.watchers = watchers
+        self.substituting = [watcher for watcher in watchers if type(watcher).begins is not TurnWatcher.begins]
 
     def _turn_over(self, turn: Suspended, error: BaseException | None) -> None:
         item = turn.item
         self._over(turn, error)
         if item is not None:
-            self._ended(turn.cell, item)
-
-    def _ended(self, cell: Cell, item: Any) -> None:
-        for watcher in self.watchers:
-            watcher.ended(cell, item)
+            for watcher in self.watchers:
+                watcher.ended(turn.cell, item)
 
 
 class SubstituteTable(Table):
@@ -117,6 +120,7 @@ class Turns:
     def __init__(self) -> None:
         self._original: Callable[[Cell, int], int] = run_loop.run_turns
         self._nodes: dict[RunLoop, Watched] = {}
+        self._holds = 0
         self._swaps = Swaps()
         self._swaps.put(run_loop, "run_turns", self.run_turns)
 
@@ -129,24 +133,38 @@ class Turns:
         """Let the watcher hear of this node's turns."""
         if node not in self._nodes:
             self._nodes[node] = Watched(node)
-        self._nodes[node].watchers.append(watcher)
+        watched = self._nodes[node]
+        watched.watch([*watched.watchers, watcher])
 
     def remove(self, node: RunLoop, watcher: TurnWatcher) -> None:
         """Stop; after the last watcher the loop has its own function back."""
         watched = self._nodes.get(node)
         if watched is None:
             return
-        watched.watchers = [other for other in watched.watchers if other is not watcher]
+        watched.watch([other for other in watched.watchers if other is not watcher])
         if not watched.watchers:
             watched.swaps.undo()
             del self._nodes[node]
-        if not self._nodes:
+        self._close()
+
+    def hold(self, change: int) -> None:
+        """Stay while anybody holds this, also where no node is watched."""
+        self._holds += change
+        self._close()
+
+    def _close(self) -> None:
+        if not self._nodes and not self._holds:
             self._swaps.undo()
+
+    @staticmethod
+    def installed() -> Turns:
+        """What stands in already, or a new one."""
+        standing = getattr(run_loop.run_turns, "__self__", None)
+        return standing if isinstance(standing, Turns) else Turns()
 
 
 def watch_turns(node: RunLoop, watcher: TurnWatcher) -> Callable[[], None]:
     """Let `watcher` hear of the turns of a node. Returns what ends that."""
-    standing = getattr(run_loop.run_turns, "__self__", None)
-    turns = standing if isinstance(standing, Turns) else Turns()
+    turns = Turns.installed()
     turns.add(node, watcher)
     return lambda: turns.remove(node, watcher)

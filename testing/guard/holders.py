@@ -13,11 +13,11 @@ import msgspec
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.node import Node
+from ..library_code import is_module_of_library
 from ..probes import Probe
 
 MOST = 20_000
 """Objects of one actor's state that are looked at."""
-LIBRARY = __name__.partition(".")[0] + "."
 PLAIN = (bool, int, float, complex, str, bytes, type(None), type, types.ModuleType, types.FunctionType)
 
 
@@ -70,5 +70,5 @@ def _within(value: Any) -> Iterator[object]:
         yield from value.keywords.values()
     elif isinstance(value, msgspec.Struct):
         yield from (getattr(value, name, None) for name in value.__struct_fields__)
-    elif isinstance(value, Probe) or not type(value).__module__.startswith(LIBRARY):
+    elif isinstance(value, Probe) or not is_module_of_library(type(value).__module__):
         yield from getattr(value, "__dict__", {}).values()

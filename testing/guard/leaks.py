@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import os
 import signal
 import sys
@@ -15,6 +16,7 @@ from typing import Any, ClassVar
 
 import psutil
 
+from ..library_code import is_file_of_library
 from .loop_leaks import LoopLeaks
 from .thread_leaks import ThreadLeaks
 
@@ -24,7 +26,9 @@ TOLD = {
     "descriptors": "descriptor was left open",
 }
 GRACE = 5.0
-"""Real seconds that processes told to end may take."""
+"""Real seconds that the library's own processes may take to end."""
+SHORT_GRACE = 1.0
+"""Real seconds that a process of the test's may take: one that it has told to end, and not waited for."""
 OPEN_FILES = "/proc/self/fd"
 RANDOM = ("/dev/urandom", "/dev/random")
 PAGES = ("-hands", "-hands (deleted)")
@@ -237,17 +241,35 @@ def is_of_test(child: psutil.Process) -> bool:
         return False
 
 
-def end_processes(find: Callable[[], Iterable[psutil.Process]]) -> list[str]:
-    """Give the processes that `find` finds time to end, kill the rest, and say which those were."""
-    deadline = monotonic() + GRACE
-    while (left := list(find())) and monotonic() < deadline:
-        psutil.wait_procs(left, timeout=0.05)
+def is_of_library(child: psutil.Process) -> bool:
+    """Whether a process is one of the library's own (a fork server, what it has forked, a reaper with its program)."""
+    try:
+        line = itertools.takewhile(lambda process: process.pid != os.getpid(), (child, *child.parents()))
+        return any(is_file_of_library(word) for process in line for word in process.cmdline())
+    except psutil.Error:
+        return False
+
+
+def end_processes(find: Callable[[], Iterable[psutil.Process]], grace: float | None = None) -> list[str]:
+    """Give the processes that `find` finds time to end, kill the rest, and say which those were.
+
+    Args:
+        grace: seconds for those that are not the library's own; SHORT_GRACE if it is not said.
+    """
+    short = SHORT_GRACE if grace is None else grace
+    began = monotonic()
     described: list[str] = []
-    for process in left:
-        try:
-            described.append(f"{process.pid} {process.status()} {' '.join(process.cmdline())}")
-            process.kill()
-        except psutil.Error:
-            pass
-    psutil.wait_procs(left, timeout=1.0)
+    killed: list[psutil.Process] = []
+    while left := [process for process in find() if process not in killed]:
+        passed = monotonic() - began
+        late = [one for one in left if passed >= GRACE or (passed >= short and not is_of_library(one))]
+        for process in late:
+            try:
+                described.append(f"{process.pid} {process.status()} {' '.join(process.cmdline())}")
+                process.kill()
+            except psutil.Error:
+                pass
+        killed += late
+        psutil.wait_procs(left, timeout=0.05)
+    psutil.wait_procs(killed, timeout=1.0)
     return described

@@ -7,11 +7,11 @@ import weakref
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
+from ..library_code import is_module_of_library
 from ..swaps import Swaps
 
 TASK_GRACE = 10
 """Turns of the loop that a cancelled task may take to end."""
-LIBRARY = __name__.partition(".")[0] + "."
 MANY = 1000
 """Timers, and futures, that are noted before those that are over are forgotten."""
 
@@ -42,8 +42,9 @@ class LoopLeaks:
             return
         self._tasks = asyncio.all_tasks()
         self._handler = self._loop.get_exception_handler()
-        for name, time in (("call_at", lambda: 0.0), ("call_later", self._loop.time)):
-            self._swaps.put(self._loop, name, self._noting_timers(getattr(self._loop, name), time))
+        self._swaps.put(self._loop, "call_at", self._noting_timers(self._loop.call_at, lambda: 0.0))
+        if getattr(type(self._loop), "call_later", None) is not asyncio.BaseEventLoop.call_later:  # It calls `call_at`.
+            self._swaps.put(self._loop, "call_later", self._noting_timers(self._loop.call_later, self._loop.time))
         self._swaps.put(self._loop, "create_future", self._noting_futures(self._loop.create_future))
         self._swaps.put(self._loop, "create_task", self._noting_tasks(self._loop.create_task))
         self._swaps.put(self._loop, "call_exception_handler", self._noting(self._loop.call_exception_handler))
@@ -128,7 +129,7 @@ class LoopLeaks:
             if not of_tasks and name == "_set_result_unless_cancelled":
                 continue
             module = getattr(callback, "__module__", None) or ""
-            if not module.startswith(LIBRARY):  # What our own systems have yet to do is no fault of the test's.
+            if not is_module_of_library(module):  # What our own systems have yet to do is no fault of the test's.
                 found[id(handle)] = f"{module}.{name}".removeprefix(".") + f", due in {when - self._loop.time():.3g} s"
         return list(found.values())
 

@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
+import os
 import site
 import sys
 import sysconfig
 import threading
-from pathlib import Path
 from time import monotonic
 from types import FrameType
 from typing import Any
 
+from ..library_code import is_file_of_library
 from ..swaps import Swaps
 from ..threads import Onlooker
 
 GRACE = 2.0
 """Real seconds that a thread which is about to end may take."""
-PACKAGE = str(Path(__file__).parents[2])
-LIBRARIES = (
-    *(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")),
-    *site.getsitepackages(),
-    *(f"{PACKAGE}/{room}/" for room in ("actors", "checkpoint", "ftm", "supervision", "system", "testing")),
+LIBRARIES = tuple(
+    os.path.join(folder, "")
+    for folder in (
+        *(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+        *site.getsitepackages(),
+    )
 )
-"""Files that begin with one of these are a library's: a thread that they start is of a pool, or is kept for later."""
+"""Files below one of these are another library's: a thread that they start is of a pool, or is kept for later."""
 
 
 class ThreadLeaks:
@@ -62,4 +64,6 @@ def _starter(frame: FrameType | None) -> FrameType | None:
     """Where a thread was started, beyond `threading` itself; None: by a library."""
     while frame is not None and frame.f_globals.get("__name__") in ("threading", __name__):
         frame = frame.f_back
-    return None if frame is None or frame.f_code.co_filename.startswith(LIBRARIES) else frame
+    if frame is None or frame.f_code.co_filename.startswith(LIBRARIES) or is_file_of_library(frame.f_code.co_filename):
+        return None
+    return frame

@@ -35,7 +35,7 @@ from ..histories.checker import linearizable
 from ..histories.history import History, Model
 from ..schedules.charts import Recorder
 from ..schedules.charts import as_text as chart_as_text
-from ..schedules.choices import ROUNDS, Choices, Production, as_text, from_text, repeated
+from ..schedules.choices import ROUNDS, Choices, Production, as_text, from_text, repeated, require_fit
 from ..schedules.control import ControlledLoop
 from ..schedules.processes import SimulatedWorker
 from ..schedules.world import World
@@ -82,7 +82,7 @@ class ActorMachine(RuleBasedStateMachine):
 
     def __init__(self, schedule: str | None = None) -> None:
         super().__init__()
-        self._is_drawn = schedule is None and currently_in_test_context()
+        self._is_drawn, self._schedule = schedule is None and currently_in_test_context(), schedule
         choices = self._choices_of(schedule)
         late = self.latency if isinstance(self.latency, tuple) else (self.latency, self.latency)
         self.history = History()
@@ -289,6 +289,8 @@ class ActorMachine(RuleBasedStateMachine):
                 raise UnexpectedEnd(tuple(problems))
             if self.model is not None and not has_failed:
                 linearizable(self.history, self.model).verify()
+            if self._schedule is not None and not has_failed:
+                require_fit(self._schedule, self._choices)
         except BaseException:
             self._note()
             raise

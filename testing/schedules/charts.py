@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import message_of
+from ..library_code import is_module_of_library
 from ..turns import Substitute, TurnWatcher
 from .turn_log import told
 
@@ -67,7 +68,7 @@ class Recorder(TurnWatcher):
 def _state(cell: Cell) -> dict[str, str]:
     """The variables of an actor, in brief. Reading them calls code of theirs, which may raise."""
     actor = cell.actor
-    if actor is None or type(actor).__module__.startswith("holdfast."):  # What is ours is no news to its user.
+    if actor is None or is_module_of_library(type(actor).__module__):  # What is ours is no news to its user.
         return {}
     found: dict[str, str] = {}
     for name, value in vars(actor).items():

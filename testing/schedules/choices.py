@@ -54,13 +54,25 @@ class NotRepeatable(HoldfastError, AssertionError):
         if self.escaped:
             return f"{text}: {'; '.join(self.escaped)}"
         return (
-            f"{text}: a clock read as datetime.now(), the addresses of objects (id(), a set of objects), what an "
+            f"{text}: the addresses of objects (id(), a set of objects), what an "
             "earlier run has left in a global, or, between two processes, a set of strings (set PYTHONHASHSEED=0)"
         )
 
 
 class BadSchedule(HoldfastError, ValueError, text="not a schedule: {text!r}: {why}"):
     """A text that should repeat a run is none."""
+
+    text: str
+    why: str
+
+
+class UnfitSchedule(
+    HoldfastError, AssertionError, text="the schedule {text!r} is of another run than this one, which has passed: {why}"
+):
+    """A run was to be repeated, and its choices are not those that this test has: what passed is something else.
+
+    It may be of another test, of another seed, or from before the test or its actors were changed.
+    """
 
     text: str
     why: str
@@ -108,6 +120,10 @@ class Choices:
     def redrawn(self, kind: str, number: int, count: int, proposed: int) -> int:
         """What becomes of a drawn choice."""
         return proposed
+
+    def made(self, kind: str) -> int:
+        """How many choices of a kind there have been."""
+        return self.steps if kind in (TURN, HOLD) else self._counts.get(kind, 0)
 
     def kept(self) -> Taken:
         """What repeats the run so far."""
@@ -184,6 +200,24 @@ class Translated(RepeatHolds):
 def repeated(seed: int, taken: Mapping[str, Mapping[int, int]]) -> Choices:
     """What repeats a run by what was kept of it."""
     return Replay(seed, taken) if TURN in taken else RepeatHolds(seed, taken)
+
+
+def require_fit(text: str, choices: Choices) -> None:
+    """Make sure that a run has taken the choices of the schedule that it was to repeat.
+
+    Raises:
+        UnfitSchedule: it could not, and says which.
+    """
+    kept, unfit = choices.kept(), list[str]()
+    for kind, chosen in from_text(text)[1].items():
+        made = choices.made(kind)
+        for number, choice in chosen.items():
+            if number > made:
+                unfit.append(f"{kind}={number}:{choice} was not come to, for the run has {made} such choices")
+            elif (done := kept.get(kind, {}).get(number, 0)) != choice:
+                unfit.append(f"{kind}={number}:{choice} is not among the options there, and {done} was taken")
+    if unfit:
+        raise UnfitSchedule(text, "; ".join(unfit))
 
 
 class Walk(Choices):

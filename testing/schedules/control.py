@@ -24,7 +24,7 @@ from ...actors.kernel.node import Node
 from ..clock import TICKS, VirtualClockLoop
 from ..swaps import Swaps
 from .disk import simulated
-from .due import DueQueue, Option
+from .due import DueQueue, Option, TellingHandle
 from .footprints import Footprints
 from .livelock import Rounds
 from .numbered import NumberedFuture, NumberedTask
@@ -150,7 +150,7 @@ class ControlledLoop(VirtualClockLoop):
         """As every loop, in half of the time."""
         if self._debug or self._closed:
             return super().call_soon(callback, *args, context=context)
-        handle = asyncio.Handle(callback, args, self, context)
+        handle = TellingHandle(callback, args, self, context)
         self.due.append(handle)
         return handle
 
@@ -417,12 +417,16 @@ class Control:
         options = due.next_options()
         if not options:  # All are cancelled.
             return due.options[0]
-        count, nodes = len(options), self._nodes
+        count, nodes, left = len(options), self._nodes, due.nodes
         drained: list[tuple[int, DrawnCells]] = []  # where the callback of a node stands, and who is ready there
         for place, option in enumerate(options):
-            if type(key := option[0]) is Node and (cells := nodes.get(key)):
-                drained.append((place, cells))
-                count += len(cells) - 1
+            if not left:
+                break
+            if type(key := option[0]) is Node:
+                left -= 1
+                if cells := nodes.get(key):
+                    drained.append((place, cells))
+                    count += len(cells) - 1
         index = 0 if count == 1 else self.choose(count, lambda: self._keys(options))
         for place, cells in drained:
             if index < place:

@@ -20,6 +20,17 @@ STEPS = (None, "task_wakeup", "__step", "__wakeup")
 """How the methods of a task are named that go on with it, in C and in Python."""
 
 
+class TellingHandle(asyncio.Handle):
+    """A callback of a controlled loop, which hears of it when one is cancelled, and need not look at each."""
+
+    __slots__ = ()
+
+    def cancel(self) -> None:
+        loop: Any = self._loop  # type: ignore[attr-defined]  # no stub has it
+        loop.due.has_cancelled = True
+        super().cancel()
+
+
 class Chooser(Protocol):
     """Decides which callback is called next."""
 
@@ -39,15 +50,19 @@ class DueQueue:
         chooser: who chooses; None: they come in order.
         is_told: whether it hears of each callback that is called.
         has_dead: whether places have died. What is scheduled for them later must not run either.
+        has_cancelled: whether some that are due may have been cancelled.
+        nodes: how many of them are of nodes.
         options: all that are due, in order.
     """
 
     def __init__(self) -> None:
         self.chooser: Chooser | None = None
         self.is_told = False
-        self.has_dead = False
+        self.has_dead = self.has_cancelled = False
+        self.nodes = 0
         self.options: list[Option] = []
         self._ordered = 0  # so many of them have a place that matters
+        self._silent = 0  # so many of them tell nobody when they are cancelled
 
     def append(self, handle: Any) -> None:
         """Put a callback last."""
@@ -58,11 +73,14 @@ class DueQueue:
             key, has_place = owner, getattr(callback, "__name__", None) not in STEPS
         elif type(owner) is Node:
             key, has_place = owner, False
+            self.nodes += 1
         elif type(handle) is asyncio.TimerHandle:
             key, has_place = handle, False
         else:
             key, has_place = lane_of(handle), True
         self._ordered += has_place
+        if type(handle) is not TellingHandle:
+            self._silent += 1
         self.options.append((key, handle, has_place))
         if self.has_dead and is_dead(handle):
             handle.cancel()
@@ -80,13 +98,22 @@ class DueQueue:
                     break
         if self.is_told and chooser is not None:
             chooser.called(chosen)
-        self._ordered -= chosen[2]
-        return chosen[1]
+        key, handle, has_place = chosen
+        self._ordered -= has_place
+        if type(key) is Node:
+            self.nodes -= 1
+        if type(handle) is not TellingHandle:
+            self._silent -= 1
+        return handle
 
     def next_options(self) -> list[Option]:
-        """Those that may be called next."""
+        """Those that may be called next. The list is not to be changed."""
         if not self._ordered:
-            return [option for option in self.options if not option[1]._cancelled]
+            if not (self._silent or self.has_cancelled):
+                return self.options
+            living = [option for option in self.options if not option[1]._cancelled]
+            self.has_cancelled = len(living) < len(self.options)
+            return living
         found: list[Option] = []
         tasks: set[int] = set()
         lanes: set[Hashable] = set()
@@ -109,7 +136,7 @@ class DueQueue:
     def clear(self) -> None:
         """Forget all of them."""
         self.options.clear()
-        self._ordered = 0
+        self._ordered = self._silent = self.nodes = 0
 
     def __iter__(self) -> Iterator[asyncio.Handle]:
         return (handle for _, handle, _ in self.options)

@@ -1,12 +1,14 @@
 """What a program asks the world for: random numbers and the time. In a simulated run both are the seed's.
 
-`random`, `uuid`, `secrets`, `os.urandom`, numpy's global generator and the functions of `time` are exchanged for the
-thread of the run. What cannot be exchanged is told: threads, sockets and processes of the program's own.
+`random`, `uuid`, `secrets`, `os.urandom`, numpy's global generator, the functions of `time` and the clocks of
+`datetime` are exchanged for the thread of the run. What cannot be exchanged is told: threads, sockets and processes of
+the program's own.
 """
 
 from __future__ import annotations
 
 import asyncio
+import datetime
 import functools
 import os
 import random
@@ -19,12 +21,12 @@ import time
 import uuid
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from anyio._backends._asyncio import CancelScope, WorkerThread
 
+from ..library_code import is_file_of_library
 from ..swaps import Swaps
 from ..threads import Onlooker
 from .numbered import as_completed, numbering, scope_in_order
@@ -36,9 +38,6 @@ EPOCH = 1_700_000_000.0
 """Unix time at which each simulated run begins."""
 NODE = 0x010000000001
 """The machine in a UUID of version 1."""
-_PACKAGE = Path(__file__).resolve().parents[2]
-OURS = tuple(f"{_PACKAGE}/{room}/" for room in ("actors", "checkpoint", "ftm", "supervision", "system", "testing"))
-"""Threads of this library are waited for, and no news."""
 
 
 class EscapesSimulation(UserWarning):
@@ -159,6 +158,9 @@ class World:
         for name, count in (("strftime", 1), ("asctime", 0)):
             real = getattr(time, name)
             put(time, name, self._own(real, _given(real, count, time.localtime)))
+        # `today`, of both of its classes, asks `time.time`.
+        for name, dated in (("now", functools.partial(_now, wall)), ("utcnow", functools.partial(_utcnow, wall))):
+            put(datetime.datetime, name, self._own_of_class(vars(datetime.datetime)[name], dated))
 
     def _drawn(self, size: int = 16, flags: int = 0) -> bytes:
         """In place of `os.urandom` and `os.getrandom`."""
@@ -193,6 +195,16 @@ class World:
             return (simulated if threading.get_ident() == self._thread else real)(*args, **options)
 
         return chosen
+
+    def _own_of_class(self, real: Any, simulated: Callable[..., Any]) -> Any:
+        """As `_own`, of a class method."""
+
+        def chosen(kind: type, *args: Any, **options: Any) -> Any:
+            if threading.get_ident() == self._thread:
+                return simulated(kind, *args, **options)
+            return real.__get__(None, kind)(*args, **options)
+
+        return classmethod(chosen)
 
     def _look_at_thread(self, thread: threading.Thread) -> None:
         if isinstance(thread, threading.Timer):
@@ -232,6 +244,21 @@ def _given(real: Callable[..., Any], count: int, made: Callable[[], object]) -> 
     return called
 
 
+def _now(
+    wall: Callable[[], float], kind: type[datetime.datetime], tz: datetime.tzinfo | None = None
+) -> datetime.datetime:
+    """In place of `datetime.now`."""
+    return kind.fromtimestamp(wall(), tz)
+
+
+def _utcnow(wall: Callable[[], float], kind: type[datetime.datetime]) -> datetime.datetime:
+    """In place of `datetime.utcnow`, which Python advises against from 3.12 on."""
+    if sys.version_info >= (3, 12):
+        text = "datetime.datetime.utcnow() is deprecated: use datetime.datetime.now(datetime.UTC)"
+        warnings.warn(text, DeprecationWarning, stacklevel=3)
+    return kind.fromtimestamp(wall(), datetime.UTC).replace(tzinfo=None)
+
+
 def _nothing() -> None:
     """What seeds a generator in a thread that is not the run's."""
 
@@ -241,8 +268,9 @@ def _in_ns(made: Callable[[], float]) -> Callable[[], int]:
 
 
 def _is_ours(function: Any) -> bool:
+    """Whether a function is of this library, whose threads are waited for, and no news."""
     code = getattr(getattr(function, "__func__", function), "__code__", None)
-    return code is not None and code.co_filename.startswith(OURS)
+    return code is not None and is_file_of_library(code.co_filename)
 
 
 def _kind_of_file(fd: Any) -> str:

@@ -126,10 +126,14 @@ async def test_does_not_wait(actor_system):
             "import subprocess; kept.append(subprocess.Popen(['sleep', '3600']))",
             "a process was left running: * sleep 3600*",
         ),
+        (  # It would end within the time that the library's own processes have.
+            "import subprocess; kept.append(subprocess.Popen(['sleep', '3']))",
+            "a process was left running: * sleep 3*",
+        ),
     ],
 )
 def test_a_leak_fails_the_test(suite, leak: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("holdfast.testing.guard.leaks.GRACE", 0.1)
+    monkeypatch.setattr("holdfast.testing.guard.leaks.SHORT_GRACE", 0.1)
     result = suite(f"""
 kept = []
 
@@ -143,6 +147,68 @@ def test_cleans_up():
 """)
     result.assert_outcomes(passed=2, errors=1)
     result.stdout.fnmatch_lines([f"*{text}*"])
+
+
+def test_what_is_exchanged_stays_between_two_tests_and_goes_with_the_session(pytester: pytest.Pytester) -> None:
+    """Meanwhile nobody is checked who does not ask for it."""
+    pytester.makeconftest(
+        CONFTEST
+        + """
+from holdfast.actors.kernel import loop
+from holdfast.actors.kernel.ref import ActorRef
+
+def exchanged():
+    return ActorRef.tell, loop.run_turns
+
+REAL = exchanged()
+
+def pytest_configure(config):
+    config.add_cleanup(lambda: print("all is back:", exchanged() == REAL))
+"""
+    )
+    pytester.makeini("[pytest]\nasyncio_mode = auto\nasyncio_default_fixture_loop_scope = function\n")
+    tests = """
+from conftest import REAL, exchanged
+
+async def test_guarded(actor_system):
+    with pytest.raises(hf.BadMessage):
+        actor_system.spawn(hf.start(Counter)).tell(Add("one"))
+
+async def test_plain():
+    assert all(now != real for now, real in zip(exchanged(), REAL, strict=True))
+    async with hf.ActorSystem(log=False) as system:
+        system.spawn(hf.start(Counter)).tell(Add("one"))
+"""
+    pytester.makepyfile(HEAD + tests)
+    result = pytester.runpytest_subprocess("-p", "no:cacheprovider", "-p", "no:randomly")
+    result.assert_outcomes(passed=2)
+    result.stdout.fnmatch_lines(["*all is back: True*"])
+
+
+def test_processes_that_are_about_to_end_are_no_leak(suite) -> None:
+    """One that the test has told to end, and the library's own, which have longer."""
+    suite("""
+import subprocess, sys
+from holdfast.actors.process.fork import boot
+
+@pytest.fixture(scope="module")
+def kept():
+    kept = []
+    yield kept
+    for process in kept:
+        process.wait()
+
+async def test_told_to_end(actor_system, kept):
+    kept.append(subprocess.Popen(["sleep", "3600"]))
+    kept[-1].terminate()
+
+async def test_own(actor_system, kept, monkeypatch):
+    monkeypatch.setattr("holdfast.testing.guard.leaks.SHORT_GRACE", 0.0)
+    program = "import sys; sys.stdin.read()"
+    kept.append(subprocess.Popen([sys.executable, "-c", program, boot.__file__], stdin=subprocess.PIPE))
+    asyncio.get_running_loop().call_later(0.0, kept[-1].stdin.close)
+    await asyncio.sleep(0.01)
+""").assert_outcomes(passed=2)
 
 
 def test_leaks_can_be_expected(suite) -> None:

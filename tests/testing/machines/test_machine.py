@@ -16,6 +16,7 @@ from hypothesis.stateful import precondition, rule, run_state_machine_as_test
 
 import holdfast as hf
 from holdfast.testing import ActorMachine, Model, NotLinearizable
+from holdfast.testing.schedules.choices import UnfitSchedule
 
 STEPS = 6
 QUICK = settings(
@@ -257,6 +258,17 @@ def repeat(machine: type[ActorMachine], schedule: str, notes: str) -> None:
                 eval(f"state.{line}", {"state": state})
     finally:
         state.teardown()
+
+
+def test_a_schedule_of_another_example_is_an_error_of_the_machine() -> None:
+    for schedule, fits in (("seed=1", True), ("seed=1 hold=900:1", False)):
+        state = CrashesRecorded(schedule=schedule)
+        state.add(amount=1)
+        if fits:
+            state.teardown()
+        else:
+            with pytest.raises(UnfitSchedule, match=r"hold=900:1 was not come to, for the run has \d+ such choices"):
+                state.teardown()
 
 
 def test_a_rule_that_hides_a_method_of_the_machine_is_refused() -> None:

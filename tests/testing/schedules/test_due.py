@@ -63,6 +63,48 @@ def test_a_task_goes_on_before_what_is_called_of_it_later() -> None:
         assert runner.run(main()) == "its result"
 
 
+class Counting(Last):
+    """Notes how many there are to choose from, but for the steps of tasks."""
+
+    def __init__(self) -> None:
+        self.counts: list[int] = []
+
+    def choose_callback(self, due: DueQueue) -> Option:
+        options = [option for option in due.next_options() if not isinstance(option[0], asyncio.Task)]
+        self.counts.append(len(options))
+        return options[-1] if options else super().choose_callback(due)
+
+
+def test_what_was_cancelled_while_it_was_due_is_no_option_any_more() -> None:
+    counting = Counting()
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, ControlledLoop)
+        called: list[str] = []
+        over = loop.create_future()
+        first = loop.call_at(1.0, called.append, "first")
+
+        def second() -> None:
+            called.append("second")
+            over.set_result(None)
+
+        def third() -> None:
+            called.append("third")
+            first.cancel()
+
+        loop.call_at(1.0, second)
+        loop.call_at(1.0, third)
+        loop.due.chooser = counting
+        await over
+        loop.due.chooser = None
+        assert called == ["third", "second"]
+
+    with asyncio.Runner(loop_factory=ControlledLoop) as runner:
+        runner.run(main())
+    assert counting.counts[:2] == [3, 1]
+
+
 def test_when_a_thread_wakes_the_loop_is_no_choice_of_the_schedule() -> None:
     def run(seconds: float) -> list[int]:
         steps: list[int] = []

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import datetime
+import itertools
 import os
 import signal
 import threading
+import time
+import warnings
 from collections.abc import Awaitable, Callable
+from datetime import UTC, date, datetime, timedelta
+from typing import Any
 
 import anyio
 import anyio.to_thread
@@ -16,7 +20,7 @@ import pytest
 import holdfast as hf
 from holdfast.testing import GuardedSystem, simulate
 from holdfast.testing.schedules.choices import NotRepeatable, Production, Walk
-from holdfast.testing.schedules.world import EscapesSimulation
+from holdfast.testing.schedules.world import EPOCH, EscapesSimulation
 from holdfast.testing.simulation import run_schedule
 
 
@@ -133,15 +137,38 @@ def test_what_threads_of_anyio_bring_comes_in_the_order_in_which_it_was_asked_fo
     assert sorted(first) == [0, 1, 2, 3]
 
 
-def test_the_date_of_now_is_found_by_the_second_run() -> None:
-    """A class in C, which others have imported by name: there is nothing that could be exchanged for all of them."""
+class Moment(datetime):
+    """A user's own."""
+
+
+def test_the_date_is_the_runs_also_where_the_class_was_imported_by_name() -> None:
+    epoch = datetime.fromtimestamp(EPOCH)
+    real: list[datetime] = []
 
     async def dated(system: GuardedSystem) -> None:
-        system.spawn(hf.start(Goer), f"at{datetime.datetime.now():%H%M%S%f}").tell(Go())
-        await asyncio.sleep(1)
+        system.spawn(hf.start(Goer), f"at{datetime.now():%H%M%S%f}").tell(Go())
+        await asyncio.sleep(60)
+        later = epoch + timedelta(seconds=60)
+        assert [datetime.now(), datetime.today(), Moment.now()] == [later] * 3
+        assert [type(Moment.now()), type(Moment.now(UTC))] == [Moment] * 2
+        assert datetime.now(UTC) == datetime.now(tz=UTC) == later.astimezone(UTC)
+        assert datetime.now(UTC) == datetime.fromtimestamp(time.time(), UTC)
+        assert date.today() == later.date()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)
+            utcnow: Any = vars(datetime)["utcnow"].__get__(None, datetime)  # deprecated, and still in use
+            assert utcnow() == datetime.now(UTC).replace(tzinfo=None)
+        with pytest.raises(TypeError):
+            datetime.now("noon")  # type: ignore[arg-type]
+        await asyncio.to_thread(lambda: real.append(datetime.now()))  # A thread has the real world.
 
-    with pytest.raises(NotRepeatable, match=r"/app/at\d+ Go.*datetime.now\(\)"):
-        simulate(dated, seeds=1)()
+    before = datetime.now()
+    now = vars(datetime)["now"]
+    simulate(dated, seeds=11)()
+    assert before <= datetime.now() < before + timedelta(minutes=10)
+    assert all(before <= one < before + timedelta(minutes=10) for one in real)
+    assert len(real) == 13  # Two of the eleven runs are made twice.
+    assert vars(datetime)["now"] is now
 
 
 class Plain:
@@ -153,8 +180,13 @@ class Plain:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_order_of_a_set_of_objects_is_found_by_the_second_run(seed: int) -> None:
+    kept: list[Plain] = []  # farther apart in each run, as the allocator may give the same addresses again
+    runs = itertools.count(1)
+
     async def in_order(system: GuardedSystem) -> None:
-        for one in {Plain(number) for number in range(8)}:
+        step = next(runs)
+        kept.extend(Plain(number // step) for number in range(8 * step))
+        for one in set(kept[-8 * step :: step]):
             system.spawn(hf.start(Goer), f"goer{one.number}").tell(Go())
         await asyncio.sleep(1)
 
