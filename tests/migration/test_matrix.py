@@ -24,7 +24,7 @@ TEXT = (Path(__file__).parents[2] / "docs" / "control.md").read_text("utf-8")
 TIMES = int(os.environ.get("HOLDFAST_MATRIX", "1"))
 # Each note: the actors it is about, what the refusal says.
 NOTES: dict[str, tuple[set[str], str]] = {
-    "¹": (set(KINDS), "its replicas know it|no supervisor looks after it|a life cannot enter or leave"),
+    "¹": (set(KINDS), "its replicas know it"),
 }
 
 
@@ -89,6 +89,7 @@ class Walk:
     def __init__(self, system: hf.ActorSystem, kind: str, place: str, draw: random.Random, faults: Faults) -> None:
         self._system, self._kind, self.place, self._draw, self._faults = system, kind, place, draw, faults
         self._home = place if place != "replicas" else "a task"
+        self._is_far = place in (BELOW, OWN_BELOW)  # its first supervisor lives in another process
         self.ref: hf.ActorRef[Any] = system.ref(path(place), Traveller)
         self.steps: list[str] = []
 
@@ -123,6 +124,9 @@ class Walk:
         places = {"task": task, "process": process, "protect": "replicas", "unprotect": self._home}
         if step in ("task", "process"):
             self._home = places[step]  # Also of one that is protected: it lives there behind its mechanism.
+        if step == "move" and self._is_far:  # Its other supervisor is in the root's process.
+            other = {BELOW: "a task", OWN_BELOW: "a process", "a task": BELOW, "a process": OWN_BELOW}
+            self.place = self._home = other[self.place]
         if step != "move" and (self.place != "replicas" or step == "unprotect"):
             self.place = places[step]
 
