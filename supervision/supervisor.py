@@ -24,6 +24,7 @@ from .admin import (
     ChildBusy,
     ChildParked,
     DeleteChild,
+    NoSuchChild,
     RemoveChild,
     RestartChild,
     StartChild,
@@ -290,6 +291,14 @@ class Supervisor(Inquiries):
         else:
             self._restart(one, reason)
 
+    def _child_lost(self, cell: Cell) -> None:
+        one = self._listed().get(cell.name)
+        if one is None or one.cell is not cell:
+            return
+        self._forget(one)
+        one.cell, one.row, one.state, one.is_lost = None, None, STOPPED, True
+        one.retry += 1
+
     def _report_end(self, one: Child, life: int, reason: ExitReason) -> None:
         """Tell that a child has ended without having been told to."""
         one.ignored_life = life
@@ -463,7 +472,8 @@ class Supervisor(Inquiries):
             child = cell if one is None or one.cell is None else one.cell
             if one is not None:
                 self._has_ended(one)
-            await child.node.stop_child(child)
+            if child.parent is self.ctx.cell:  # Else it was given to another supervisor while we stopped others.
+                await child.node.stop_child(child)
 
     def _is_parked(self, name: str) -> bool:
         """Whether this child was stopped by order, and not started since; also if it is forgotten by now."""
@@ -571,6 +581,8 @@ class Supervisor(Inquiries):
         self._forget(one)  # From here on nobody starts it again, with others or by itself.
         reason = SHUTDOWN if message.reason is None else unpack_exit(message.reason)
         await self._stop(one, reason)
+        if one.is_lost:
+            raise NoSuchChild(message.id)
         if one.cell is not None:
             lifecycle.retire(one.cell, reason)
         if message.erase:
@@ -587,6 +599,8 @@ class Supervisor(Inquiries):
         if message.parks:
             self._parked.add(one.spec.id)
         await self._stop(one, reason)
+        if one.is_lost:
+            raise NoSuchChild(message.id)
         if one.row is None:  # Else it is started again with others meanwhile.
             self._give_up_address(one, reason)
 

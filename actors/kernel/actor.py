@@ -18,6 +18,7 @@ from .message import Message
 
 if TYPE_CHECKING:
     from ..exit_reasons import ExitReason
+    from .cell import Cell
     from .context import ActorContext
     from .envelope import ReplyHandle
     from .ref import ActorRef
@@ -218,6 +219,9 @@ class Actor:
     def _is_starting(self) -> bool:
         """Whether the start goes on though `on_start` has returned; the end of it is `lives.came_up`."""
         return False
+
+    def _child_lost(self, cell: Cell) -> None:
+        """A child that lives on in another process has another supervisor from now on."""
 
     async def _stop_children(self) -> None:
         """The life ends: its children go first, newest first."""

@@ -57,6 +57,9 @@ class Home:
         """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
         return True
 
+    def handed_to(self, parent: Parent) -> None:
+        """Another supervisor has the address from now on."""
+
     def retired(self, cell: Cell) -> None:
         """The address is gone for good; called before its queue is drained."""
 
@@ -119,6 +122,12 @@ class Place:
     def left(self, cell: Cell) -> list[asyncio.Future[Any]]:
         """What has to come to its end before another life may begin."""
         return []
+
+    def handed_to(self, parent: Parent) -> None:
+        """Another supervisor has the address from now on."""
+
+    def disowned(self, cell: Cell) -> None:
+        """The supervisor here has lost the actor to another one: whoever waits for its start is told so."""
 
     def retired(self, cell: Cell) -> None:
         """The address is gone for good: what is under way there is not wanted any more."""
@@ -212,6 +221,12 @@ class AddressHost:
 
     def is_up(self, cell: Cell) -> bool:
         return self.home.is_open(cell) and self.place.is_up(cell)
+
+    def handed_to(self, parent: Parent) -> None:
+        """Have another supervisor decide what follows from the ends of lives."""
+        self.parent = parent
+        self.place.handed_to(parent)
+        self.home.handed_to(parent)
 
     def retired(self, cell: Cell) -> None:
         self.place.retired(cell)

@@ -73,6 +73,10 @@ class Host(Protocol):
         """End the life at once."""
         ...
 
+    def handed_to(self, parent: Parent) -> None:
+        """Have another supervisor decide what follows from the ends of lives."""
+        ...
+
     def retired(self, cell: Cell) -> None:
         """The address is gone for good; called before its queue is drained."""
         ...

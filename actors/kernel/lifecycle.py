@@ -582,6 +582,19 @@ def retire(cell: Cell, why: object) -> None:
             cell.undelivered(item, str(why))
 
 
+def disown(cell: Cell) -> None:
+    """The actor at a cell has another supervisor from now on, and its life goes on; here nobody hears of an end."""
+    parent = cell.parent
+    assert parent is not None
+    if parent.actor is not None:
+        parent.actor._child_lost(cell)
+    cell.host.place.disowned(cell)
+    if parent.children is not None and parent.children.get(cell.name) is cell:
+        del parent.children[cell.name]
+    cell.parent = cell.spec = None
+    tell_enders(cell.extra(), SHUTDOWN)  # Whoever has stopped it does not wait for its end any more.
+
+
 def parent_ended(cell: Cell) -> bool:
     """Whether it is the supervisor of a retired cell that has ended, and both may be started again."""
     if cell.parent is None or cell.parent.state is RUNNING:

@@ -248,8 +248,10 @@ class Node(RunLoop):
         if cell.state is DOWN or cell.state is GONE:
             lifecycle.retire(cell, "its parent has stopped")
             return cell.extra().reason
+        parent = cell.parent
         reason: ExitReason = await (lifecycle.stop_in_time(cell) if cell.spec is None else cell.spec.stop(cell))
-        lifecycle.retire(cell, "its parent has stopped")
+        if cell.parent is parent:  # Else it has another one now, and lives on.
+            lifecycle.retire(cell, "its parent has stopped")
         return reason
 
     def find(self, path: str) -> Cell | None:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from ..exit_reasons import ExitReason
     from ..kernel.actor import Actor
+    from ..kernel.address_host import Parent
 
 ATTEMPTS = itertools.count(1)
 """Numbers of attempts to have an actor in another process come to rest: what it says to an earlier one is void."""
@@ -163,6 +164,10 @@ class Transit:
 
     def retired(self, cell: Cell) -> None:
         self.old.retired(cell)
+
+    def handed_to(self, parent: Parent) -> None:
+        self.parent = parent
+        self.old.handed_to(parent)
 
     def push(self, cell: Cell, item: Item) -> None:
         carry([item])

@@ -387,6 +387,14 @@ class WorkerPlace(Place):
             worker.readdress(was, now)
         self.home.readdressed(cell)
 
+    def handed_to(self, parent: Parent) -> None:
+        self.parent = parent
+
+    @property
+    def is_ending(self) -> bool:
+        """Whether the life there has been told to stop."""
+        return self.stop_sent is not None or self._stop_wanted is not None
+
     # -- beginning --------------------------------------------------------------------------------------------------
 
     def start(self, cell: Cell) -> asyncio.Future[None]:

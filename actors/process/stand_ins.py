@@ -72,6 +72,20 @@ class Inner:
         """The process's own actor has another address, and so have these."""
         self._cells = {new + path[len(old) :]: cell for path, cell in self._cells.items()}
 
+    def adopt(self, path: str, cell: Cell) -> None:
+        """An actor whose home is here has come to an address below."""
+        self._cells[path] = cell
+
+    def lost(self, path: str, cell: Cell) -> None:
+        """The actor has left that address below; those here who are tied to it know it by its new one."""
+        self._cells.pop(path, None)
+        within, ties = set(self._cells.values()), cell.extra().ties
+        for peer in within & ties.links.keys():
+            peer.extra().ties.links[cell] = cell.path
+        for watch in ties.monitors:
+            if watch.watcher in within:
+                watch.name = cell.path
+
     def lived_there(self, cell: Cell) -> Host:
         """What is sent to an address goes into the process from now on; returns its host."""
         cell.admit = self._admit

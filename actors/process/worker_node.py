@@ -208,10 +208,9 @@ class Guest(Peer):
 
     def outside(self, path: str) -> Cell | None:
         """The stand-in for an address that is not in this process; None for one that would be."""
-        root = self.node.root
-        if root is not None and (path == root.path or path.startswith(root.path + "/")):
+        cell, root = self._outside.get(path), self.node.root
+        if cell is None and root is not None and (path == root.path or path.startswith(root.path + "/")):
             return None
-        cell = self._outside.get(path)
         if cell is None:
             cell = self._outside[path] = Cell(self.node, None, path, self._host)
             cell.state = RUNNING
@@ -421,7 +420,9 @@ class Guest(Peer):
             self._readdress(str(frame.data["was"]), str(frame.data["now"]))
             return
         cell = self._target(frame.to)
-        if frame.verb == "bind":
+        if frame.verb == "disown":
+            self._disown(cell, self.connection.names.from_wire(frame.to), str(frame.data["path"]), frame.data["life"])
+        elif frame.verb == "bind":
             more, port = cell.extra(), str(frame.data["port"])
             more.bindings[port] = named(self.node, frame, "target")
             more.claimed = more.claimed | {port} if frame.data.get("is_claimed") else more.claimed - {port}
@@ -445,7 +446,28 @@ class Guest(Peer):
             self.recovery.readdressed(old, cell.path)
         for one in every_cell(cell):
             one.host.place.readdress(one, was, now)
+        self._has_heard(was)
+
+    def _has_heard(self, old: str) -> None:
+        """From here on the address `old` is not meant as that of the actor that has left it."""
+        cell = self.node.root
+        assert cell is not None
+        self.connection.names.give_anew(old)
         self.command(cell, "readdressed", {})
+
+    def _disown(self, cell: Cell, old: str, path: str, life: int) -> None:
+        """A child that is lived elsewhere has a supervisor elsewhere, too: its cell stands for one outside."""
+        self._has_heard(old)
+        self._outside[path] = self._outside[old] = cell  # Until somebody else lives there, `old` leads to it as well.
+        if cell.parent is not None:
+            lifecycle.disown(cell)
+        cell.name, cell.state = path, RUNNING
+        cell.host, cell.admit, cell.table = self._host, self._host.home.admit, OUTSIDE
+        more = cell.extra()
+        more.start = more.outlet = None
+        for watch in more.ties.monitors:  # The root was not told of these, for whoever watches it was told here.
+            data = {"watcher": watch.watcher.path, "for_good": watch.for_good, "life": life}
+            cell.host.told(cell, "monitor", data)
 
     # -- the end ----------------------------------------------------------------------------------------------------
 

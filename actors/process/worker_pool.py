@@ -168,6 +168,14 @@ class Worker(Peer):
         to = self.connection.names.to_wire(self.home)
         self.connection.send(frames.Command(to, "readdress", {"was": was, "now": now}))
 
+    def disown(self, cell: Cell, old: str) -> None:
+        """The actor that has left `old`, below its own, has another supervisor from now on, elsewhere."""
+        new, connection = cell.path, self.connection
+        self.gate.readdressed(old, new)
+        self.inner.lost(old, cell)
+        told = {"path": new, "life": cell.life}
+        connection.send(frames.Command(connection.names.to_wire(old), "disown", told))
+
     def give_back(self) -> None:
         """The actor is not moved into this process: it ends, and nobody is told."""
         self.cell = self._died = None
@@ -234,8 +242,8 @@ class Worker(Peer):
     # -- what it says -----------------------------------------------------------------------------------------------
 
     def _on_frame(self, frame: frames.AnyFrame) -> None:
-        self.gate.check(frame)
-        self._workers.on_frame(self.node, self, frame)
+        if self.gate.admits(frame):
+            self._workers.on_frame(self.node, self, frame)
 
     def on_forget(self, frame: frames.Forget) -> None:
         """The process gives all its names anew."""

@@ -256,6 +256,9 @@ class JournalHome(RecordedHome):
 
     # -- ends -------------------------------------------------------------------------------------------------------
 
+    def handed_to(self, parent: Parent) -> None:
+        self.parent = parent
+
     def retired(self, cell: Cell) -> None:
         self.give_up(cell)
 

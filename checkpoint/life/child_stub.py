@@ -190,6 +190,11 @@ class ChildPlace(Place):
             self._up.set_exception(error)
             self._up.exception()  # Nobody may be left to look.
 
+    def disowned(self, cell: Cell) -> None:
+        self._number += 1
+        self.fail(StartFailed(cell.path, "another supervisor has it now"))
+        self.home.guest.recovery.vacated(cell.path)
+
     def say_closed(self, cell: Cell, reason: ExitReason) -> None:
         """Tell the home that the supervisor has seen the end of the life."""
         assert self._port is not None

@@ -63,6 +63,7 @@ class FarParent(Parent):
         self._is_restarting = False  # it is the supervisor that has ended
         self._made = AtRoot(b"", [])
         self._topics: list[str] = []
+        self._visitor: Visitor | None = None  # who may come to live here, with its life
 
     @property
     def home(self) -> JournalHome:
@@ -104,6 +105,9 @@ class FarParent(Parent):
 
     def _begin(self, wanted: Wanted) -> None:
         """Bring the actor back: its state, what it has handled since, what waits."""
+        if self._visitor is not None:
+            self._visitor.wanted = wanted
+            return
         left = self._left()
         if left:
             self._next = wanted
@@ -168,7 +172,9 @@ class FarParent(Parent):
 
     def _hear_closed(self, record: Closed) -> None:
         """It has heard of the end of a life, or gives up its start."""
-        if self._next is not None:
+        if self._visitor is not None:
+            self._visitor.wanted = None
+        elif self._next is not None:
             self._next = None  # There was none yet.
         elif self.wanted is None or record.number != self.wanted.number or self.cell is None:
             return
@@ -186,6 +192,8 @@ class FarParent(Parent):
         if worker is not self.worker:
             return
         self._next = None
+        if self._visitor is not None:
+            self._visitor.wanted = None
         if self.on_lost is not None:
             self.on_lost(reason)
         if self.wanted is None or self.cell is None:
@@ -282,6 +290,53 @@ class FarParent(Parent):
         if self.cell is cell and self._next is None and self.arriving is None:
             self._vacated(self)
 
+    # -- actors that come with their lives from another supervisor, or leave for one --------------------------------
+
+    def expect(self) -> None:
+        """An actor may come to live here: the life that the supervisor wants is not begun, but waits for it."""
+        if self._visitor is None:
+            self._visitor = Visitor()
+
+    @property
+    def is_expected(self) -> bool:
+        """Whether the supervisor wants a life for the actor that may come."""
+        return self._visitor is not None and self._visitor.wanted is not None
+
+    def expect_nobody(self) -> None:
+        """Nobody comes; the supervisor has given up the life that it wanted, or has ended."""
+        self._visitor = None
+
+    def take(self, cell: Cell) -> None:
+        """The actor has come: its life is the one that was wanted."""
+        visitor, self._visitor = self._visitor, None
+        assert visitor is not None
+        assert self.worker is not None
+        wanted = visitor.wanted
+        assert wanted is not None
+        assert wanted.at_root is not None
+        self.cell, self.wanted, self._last, self._is_restarting = cell, wanted, None, False
+        self._made, self._topics = wanted.at_root, wanted.topics
+        self.worker.inner.adopt(self.path, cell)
+        cell.host.handed_to(self)
+        self.port().to_life(Started(wanted.number))
+
+    def give_away(self, parent: Parent) -> None:
+        """The actor has another supervisor, and another address, from now on."""
+        cell = self.cell
+        assert cell is not None
+        cell.host.handed_to(parent)
+        if self.worker is not None:
+            self.worker.disown(cell, self.path)
+        self.cell = self.wanted = None
+        self._vacated(self)
+
+    def why_busy(self, cell: Cell) -> str:
+        """Why the life at the root cannot be given to another supervisor at this instant; "" if it can."""
+        is_starting = self._starting is not None and not self._starting.done()
+        if self.cell is not cell or self.wanted is None or self.has_ended or is_starting or cell.state is not RUNNING:
+            return f"{self.path} is being restarted"
+        return ""
+
     # -- lives that move while they are lived -----------------------------------------------------------------------
 
     def prepare(self, made: AtRoot, topics: list[str]) -> None:
@@ -312,6 +367,13 @@ class FarParent(Parent):
     def goes_for_good(self) -> None:
         """It is lived in the process again, and there is no home."""
         self.cell = self.wanted = self.home.switch = None
+
+
+class Visitor:
+    """An actor that may come with its life."""
+
+    def __init__(self) -> None:
+        self.wanted: Wanted | None = None  # what the supervisor has asked for
 
 
 class SlotPlace(Place):

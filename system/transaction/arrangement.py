@@ -16,7 +16,8 @@ from ...actors.kernel.cell import GONE, RUNNING, Cell
 from ...actors.kernel.ref import ActorRef
 from ...checkpoint.addresses import renamed
 from ...supervision.admin import ChangeSupervisor
-from ...supervision.children import Child, new_cell
+from ...supervision.children import UP, Child, complete, new_cell
+from ...supervision.respec import recipe_spec
 from ...supervision.spec import ChildSpec, Flags
 from ...supervision.supervisor import Supervisor
 from .draft import START_TIMEOUT, DraftPlace, is_elsewhere
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
     from ...actors.kernel.node import Node
     from ..system import ActorSystem
+    from .handing import Handing
 
 
 class Arrangement:
@@ -40,6 +42,8 @@ class Arrangement:
         self._names: dict[
             str, tuple[Operation, DraftPlace | None, DraftPlace | None]
         ] = {}  # the step; who had it, who has it
+        self.handings: dict[DraftPlace, Handing] = {}
+        """Of each child that is moved, how it is given to a supervisor, or by one, in another process."""
         self.step = ""
         """The step that is in the way, or has failed."""
 
@@ -109,14 +113,15 @@ class Arrangement:
             for place, cell in cells.items()
             if place in self._rearranged and isinstance(cell.actor, Supervisor)
         }
-        moved = [child for place in here for child in place.children.values() if child.has_moved]
+        changed = [place for place in cells if place in self._rearranged]
+        moved = [child for place in changed for child in place.children.values() if child.has_moved]
         was = {child: f"{cells[_left(child)].path}/{child.name}" for child in moved}
         if moved:
             settle_bindings(system.node.root)
-        taken = {child: here[_left(child)]._children.pop(child.name) for child in moved}
+        taken = {child: _taken(child, self.handings[child], here, cells) for child in moved}
         for place, supervisor in here.items():
             _arrange(place, supervisor, taken)
-        _readdress(here, taken)
+        _readdress(cells, here, taken)
         now = {path: f"{cells[_below(child)].path}/{child.name}" for child, path in was.items()}
         if moved and system.node.root is not None:  # First: what comes now is called by addresses as they are now.
             Renamed(now).keep(system.node.root)
@@ -130,6 +135,9 @@ class Arrangement:
         for child in moved:  # Before anything else is said to their processes.
             for cell in every_cell(taken[child].cell):
                 cell.host.place.readdress(cell, was[child], now[was[child]])
+            top = taken[child].cell
+            if top is not None:
+                self.handings[child].commit(top)
         if moved:
             tell_bindings(system.node.root, {new: old for old, new in now.items()})
 
@@ -221,6 +229,25 @@ def _left(place: DraftPlace) -> DraftPlace:
     return place.was.below
 
 
+def _taken(
+    child: DraftPlace, handing: Handing, here: dict[DraftPlace, Supervisor], cells: dict[DraftPlace, Cell]
+) -> Child:
+    """The child as its new supervisor has it from now on; the old one, if it lives in this process, has it no more."""
+    if _left(child) in here:
+        one = here[_left(child)]._children.pop(child.name)
+        one.spec = handing.spec(one.spec)
+        return one
+    cell, above = child.cell, cells[_below(child)]
+    assert cell is not None
+    known = recipe_spec(cell)
+    assert known is not None
+    spec = handing.spec(known)
+    if _below(child) in here:
+        spec = complete(above, spec)
+    cell.spec, cell.extra().start = spec, spec.start
+    return Child(spec, cell, UP, up_since=cell.node.loop.time())
+
+
 def _arrange(place: DraftPlace, supervisor: Supervisor, taken: dict[DraftPlace, Child]) -> None:
     """The children in the order of the draft; those that came meanwhile, and are not known there, behind them."""
     known, children = supervisor._children, dict[str, Child]()
@@ -234,15 +261,17 @@ def _arrange(place: DraftPlace, supervisor: Supervisor, taken: dict[DraftPlace, 
     supervisor._flags = dataclasses.replace(supervisor._flags, **place.wanted)
 
 
-def _readdress(here: dict[DraftPlace, Supervisor], taken: dict[DraftPlace, Child]) -> None:
+def _readdress(
+    cells: dict[DraftPlace, Cell], here: dict[DraftPlace, Supervisor], taken: dict[DraftPlace, Child]
+) -> None:
     """Each cell below the supervisor that has it now, in the order of the children."""
-    cells: dict[DraftPlace, Cell] = {}
+    moved: dict[DraftPlace, Cell] = {}
     for child, one in taken.items():
         if one.cell is not None and one.cell.state is not GONE and one.cell.parent is not None:
             (one.cell.parent.children or {}).pop(child.name, None)
-            cells[child] = one.cell
-    for child, cell in cells.items():  # If it is between two lives, the old supervisor hands on what it hears of it.
-        above = here[_below(child)].ctx.cell
+            moved[child] = one.cell
+    for child, cell in moved.items():  # If it is between two lives, the old supervisor hands on what it hears of it.
+        above = cells[_below(child)]
         above.children = {**(above.children or {}), child.name: cell}
         cell.parent = above
     for supervisor in here.values():

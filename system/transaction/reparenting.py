@@ -13,18 +13,21 @@ from ...checkpoint.home.recorded_home import switch_of
 from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import SnapshotNow
 from ...supervision.children import STOPPED, UP
+from ...supervision.respec import recipe_spec
 from .arrangement import busy, child_of
 from .draft import Draft, DraftPlace, Target, is_elsewhere, rules
+from .handing import Handing, check_handing, is_far
 from .operation import Operation, text_of, wrong
 from .relocation import MOVED_WITHIN, Gated
 from .structure import check_child, check_not_uniform
 
 if TYPE_CHECKING:
+    from ...actors.kernel.cell import Cell
     from ..system import ActorSystem
 
 
 class Reparent(Operation):
-    """Put a child under another supervisor of this process."""
+    """Put a child under another supervisor."""
 
     verb: ClassVar[str] = "move"
 
@@ -33,9 +36,9 @@ class Reparent(Operation):
         self._to = supervisor
         self._above: DraftPlace | None = None  # the new supervisor, at this point
         self._root: DraftPlace | None = None
-        self._leads = False  # it is the first step that moves this actor: it brings it to where the last one wants it
         self._asked: dict[Switch, int] = {}  # who was asked for a snapshot, behind which turn
         self._rests: dict[DraftPlace, Gated] = {}
+        self._handing: Handing | None = None  # by the first step that moves this actor, to where the last one wants it
 
     @property
     def text(self) -> str:
@@ -45,14 +48,15 @@ class Reparent(Operation):
         place = draft.find(self._at)
         new, old = await draft.supervisor(self._to), place.parent
         self.target = place.path
+        if place.spec is None and place.cell is not None:  # Its supervisor lives in another process.
+            place.spec = recipe_spec(place.cell)
         if old is None or not old.is_supervisor or place.spec is None:
             raise wrong(place.path, "no supervisor looks after it, so it cannot be moved to another")
         if new in place.walk():
             raise wrong(place.path, f"it cannot be moved below itself, to {new.path}")
         check_not_uniform(old)
-        for above in (old, new):
-            if above.cell is not None and is_elsewhere(above.cell):
-                raise wrong(above.path, "it lives in another process, which a life cannot enter or leave")
+        if is_far(old) or is_far(new):
+            check_handing(place, old, new)
         for above in new.upwards():
             if above.comes_last:
                 raise wrong(
@@ -66,7 +70,8 @@ class Reparent(Operation):
         del old.children[place.name]
         new.children[place.name], place.parent = place, new
         self._found, self._above, self._root = place, new, draft.root
-        self._leads = not (place.is_moved or place.is_planned)  # Who is added is started where it is to be.
+        if not (place.is_moved or place.is_planned):  # Who is added is started where it is to be.
+            self._handing = draft.arrangement.handings[place] = Handing(place)
         place.is_moved = True
         self.between_turns_of = (old, new)
         for holder in (old, new):
@@ -74,8 +79,9 @@ class Reparent(Operation):
 
     async def prepare(self, system: ActorSystem) -> None:
         """Have recorded and protected actors rest: no turn of theirs is to be repeated under another address."""
-        if self._found is None or not (self._leads and self._place.has_moved):
+        if self._found is None or self._handing is None or not self._place.has_moved:
             return
+        await self._handing.prepare(system)
         waits = bool(self._others_settle(system)) or bool(self._unsteady(system))
         for one, rest in self._resting(system):
             if waits:  # Perhaps for what those here have to answer.
@@ -113,17 +119,12 @@ class Reparent(Operation):
 
     def ready(self, system: ActorSystem) -> str:
         place = self._place
-        if not (self._leads and place.has_moved):
+        if self._handing is None or not place.has_moved:
             return ""
         assert place.was.below is not None
         old = place.was.below.living(system.node)
-        if why := busy(old):
+        if why := self._handing.ready(system) or (self._is_busy(old, place.name) if not is_elsewhere(old) else ""):
             return why
-        one = child_of(old, place.name)
-        if one is None:
-            raise wrong(old.path, f"it has no child {place.name!r} any more")
-        if one.state not in (UP, STOPPED) or one.row is not None or one.up is not None:
-            return f"{self.target} is being restarted"
         if why := self._others_settle(system) or self._unsteady(system):
             return why
         for resting, rest in self._resting(system):
@@ -134,11 +135,24 @@ class Reparent(Operation):
                 return f"the last snapshot of {resting.path} is not in the store yet"
         return ""
 
+    def _is_busy(self, old: Cell, name: str) -> str:
+        """Why a supervisor of this process cannot let its child go at this instant; "" if it can."""
+        if why := busy(old):
+            return why
+        one = child_of(old, name)
+        if one is None:
+            raise wrong(old.path, f"it has no child {name!r} any more")
+        if one.state not in (UP, STOPPED) or one.row is not None or one.up is not None:
+            return f"{self.target} is being restarted"
+        return ""
+
     def commit(self, system: ActorSystem) -> None:
         for rest in self._rests.values():
             rest.open()
 
     async def finish(self, system: ActorSystem) -> None:
+        if self._handing is not None:
+            await self._handing.finish(system)
         for rest in self._rests.values():
             if rest.task is not None:
                 with contextlib.suppress(HoldfastError):  # Its life has ended: the next one begins where it is now.
@@ -147,6 +161,8 @@ class Reparent(Operation):
     async def release(self, system: ActorSystem) -> None:
         for rest in self._rests.values():
             await rest.give_up(system)
+        if self._handing is not None:
+            await self._handing.release(system)
 
 
 def addressed(place: DraftPlace) -> Iterator[DraftPlace]:

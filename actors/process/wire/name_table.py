@@ -60,6 +60,12 @@ class NameTable:
             if field in ("to", "name", "sender") and type(value) is str:
                 self._given.pop(value, None)
 
+    def give_anew(self, path: str) -> None:
+        """Give an address, and those below it, anew: the other side takes the numbers that they have for another."""
+        for text in [one for one in self._given if one == path or one.startswith(f"{path}/")]:
+            number = self._given.pop(text)
+            self._given[f" {number}"] = number  # Nobody's name: numbers are counted by what was given.
+
     def forget_given(self) -> None:
         """Give all names to the other side anew, for it knows none of them."""
         self._given.clear()

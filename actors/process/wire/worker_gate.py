@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, Final
 
+from ...errors import NotGranted
 from ...events import DeadLetter
 from ...exit_reasons import unpack_exit
 from ...kernel.bindings import unclaimed
@@ -54,8 +55,12 @@ class WorkerGate:
         self._left: deque[tuple[str, str]] = deque()  # addresses it had, and has not heard yet that it has others
 
     def readdressed(self, was: str, now: str) -> None:
-        """An address has become another, with all below it: what it says until it knows that is meant so."""
+        """An address has become another, with all below it: what it says until it knows that is meant so.
+
+        If that is an actor of its own, and not below its own any more, all is void that it says of it then.
+        """
         self._left.append((was, now))
+        self._own.clear()
         self._worker.connection.names.rename_got(self._now)
 
     def _now(self, path: str) -> str:
@@ -82,12 +87,43 @@ class WorkerGate:
         self._cleared.clear()
         self._chars = 0
 
-    def check(self, frame: frames.AnyFrame) -> None:
-        """See whether the process may say this.
+    def admits(self, frame: frames.AnyFrame) -> bool:
+        """See whether the process may say this. False: it is void, for it has not heard yet whom it speaks of.
 
         Raises:
             BadFrame: it may not.
         """
+        try:
+            self._check(frame)
+        except BadFrame:
+            if not self._is_of_lost(frame):
+                raise
+            self._refuse(frame)
+            return False
+        return True
+
+    def _is_of_lost(self, frame: frames.AnyFrame) -> bool:
+        """Whether it names an actor that has left, and the process has not heard so."""
+        named: list[object] = []
+        if isinstance(frame, (frames.Command, frames.Note)):
+            named += frame.data.values()
+        if isinstance(frame, (frames.Command, frames.Tell, frames.Offer, frames.Ask, frames.Record, frames.Migrate)):
+            known = type(frame.to) is int
+            named += [self._worker.connection.names.from_wire(frame.to)] if known else []
+        lost = [now for _, now in self._left if not (self.owns(now) or is_at_or_below(self.home, now))]
+        return any(isinstance(one, str) and any(is_at_or_below(one, new) for new in lost) for one in named)
+
+    def _refuse(self, frame: frames.AnyFrame) -> None:
+        """Whoever waits for an answer gets one."""
+        answer: object = None
+        if isinstance(frame, (frames.Ask, frames.Offer)):
+            answer = frame.id
+        elif isinstance(frame, frames.Command):
+            answer = frame.data.get("answer")
+        if type(answer) is int:
+            self._worker.accepted(answer, NotGranted(self._left[0][0], "an order", self.home))
+
+    def _check(self, frame: frames.AnyFrame) -> None:
         rule = RULES.get(type(frame))
         if rule is None:
             raise BadFrame(f"an actor process cannot send a {type(frame).__name__}")

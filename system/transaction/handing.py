@@ -1,0 +1,207 @@
+"""A child whose old or new supervisor lives in another process: its life goes on, and the root exchanges who decides.
+
+The new supervisor, in its process, has the child started as a candidate; the root does not begin the life that is so
+wanted, for it has one. At the commit that life is the one, and the old supervisor is told that it has lost the child.
+If there is no commit the candidate is withdrawn. A child without a process of its own has one while it is given away.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+from ...actors.errors import ActorStopped, HoldfastError
+from ...actors.kernel.cell import RUNNING, Cell
+from ...actors.kernel.lifecycle import NEAR
+from ...actors.kernel.ref import ActorRef
+from ...actors.process.process_host import WorkerPlace
+from ...checkpoint.places.far_parent import FarParent
+from ...checkpoint.places.subtree_place import SubtreePlace
+from ...supervision.admin import Boxed, RemoveChild, StartChild
+from ...supervision.respec import recipe_spec
+from ...supervision.supervisor_changes import check_subtree
+from ..live_moves import place_of
+from .arrangement import planned_spec
+from .draft import START_TIMEOUT, DraftPlace, is_elsewhere
+from .operation import wrong
+from .relocation import MOVED_WITHIN
+from .structure import CANDIDATES
+
+if TYPE_CHECKING:
+    from ...supervision.spec import ChildSpec
+    from ...supervision.supervisor import Supervisor
+    from ..system import ActorSystem
+
+
+def is_far(supervisor: DraftPlace) -> bool:
+    """Whether a supervisor lives, or will live, in another process."""
+    if supervisor.cell is not None:
+        return is_elsewhere(supervisor.cell)
+    return any(
+        one.is_planned and one.spec is not None and one.spec.isolation == "process" for one in supervisor.upwards()
+    )
+
+
+def check_handing(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> None:
+    """Whether a child can be given by one supervisor to another, one of which lives in another process.
+
+    Raises:
+        SpecError: why not.
+    """
+    cell, spec = place.cell, place.spec
+    if cell is None or place.is_stopped or spec is None:
+        raise wrong(place.path, "it does not run, and a supervisor lives in another process: start it first")
+    if place.is_supervisor:
+        raise wrong(place.path, "it is a supervisor: its children live where it does")
+    if place.is_protected:
+        raise wrong(place.path, "a supervisor of its replicas lives in another process: detach its mechanism first")
+    if is_far(old) and recipe_spec(cell) is None:
+        raise wrong(
+            place.path, "no recipe at the root has its spec: its supervisor alone, in another process, knows it"
+        )
+    if is_far(new):
+        if place.name in new.was.children:
+            raise wrong(new.path, f"it has a child {place.name!r} until this transaction is in force: use the next one")
+        check_subtree(new.path, (spec,))
+        Boxed(spec).packed()
+
+
+class Handing:
+    """One child that is given to another supervisor."""
+
+    def __init__(self, place: DraftPlace) -> None:
+        self._place = place
+        self._candidate = next(CANDIDATES)
+        self._start: asyncio.Task[Any] | None = None  # by the new supervisor, in its process; over behind the commit
+        self._asked: Cell | None = None  # that supervisor
+        self._life = 0  # of it
+        self._parent: FarParent | None = None  # at the new address
+        self._is_lodged = False  # it has a process for this only
+
+    @property
+    def _above(self) -> DraftPlace:
+        above = self._place.parent
+        assert above is not None
+        return above
+
+    @property
+    def _is_needed(self) -> bool:
+        old = self._place.was.below
+        assert old is not None
+        return is_far(old) or is_far(self._above)
+
+    async def prepare(self, system: ActorSystem) -> None:
+        """Have the new supervisor make room, if it lives in another process."""
+        place = self._place
+        if not self._is_needed:
+            return
+        if place.rework is not None or place.relocation is not None:
+            raise wrong(place.path, "it goes to another process's supervisor: change it in a transaction of its own")
+        cell = place.living(system.node)
+        if place_of(cell) != "process":
+            self._is_lodged = True
+            await system._moves.move(cell, "process", None, MOVED_WITHIN)
+        above = self._above.living(system.node)
+        if not is_elsewhere(above) or (self._asked is above and self._life == above.life and not self._has_failed()):
+            return
+        await self._withdraw()
+        self._asked, self._life = above, above.life
+        self._parent = far_parent(above, place.path)
+        self._parent.expect()
+        supervisor: ActorRef[Supervisor] = ActorRef(above)
+        spec = dataclasses.replace(planned_spec(place, in_force=True), isolation="process")
+        asked = supervisor.ask(StartChild(spec, candidate=self._candidate), START_TIMEOUT)
+        self._start = system.node.loop.create_task(_reply(asked), name=f"room for {place.path}")
+
+    def _has_failed(self) -> bool:
+        """Whether the supervisor has ended before it had answered. Raises what it has answered: a refusal."""
+        start = self._start
+        if start is None or not start.done():
+            return False
+        error = start.exception()
+        if error is not None and not isinstance(error, ActorStopped):
+            raise error
+        return True
+
+    def ready(self, system: ActorSystem) -> str:
+        """What is in the way of giving it away at this instant; "" if nothing is."""
+        if not self._is_needed:
+            return ""
+        cell = self._place.living(system.node)
+        old, at = cell.host.parent, cell.host.place
+        if not isinstance(at, WorkerPlace):
+            return f"{cell.path} has no process of its own"
+        if cell.state is not RUNNING or not cell.host.is_up(cell) or at.is_ending:
+            return f"{cell.path} is being restarted"
+        if isinstance(old, FarParent) and (why := old.why_busy(cell)):
+            return why
+        if is_elsewhere(self._above.living(system.node)) and (
+            self._parent is None or self._has_failed() or not self._parent.is_expected
+        ):
+            return f"{self._above.path} has not made room for {self._place.name!r} yet"
+        return ""
+
+    def commit(self, cell: Cell) -> None:
+        """From here on the other supervisor decides what follows from its ends."""
+        if not self._is_needed:
+            return
+        old, new = cell.host.parent, self._parent
+        if isinstance(old, FarParent):
+            old.give_away(NEAR if new is None else new)
+        if new is not None:
+            new.take(cell)
+
+    def spec(self, spec: ChildSpec) -> ChildSpec:
+        """Its spec from the commit on: as it was before it had a process for this."""
+        known = self._place.spec
+        assert known is not None
+        return dataclasses.replace(spec, isolation=known.isolation, limits=known.limits) if self._is_lodged else spec
+
+    async def finish(self, system: ActorSystem) -> None:
+        """Have it live where its spec says, when the new supervisor knows of it."""
+        if self._start is not None:
+            with contextlib.suppress(HoldfastError):  # It has ended: the next life has it in its recipe.
+                await asyncio.shield(self._start)
+        await self._settle(system)
+
+    async def _settle(self, system: ActorSystem) -> None:
+        cell = self._place.now(system.node)
+        if self._is_lodged and cell is not None:
+            await system._moves.move(cell, "task", None, MOVED_WITHIN)
+
+    async def release(self, system: ActorSystem) -> None:
+        """The new supervisor forgets it, and it lives where it did."""
+        try:
+            await self._withdraw()
+        finally:
+            await self._settle(system)
+
+    async def _withdraw(self) -> None:
+        start, parent, asked = self._start, self._parent, self._asked
+        if start is None or parent is None or asked is None:
+            return
+        supervisor: ActorRef[Supervisor] = ActorRef(asked)
+        try:
+            with contextlib.suppress(ActorStopped):  # What it had made is gone with it.
+                await supervisor.ask(RemoveChild(self._place.name, candidate=self._candidate), START_TIMEOUT)
+        finally:
+            parent.expect_nobody()
+        with contextlib.suppress(HoldfastError):
+            await start
+        self._start = self._parent = self._asked = None
+
+
+async def _reply(asked: Any) -> Any:
+    return await asked
+
+
+def far_parent(supervisor: Cell, path: str) -> FarParent:
+    """Where a supervisor in another process is heard about an address below it."""
+    top: Cell | None = supervisor
+    while top is not None:
+        if isinstance(top.host.place, SubtreePlace):
+            return top.host.place.at(path)
+        top = top.parent
+    raise wrong(path, f"{supervisor.path} has no process, nor has anybody above it")
