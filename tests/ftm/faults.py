@@ -108,7 +108,7 @@ def of_root(layers: Layers) -> list[Fault]:
     parts = [
         ("proxy", "SendNext"),
         ("proxy", heard),
-        ("detector", "Beat"),
+        ("detector", "ReplicaBeat"),
         ("failover", "LookAgain"),
         ("join", "LookAgain"),
     ]

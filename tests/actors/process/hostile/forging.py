@@ -78,7 +78,7 @@ BREACHES: dict[str, Callable[[], bytes]] = {
     "text that is no UTF-8": lambda: framed(b"\x94\x08\xa2\xff\xfe\xa4kill\x80"),
     # frames that only the root sends
     "Launch": lambda: frame(f.Launch(1, EVIL, 1, b"", {})),
-    "Run": lambda: frame(f.TellRun(0, 0, 1, raw([]))),
+    "TellRun": lambda: frame(f.TellRun(0, 0, 1, raw([]))),
     # senders and addresses
     "a message of another": lambda: tell([1000], ADD, sender=OTHER),
     "an ask of another": lambda: frame(f.Ask(1, VICTIM, ADD, raw([1000]), 1e18, 0, OTHER)),
