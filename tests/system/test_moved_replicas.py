@@ -7,6 +7,7 @@ import dataclasses
 import os
 import signal
 import sys
+import time
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any, ClassVar
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.alarms import StatesDiffer
+from holdfast.ftm.alarms import ProtectionCostly, StatesDiffer
 from holdfast.ftm.bricks.brick_messages import Work
 from holdfast.ftm.bricks.bricks import Before
 from holdfast.ftm.events import ReplicaLost
@@ -51,6 +52,12 @@ class Wake(hf.Message[bool]):
 class Break(hf.Message[int]): ...
 
 
+class Speak(hf.Message[bool]):
+    """When a file is there, keep the whole process busy until it is not, and then tell of something."""
+
+    file: str
+
+
 class Dawdle(hf.Message[int]):
     """Keep one of the replicas busy while a file is there."""
 
@@ -83,6 +90,22 @@ class Resident(hf.Actor):
     @hf.on(Ring)
     def ring(self, message: Ring) -> None:
         self.rung += 1
+
+    @hf.on(Speak)
+    def speak(self, message: Speak) -> bool:
+        file, loop = Path(message.file), asyncio.get_running_loop()
+
+        def look() -> None:
+            if not file.exists():
+                loop.call_later(0.001, look)
+                return
+            file.with_suffix(".begun").touch()
+            while file.exists():
+                time.sleep(0.001)
+            self.ctx.cell.node.emit(ProtectionCostly(self.ctx.path, "", 1.0, 1))
+
+        look()
+        return True
 
     @hf.on(Dawdle)
     async def dawdle(self, message: Dawdle) -> int:
@@ -612,6 +635,31 @@ class Strike(hf.Operation):
 
     async def finish(self, system: hf.ActorSystem) -> None:
         self._at("finish")
+
+
+async def test_what_a_replica_says_before_it_has_heard_of_its_address_is_meant_so(tmp_path: Path) -> None:
+    file, begun = tmp_path / "busy", tmp_path / "busy.begun"
+    async with program("PBR", "plain") as system:
+        one = resident(system)
+        await whole(one)
+        assert await one.ask(Speak(str(file)), IN_TIME)
+        before = pids(one)
+
+        def strike() -> None:
+            file.touch()
+            while not begun.exists():
+                time.sleep(0.001)
+
+        with system.events() as events:
+            await moved(system, then=Strike("prepare", strike))
+            async with system.transaction(timeout=IN_TIME) as change:
+                change.add("/app/here", counter("one", 50))
+            file.unlink()
+            assert await one.ask(Add(), IN_TIME) == 1
+            seen = events.take()
+            assert not [event for event in seen if isinstance(event, (hf.TrustBreached, hf.DeadLetter))]
+            assert [event.address for event in seen if isinstance(event, ProtectionCostly)] == [THERE]
+        assert pids(one) == before
 
 
 @KIND
