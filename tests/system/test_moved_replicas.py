@@ -52,6 +52,12 @@ class Wake(hf.Message[bool]):
 class Break(hf.Message[int]): ...
 
 
+class Compute(hf.Message[bool]):
+    """Have something be computed beside, while a file is there, and then be added."""
+
+    file: str
+
+
 class Speak(hf.Message[bool]):
     """When a file is there, keep the whole process busy until it is not, and then tell of something."""
 
@@ -90,6 +96,16 @@ class Resident(hf.Actor):
     @hf.on(Ring)
     def ring(self, message: Ring) -> None:
         self.rung += 1
+
+    @hf.on(Compute)
+    def compute(self, message: Compute) -> bool:
+        async def beside() -> int:
+            while Path(message.file).exists():
+                await asyncio.sleep(0.001)
+            return 40
+
+        self.ctx.pipe_to_self(beside(), Add)
+        return True
 
     @hf.on(Speak)
     def speak(self, message: Speak) -> bool:
@@ -403,6 +419,24 @@ async def test_two_that_are_protected_exchange_their_addresses(kind: str) -> Non
             await fail_over(one)
             await fail_over(other)
         assert [await ref.ask(Add(), IN_TIME) for ref in (one, other)] == [2, 11]
+
+
+@pytest.mark.parametrize("stack", ["PBR", "LFR"])
+async def test_what_is_computed_beside_comes_in_at_the_new_address(tmp_path: Path, stack: str) -> None:
+    file = tmp_path / "busy"
+    file.touch()
+    async with program(stack, "plain") as system:
+        one = resident(system)
+        await whole(one)
+        assert await one.ask(Compute(str(file)), IN_TIME)
+        await moved(system)
+        assert await one.ask(Add(), IN_TIME) == 1
+        file.unlink()
+        async with asyncio.timeout(IN_TIME):
+            while (await one.ask(Told(), IN_TIME))["count"] != 41:
+                await asyncio.sleep(0.005)
+        await fail_over(one)
+        assert (await one.ask(Told(), IN_TIME))["at"] == [THERE, THERE]
 
 
 async def test_one_that_is_suspended_is_moved_and_stays_so() -> None:
