@@ -7,6 +7,7 @@ import dataclasses
 import os
 import signal
 import sys
+import time
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any, ClassVar
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.alarms import StatesDiffer
+from holdfast.ftm.alarms import ProtectionCostly, StatesDiffer
 from holdfast.ftm.bricks.brick_messages import Work
 from holdfast.ftm.bricks.bricks import Before
 from holdfast.ftm.events import ReplicaLost
@@ -51,6 +52,18 @@ class Wake(hf.Message[bool]):
 class Break(hf.Message[int]): ...
 
 
+class Compute(hf.Message[bool]):
+    """Have something be computed beside, while a file is there, and then be added."""
+
+    file: str
+
+
+class Speak(hf.Message[bool]):
+    """When a file is there, keep the whole process busy until it is not, and then tell of something."""
+
+    file: str
+
+
 class Dawdle(hf.Message[int]):
     """Keep one of the replicas busy while a file is there."""
 
@@ -83,6 +96,32 @@ class Resident(hf.Actor):
     @hf.on(Ring)
     def ring(self, message: Ring) -> None:
         self.rung += 1
+
+    @hf.on(Compute)
+    def compute(self, message: Compute) -> bool:
+        async def beside() -> int:
+            while Path(message.file).exists():
+                await asyncio.sleep(0.001)
+            return 40
+
+        self.ctx.pipe_to_self(beside(), Add)
+        return True
+
+    @hf.on(Speak)
+    def speak(self, message: Speak) -> bool:
+        file, loop = Path(message.file), asyncio.get_running_loop()
+
+        def look() -> None:
+            if not file.exists():
+                loop.call_later(0.001, look)
+                return
+            file.with_suffix(".begun").touch()
+            while file.exists():
+                time.sleep(0.001)
+            self.ctx.cell.node.emit(ProtectionCostly(self.ctx.path, "", 1.0, 1))
+
+        look()
+        return True
 
     @hf.on(Dawdle)
     async def dawdle(self, message: Dawdle) -> int:
@@ -382,6 +421,24 @@ async def test_two_that_are_protected_exchange_their_addresses(kind: str) -> Non
         assert [await ref.ask(Add(), IN_TIME) for ref in (one, other)] == [2, 11]
 
 
+@pytest.mark.parametrize("stack", ["PBR", "LFR"])
+async def test_what_is_computed_beside_comes_in_at_the_new_address(tmp_path: Path, stack: str) -> None:
+    file = tmp_path / "busy"
+    file.touch()
+    async with program(stack, "plain") as system:
+        one = resident(system)
+        await whole(one)
+        assert await one.ask(Compute(str(file)), IN_TIME)
+        await moved(system)
+        assert await one.ask(Add(), IN_TIME) == 1
+        file.unlink()
+        async with asyncio.timeout(IN_TIME):
+            while (await one.ask(Told(), IN_TIME))["count"] != 41:
+                await asyncio.sleep(0.005)
+        await fail_over(one)
+        assert (await one.ask(Told(), IN_TIME))["at"] == [THERE, THERE]
+
+
 async def test_one_that_is_suspended_is_moved_and_stays_so() -> None:
     async with program("PBR", "recorded") as system:
         one = resident(system)
@@ -612,6 +669,31 @@ class Strike(hf.Operation):
 
     async def finish(self, system: hf.ActorSystem) -> None:
         self._strike("finish")
+
+
+async def test_what_a_replica_says_before_it_has_heard_of_its_address_is_meant_so(tmp_path: Path) -> None:
+    file, begun = tmp_path / "busy", tmp_path / "busy.begun"
+    async with program("PBR", "plain") as system:
+        one = resident(system)
+        await whole(one)
+        assert await one.ask(Speak(str(file)), IN_TIME)
+        before = pids(one)
+
+        def strike() -> None:
+            file.touch()
+            while not begun.exists():
+                time.sleep(0.001)
+
+        with system.events() as events:
+            await moved(system, then=Strike("prepare", strike))
+            async with system.transaction(timeout=IN_TIME) as change:
+                change.add("/app/here", counter("one", 50))
+            file.unlink()
+            assert await one.ask(Add(), IN_TIME) == 1
+            seen = events.take()
+            assert not [event for event in seen if isinstance(event, (hf.TrustBreached, hf.DeadLetter))]
+            assert [event.address for event in seen if isinstance(event, ProtectionCostly)] == [THERE]
+        assert pids(one) == before
 
 
 @KIND

@@ -239,6 +239,13 @@ CHECKS = {
         REPLICAS,
         "test_replicas_that_are_killed_at_a_step and prepare and follower",
     ),
+    "what a replica tells of whom it protects is meant as it is now": Check(
+        "actors/process/worker_pool.py",
+        "        self.gate.readdressed(was, now)\n",
+        "        self.gate.readdressed(old, self.home)\n",
+        REPLICAS,
+        "test_what_a_replica_says",
+    ),
     "certified replicas are not moved": Check(
         "system/transaction/reparenting.py",
         "    if place.is_protected and cell is not None and any(",
