@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import itertools
+import os
+import random
+import signal
 from typing import Any
 
 import pytest
 
 import holdfast as hf
-from tests.migration.travellers import KINDS, Luggage, Stream, Traveller
+from tests.migration.travellers import KINDS, TOLD, Add, Luggage, Seen, Stream, Traveller
 
 IN_TIME = 60.0
 WAYS = {"far to near": ("far", "near"), "near to far": ("near", "far"), "far to far": ("far", "other")}
@@ -67,3 +73,76 @@ async def test_it_goes_with_all_it_has(system: hf.ActorSystem, isolation: str, k
     for name in ("near", "far", "other"):
         below = await system.ref(f"/app/{name}", hf.Supervisor).ask(hf.WhichChildren(), IN_TIME)
         assert [(one.id, one.state) for one in below] == ([("one", "running")] if name == new else [])
+
+
+class Pump:
+    """Tells, and asks one after another. There may be thousands: each answer must be the sum of what stands before it."""
+
+    def __init__(self, ref: Any) -> None:
+        self._ref, self._is_over = ref, False
+        self.answers: list[int] = []
+        self._task = asyncio.create_task(self._send())
+
+    async def _send(self) -> None:
+        while not self._is_over:
+            self._ref.tell(Add(TOLD + len(self.answers)))
+            self.answers.append(await self._ref.ask(Add(1 + len(self.answers)), IN_TIME))
+
+    async def reached(self, more: int) -> None:
+        wanted = len(self.answers) + more
+        while len(self.answers) < wanted and not self._task.done():
+            await asyncio.sleep(0)
+
+    async def judge(self) -> None:
+        self._is_over = True
+        await self._task
+        added, count = (await self._ref.ask(Seen(), IN_TIME))["added"], len(self.answers)
+        assert added == [n for number in range(count) for n in (TOLD + number, 1 + number)]
+        assert self.answers == list(itertools.accumulate(added))[1::2]
+
+
+async def is_at_one_place(system: hf.ActorSystem, ref: Any) -> None:
+    """Its address, and what the supervisors say in the end, agree."""
+    async with asyncio.timeout(IN_TIME):
+        while True:
+            told = [
+                f"/app/{name}/{one.id}"
+                for name in ("near", "far", "other")
+                for one in await system.ref(f"/app/{name}", hf.Supervisor).ask(hf.WhichChildren(), IN_TIME)
+                if one.state == "running"
+            ]
+            if told == [ref.path]:
+                return
+
+
+@pytest.mark.pairs
+@pytest.mark.parametrize("way", list(WAYS))
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("victim", ["old", "new", "own"])
+@pytest.mark.parametrize("seed", range(6))
+async def test_a_process_that_is_killed_at_any_instant_loses_nothing(
+    system: hf.ActorSystem, seed: int, victim: str, isolation: str, way: str
+) -> None:
+    old, new = WAYS[way]
+    for spec in supervisors("recorded", old, isolation):
+        await system.start(spec)
+    ref = system.ref(f"/app/{old}/one", Traveller)
+    pump = Pump(ref)
+    await pump.reached(10)
+    moving = asyncio.ensure_future(move(system, ref, new))
+    struck = system.node.loop.time() + random.Random(seed).random() * 0.3
+    while not moving.done() and system.node.loop.time() < struck:
+        await asyncio.sleep(0)
+    with contextlib.suppress(hf.NoSuchActor, ProcessLookupError):  # It lives nowhere just now.
+        pid = system.pid_of(ref) if victim == "own" else pid_of(system, {"old": old, "new": new}[victim])
+        if pid != os.getpid():
+            os.kill(pid, signal.SIGKILL)
+    try:
+        await moving
+    except (hf.TransactionFailed, hf.TransactionRefused):
+        await pump.reached(5)
+        await move(system, ref, new)
+    await pump.reached(10)
+    await pump.judge()
+    assert ref.path == f"/app/{new}/one"
+    await is_at_one_place(system, ref)
