@@ -59,6 +59,7 @@ class Move(Operation):
         if old.is_partitioned:
             raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
         if is_far(old) or is_far(new):
+            await draft.supervisor(old.path)  # It tells whom it has before it has one less in the draft.
             check_handing(place, old, new)
         for above in new.upwards():
             if above.comes_last:
