@@ -8,12 +8,17 @@ import itertools
 import os
 import random
 import signal
+import sys
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 import holdfast as hf
 from tests.migration.travellers import KINDS, TOLD, Add, Luggage, Seen, Stream, Traveller
+from tests.system.test_transaction_commit import Die
 
 IN_TIME = 60.0
 WAYS = {"far to near": ("far", "near"), "near to far": ("near", "far"), "far to far": ("far", "other")}
@@ -146,3 +151,56 @@ async def test_a_process_that_is_killed_at_any_instant_loses_nothing(
     await pump.judge()
     assert ref.path == f"/app/{new}/one"
     await is_at_one_place(system, ref)
+
+
+@asynccontextmanager
+async def program(store: str, old: str, isolation: str) -> AsyncGenerator[hf.ActorSystem]:
+    async with hf.ActorSystem("app", store=f"sqlite:{store}", durability="os", log=False, intensity=99) as system:
+        for spec in supervisors("recorded", old, isolation):
+            await system.start(spec)
+        yield system
+
+
+async def killed(store: str, when: str, old: str, new: str, isolation: str) -> None:
+    """The root is killed by a step in the middle of the move."""
+    async with program(store, old, isolation) as system:
+        ref = system.ref(f"/app/{old}/one", Traveller)
+        await ref.ask(Add(7))
+        async with system.transaction(timeout=IN_TIME) as change:
+            if when == "finish":
+                change.step(Die(when))
+            change.move(ref, f"/app/{new}")
+            change.step(Die("finish" if when == "settled" else when))
+
+
+PROGRAM = """
+import asyncio, sys
+from tests.migration.test_far_moves import killed
+
+if __name__ == "__main__":
+    asyncio.run(killed(*sys.argv[1:]))
+"""
+
+
+@pytest.mark.pairs
+@pytest.mark.parametrize("way", list(WAYS))
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("when", ["prepare", "commit", "finish", "settled"])
+async def test_a_root_that_is_killed_has_it_at_one_of_the_two(
+    tmp_path: Path, when: str, isolation: str, way: str
+) -> None:
+    (tmp_path / "program.py").write_text(PROGRAM)
+    old, new = WAYS[way]
+    here = str(Path(__file__).parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
+    arguments = (str(tmp_path / "program.py"), str(tmp_path / "store"), when, old, new, isolation)
+    process = await asyncio.create_subprocess_exec(sys.executable, *arguments, env=environment)
+    assert await asyncio.wait_for(process.wait(), IN_TIME) == -signal.SIGKILL
+    async with program(str(tmp_path / "store"), old, isolation) as system:
+        at = new if when in ("finish", "settled") else old
+        ref = system.ref(f"/app/{at}/one", Traveller)
+        assert await ref.ask(Add(1), IN_TIME) == 8
+        await is_at_one_place(system, ref)
+        assert (system.pid_of(ref) == pid_of(system, at)) == (isolation == "task")
+        if at != old:  # Who knows only the address of before reaches it.
+            assert await system.ref(f"/app/{old}/one", Traveller).ask(Add(1), IN_TIME) == 9

@@ -247,7 +247,9 @@ async def test_who_is_bound_to_one_that_goes_from_process_to_process_reaches_it(
             await system.start(spec)
         async with system.transaction(timeout=IN_TIME) as change:
             change.add(f"/app/{first}", hf.child("named", hf.start(Named, "first"), **PLACES[target]))
-            change.add(f"/app/{client}", hf.child("client", hf.start(Client), bindings={"other": f"/app/{first}/named"}))
+            change.add(
+                f"/app/{client}", hf.child("client", hf.start(Client), bindings={"other": f"/app/{first}/named"})
+            )
         ref, named = system.ref(f"/app/{client}/client", Client), system.ref(f"/app/{first}/named", Named)
         assert await ref.ask(AskBound(), IN_TIME) == "first"
         if client == to:
