@@ -9,6 +9,7 @@ import os
 import random
 import signal
 import sys
+import time
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -19,6 +20,7 @@ import pytest
 import holdfast as hf
 from tests.migration.travellers import KINDS, TOLD, Add, Luggage, Seen, Stream, Traveller
 from tests.system.test_transaction_commit import Die
+from tests.system.trees import Stumble
 
 IN_TIME = 60.0
 WAYS = {"far to near": ("far", "near"), "near to far": ("near", "far"), "far to far": ("far", "other")}
@@ -81,7 +83,7 @@ async def test_it_goes_with_all_it_has(system: hf.ActorSystem, isolation: str, k
 
 
 class Pump:
-    """Tells, and asks one after another. There may be thousands: each answer must be the sum of what stands before it."""
+    """Tells, and asks one after another. Each answer must be the sum of what stands before it."""
 
     def __init__(self, ref: Any) -> None:
         self._ref, self._is_over = ref, False
@@ -204,3 +206,173 @@ async def test_a_root_that_is_killed_has_it_at_one_of_the_two(
         assert (system.pid_of(ref) == pid_of(system, at)) == (isolation == "task")
         if at != old:  # Who knows only the address of before reaches it.
             assert await system.ref(f"/app/{old}/one", Traveller).ask(Add(1), IN_TIME) == 9
+
+
+class Hold(hf.Message[bool]):
+    """Keep the whole process busy while a file is there; then do to `one` all that may be done to a neighbour."""
+
+    file: str
+
+
+class Watch(hf.Message[bool]): ...
+
+
+class Ended(hf.Message[list[str]]): ...
+
+
+class Reach(hf.Message[dict[str, Any]]):
+    path: str
+
+
+class Holder(hf.Actor):
+    """Lives with the old supervisor."""
+
+    def __init__(self) -> None:
+        self.downs: list[str] = []
+
+    @hf.on(Watch)
+    def watch(self, message: Watch) -> bool:
+        self.ctx.monitor(self.ctx.find("/app/far/one", Traveller))
+        return True
+
+    @hf.on(Hold)
+    def hold(self, message: Hold) -> bool:
+        Path(message.file).touch()
+        while Path(message.file).exists():
+            time.sleep(0.001)
+        one = self.ctx.find("/app/far/one", Traveller)
+        one.tell(Add(5))
+        self.ctx.monitor(one)
+        self.ctx.find("/app/far", hf.Supervisor).tell(hf.TerminateChild("one"))
+        return True
+
+    @hf.on(Reach)
+    async def reach(self, message: Reach) -> dict[str, Any]:
+        return await self.ctx.find(message.path, Traveller).ask(Seen(), IN_TIME)
+
+    @hf.on(Ended, readonly=True)
+    def ended(self, message: Ended) -> list[str]:
+        return self.downs
+
+    def on_down(self, source: hf.ActorRef[Any], reason: hf.ExitReason, recovering: bool) -> None:
+        self.downs.append(source.path)
+
+
+async def held(system: hf.ActorSystem, file: Path, then: Any) -> Any:
+    """Move `one` out of a process that is busy, do something, and let that process go on."""
+    holder, one = system.ref("/app/far/holder", Holder), system.ref("/app/far/one", Traveller)
+    asked: list[Any] = []
+
+    async def hold(system: hf.ActorSystem) -> None:
+        asked.append(holder.ask(Hold(str(file)), IN_TIME))
+        while not file.exists():
+            await asyncio.sleep(0.005)
+
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.move(one, "/app/near")
+        change.step(Stumble(hold))
+    await then()
+    file.unlink()
+    assert await asked[0]
+    return one
+
+
+@pytest.fixture
+async def busy(system: hf.ActorSystem) -> hf.ActorSystem:
+    near, far, _ = supervisors("plain", "far", "process")
+    await system.start(near)
+    children = (*far.start.args[1], hf.child("holder", hf.start(Holder)))
+    await system.start(hf.supervisor("far", children=children, isolation="process", intensity=1000))
+    return system
+
+
+async def test_what_its_old_supervisor_says_before_it_has_heard_is_void(busy: hf.ActorSystem, tmp_path: Path) -> None:
+    own = busy.pid_of(busy.ref("/app/far/one", Traveller))
+    with busy.events() as events:
+
+        async def nothing() -> None: ...
+
+        one = await held(busy, tmp_path / "held", nothing)
+        assert (await one.ask(Seen(), IN_TIME))["added"] == [5]
+        holder = busy.ref("/app/far/holder", Holder)
+        assert (await holder.ask(Reach("/app/far/one"), IN_TIME))["added"] == [5]
+        assert not [event for event in events.take() if isinstance(event, hf.TrustBreached)]
+    assert (one.path, busy.pid_of(one)) == ("/app/near/one", own)
+    assert [info.id for info in await busy.ref("/app/far", hf.Supervisor).ask(hf.WhichChildren())] == ["holder"]
+    await busy.stop(one)
+    async with asyncio.timeout(IN_TIME):
+        while not await holder.ask(Ended(), IN_TIME):
+            await asyncio.sleep(0.005)
+    assert await holder.ask(Ended(), IN_TIME) == ["/app/near/one"]
+
+
+async def test_an_end_that_its_old_supervisor_process_has_not_heard_of_is_told_there(
+    busy: hf.ActorSystem, tmp_path: Path
+) -> None:
+    holder, one = busy.ref("/app/far/holder", Holder), busy.ref("/app/far/one", Traveller)
+    assert await holder.ask(Watch())
+
+    async def restarted() -> None:
+        own = busy.pid_of(one)
+        os.kill(own, signal.SIGKILL)
+        assert (await one.ask(Seen(), IN_TIME))["added"] == []
+
+    await held(busy, tmp_path / "held", restarted)
+    async with asyncio.timeout(IN_TIME):
+        while not await holder.ask(Ended(), IN_TIME):
+            await asyncio.sleep(0.005)
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_supervisor_within_a_process_comes_back_with_who_has_come_and_without_who_has_left(
+    system: hf.ActorSystem, isolation: str
+) -> None:
+    inner = [
+        hf.supervisor(name, children=[traveller("recorded", isolation)] if name == "left" else [], intensity=9)
+        for name in ("left", "right")
+    ]
+    await system.start(hf.supervisor("far", children=inner, isolation="process", intensity=99))
+    one = system.ref("/app/far/left/one", Traveller)
+    assert await one.ask(Add(1)) == 1
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.move(one, "/app/far/right")
+    process = pid_of(system, "far")
+    for name, below in (("left", []), ("right", ["one"])):
+        top = system.ref("/app/far", hf.Supervisor)
+        await top.ask(hf.RestartChild(name, running=True), IN_TIME)
+        async with asyncio.timeout(IN_TIME):
+            while True:
+                await asyncio.sleep(0.005)
+                with contextlib.suppress(hf.NoSuchActor, hf.ActorStopped, hf.AskFailed):
+                    told = await system.ref(f"/app/far/{name}", hf.Supervisor).ask(hf.WhichChildren(), IN_TIME)
+                    if [info.id for info in told] == below:
+                        break
+    assert pid_of(system, "far") == process
+    assert await system.ref("/app/far/right/one", Traveller).ask(Add(1), IN_TIME) == 2
+    assert await system.ref("/app/far/left/one", Traveller).ask(Add(1), IN_TIME) == 3
+
+
+async def test_a_process_that_is_started_anew_knows_where_they_are_who_have_left(busy: hf.ActorSystem) -> None:
+    one = busy.ref("/app/far/one", Traveller)
+    assert await one.ask(Add(4)) == 4
+    await move(busy, one, "near")
+    os.kill(pid_of(busy, "far"), signal.SIGKILL)
+    seen: dict[str, Any] = {}
+    async with asyncio.timeout(IN_TIME):
+        while not seen:
+            await asyncio.sleep(0.005)
+            with contextlib.suppress(hf.NoSuchActor, hf.ActorStopped, hf.AskFailed):
+                seen = await busy.ref("/app/far/holder", Holder).ask(Reach("/app/far/one"), IN_TIME)
+    assert seen["added"] == [4]
+
+
+async def test_who_comes_to_the_address_that_was_left_is_reached_there(busy: hf.ActorSystem) -> None:
+    """Though the process has named that address before."""
+    holder, one = busy.ref("/app/far/holder", Holder), busy.ref("/app/far/one", Traveller)
+    assert await one.ask(Add(4)) == 4
+    assert (await holder.ask(Reach("/app/far/one"), IN_TIME))["added"] == [4]
+    await move(busy, one, "near")
+    async with busy.transaction(timeout=IN_TIME) as change:
+        change.add("/app/far", traveller("plain", "process"))
+    assert (await holder.ask(Reach("/app/far/one"), IN_TIME))["added"] == []
+    assert (await holder.ask(Reach("/app/near/one"), IN_TIME))["added"] == [4]
