@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.supervision.admin import RemoveChild
 from tests.migration.travellers import KINDS, TOLD, Add, Luggage, Seen, Stream, Traveller
 from tests.system.test_transaction_commit import Die
 from tests.system.trees import Stumble
@@ -42,9 +43,11 @@ def supervisors(kind: str, at: str, isolation: Any) -> list[hf.ChildSpec]:
     ]
 
 
-async def move(system: hf.ActorSystem, ref: Any, to: str) -> None:
+async def move(system: hf.ActorSystem, ref: Any, to: str, *then: hf.Operation) -> None:
     async with system.transaction(timeout=IN_TIME) as change:
         change.move(ref, f"/app/{to}")
+        for step in then:
+            change.step(step)
 
 
 def pid_of(system: hf.ActorSystem, supervisor: str) -> int:
@@ -208,10 +211,15 @@ async def test_a_root_that_is_killed_has_it_at_one_of_the_two(
             assert await system.ref(f"/app/{old}/one", Traveller).ask(Add(1), IN_TIME) == 9
 
 
-class Hold(hf.Message[bool]):
-    """Keep the whole process busy while a file is there; then do to `one` all that may be done to a neighbour."""
+class Hold(hf.Message[str]):
+    """Keep the whole process busy while a file is there; then do to `one` all that may be done to a neighbour.
+
+    The reply is how its supervisor has answered the order.
+    """
 
     file: str
+    order: str
+    path: str
 
 
 class Watch(hf.Message[bool]): ...
@@ -236,15 +244,19 @@ class Holder(hf.Actor):
         return True
 
     @hf.on(Hold)
-    def hold(self, message: Hold) -> bool:
+    async def hold(self, message: Hold) -> str:
         Path(message.file).touch()
         while Path(message.file).exists():
             time.sleep(0.001)
-        one = self.ctx.find("/app/far/one", Traveller)
+        one = self.ctx.find(message.path, Traveller)
         one.tell(Add(5))
         self.ctx.monitor(one)
-        self.ctx.find("/app/far", hf.Supervisor).tell(hf.TerminateChild("one"))
-        return True
+        order = {"terminate": hf.TerminateChild("one"), "remove": RemoveChild("one", erase=True)}.get(message.order)
+        try:
+            await self.ctx.find("/app/far", hf.Supervisor).ask(order or hf.RestartChild("inner", running=True), IN_TIME)
+        except hf.Refusal as no:
+            return type(no).__name__
+        return "done"
 
     @hf.on(Reach)
     async def reach(self, message: Reach) -> dict[str, Any]:
@@ -258,13 +270,13 @@ class Holder(hf.Actor):
         self.downs.append(source.path)
 
 
-async def held(system: hf.ActorSystem, file: Path, then: Any) -> Any:
+async def held(system: hf.ActorSystem, file: Path, then: Any, order: str = "terminate") -> str:
     """Move `one` out of a process that is busy, do something, and let that process go on."""
     holder, one = system.ref("/app/far/holder", Holder), system.ref("/app/far/one", Traveller)
     asked: list[Any] = []
 
     async def hold(system: hf.ActorSystem) -> None:
-        asked.append(holder.ask(Hold(str(file)), IN_TIME))
+        asked.append(holder.ask(Hold(str(file), order, one.path), IN_TIME))
         while not file.exists():
             await asyncio.sleep(0.005)
 
@@ -273,8 +285,7 @@ async def held(system: hf.ActorSystem, file: Path, then: Any) -> Any:
         change.step(Stumble(hold))
     await then()
     file.unlink()
-    assert await asked[0]
-    return one
+    return str(await asked[0])
 
 
 @pytest.fixture
@@ -286,13 +297,17 @@ async def busy(system: hf.ActorSystem) -> hf.ActorSystem:
     return system
 
 
-async def test_what_its_old_supervisor_says_before_it_has_heard_is_void(busy: hf.ActorSystem, tmp_path: Path) -> None:
-    own = busy.pid_of(busy.ref("/app/far/one", Traveller))
+@pytest.mark.parametrize("order", ["terminate", "remove"])
+async def test_what_its_old_supervisor_says_before_it_has_heard_is_void(
+    busy: hf.ActorSystem, tmp_path: Path, order: str
+) -> None:
+    one = busy.ref("/app/far/one", Traveller)
+    own = busy.pid_of(one)
     with busy.events() as events:
 
         async def nothing() -> None: ...
 
-        one = await held(busy, tmp_path / "held", nothing)
+        assert await held(busy, tmp_path / "held", nothing, order) == "NoSuchChild"
         assert (await one.ask(Seen(), IN_TIME))["added"] == [5]
         holder = busy.ref("/app/far/holder", Holder)
         assert (await holder.ask(Reach("/app/far/one"), IN_TIME))["added"] == [5]
@@ -376,3 +391,116 @@ async def test_who_comes_to_the_address_that_was_left_is_reached_there(busy: hf.
         change.add("/app/far", traveller("plain", "process"))
     assert (await holder.ask(Reach("/app/far/one"), IN_TIME))["added"] == []
     assert (await holder.ask(Reach("/app/near/one"), IN_TIME))["added"] == [4]
+
+
+@pytest.mark.parametrize("way", list(WAYS))
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_move_that_is_given_up_leaves_it_where_it_was(system: hf.ActorSystem, isolation: str, way: str) -> None:
+    old, new = WAYS[way]
+    for spec in supervisors("plain", old, isolation):
+        await system.start(spec)
+    ref = system.ref(f"/app/{old}/one", Traveller)
+    pump = Pump(ref)
+    await pump.reached(5)
+    process, tree = system.pid_of(ref), system.tree()
+    for _ in range(2):
+        with pytest.raises(hf.TransactionFailed, match="there was a stone") as failed:
+            await move(system, ref, new, Stumble())
+        assert failed.value.kept == ()
+        await pump.reached(5)
+        assert (ref.path, system.pid_of(ref), system.tree()) == (f"/app/{old}/one", process, tree)
+        await is_at_one_place(system, ref)
+    await move(system, ref, new)
+    await pump.judge()
+
+
+async def test_what_cannot_be_is_refused_before_anything_is_done(system: hf.ActorSystem) -> None:
+    far = [
+        traveller("plain", "task"),
+        hf.supervisor("team"),
+        hf.dynamic("pool"),
+        hf.child("stopped", hf.start(Traveller), autostart=False),
+    ]
+    await system.start(hf.supervisor("near", children=[hf.child("two", hf.start(Traveller), autostart=False)]))
+    await system.start(hf.supervisor("far", children=far, isolation="process"))
+    pooled = await system.ref("/app/far/pool", hf.Supervisor).ask(
+        hf.StartChild(hf.child("pooled", hf.start(Traveller))), IN_TIME
+    )
+    refusals: dict[str, Any] = {
+        "its children live where it does": lambda change: change.move("/app/far/team", "/app/near"),
+        "no supervisor looks after it": lambda change: change.move(pooled.path, "/app/near"),
+        "it does not run": lambda change: change.move("/app/near/two", "/app/far"),
+    }
+    for why, step in refusals.items():
+        with pytest.raises(hf.TransactionRefused, match=why):
+            async with system.transaction(timeout=IN_TIME) as change:
+                step(change)
+
+    def both(change: Any) -> None:
+        change.move("/app/far/one", "/app/near")
+        change.isolation("/app/near/one", "process")
+
+    with pytest.raises(hf.TransactionFailed, match="in a transaction of its own"):
+        async with system.transaction(timeout=IN_TIME) as change:
+            both(change)
+
+
+class Slow(hf.Actor):
+    """Its end waits until a file is gone."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+
+    async def on_stop(self, reason: hf.ExitReason) -> None:
+        while Path(self.file).exists():
+            await asyncio.sleep(0.005)
+
+
+class Last(hf.Actor):
+    """Its end leaves a file."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+
+    def on_stop(self, reason: hf.ExitReason) -> None:
+        Path(self.file).touch()
+
+
+@pytest.fixture
+def slow(tmp_path: Path) -> Any:
+    file = tmp_path / "slow"
+    file.touch()
+    yield file
+    file.unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("first", ["one", "slow"])
+async def test_a_supervisor_that_stops_loses_its_child_and_lets_it_live(
+    system: hf.ActorSystem, slow: Path, tmp_path: Path, first: str
+) -> None:
+    """It stops one behind the other; this one, which it has told to stop, or is about to, has another supervisor."""
+    children = [traveller("plain", "process"), hf.child("slow", hf.start(Slow, str(slow)), shutdown="infinity")]
+    last = hf.child("last", hf.start(Last, str(tmp_path / "last")))
+    children = [last, *(children if first == "slow" else children[::-1])]
+    inner = hf.supervisor("inner", children=children, intensity=9)
+    await system.start(hf.supervisor("near"))
+    team = [inner, hf.child("holder", hf.start(Holder))]
+    await system.start(hf.supervisor("far", children=team, isolation="process", intensity=99))
+    one, holder = system.ref("/app/far/inner/one", Traveller), system.ref("/app/far/holder", Holder)
+    own, file, asked = system.pid_of(one), tmp_path / "held", list[Any]()
+
+    async def hold(system: hf.ActorSystem) -> None:
+        asked.append(holder.ask(Hold(str(file), "restart", one.path), IN_TIME))
+        while not file.exists():
+            await asyncio.sleep(0.005)
+
+    await move(system, one, "near", Stumble(hold))
+    file.unlink()
+    async with asyncio.timeout(IN_TIME):
+        while (await one.ask(Seen(), IN_TIME))["added"] != [5]:
+            await asyncio.sleep(0.005)
+    slow.unlink()
+    assert await asked[0] == "done"
+    assert (tmp_path / "last").exists()
+    assert (await holder.ask(Reach("/app/far/inner/one"), IN_TIME))["added"] == [5]
+    assert (one.path, system.pid_of(one)) == ("/app/near/one", own)

@@ -212,6 +212,26 @@ async def test_it_hears_of_the_end_of_who_goes_from_process_to_process(
         await hears_once(one, "exit" if verb == "link" else "down")
 
 
+@pytest.mark.parametrize("verb", ["monitor", "watch", "link"])
+@pytest.mark.parametrize("target", list(PLACES))
+async def test_it_hears_of_the_end_though_somebody_else_has_the_address(target: str, verb: str) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        for spec in among_processes(PLACES[target], "far"):
+            await system.start(spec)
+        one, other = system.ref("/app/far/watcher", Party), system.ref("/app/far/target", Party)
+        assert await one.ask(Tie(verb, other.path), IN_TIME)
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.move(other, "/app/near")
+            change.add("/app/far", hf.child("target", hf.start(Party)))
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.remove("/app/far/target")
+        assert await one.ask(Heard(), IN_TIME) == []
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.add("/app/far", hf.child("target", hf.start(Party)))
+            change.remove(other)
+        await hears_once(one, "exit" if verb == "link" else "down")
+
+
 @pytest.mark.pairs
 @pytest.mark.parametrize("verb", ["monitor", "watch", "link"])
 @pytest.mark.parametrize("target", list(PLACES))
