@@ -45,6 +45,10 @@ class Addresses:
         """The address that an actor has now which is known by this one: the same, unless it has moved."""
         return renamed(self._left, path) if self._left else path
 
+    def left_below(self, above: str) -> list[str]:
+        """The addresses below another one whose actors live elsewhere now."""
+        return [path for path in self._left if path.startswith(f"{above}/")]
+
     def find(self, path: str) -> Cell | None:
         """Who lives at an address where the node has nobody: one that waits for its next life, or has moved."""
         found = self._recorded(path)

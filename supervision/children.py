@@ -38,7 +38,6 @@ class Child:
     up: asyncio.Future[None] | None = None  # a start that is waited for outside our turn; None once it is known or void
     row: StartRow | None = None  # those that are started one after another, and it is one of them
     candidate: int = 0  # as whose candidate it was started; 0: it is none
-    is_lost: bool = False  # it lives on below a supervisor in another process
 
     @property
     def is_running(self) -> bool:

@@ -296,8 +296,12 @@ class Supervisor(Inquiries):
         if one is None or one.cell is not cell:
             return
         self._forget(one)
-        one.cell, one.row, one.state, one.is_lost = None, None, STOPPED, True
+        one.row, one.state = None, STOPPED
         one.retry += 1
+
+    def _has_lost(self, one: Child) -> bool:
+        """Whether another supervisor has this child now, and its life goes on."""
+        return one.cell is not None and one.cell.parent is not self.ctx.cell
 
     def _report_end(self, one: Child, life: int, reason: ExitReason) -> None:
         """Tell that a child has ended without having been told to."""
@@ -581,7 +585,7 @@ class Supervisor(Inquiries):
         self._forget(one)  # From here on nobody starts it again, with others or by itself.
         reason = SHUTDOWN if message.reason is None else unpack_exit(message.reason)
         await self._stop(one, reason)
-        if one.is_lost:
+        if self._has_lost(one):
             raise NoSuchChild(message.id)
         if one.cell is not None:
             lifecycle.retire(one.cell, reason)
@@ -599,7 +603,7 @@ class Supervisor(Inquiries):
         if message.parks:
             self._parked.add(one.spec.id)
         await self._stop(one, reason)
-        if one.is_lost:
+        if self._has_lost(one):
             raise NoSuchChild(message.id)
         if one.row is None:  # Else it is started again with others meanwhile.
             self._give_up_address(one, reason)

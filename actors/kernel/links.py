@@ -63,6 +63,18 @@ def monitor(watcher: Cell, target: Cell, *, for_good: bool, name: str = "") -> M
     return watch
 
 
+def has_missed(watch: Monitor) -> None:
+    """The life that was watched is over, though the actor lives: its watcher is told so now."""
+    target = watch.target
+    if watch.for_good or not watch.active or target.more is None or watch not in target.more.ties.monitors:
+        return  # It is told already, or is not to be told.
+    reason = target.more.reason
+    recovering = target.host.recovers(reason)
+    if not recovering:
+        drop_watch(watch)
+    watch.watcher.push(Down(watch, reason, recovering))
+
+
 def note_watch(watch: Monitor) -> Monitor:
     """Have a watch here that is kept on the other side of a border already: nobody is told of it."""
     watch.target.extra().ties.monitors.append(watch)

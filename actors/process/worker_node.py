@@ -175,6 +175,7 @@ class Guest(Peer):
         self._starting: tuple[int, asyncio.Future[None]] | None = None  # the launch whose `on_start` is awaited
         self._targets: dict[int, Cell] = {}
         self._outside: dict[str, Cell] = {}
+        self._left: set[str] = set()  # addresses below ours whose actors live elsewhere now: the root knows where
         self._host = OutsideHost(self)
         self.parent = GuestParent(self)
         self.node.connect(
@@ -208,9 +209,10 @@ class Guest(Peer):
 
     def outside(self, path: str) -> Cell | None:
         """The stand-in for an address that is not in this process; None for one that would be."""
-        cell, root = self._outside.get(path), self.node.root
-        if cell is None and root is not None and (path == root.path or path.startswith(root.path + "/")):
+        root = self.node.root
+        if root is not None and is_at_or_below(path, root.path) and path not in self._left:
             return None
+        cell = self._outside.get(path)
         if cell is None:
             cell = self._outside[path] = Cell(self.node, None, path, self._host)
             cell.state = RUNNING
@@ -370,6 +372,7 @@ class Guest(Peer):
             self.page = NudgingPage(self, self.page)
         node = self.node
         cell = node.root = Cell(node, None, path, node.ports.here)
+        self._left.update(frame.options.get("left", ()))
         cell.life = frame.life - 1
         try:
             _apply(limits)
@@ -422,6 +425,8 @@ class Guest(Peer):
         cell = self._target(frame.to)
         if frame.verb == "disown":
             self._disown(cell, self.connection.names.from_wire(frame.to), str(frame.data["path"]), frame.data["life"])
+        elif frame.verb == "recipe":
+            self.node.ports.respec(cell, unpack_recipe(frame.data["start"]))
         elif frame.verb == "bind":
             more, port = cell.extra(), str(frame.data["port"])
             more.bindings[port] = named(self.node, frame, "target")
@@ -458,7 +463,8 @@ class Guest(Peer):
     def _disown(self, cell: Cell, old: str, path: str, life: int) -> None:
         """A child that is lived elsewhere has a supervisor elsewhere, too: its cell stands for one outside."""
         self._has_heard(old)
-        self._outside[path] = self._outside[old] = cell  # Until somebody else lives there, `old` leads to it as well.
+        self._outside[path] = self._outside[old] = cell
+        self._left.add(old)
         if cell.parent is not None:
             lifecycle.disown(cell)
         cell.name, cell.state = path, RUNNING

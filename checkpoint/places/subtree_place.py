@@ -54,7 +54,13 @@ class SubtreePlace(WorkerPlace):
     def options(self, cell: Cell) -> dict[str, Any]:
         file = self._homes.file
         more = {} if file is None else {"recovery_file": file.data()}
-        return {"kept": self._homes.notes(child_key(cell.path, "")), "known": self._homes.known(cell.path), **more}
+        left = self._homes.addresses.left_below(cell.path)
+        return {
+            "kept": self._homes.notes(child_key(cell.path, "")),
+            "known": self._homes.known(cell.path),
+            "left": left,
+            **more,
+        }
 
     def at(self, path: str) -> FarParent:
         """The supervisor of an address below."""

@@ -14,6 +14,8 @@ from ...actors.errors import HoldfastError, NameTaken
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import GONE, RUNNING, Cell
 from ...actors.kernel.ref import ActorRef
+from ...actors.process.wire.peer import OutsidePlace
+from ...actors.process.wire.start_codec import pack_recipe
 from ...checkpoint.addresses import renamed
 from ...supervision.admin import ChangeSupervisor
 from ...supervision.children import UP, Child, complete, new_cell
@@ -21,7 +23,7 @@ from ...supervision.respec import recipe_spec
 from ...supervision.spec import ChildSpec, Flags
 from ...supervision.supervisor import Supervisor
 from .draft import START_TIMEOUT, DraftPlace, is_elsewhere
-from .lasting import Renamed, Specs, keep, recipe_flags, recipe_specs
+from .lasting import Renamed, Specs, keep, recipe, recipe_flags, recipe_specs
 from .operation import Operation, wrong
 
 if TYPE_CHECKING:
@@ -138,6 +140,10 @@ class Arrangement:
             top = taken[child].cell
             if top is not None:
                 self.handings[child].commit(top)
+        for cell in map(cells.__getitem__, changed):  # Its next life may begin in the process that it is in.
+            start = recipe(cell) if isinstance(cell.host.place, OutsidePlace) else None
+            if start is not None:
+                cell.host.told(cell, "recipe", {"start": pack_recipe(start, cell.path)})
         if moved:
             tell_bindings(system.node.root, {new: old for old, new in now.items()})
 

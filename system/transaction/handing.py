@@ -25,6 +25,7 @@ from ...supervision.supervisor_changes import check_subtree
 from ..live_moves import place_of
 from .arrangement import planned_spec
 from .draft import START_TIMEOUT, DraftPlace, is_elsewhere
+from .lasting import recipe_specs
 from .operation import wrong
 from .relocation import MOVED_WITHIN
 from .structure import CANDIDATES
@@ -62,6 +63,10 @@ def check_handing(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> None:
             place.path, "no recipe at the root has its spec: its supervisor alone, in another process, knows it"
         )
     if is_far(new):
+        for one in (recipe_specs(new.cell) or ()) if new.cell is not None else ():
+            if port := next((port for port, path in one.bindings.items() if cell.node.find(path) is cell), ""):
+                why = f"it is started before the one to which its spec binds {port!r}"
+                raise wrong(f"{new.path}/{one.id}", f"{why}: a restart of its supervisor would fail")
         if place.name in new.was.children:
             raise wrong(new.path, f"it has a child {place.name!r} until this transaction is in force: use the next one")
         check_subtree(new.path, (spec,))

@@ -31,6 +31,11 @@ def recipe_specs(cell: Cell) -> Specs | None:
     return _parts(_recipe(cell)[1])[1]
 
 
+def recipe(cell: Cell) -> Start[Any] | None:
+    """What a supervisor's next lives begin with, if the root knows that."""
+    return _recipe(cell)[1]
+
+
 def keep(cell: Cell, edit: Edit) -> None:
     """Have the next lives of a supervisor begin with a changed recipe."""
     holder, start = _recipe(cell)

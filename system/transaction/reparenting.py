@@ -56,6 +56,7 @@ class Reparent(Operation):
             raise wrong(place.path, f"it cannot be moved below itself, to {new.path}")
         check_not_uniform(old)
         if is_far(old) or is_far(new):
+            await draft.supervisor(old.path)  # It tells whom it has before it has one less in the draft.
             check_handing(place, old, new)
         for above in new.upwards():
             if above.comes_last:

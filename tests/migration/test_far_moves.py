@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import itertools
+import os
+import random
+import signal
+import sys
+import time
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 import holdfast as hf
-from tests.migration.travellers import KINDS, Luggage, Stream, Traveller
+from holdfast.supervision.admin import RemoveChild
+from tests.migration.travellers import KINDS, TOLD, Add, Luggage, Seen, Stream, Traveller
+from tests.system.test_transaction_commit import Die
+from tests.system.trees import Stumble
 
 IN_TIME = 60.0
 WAYS = {"far to near": ("far", "near"), "near to far": ("near", "far"), "far to far": ("far", "other")}
@@ -29,9 +43,11 @@ def supervisors(kind: str, at: str, isolation: Any) -> list[hf.ChildSpec]:
     ]
 
 
-async def move(system: hf.ActorSystem, ref: Any, to: str) -> None:
+async def move(system: hf.ActorSystem, ref: Any, to: str, *then: hf.Operation) -> None:
     async with system.transaction(timeout=IN_TIME) as change:
         change.move(ref, f"/app/{to}")
+        for step in then:
+            change.step(step)
 
 
 def pid_of(system: hf.ActorSystem, supervisor: str) -> int:
@@ -67,3 +83,424 @@ async def test_it_goes_with_all_it_has(system: hf.ActorSystem, isolation: str, k
     for name in ("near", "far", "other"):
         below = await system.ref(f"/app/{name}", hf.Supervisor).ask(hf.WhichChildren(), IN_TIME)
         assert [(one.id, one.state) for one in below] == ([("one", "running")] if name == new else [])
+
+
+class Pump:
+    """Tells, and asks one after another. Each answer must be the sum of what stands before it."""
+
+    def __init__(self, ref: Any) -> None:
+        self._ref, self._is_over = ref, False
+        self.answers: list[int] = []
+        self._task = asyncio.create_task(self._send())
+
+    async def _send(self) -> None:
+        while not self._is_over:
+            self._ref.tell(Add(TOLD + len(self.answers)))
+            self.answers.append(await self._ref.ask(Add(1 + len(self.answers)), IN_TIME))
+
+    async def reached(self, more: int) -> None:
+        wanted = len(self.answers) + more
+        while len(self.answers) < wanted and not self._task.done():
+            await asyncio.sleep(0)
+
+    async def judge(self) -> None:
+        self._is_over = True
+        await self._task
+        added, count = (await self._ref.ask(Seen(), IN_TIME))["added"], len(self.answers)
+        assert added == [n for number in range(count) for n in (TOLD + number, 1 + number)]
+        assert self.answers == list(itertools.accumulate(added))[1::2]
+
+
+async def is_at_one_place(system: hf.ActorSystem, ref: Any) -> None:
+    """Its address, and what the supervisors say in the end, agree."""
+    async with asyncio.timeout(IN_TIME):
+        while True:
+            told = [
+                f"/app/{name}/{one.id}"
+                for name in ("near", "far", "other")
+                for one in await system.ref(f"/app/{name}", hf.Supervisor).ask(hf.WhichChildren(), IN_TIME)
+                if one.state == "running"
+            ]
+            if told == [ref.path]:
+                return
+
+
+@pytest.mark.pairs
+@pytest.mark.parametrize("way", list(WAYS))
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("victim", ["old", "new", "own"])
+@pytest.mark.parametrize("seed", range(6))
+async def test_a_process_that_is_killed_at_any_instant_loses_nothing(
+    system: hf.ActorSystem, seed: int, victim: str, isolation: str, way: str
+) -> None:
+    old, new = WAYS[way]
+    for spec in supervisors("recorded", old, isolation):
+        await system.start(spec)
+    ref = system.ref(f"/app/{old}/one", Traveller)
+    pump = Pump(ref)
+    await pump.reached(10)
+    moving = asyncio.ensure_future(move(system, ref, new))
+    struck = system.node.loop.time() + random.Random(seed).random() * 0.3
+    while not moving.done() and system.node.loop.time() < struck:
+        await asyncio.sleep(0)
+    with contextlib.suppress(hf.NoSuchActor, ProcessLookupError):  # It lives nowhere just now.
+        pid = system.pid_of(ref) if victim == "own" else pid_of(system, {"old": old, "new": new}[victim])
+        if pid != os.getpid():
+            os.kill(pid, signal.SIGKILL)
+    try:
+        await moving
+    except (hf.TransactionFailed, hf.TransactionRefused):
+        await pump.reached(5)
+        await move(system, ref, new)
+    await pump.reached(10)
+    await pump.judge()
+    assert ref.path == f"/app/{new}/one"
+    await is_at_one_place(system, ref)
+
+
+@asynccontextmanager
+async def program(store: str, old: str, isolation: str) -> AsyncGenerator[hf.ActorSystem]:
+    async with hf.ActorSystem("app", store=f"sqlite:{store}", durability="os", log=False, intensity=99) as system:
+        for spec in supervisors("recorded", old, isolation):
+            await system.start(spec)
+        yield system
+
+
+async def killed(store: str, when: str, old: str, new: str, isolation: str) -> None:
+    """The root is killed by a step in the middle of the move."""
+    async with program(store, old, isolation) as system:
+        ref = system.ref(f"/app/{old}/one", Traveller)
+        await ref.ask(Add(7))
+        async with system.transaction(timeout=IN_TIME) as change:
+            if when == "finish":
+                change.step(Die(when))
+            change.move(ref, f"/app/{new}")
+            change.step(Die("finish" if when == "settled" else when))
+
+
+PROGRAM = """
+import asyncio, sys
+from tests.migration.test_far_moves import killed
+
+if __name__ == "__main__":
+    asyncio.run(killed(*sys.argv[1:]))
+"""
+
+
+@pytest.mark.pairs
+@pytest.mark.parametrize("way", list(WAYS))
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("when", ["prepare", "commit", "finish", "settled"])
+async def test_a_root_that_is_killed_has_it_at_one_of_the_two(
+    tmp_path: Path, when: str, isolation: str, way: str
+) -> None:
+    (tmp_path / "program.py").write_text(PROGRAM)
+    old, new = WAYS[way]
+    here = str(Path(__file__).parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
+    arguments = (str(tmp_path / "program.py"), str(tmp_path / "store"), when, old, new, isolation)
+    process = await asyncio.create_subprocess_exec(sys.executable, *arguments, env=environment)
+    assert await asyncio.wait_for(process.wait(), IN_TIME) == -signal.SIGKILL
+    async with program(str(tmp_path / "store"), old, isolation) as system:
+        at = new if when in ("finish", "settled") else old
+        ref = system.ref(f"/app/{at}/one", Traveller)
+        assert await ref.ask(Add(1), IN_TIME) == 8
+        await is_at_one_place(system, ref)
+        assert (system.pid_of(ref) == pid_of(system, at)) == (isolation == "task")
+        if at != old:  # Who knows only the address of before reaches it.
+            assert await system.ref(f"/app/{old}/one", Traveller).ask(Add(1), IN_TIME) == 9
+
+
+class Hold(hf.Message[str]):
+    """Keep the whole process busy while a file is there; then do to `one` all that may be done to a neighbour.
+
+    The reply is how its supervisor has answered the order.
+    """
+
+    file: str
+    order: str
+    path: str
+
+
+class Watch(hf.Message[bool]): ...
+
+
+class Ended(hf.Message[list[str]]): ...
+
+
+class Reach(hf.Message[dict[str, Any]]):
+    path: str
+
+
+class Holder(hf.Actor):
+    """Lives with the old supervisor."""
+
+    def __init__(self) -> None:
+        self.downs: list[str] = []
+
+    @hf.on(Watch)
+    def watch(self, message: Watch) -> bool:
+        self.ctx.monitor(self.ctx.find("/app/far/one", Traveller))
+        return True
+
+    @hf.on(Hold)
+    async def hold(self, message: Hold) -> str:
+        Path(message.file).touch()
+        while Path(message.file).exists():
+            time.sleep(0.001)
+        one = self.ctx.find(message.path, Traveller)
+        one.tell(Add(5))
+        self.ctx.monitor(one)
+        order = {"terminate": hf.TerminateChild("one"), "remove": RemoveChild("one", erase=True)}.get(message.order)
+        try:
+            await self.ctx.find("/app/far", hf.Supervisor).ask(order or hf.RestartChild("inner", running=True), IN_TIME)
+        except hf.Refusal as no:
+            return type(no).__name__
+        return "done"
+
+    @hf.on(Reach)
+    async def reach(self, message: Reach) -> dict[str, Any]:
+        return await self.ctx.find(message.path, Traveller).ask(Seen(), IN_TIME)
+
+    @hf.on(Ended, readonly=True)
+    def ended(self, message: Ended) -> list[str]:
+        return self.downs
+
+    def on_down(self, source: hf.ActorRef[Any], reason: hf.ExitReason, recovering: bool) -> None:
+        self.downs.append(source.path)
+
+
+async def held(system: hf.ActorSystem, file: Path, then: Any, order: str = "terminate") -> str:
+    """Move `one` out of a process that is busy, do something, and let that process go on."""
+    holder, one = system.ref("/app/far/holder", Holder), system.ref("/app/far/one", Traveller)
+    asked: list[Any] = []
+
+    async def hold(system: hf.ActorSystem) -> None:
+        asked.append(holder.ask(Hold(str(file), order, one.path), IN_TIME))
+        while not file.exists():
+            await asyncio.sleep(0.005)
+
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.move(one, "/app/near")
+        change.step(Stumble(hold))
+    await then()
+    file.unlink()
+    return str(await asked[0])
+
+
+@pytest.fixture
+async def busy(system: hf.ActorSystem) -> hf.ActorSystem:
+    near, far, _ = supervisors("plain", "far", "process")
+    await system.start(near)
+    children = (*far.start.args[1], hf.child("holder", hf.start(Holder)))
+    await system.start(hf.supervisor("far", children=children, isolation="process", intensity=1000))
+    return system
+
+
+@pytest.mark.parametrize("order", ["terminate", "remove"])
+async def test_what_its_old_supervisor_says_before_it_has_heard_is_void(
+    busy: hf.ActorSystem, tmp_path: Path, order: str
+) -> None:
+    one = busy.ref("/app/far/one", Traveller)
+    own = busy.pid_of(one)
+    with busy.events() as events:
+
+        async def nothing() -> None: ...
+
+        assert await held(busy, tmp_path / "held", nothing, order) == "NoSuchChild"
+        assert (await one.ask(Seen(), IN_TIME))["added"] == [5]
+        holder = busy.ref("/app/far/holder", Holder)
+        assert (await holder.ask(Reach("/app/far/one"), IN_TIME))["added"] == [5]
+        assert not [event for event in events.take() if isinstance(event, hf.TrustBreached)]
+    assert (one.path, busy.pid_of(one)) == ("/app/near/one", own)
+    assert [info.id for info in await busy.ref("/app/far", hf.Supervisor).ask(hf.WhichChildren())] == ["holder"]
+    await busy.stop(one)
+    async with asyncio.timeout(IN_TIME):
+        while not await holder.ask(Ended(), IN_TIME):
+            await asyncio.sleep(0.005)
+    assert await holder.ask(Ended(), IN_TIME) == ["/app/near/one"]
+
+
+async def test_an_end_that_its_old_supervisor_process_has_not_heard_of_is_told_there(
+    busy: hf.ActorSystem, tmp_path: Path
+) -> None:
+    holder, one = busy.ref("/app/far/holder", Holder), busy.ref("/app/far/one", Traveller)
+    assert await holder.ask(Watch())
+
+    async def restarted() -> None:
+        own = busy.pid_of(one)
+        os.kill(own, signal.SIGKILL)
+        assert (await one.ask(Seen(), IN_TIME))["added"] == []
+
+    await held(busy, tmp_path / "held", restarted)
+    async with asyncio.timeout(IN_TIME):
+        while not await holder.ask(Ended(), IN_TIME):
+            await asyncio.sleep(0.005)
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_supervisor_within_a_process_comes_back_with_who_has_come_and_without_who_has_left(
+    system: hf.ActorSystem, isolation: str
+) -> None:
+    inner = [
+        hf.supervisor(name, children=[traveller("recorded", isolation)] if name == "left" else [], intensity=9)
+        for name in ("left", "right")
+    ]
+    await system.start(hf.supervisor("far", children=inner, isolation="process", intensity=99))
+    one = system.ref("/app/far/left/one", Traveller)
+    assert await one.ask(Add(1)) == 1
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.move(one, "/app/far/right")
+    process = pid_of(system, "far")
+    for name, below in (("left", []), ("right", ["one"])):
+        top = system.ref("/app/far", hf.Supervisor)
+        await top.ask(hf.RestartChild(name, running=True), IN_TIME)
+        async with asyncio.timeout(IN_TIME):
+            while True:
+                await asyncio.sleep(0.005)
+                with contextlib.suppress(hf.NoSuchActor, hf.ActorStopped, hf.AskFailed):
+                    told = await system.ref(f"/app/far/{name}", hf.Supervisor).ask(hf.WhichChildren(), IN_TIME)
+                    if [info.id for info in told] == below:
+                        break
+    assert pid_of(system, "far") == process
+    assert await system.ref("/app/far/right/one", Traveller).ask(Add(1), IN_TIME) == 2
+    assert await system.ref("/app/far/left/one", Traveller).ask(Add(1), IN_TIME) == 3
+
+
+async def test_a_process_that_is_started_anew_knows_where_they_are_who_have_left(busy: hf.ActorSystem) -> None:
+    one = busy.ref("/app/far/one", Traveller)
+    assert await one.ask(Add(4)) == 4
+    await move(busy, one, "near")
+    os.kill(pid_of(busy, "far"), signal.SIGKILL)
+    seen: dict[str, Any] = {}
+    async with asyncio.timeout(IN_TIME):
+        while not seen:
+            await asyncio.sleep(0.005)
+            with contextlib.suppress(hf.NoSuchActor, hf.ActorStopped, hf.AskFailed):
+                seen = await busy.ref("/app/far/holder", Holder).ask(Reach("/app/far/one"), IN_TIME)
+    assert seen["added"] == [4]
+
+
+async def test_who_comes_to_the_address_that_was_left_is_reached_there(busy: hf.ActorSystem) -> None:
+    """Though the process has named that address before."""
+    holder, one = busy.ref("/app/far/holder", Holder), busy.ref("/app/far/one", Traveller)
+    assert await one.ask(Add(4)) == 4
+    assert (await holder.ask(Reach("/app/far/one"), IN_TIME))["added"] == [4]
+    await move(busy, one, "near")
+    async with busy.transaction(timeout=IN_TIME) as change:
+        change.add("/app/far", traveller("plain", "process"))
+    assert (await holder.ask(Reach("/app/far/one"), IN_TIME))["added"] == []
+    assert (await holder.ask(Reach("/app/near/one"), IN_TIME))["added"] == [4]
+
+
+@pytest.mark.parametrize("way", list(WAYS))
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_move_that_is_given_up_leaves_it_where_it_was(system: hf.ActorSystem, isolation: str, way: str) -> None:
+    old, new = WAYS[way]
+    for spec in supervisors("plain", old, isolation):
+        await system.start(spec)
+    ref = system.ref(f"/app/{old}/one", Traveller)
+    pump = Pump(ref)
+    await pump.reached(5)
+    process, tree = system.pid_of(ref), system.tree()
+    for _ in range(2):
+        with pytest.raises(hf.TransactionFailed, match="there was a stone") as failed:
+            await move(system, ref, new, Stumble())
+        assert failed.value.kept == ()
+        await pump.reached(5)
+        assert (ref.path, system.pid_of(ref), system.tree()) == (f"/app/{old}/one", process, tree)
+        await is_at_one_place(system, ref)
+    await move(system, ref, new)
+    await pump.judge()
+
+
+async def test_what_cannot_be_is_refused_before_anything_is_done(system: hf.ActorSystem) -> None:
+    far = [
+        traveller("plain", "task"),
+        hf.supervisor("team"),
+        hf.dynamic("pool"),
+        hf.child("stopped", hf.start(Traveller), autostart=False),
+    ]
+    await system.start(hf.supervisor("near", children=[hf.child("two", hf.start(Traveller), autostart=False)]))
+    await system.start(hf.supervisor("far", children=far, isolation="process"))
+    pooled = await system.ref("/app/far/pool", hf.Supervisor).ask(
+        hf.StartChild(hf.child("pooled", hf.start(Traveller))), IN_TIME
+    )
+    refusals: dict[str, Any] = {
+        "its children live where it does": lambda change: change.move("/app/far/team", "/app/near"),
+        "no supervisor looks after it": lambda change: change.move(pooled.path, "/app/near"),
+        "it does not run": lambda change: change.move("/app/near/two", "/app/far"),
+    }
+    for why, step in refusals.items():
+        with pytest.raises(hf.TransactionRefused, match=why):
+            async with system.transaction(timeout=IN_TIME) as change:
+                step(change)
+
+    def both(change: Any) -> None:
+        change.move("/app/far/one", "/app/near")
+        change.isolation("/app/near/one", "process")
+
+    with pytest.raises(hf.TransactionFailed, match="in a transaction of its own"):
+        async with system.transaction(timeout=IN_TIME) as change:
+            both(change)
+
+
+class Slow(hf.Actor):
+    """Its end waits until a file is gone."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+
+    async def on_stop(self, reason: hf.ExitReason) -> None:
+        while Path(self.file).exists():
+            await asyncio.sleep(0.005)
+
+
+class Last(hf.Actor):
+    """Its end leaves a file."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+
+    def on_stop(self, reason: hf.ExitReason) -> None:
+        Path(self.file).touch()
+
+
+@pytest.fixture
+def slow(tmp_path: Path) -> Any:
+    file = tmp_path / "slow"
+    file.touch()
+    yield file
+    file.unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("first", ["one", "slow"])
+async def test_a_supervisor_that_stops_loses_its_child_and_lets_it_live(
+    system: hf.ActorSystem, slow: Path, tmp_path: Path, first: str
+) -> None:
+    """It stops one behind the other; this one, which it has told to stop, or is about to, has another supervisor."""
+    children = [traveller("plain", "process"), hf.child("slow", hf.start(Slow, str(slow)), shutdown="infinity")]
+    last = hf.child("last", hf.start(Last, str(tmp_path / "last")))
+    children = [last, *(children if first == "slow" else children[::-1])]
+    inner = hf.supervisor("inner", children=children, intensity=9)
+    await system.start(hf.supervisor("near"))
+    team = [inner, hf.child("holder", hf.start(Holder))]
+    await system.start(hf.supervisor("far", children=team, isolation="process", intensity=99))
+    one, holder = system.ref("/app/far/inner/one", Traveller), system.ref("/app/far/holder", Holder)
+    own, file, asked = system.pid_of(one), tmp_path / "held", list[Any]()
+
+    async def hold(system: hf.ActorSystem) -> None:
+        asked.append(holder.ask(Hold(str(file), "restart", one.path), IN_TIME))
+        while not file.exists():
+            await asyncio.sleep(0.005)
+
+    await move(system, one, "near", Stumble(hold))
+    file.unlink()
+    async with asyncio.timeout(IN_TIME):
+        while (await one.ask(Seen(), IN_TIME))["added"] != [5]:
+            await asyncio.sleep(0.005)
+    slow.unlink()
+    assert await asked[0] == "done"
+    assert (tmp_path / "last").exists()
+    assert (await holder.ask(Reach("/app/far/inner/one"), IN_TIME))["added"] == [5]
+    assert (one.path, system.pid_of(one)) == ("/app/near/one", own)

@@ -13,6 +13,7 @@ KEPT = "tests/system/test_specification.py"
 MOVED = "tests/system/test_readdressed.py"
 TIES = "tests/system/test_moved_ties.py"
 REPLICAS = "tests/system/test_moved_replicas.py"
+FAR = "tests/migration/test_far_moves.py"
 
 CHECKS = {
     "the states are in the store together": Check(
@@ -105,6 +106,90 @@ CHECKS = {
         "            if False:\n",
         MOVED,
         "test_what_is_recorded and task",
+    ),
+    "what a process says of who has left is void": Check(
+        "actors/process/wire/worker_gate.py",
+        "            if not self._is_of_lost(frame):\n",
+        "            if True:\n",
+        FAR,
+        "test_what_its_old_supervisor_says",
+    ),
+    "a name that was left is given anew": Check(
+        "actors/process/worker_node.py",
+        "        self.connection.names.give_anew(old)\n",
+        "",
+        FAR,
+        "test_who_comes_to_the_address",
+    ),
+    "an end that a process has not heard of is told there": Check(
+        "actors/process/wire/peer.py",
+        '            if data.get("life", cell.life) != cell.life:',
+        "            if False:",
+        FAR,
+        "test_an_end_that_its_old",
+    ),
+    "who watches it from there is known by the root": Check(
+        "actors/process/worker_node.py",
+        '            cell.host.told(cell, "monitor", data)\n',
+        "            pass\n",
+        TIES,
+        "test_it_hears_of_the_end_of_who_goes",
+    ),
+    "who is linked with it from there knows its new address": Check(
+        "actors/process/stand_ins.py",
+        "            peer.extra().ties.links[cell] = cell.path\n",
+        "            pass\n",
+        TIES,
+        "test_it_hears_of_the_end_though",
+    ),
+    "a supervisor within a process has its recipe as it is now": Check(
+        "system/transaction/arrangement.py",
+        "            if start is not None:\n",
+        "            if False:\n",
+        FAR,
+        "test_a_supervisor_within_a_process",
+    ),
+    "a process that is started anew knows who has left": Check(
+        "actors/process/worker_node.py",
+        '        self._left.update(frame.options.get("left", ()))\n',
+        "",
+        FAR,
+        "test_a_process_that_is_started_anew",
+    ),
+    "a supervisor that has lost a child says so": Check(
+        "supervision/supervisor.py",
+        "        return one.cell is not None and one.cell.parent is not self.ctx.cell\n",
+        "        return False\n",
+        FAR,
+        "test_what_its_old_supervisor_says",
+    ),
+    "a supervisor does not stop who was given to another": Check(
+        "supervision/supervisor.py",
+        "            if child.parent is self.ctx.cell:  # Else",
+        "            if True:  # Else",
+        FAR,
+        "test_a_supervisor_that_stops",
+    ),
+    "a supervisor does not retire who was given to another": Check(
+        "actors/kernel/node.py",
+        "        if cell.parent is parent:  # Else",
+        "        if True:  # Else",
+        FAR,
+        "test_a_supervisor_that_stops",
+    ),
+    "who was lodged in a process lives where it did if the move is given up": Check(
+        "system/transaction/handing.py",
+        "        if self._is_lodged and cell is not None:\n",
+        "        if False:\n",
+        FAR,
+        "test_a_move_that_is_given_up",
+    ),
+    "a restart that would fail is refused also in a process": Check(
+        "system/transaction/handing.py",
+        "            if port := next(",
+        '            if port := "" and next(',
+        TIES,
+        "test_who_is_bound_to_one_that_goes",
     ),
     "a process is told its address": Check(
         "system/transaction/arrangement.py",

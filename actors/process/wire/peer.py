@@ -504,7 +504,10 @@ def obey(node: Node, cell: Cell, name: str, frame: frames.Command, *, by_root: b
             carried = by_root and bool(data.get("carried"))
             links.down_arrived(cell, source, reason, recovering=recovering, for_good=for_good, is_carried=carried)
         case "monitor":
-            links.monitor(named(node, frame, "watcher"), cell, for_good=bool(data.get("for_good")), name=name)
+            watcher, for_good = named(node, frame, "watcher"), bool(data.get("for_good"))
+            watch = links.monitor(watcher, cell, for_good=for_good, name=name)
+            if data.get("life", cell.life) != cell.life:  # It was watched where its supervisor was.
+                links.has_missed(watch)
         case "demonitor":
             links.demonitor(named(node, frame, "watcher"), cell, for_good=bool(data.get("for_good")))
         case "link":
