@@ -330,14 +330,16 @@ class RelayedAsk(Ask, eq=False):
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         page = item.page
-        if page is None:
-            return Ask.run(actor, item)
-        page[0] = item.number
+        if page is not None:
+            page[0] = item.number
         if item.until <= monotonic():  # In this order: if the page did not say so at the deadline, it is not run.
             item.expire()
-            page[1] = item.number
+            if page is not None:
+                page[1] = item.number
             return None
         result = Ask.run(actor, item)
+        if page is None:
+            return result
         if type(result) is Coroutine_:
             return _until_done(result, item)
         page[1] = item.number
