@@ -544,12 +544,13 @@ async def test_a_process_does_not_speak_for_an_actor_that_has_left_it(system: hf
     await system.start(hf.supervisor("far", children=team, isolation="process", intensity=99))
     other = await system.start(hf.child("other", hf.start(Traveller)))
     one, evil = (system.ref(f"/app/far/{name}", Speaker) for name in ("one", "evil"))
-    for sender in [await each.ask(Speak(other.path), IN_TIME) for each in (evil, one)]:
+    senders = [await each.ask(Speak(other.path), IN_TIME) for each in (evil, one)]
+    for sender in senders:
         await evil.ask(Forge(other.path, sender), IN_TIME)  # Both are of its own process.
     assert len((await other.ask(Seen(), IN_TIME))["added"]) == 4
     await move(system, one, "near")
     with system.events() as events:
-        evil.tell(Forge(other.path, sender))
+        evil.tell(Forge(other.path, senders[-1]))
         breach = await next_event(events, hf.TrustBreached)
     assert breach.address == "/app/far"
     assert len((await other.ask(Seen(), IN_TIME))["added"]) == 4
