@@ -15,10 +15,14 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 import holdfast as hf
+from holdfast.actors.kernel.message import message_name
+from holdfast.actors.process.wire import frames
 from holdfast.supervision.admin import RemoveChild
+from tests.actors.process.waiting import next_event
 from tests.migration.travellers import KINDS, TOLD, Add, Luggage, Seen, Stream, Traveller
 from tests.system.test_transaction_commit import Die
 from tests.system.trees import Stumble
@@ -504,3 +508,49 @@ async def test_a_supervisor_that_stops_loses_its_child_and_lets_it_live(
     assert (tmp_path / "last").exists()
     assert (await holder.ask(Reach("/app/far/inner/one"), IN_TIME))["added"] == [5]
     assert (one.path, system.pid_of(one)) == ("/app/near/one", own)
+
+
+class Speak(hf.Message[int]):
+    """Tell that actor something; the reply is the number under which the root knows who tells it."""
+
+    to: str
+
+
+class Forge(hf.Message[bool]):
+    """Tell that actor something in the name of another one."""
+
+    to: str
+    sender: int
+
+
+class Speaker(hf.Actor):
+    @hf.on(Speak)
+    def speak(self, message: Speak) -> int:
+        names = self.ctx.cell.node.ports.uplink.connection.names
+        self.ctx.find(message.to, Traveller).tell(Add(1))
+        return int(names.to_wire(self.ctx.path))
+
+    @hf.on(Forge)
+    def forge(self, message: Forge) -> bool:
+        connection = self.ctx.cell.node.ports.uplink.connection
+        name, to = connection.names.to_wire(message_name(Add)), connection.names.to_wire(message.to)
+        connection.send(frames.Tell(to, name, msgspec.Raw(msgspec.msgpack.encode([1])), 0, message.sender))
+        return True
+
+
+async def test_a_process_does_not_speak_for_an_actor_that_has_left_it(system: hf.ActorSystem) -> None:
+    team = [hf.child(name, hf.start(Speaker)) for name in ("one", "evil")]
+    await system.start(hf.supervisor("near"))
+    await system.start(hf.supervisor("far", children=team, isolation="process", intensity=99))
+    other = await system.start(hf.child("other", hf.start(Traveller)))
+    one, evil = (system.ref(f"/app/far/{name}", Speaker) for name in ("one", "evil"))
+    senders = [await each.ask(Speak(other.path), IN_TIME) for each in (evil, one)]
+    for sender in senders:
+        await evil.ask(Forge(other.path, sender), IN_TIME)  # Both are of its own process.
+    assert len((await other.ask(Seen(), IN_TIME))["added"]) == 4
+    await move(system, one, "near")
+    with system.events() as events:
+        evil.tell(Forge(other.path, senders[-1]))
+        breach = await next_event(events, hf.TrustBreached)
+    assert breach.address == "/app/far"
+    assert len((await other.ask(Seen(), IN_TIME))["added"]) == 4

@@ -114,6 +114,13 @@ CHECKS = {
         FAR,
         "test_what_its_old_supervisor_says",
     ),
+    "a process does not speak for an actor that has left it": Check(
+        "actors/process/wire/worker_gate.py",
+        "        self._own.clear()\n        self._worker",
+        "        self._worker",
+        FAR,
+        "test_a_process_does_not_speak_for",
+    ),
     "a name that was left is given anew": Check(
         "actors/process/worker_node.py",
         "        self.connection.names.give_anew(old)\n",
