@@ -108,6 +108,8 @@ BUILTINS, FUNCTIONS, DRAWING = _builtins(), _functions(), _drawing()
 MAPPING_GET = Mapping.get.__code__
 SHARED: random.Random = random._inst
 MADE = random.Random.__init__.__code__
+STANDS_FOR = "stands_for"
+"""What a function in place of a clock or a generator, under a simulation, calls the one that it stands for."""
 CLASS_CLOCKS = {("datetime", "now"), ("datetime", "utcnow"), ("datetime", "today"), ("date", "today")}
 
 
@@ -171,6 +173,9 @@ class DeterminismGuard:
                     self._refuse(*known, frame.f_back)
             elif frame.f_code is MADE and frame.f_locals["x"] is None:
                 self._refuse("random.Random, without a seed,", DICE, frame.f_back)
+            elif STANDS_FOR in frame.f_code.co_freevars:
+                function, kind = frame.f_locals[STANDS_FOR], frame.f_locals.get("kind")
+                self._look_at_builtin(frame.f_back, function if kind is None else function.__get__(None, kind))
             elif frame.f_code in DRAWING:
                 drawn_from = frame.f_locals.get("self")
                 if drawn_from is SHARED:
@@ -178,7 +183,7 @@ class DeterminismGuard:
                 elif isinstance(drawn_from, random.SystemRandom):
                     self._refuse(f"random.SystemRandom.{DRAWING[frame.f_code]}", DICE, frame.f_back)
 
-    def _look_at_builtin(self, frame: FrameType, function: Any) -> None:
+    def _look_at_builtin(self, frame: FrameType | None, function: Any) -> None:
         known = BUILTINS.get(id(function))
         if known is None:
             owner = getattr(function, "__self__", None)

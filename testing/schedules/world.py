@@ -188,21 +188,24 @@ class World:
             self._own_numpy_state = numpy.get_state()
             numpy.set_state(self._numpy_state)
 
-    def _own(self, real: Callable[..., Any], simulated: Callable[..., Any]) -> Callable[..., Any]:
-        """For the thread of the run the simulated function, for all others the real one."""
+    def _own(self, stands_for: Callable[..., Any], simulated: Callable[..., Any]) -> Callable[..., Any]:
+        """For the thread of the run the simulated function, for all others the real one.
+
+        The guard of strict actors finds that by its name, and refuses either.
+        """
 
         def chosen(*args: Any, **options: Any) -> Any:
-            return (simulated if threading.get_ident() == self._thread else real)(*args, **options)
+            return (simulated if threading.get_ident() == self._thread else stands_for)(*args, **options)
 
         return chosen
 
-    def _own_of_class(self, real: Any, simulated: Callable[..., Any]) -> Any:
+    def _own_of_class(self, stands_for: Any, simulated: Callable[..., Any]) -> Any:
         """As `_own`, of a class method."""
 
         def chosen(kind: type, *args: Any, **options: Any) -> Any:
             if threading.get_ident() == self._thread:
                 return simulated(kind, *args, **options)
-            return real.__get__(None, kind)(*args, **options)
+            return stands_for.__get__(None, kind)(*args, **options)
 
         return classmethod(chosen)
 

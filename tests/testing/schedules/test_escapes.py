@@ -192,3 +192,40 @@ def test_the_order_of_a_set_of_objects_is_found_by_the_second_run(seed: int) -> 
 
     with pytest.raises(NotRepeatable, match="the addresses of objects"):
         simulate(in_order, seed=10 * seed)()
+
+
+class Read(hf.Message[str]):
+    """Answered with what a clock shows, or a generator draws."""
+
+    which: str
+
+
+READINGS: dict[str, Callable[[], object]] = {
+    "time.time": lambda: time.time(),
+    "time.monotonic_ns": lambda: time.monotonic_ns(),
+    "datetime.now": lambda: datetime.now(UTC),
+    "date.today": lambda: date.today(),
+    "os.urandom": lambda: os.urandom(4),
+}
+
+
+class Reader(hf.Actor):
+    """Asks the world."""
+
+    @hf.on(Read)
+    def read(self, message: Read) -> str:
+        return str(READINGS[message.which]())
+
+
+@pytest.mark.parametrize("which", READINGS)
+@simulate(seeds=2)
+async def test_a_strict_actor_is_refused_a_simulated_clock_as_it_is_a_real_one(
+    system: GuardedSystem, which: str
+) -> None:
+    """A seed decides what it shows, and a replay after a crash shows something else all the same."""
+    system.expect_crashes()
+    ref = await system.start(hf.child("reader", hf.start(Reader), recovery=hf.hybrid(strict=True)))
+    with pytest.raises(hf.RemoteCrash, match="NotDeterministic"):
+        await ref.ask(Read(which))
+    free = await system.start(hf.child("free", hf.start(Reader), recovery=hf.hybrid()))
+    assert await free.ask(Read(which))
