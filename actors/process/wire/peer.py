@@ -315,7 +315,7 @@ class RelayedAsk(Ask, eq=False):
     number: int = 0
     page: Any = None
     is_over: bool = False
-    until: float = 0.0  # the deadline on the monotonic clock, which both sides read
+    until: float = math.inf  # the deadline on the monotonic clock, which both sides read; without a frame, none
 
     @classmethod
     def taken(cls, peer: Peer, frame: frames.Ask, cell: Cell, page: memoryview | None) -> RelayedAsk:
