@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections import deque
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from .standing import Standing
 
 R = TypeVar("R")
-NO_BATCH: Final = -1
-"""In place of the number of the last batch, before there is one."""
 
 
 class AwaitHandled(Message[None]):
@@ -196,7 +194,7 @@ class Proceed(Brick):
         super().__init__(standing, mechanism, slot)
         self._works: deque[Work] = deque()
         self._task: asyncio.Task[None] | None = None
-        self._number = NO_BATCH
+        self._number = -1
         self._last, self._last_epoch = -1, -1  # batch that came last
         self._at_home: asyncio.Future[None] | None = None
         self._flushes: list[ReplyHandle[None]] = []
@@ -274,9 +272,6 @@ class Proceed(Brick):
                 if self._works:
                     self._work_now = self._works.popleft()
                     await self._batch(self._work_now)
-                elif returned := self._returned():
-                    self._work_now = Work(self.epoch, self._standing.config, self._number, returned)
-                    await self._batch(self._work_now)
                 elif server.reports.more or server.reports.is_snapshot_wanted:
                     more = server.take_more()
                     if not more:
@@ -292,13 +287,6 @@ class Proceed(Brick):
             for handle in flushes:
                 handle.reply(None)
 
-    def _returned(self) -> list[Request]:
-        """What a state that was taken over says was put back, and not handled: it belongs to no batch."""
-        pending = deque[Request]()
-        if self._standing.computes and self._number != NO_BATCH and not self._flushes:
-            self._standing.server.returned_first(pending)
-        return list(pending)
-
     async def _batch(self, work: Work) -> None:
         server = self._standing.server
         state = server.state
@@ -306,6 +294,7 @@ class Proceed(Brick):
         if work.number >= 0 and self.leads:
             state.confirmed = state.handed  # It is sent when home has all that came before.
         pending, go = deque(work.requests), work.go
+        brings = bool(pending) or go is not None  # Else home may not have what was handled before.
         if pending and not state.is_over:
             await server.ensure()
             server.returned_first(pending)
@@ -320,11 +309,14 @@ class Proceed(Brick):
                 live = None
             if live is not None:
                 go = None
-            server.returned_first(pending)
+            if brings and not server.part.is_given_up:
+                server.returned_first(pending)
             is_last = not pending or state.is_over
             waits = not is_last and self.leads and server.runs_alone(pending[0])
             await self._hand(ends, is_last=is_last, live=live, wait=waits)
-            if is_last:
+            if is_last and brings and not server.part.is_given_up:
+                server.returned_first(pending)  # An alternate that is taken instead may have put back something.
+            if is_last and not pending:
                 return
 
     async def hand_over_before(self, ends: list[TurnEnd], wait: bool) -> None:

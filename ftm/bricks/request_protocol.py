@@ -104,6 +104,8 @@ class RequestProtocol(Transfer):
         self._marker: int | None = None  # what the last leader gave us to compute is over when this comes back
         self._least = -1  # the turn after which we go on, if those up to it have left nothing here
         self._wanted: int | None = None  # part of Proceed that waits, meanwhile, for home to have all before it
+        self._home_turn = -1  # the last turn that home knew of when we began to lead
+        self._owed: set[int] = set()  # requests whose ends home has not asked for again: what was put back comes later
         self._later: list[Any] = []  # what goes home behind that, and of a follower what it would have to say
         self._behind_turn = -1  # the last turn before that
         self._turn = -1  # the last one before the batch that is inside
@@ -137,6 +139,8 @@ class RequestProtocol(Transfer):
 
     def _begin(self, work: Work) -> None:
         known, left = self._split(work)
+        if not self._owed:
+            left = self._standing.server.returned_before(left)
         goes_in = bool(left) or work.go is not None
         if known or self._later or not goes_in:
             more, self._later = self._later, []
@@ -154,6 +158,7 @@ class RequestProtocol(Transfer):
         """The outcomes that are known, in turn order, and the requests that were never handled."""
         standing, left, known = self._standing, list[Request](), list[TurnEnd]()
         log = standing.log
+        self._owed.difference_update(one.feed.id for one in work.requests)
         for request in work.requests:
             number = request.feed.id
             end = log.find(number)
@@ -225,6 +230,7 @@ class RequestProtocol(Transfer):
         self._behind_turn = max(self._behind_turn, done.behind)
         if done.number == self._marker:
             self._marker = self._wanted = None
+            self._owed = {end.id for *_, end in self._standing.log.entries() if end.turn > self._home_turn}
             if self._standing.server.turn < self._least:
                 self._standing.server.skip_to(self._least)
         elif done.wait:
@@ -332,7 +338,7 @@ class RequestProtocol(Transfer):
         standing.following.ready()
         # What the last leader gave us to compute ends first: only then is it known what is a duplicate.
         self._current = self._marker = marker = marker_of(epoch)
-        self._least = order.turn
+        self._least, self._home_turn = order.turn, order.known
         if not standing.leads:
             self._later = [one for one in self._later if is_still_due(one, order.known)]
             if server.life is None and server.turn >= 0:  # What has led to our state has begun its work elsewhere.

@@ -141,7 +141,12 @@ class Handling(Before):
         await standing.following.until_ready()
         log = standing.log
         work = message.work
-        left = [one for one in work.requests if log.find(one.feed.id) is None and one.feed.id not in standing.inside]
+        left = [
+            one
+            for one in work.requests
+            if one.feed.id not in standing.inside
+            and (log.find(one.feed.id) is None or standing.server.is_returned(one.feed.id))
+        ]
         standing.inside.update((one.feed.id, one) for one in left)
         if message.looks:
             standing.looking.name(left)

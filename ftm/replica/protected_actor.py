@@ -603,21 +603,31 @@ class Server(lifecycle.HerePlace):
         answer = Answer(*codec.encode_error(error)) if request.feed.is_ask else Answer()
         self.attempts.skips[end.id] = TurnEnd(end.turn, end.id, FAILED, [], answer)
 
+    def _returned(self) -> list[Feed]:
+        life, point = self.life, self.points.point
+        if life is not None:
+            return [fed.feed for fed in life.returned.values()] if life.is_live else []
+        return point.returned if point is not None and point.live else []
+
+    def is_returned(self, number: int) -> bool:
+        """Whether a request was put aside, is put back, and has not been handled since."""
+        return any(feed.id == number for feed in self._returned())
+
     def returned_first(self, pending: deque[Request]) -> None:
         """Have what was put aside and is put back handled before anything else, each once."""
-        life, point = self.life, self.points.point
-        if self.part.is_given_up or self.state.is_over:
-            return
-        if life is not None:
-            feeds = [fed.feed for fed in life.returned.values()] if life.is_live else []
-        else:
-            feeds = point.returned if point is not None and point.live else []
+        feeds = [] if self.state.is_over else self._returned()
         if feeds:
             numbers = {feed.id for feed in feeds}
             behind = [one for one in pending if one.feed.id not in numbers]
             pending.clear()
             pending.extend(Request("", 0, feed) for feed in feeds)
             pending.extend(behind)
+
+    def returned_before(self, requests: list[Request]) -> list[Request]:
+        """These requests behind what was put back."""
+        pending = deque(requests)
+        self.returned_first(pending)
+        return list(pending)
 
     def has_taken(self, request: Request) -> bool:
         """Whether the life has a request without an end: its stash has it, or it is the tick of a cancelled timer."""
