@@ -471,6 +471,13 @@ CHECKS = {
         PUT_BACK,
         "as_without_a_mechanism and tr-without",
     ),
+    "what was put back and has failed is not handled again": Check(
+        "ftm/replica/replica_life.py",
+        "        life.returned.pop(end.id, None)",
+        "        pass",
+        PUT_BACK,
+        "raises_fails_once and pbr-without",
+    ),
     "what was put back, and is in no batch, is handled": Check(
         "ftm/bricks/bricks.py",
         "                elif returned := self._returned():\n",
