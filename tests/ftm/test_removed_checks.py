@@ -471,6 +471,13 @@ CHECKS = {
         PUT_BACK,
         "as_without_a_mechanism and tr-without",
     ),
+    "what two runs of a turn have begun in the background comes once": Check(
+        "ftm/bricks/background_work.py",
+        "        return is_out or",
+        "        return True or",
+        "tests/ftm/test_background_order.py",
+        "two_runs_of_a_turn and without",
+    ),
     "what was put back and has failed is not handled again": Check(
         "ftm/replica/replica_life.py",
         "        life.returned.pop(end.id, None)",
