@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import itertools
 import os
 import random
@@ -554,3 +555,36 @@ async def test_a_process_does_not_speak_for_an_actor_that_has_left_it(system: hf
         breach = await next_event(events, hf.TrustBreached)
     assert breach.address == "/app/far"
     assert len((await other.ask(Seen(), IN_TIME))["added"]) == 4
+
+
+class Reluctant(Traveller):
+    """Does not begin while there is a file."""
+
+    def __init__(self, file: str = "") -> None:
+        super().__init__()
+        self.file = file
+
+    async def on_start(self, restored: bool) -> None:
+        while Path(self.file).exists():
+            await asyncio.sleep(0.005)
+
+
+@pytest.mark.parametrize("way", list(WAYS))
+@pytest.mark.parametrize("kind", list(KINDS))
+async def test_the_time_limit_holds_for_the_process_that_it_is_lent(
+    system: hf.ActorSystem, kind: str, way: str, tmp_path: Path
+) -> None:
+    """What does not begin there is given up with the transaction, and the life goes on as it was."""
+    old, new = WAYS[way]
+    one = dataclasses.replace(traveller(kind, "task"), start=hf.start(Reluctant, str(tmp_path / "no")))
+    for name in {old, new}:
+        place: Any = "task" if name == "near" else "process"
+        await system.start(hf.supervisor(name, children=[one] if name == old else [], isolation=place))
+    ref = system.ref(f"/app/{old}/one", Reluctant)
+    assert await ref.ask(Add(1), timeout=IN_TIME) == 1
+    (tmp_path / "no").touch()
+    with pytest.raises(hf.TransactionFailed, match="not within 0.5 s") as failed:
+        async with asyncio.timeout(IN_TIME), system.transaction(timeout=0.5) as change:
+            change.move(ref, f"/app/{new}")
+    assert failed.value.kept == ()
+    assert (await ref.ask(Add(1), timeout=5.0), ref.path) == (2, f"/app/{old}/one")
