@@ -141,6 +141,8 @@ class Handing:
             return f"{cell.path} has no process of its own"
         if cell.state is not RUNNING or not cell.host.is_up(cell) or at.is_ending:
             return f"{cell.path} is being restarted"
+        if system._moves.is_moving(cell):  # Its processes speak of it by the address at which that began.
+            return f"{cell.path} is on its way to live elsewhere"
         if isinstance(old, FarParent) and (why := old.why_busy(cell)):
             return why
         if is_elsewhere(self._above.living(system.node)) and (

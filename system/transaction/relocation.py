@@ -61,7 +61,7 @@ class Gated:
             task.result()
 
     async def done(self, system: ActorSystem, work: Coroutine[Any, Any, None]) -> None:
-        """Have it done at once, without a gate. It goes on if whoever waits is cancelled, who then has to give it up."""
+        """Have it done at once, without a gate. Whoever waits no more has to give it up."""
         self.begin(system, work)
         assert self.task is not None
         await asyncio.shield(self.task)

@@ -37,6 +37,13 @@ CHECKS = {
         FAR,
         "test_the_time_limit_holds and plain and near",
     ),
+    "nobody is given away on its way to live elsewhere": Check(
+        "system/transaction/handing.py",
+        "        if system._moves.is_moving(cell):",
+        "        if False:",
+        FAR,
+        "test_who_is_on_its_way and plain",
+    ),
     "a mechanism on trial is not in it": Check(
         "system/specification.py",
         "self._packed(_with_mechanisms(address, spec, before))",
