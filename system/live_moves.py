@@ -284,6 +284,11 @@ class Moves:
         spec = _spec_there(cell, isolation, limits)
         await self._moved(cell, timeout, lambda: self._made(cell, spec, timeout), lambda: replace_place(cell, spec))
 
+    def is_moving(self, cell: Cell) -> bool:
+        """Whether an actor is on its way to live elsewhere."""
+        move = self._under_way.get(cell)
+        return move is not None and not move.stays
+
     def give_up(self, cell: Cell, why: str) -> None:
         """What is under way there ends soon, undone, unless it is done already."""
         move = self._under_way.get(cell)

@@ -16,7 +16,6 @@ class Background:
     def __init__(self, switch: Switch, on_lost: Callable[[int], None]) -> None:
         self._switch, self._on_lost = switch, on_lost
         self._out: set[tuple[int, int]] = set()  # by turn and output
-        self._told: set[tuple[int, int]] = set()  # said to be lost; a follower may have begun it too
 
     def note(self, turn: int, outs: list[Out]) -> None:
         """A turn has begun some."""
@@ -24,10 +23,15 @@ class Background:
         self._out.update((turn, out.k) for out in outs if out.verb == "pipe" and out.k not in done)
 
     def back(self, record: PipeDone) -> bool:
-        """It has an outcome. Does that count? What was said to be lost does not come."""
+        """It has an outcome. Does that count? What was said to be lost does not come, nor what has come before.
+
+        More than one run of a turn may have begun it, on one replica or on several, and each is told of. With a replay
+        the ledger knows which have come.
+        """
         one = record.turn, record.k
+        is_out = one in self._out
         self._out.discard(one)
-        return not record.k or one not in self._told
+        return is_out or not record.k or self._switch.method.replays
 
     def is_lost(self, turn: int | None = None) -> bool:
         """What turns up to this one (None: all) have begun has ended without an outcome.
@@ -37,7 +41,6 @@ class Background:
         lost = {one for one in self._out if turn is None or one[0] <= turn}
         self._out -= lost
         if lost and not self._switch.method.replays:
-            self._told |= lost
             self._on_lost(len(lost))
             return False
         return bool(lost)

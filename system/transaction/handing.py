@@ -27,7 +27,7 @@ from .arrangement import planned_spec
 from .draft import START_TIMEOUT, DraftPlace, is_elsewhere
 from .lasting import recipe_specs
 from .operation import wrong
-from .relocation import MOVED_WITHIN
+from .relocation import MOVED_WITHIN, Gated
 from .structure import CANDIDATES
 
 if TYPE_CHECKING:
@@ -84,6 +84,7 @@ class Handing:
         self._life = 0  # of it
         self._parent: FarParent | None = None  # at the new address
         self._is_lodged = False  # it has a process for this only
+        self._lodging = Gated(place, f"a process for {place.path}")
 
     @property
     def _above(self) -> DraftPlace:
@@ -107,7 +108,7 @@ class Handing:
         cell = place.living(system.node)
         if place_of(cell) != "process":
             self._is_lodged = True
-            await system._moves.move(cell, "process", None, MOVED_WITHIN)
+            await self._lodging.done(system, system._moves.move(cell, "process", None, MOVED_WITHIN))
         above = self._above.living(system.node)
         if not is_elsewhere(above) or (self._asked is above and self._life == above.life and not self._has_failed()):
             return
@@ -140,6 +141,8 @@ class Handing:
             return f"{cell.path} has no process of its own"
         if cell.state is not RUNNING or not cell.host.is_up(cell) or at.is_ending:
             return f"{cell.path} is being restarted"
+        if system._moves.is_moving(cell):  # Its processes speak of it by the address at which that began.
+            return f"{cell.path} is on its way to live elsewhere"
         if isinstance(old, FarParent) and (why := old.why_busy(cell)):
             return why
         if is_elsewhere(self._above.living(system.node)) and (
@@ -179,6 +182,7 @@ class Handing:
     async def release(self, system: ActorSystem) -> None:
         """The new supervisor forgets it, and it lives where it did."""
         try:
+            await self._lodging.give_up(system)
             await self._withdraw()
         finally:
             await self._settle(system)

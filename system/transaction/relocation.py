@@ -60,6 +60,12 @@ class Gated:
         if task.done():
             task.result()
 
+    async def done(self, system: ActorSystem, work: Coroutine[Any, Any, None]) -> None:
+        """Have it done at once, without a gate. Whoever waits no more has to give it up."""
+        self.begin(system, work)
+        assert self.task is not None
+        await asyncio.shield(self.task)
+
     @property
     def is_waiting(self) -> bool:
         """Whether it is ready at this instant, or there was nothing to be done. Raises what has ended it."""

@@ -15,7 +15,7 @@ import holdfast as hf
 from holdfast.checkpoint.home.switch import Switch
 from holdfast.checkpoint.protocol import PipeDone
 from holdfast.ftm.bricks.brick_messages import Done
-from holdfast.ftm.group.group import Group
+from holdfast.ftm.group.group import KEPT_TURNS, Group
 from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
@@ -63,6 +63,24 @@ class Worker(Counter):
         if os.getpid() != message.pid:
             Path(message.folder, "computed").touch()
         return self.total
+
+
+class Runner(Counter):
+    """Each run of its turn begins work that lasts as long as a file of its own is there."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._runs = 0
+
+    @hf.on(Begin)
+    def begin(self, message: Begin) -> int:
+        self._runs += 1
+        self.ctx.pipe_to_self(self.last(Path(message.folder), self._runs), lambda _: Add(BROUGHT))
+        return self.total
+
+    async def last(self, folder: Path, run: int) -> None:
+        await until_gone(folder / f"work{run}")
+        (folder / f"done{run}").touch()
 
 
 async def work(folder: Path) -> None:
@@ -196,6 +214,27 @@ async def test_work_of_a_turn_that_only_the_backup_has_is_begun_again_or_said_to
     events.close()
     assert tags == ([0, 1, BROUGHT] if recovery is not None else [0, 1])
     assert [one.count for one in lost] == ([] if recovery is not None else [1])
+
+
+@pytest.mark.parametrize("method", ["without recovery", "hybrid"])
+@pytest.mark.parametrize("first", [1, 2])
+async def test_what_two_runs_of_a_turn_have_begun_comes_once_however_late_the_second_is(
+    system: hf.ActorSystem, method: str, first: int, tmp_path: Path
+) -> None:
+    """The home of an actor without recovery has forgotten the turn by then."""
+    for run in (1, 2):
+        (tmp_path / f"work{run}").touch()
+    recovery = hf.hybrid() if method == "hybrid" else None
+    ref = await system.start(hf.child("alice", hf.start(Runner), mechanism=hf.TR(), recovery=recovery))
+    await ref.ask(Begin(str(tmp_path)))
+    for run in (first, 3 - first):
+        (tmp_path / f"work{run}").unlink()
+        async with asyncio.timeout(30):
+            while not (tmp_path / f"done{run}").exists():
+                await asyncio.sleep(0.002)
+        for _ in range(KEPT_TURNS + 50):
+            await ref.ask(Add(1))
+    assert (await ref.ask(Tags())).count(BROUGHT) == 1
 
 
 async def test_what_was_said_to_be_lost_does_not_come(system: hf.ActorSystem, tmp_path: Path) -> None:

@@ -85,6 +85,21 @@ class Mortal(Host):
         return len(self.tags)
 
 
+class Rude(hf.Message[int]):
+    """A guest at whom the host raises when it is let in."""
+
+
+class Touchy(Host):
+    """Raises at rude guests."""
+
+    @hf.on(Rude)
+    def let_in(self, message: Rude) -> int:
+        if not self.is_open:
+            self.ctx.stash()
+            return 0
+        raise ValueError("rude")
+
+
 class Welcome(hf.Message[bool]):
     """Answered with whether it has opened the house for all."""
 
@@ -220,6 +235,24 @@ async def test_who_dies_of_what_was_put_back_leaves_it_in_no_batch_and_its_heir_
     await ref.ask(Open("asks"), timeout=IN_TIME)
     assert await guest == 0
     assert (tmp_path / "killed").exists()
+
+
+@pytest.mark.parametrize("method", ["without recovery", "hybrid"])
+@pytest.mark.parametrize("mechanism", [name for name in MECHANISMS if name != "none"])
+async def test_what_was_put_back_and_raises_fails_once_and_all_behind_it_is_handled(
+    system: hf.ActorSystem, mechanism: str, method: str
+) -> None:
+    other = await system.start(hf.child("other", hf.start(Counter)))
+    recovery = hf.hybrid(interval=0.05) if method == "hybrid" else None
+    spec = hf.child("host", hf.start(Touchy), mechanism=MECHANISMS[mechanism](), recovery=recovery)
+    ref = await system.start(spec)
+    guests = (Meet(1, "asks"), Rude(), Meet(2, "asks"), Rude())
+    asks = [asyncio.ensure_future(ref.ask(one, timeout=60.0)) for one in guests]
+    await ref.ask(Open("asks"), timeout=60.0)
+    assert await ref.ask(Meet(3, "asks"), timeout=60.0) == 3
+    first, rude, second, last = await asyncio.gather(*asks, return_exceptions=True)
+    assert (first, second, await other.ask(Tags())) == (1, 2, [1, 2, 3])
+    assert type(rude) is type(last) is hf.RemoteCrash
 
 
 async def test_what_an_alternate_has_put_back_is_in_no_batch_and_is_handled(system: hf.ActorSystem) -> None:

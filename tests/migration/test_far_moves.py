@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import itertools
 import os
 import random
@@ -457,6 +458,7 @@ class Slow(hf.Actor):
 
     async def on_stop(self, reason: hf.ExitReason) -> None:
         while Path(self.file).exists():
+            Path(f"{self.file}.met").touch()
             await asyncio.sleep(0.005)
 
 
@@ -554,3 +556,64 @@ async def test_a_process_does_not_speak_for_an_actor_that_has_left_it(system: hf
         breach = await next_event(events, hf.TrustBreached)
     assert breach.address == "/app/far"
     assert len((await other.ask(Seen(), IN_TIME))["added"]) == 4
+
+
+class Reluctant(Traveller):
+    """Does not begin while there is a file."""
+
+    def __init__(self, file: str = "") -> None:
+        super().__init__()
+        self.file = file
+
+    async def on_start(self, restored: bool) -> None:
+        while Path(self.file).exists():
+            Path(f"{self.file}.met").touch()
+            await asyncio.sleep(0.005)
+
+
+@pytest.mark.parametrize("way", list(WAYS))
+@pytest.mark.parametrize("kind", list(KINDS))
+async def test_the_time_limit_holds_for_the_process_that_it_is_lent(
+    system: hf.ActorSystem, kind: str, way: str, tmp_path: Path
+) -> None:
+    """What does not begin there is given up with the transaction, and the life goes on as it was."""
+    old, new = WAYS[way]
+    one = dataclasses.replace(traveller(kind, "task"), start=hf.start(Reluctant, str(tmp_path / "no")))
+    for name in {old, new}:
+        place: Any = "task" if name == "near" else "process"
+        await system.start(hf.supervisor(name, children=[one] if name == old else [], isolation=place))
+    ref = system.ref(f"/app/{old}/one", Reluctant)
+    assert await ref.ask(Add(1), timeout=IN_TIME) == 1
+    (tmp_path / "no").touch()
+    with pytest.raises(hf.TransactionFailed, match=r"not within 0\.5 s") as failed:
+        async with asyncio.timeout(IN_TIME), system.transaction(timeout=0.5) as change:
+            change.move(ref, f"/app/{new}")
+    assert failed.value.kept == ()
+    assert (await ref.ask(Add(1), timeout=5.0), ref.path) == (2, f"/app/{old}/one")
+
+
+@pytest.mark.parametrize("kind", ["plain", "checkpoint_only"])  # Another one rests for the transaction, in its turn.
+@pytest.mark.parametrize("new", ["near", "other"])
+async def test_who_is_on_its_way_to_live_elsewhere_is_not_given_away_meanwhile(
+    system: hf.ActorSystem, new: str, kind: str, tmp_path: Path
+) -> None:
+    """Its old supervisor's process would speak of an actor that has left it, and be ended for that."""
+    one = dataclasses.replace(traveller(kind, "process"), start=hf.start(Reluctant, str(tmp_path / "no")))
+    for name in {"far", new}:
+        place: Any = "task" if name == "near" else "process"
+        await system.start(hf.supervisor(name, children=[one] if name == "far" else [], isolation=place))
+    ref, far = system.ref("/app/far/one", Reluctant), pid_of(system, "far")
+    assert await ref.ask(Add(1), timeout=IN_TIME) == 1
+    (tmp_path / "no").touch()
+    moved = asyncio.ensure_future(system.set_isolation(ref, "task", timeout=IN_TIME))
+    async with asyncio.timeout(IN_TIME):
+        while not (tmp_path / "no.met").exists():
+            await asyncio.sleep(0.005)
+    with pytest.raises(hf.TransactionFailed):
+        async with system.transaction(timeout=0.5) as change:
+            change.move(ref, f"/app/{new}")
+    (tmp_path / "no").unlink()
+    await moved
+    assert (await ref.ask(Add(1), timeout=IN_TIME), system.pid_of(ref)) == (2, far)
+    await move(system, ref, new)
+    assert (await ref.ask(Add(1), timeout=IN_TIME), pid_of(system, "far")) == (3, far)

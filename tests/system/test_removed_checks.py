@@ -30,6 +30,20 @@ CHECKS = {
         KEPT,
         "test_a_root_that_is_killed and finish",
     ),
+    "the process that a child is lent is given up with the transaction": Check(
+        "system/transaction/handing.py",
+        "            await self._lodging.give_up(system)\n",
+        "            pass\n",
+        FAR,
+        "test_the_time_limit_holds and plain and near",
+    ),
+    "nobody is given away on its way to live elsewhere": Check(
+        "system/transaction/handing.py",
+        "        if system._moves.is_moving(cell):",
+        "        if False:",
+        FAR,
+        "test_who_is_on_its_way and plain",
+    ),
     "a mechanism on trial is not in it": Check(
         "system/specification.py",
         "self._packed(_with_mechanisms(address, spec, before))",
