@@ -7,6 +7,7 @@ to our state, or the state is given out (`transfer`).
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import deque
 from collections.abc import Awaitable, Coroutine
 from typing import TYPE_CHECKING, Any
@@ -104,8 +105,7 @@ class RequestProtocol(Transfer):
         self._marker: int | None = None  # what the last leader gave us to compute is over when this comes back
         self._least = -1  # the turn after which we go on, if those up to it have left nothing here
         self._wanted: int | None = None  # part of Proceed that waits, meanwhile, for home to have all before it
-        self._home_turn = -1  # the last turn that home knew of when we began to lead
-        self._owed: set[int] = set()  # requests whose ends home has not asked for again: what was put back comes later
+        self._told = math.inf  # the last turn that home knows of, until it has been told all that we know
         self._later: list[Any] = []  # what goes home behind that, and of a follower what it would have to say
         self._behind_turn = -1  # the last turn before that
         self._turn = -1  # the last one before the batch that is inside
@@ -139,8 +139,7 @@ class RequestProtocol(Transfer):
 
     def _begin(self, work: Work) -> None:
         known, left = self._split(work)
-        if not self._owed:
-            left = self._standing.server.returned_before(left)
+        left = self._standing.server.returned_before(left)
         goes_in = bool(left) or work.go is not None
         if known or self._later or not goes_in:
             more, self._later = self._later, []
@@ -158,7 +157,6 @@ class RequestProtocol(Transfer):
         """The outcomes that are known, in turn order, and the requests that were never handled."""
         standing, left, known = self._standing, list[Request](), list[TurnEnd]()
         log = standing.log
-        self._owed.difference_update(one.feed.id for one in work.requests)
         for request in work.requests:
             number = request.feed.id
             end = log.find(number)
@@ -171,6 +169,10 @@ class RequestProtocol(Transfer):
                 known.append(TurnEnd(-1, number, DROPPED, [], answer))
             else:
                 left.append(request)
+        if self._told < math.inf:  # It asks in the order of requests. Turns may have had another: some were put aside.
+            asked = {end.id for end in known}
+            known += [end for *_, end in log.entries() if end.turn > self._told and end.id not in asked]
+            self._told = math.inf if self._marker is None else max([self._told, *(end.turn for end in known)])
         known.sort(key=lambda end: end.turn)
         return known, left
 
@@ -230,7 +232,6 @@ class RequestProtocol(Transfer):
         self._behind_turn = max(self._behind_turn, done.behind)
         if done.number == self._marker:
             self._marker = self._wanted = None
-            self._owed = {end.id for *_, end in self._standing.log.entries() if end.turn > self._home_turn}
             if self._standing.server.turn < self._least:
                 self._standing.server.skip_to(self._least)
         elif done.wait:
@@ -338,7 +339,7 @@ class RequestProtocol(Transfer):
         standing.following.ready()
         # What the last leader gave us to compute ends first: only then is it known what is a duplicate.
         self._current = self._marker = marker = marker_of(epoch)
-        self._least, self._home_turn = order.turn, order.known
+        self._least, self._told = order.turn, order.known
         if not standing.leads:
             self._later = [one for one in self._later if is_still_due(one, order.known)]
             if server.life is None and server.turn >= 0:  # What has led to our state has begun its work elsewhere.

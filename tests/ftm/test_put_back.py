@@ -21,7 +21,7 @@ pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
 
 SEED = int(os.environ.get("HOLDFAST_SEED", "20261125"))
 OTHER = "/app/other"
-IN_TIME = float(os.environ.get("HF_IN_TIME", "60"))
+IN_TIME = 60.0
 
 
 class Meet(hf.Message[int]):
@@ -231,7 +231,7 @@ async def test_who_dies_of_what_was_put_back_leaves_it_in_no_batch_and_its_heir_
     ref = await system.start(spec)
     if mechanism != "tr":
         await two_again(ref)
-    guest = asyncio.ensure_future(ref.ask(Fatal(str(tmp_path / "killed")), timeout=IN_TIME))
+    guest = asyncio.ensure_future(ref.ask(Fatal(str(tmp_path / "killed")), timeout=25.0))
     await ref.ask(Open("asks"), timeout=IN_TIME)
     assert await guest == 0
     assert (tmp_path / "killed").exists()
@@ -263,6 +263,25 @@ async def test_what_an_alternate_has_put_back_is_in_no_batch_and_is_handled(syst
     assert await ref.ask(Welcome(), timeout=IN_TIME)
     assert await asyncio.gather(*guests) == [1, 2, 3]
     assert await other.ask(Tags()) == [1, 2, 3]
+
+
+@pytest.mark.parametrize("spins", range(0, 60, 6))
+async def test_whoever_leads_dies_as_soon_as_it_has_handled_what_home_has_not_heard_of(
+    system: hf.ActorSystem, spins: int
+) -> None:
+    """The follower has handled all of it. Home asks again in the order in which it was sent, one after the other."""
+    spec = hf.child("host", hf.start(Host), mechanism=hf.LFR(), recovery=hf.hybrid(interval=0.05))
+    ref = await system.start(spec)
+    await two_again(ref)
+    messages = [Meet(1, "says"), Meet(2, "says"), Open("says"), Close(), Meet(3, "says"), Open("says")]
+    asks = [asyncio.ensure_future(ref.ask(one, timeout=25.0)) for one in messages]
+    for _ in range(spins):
+        await asyncio.sleep(0)
+    primary = group_of(ref).membership.primary
+    assert primary is not None
+    os.kill(pid_of(system, ref, primary), signal.SIGKILL)
+    assert await asyncio.gather(*asks) == [1, 2, None, None, 3, None]
+    assert await ref.ask(Tags(), timeout=IN_TIME) == [1, 2, 3]
 
 
 @pytest.mark.parametrize("mechanism", ["pbr", "lfr", "tr"])

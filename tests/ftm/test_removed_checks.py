@@ -471,27 +471,6 @@ CHECKS = {
         PUT_BACK,
         "as_without_a_mechanism and tr-without",
     ),
-    "whoever leads next handles what is put back when home has what was before": Check(
-        "ftm/bricks/request_protocol.py",
-        "            left = self._standing.server.returned_before(left)\n",
-        "            pass\n",
-        PUT_BACK,
-        "leaves_it_in_no_batch",
-    ),
-    "what two runs of a turn have begun in the background comes once": Check(
-        "ftm/bricks/background_work.py",
-        "        return is_out or",
-        "        return True or",
-        "tests/ftm/test_background_order.py",
-        "two_runs_of_a_turn and without",
-    ),
-    "what was put back and has failed is not handled again": Check(
-        "ftm/replica/replica_life.py",
-        "        life.returned.pop(end.id, None)",
-        "        pass",
-        PUT_BACK,
-        "raises_fails_once and pbr-without",
-    ),
     "what was put back, and is in no batch, is handled": Check(
         "ftm/bricks/bricks.py",
         "            if is_last and brings and not",
