@@ -75,12 +75,13 @@ class Mortal(Host):
     """Dies of its first fatal guest."""
 
     @hf.on(Fatal)
-    def meet_once(self, message: Fatal) -> int:
+    async def meet_once(self, message: Fatal) -> int:
         if not self.is_open:
             self.ctx.stash()
             return 0
         if not Path(message.note).exists():
             Path(message.note).touch()
+            await asyncio.sleep(0.3)  # Its heir has the state meanwhile, or has not: both must do.
             os.kill(os.getpid(), signal.SIGKILL)
         return len(self.tags)
 
@@ -193,12 +194,13 @@ async def test_what_is_put_back_is_handled_as_without_a_mechanism(
     assert sorted(await other.ask(Tags())) == sorted(2 * numbers(messages))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, "101", "103", "110"])
 @pytest.mark.parametrize("mechanism", ["pbr", "lfr", "tmr", "tr+pbr"])
 async def test_whoever_leads_dies_while_what_was_put_back_is_handled(
-    system: hf.ActorSystem, mechanism: str, seed: int
+    system: hf.ActorSystem, mechanism: str, seed: int | str
 ) -> None:
-    rng = random.Random(f"{SEED} killed {seed}")
+    """Those that are texts have shown faults, at some instants."""
+    rng = random.Random(f"{seed} killed" if isinstance(seed, str) else f"{SEED} killed {seed}")
     messages = script(rng, 60)
     print(f"HOLDFAST_SEED={SEED}, script {seed}")
     other = await system.start(hf.child("other", hf.start(Counter)))

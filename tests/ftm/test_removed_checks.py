@@ -471,6 +471,13 @@ CHECKS = {
         PUT_BACK,
         "as_without_a_mechanism and tr-without",
     ),
+    "whoever leads next handles what is put back": Check(
+        "ftm/bricks/request_protocol.py",
+        "        left = self._standing.server.returned_before(left)\n",
+        "",
+        PUT_BACK,
+        "leaves_it_in_no_batch and pbr",
+    ),
     "what was put back, and is in no batch, is handled": Check(
         "ftm/bricks/bricks.py",
         "            if is_last and brings and not",
