@@ -135,7 +135,8 @@ class Driver:
         """A new epoch, with this one as the primary."""
         self.epoch += 1
         self.primary = name
-        return await self.protocol(name).ask(Lead(self.epoch, self.config))
+        known = max((end.turn for end in self.order), default=-1)
+        return await self.protocol(name).ask(Lead(self.epoch, self.config, known=known))
 
     async def join(self, name: str) -> int:
         await self.protocol(name).ask(Follow(self.epoch, self.config))
