@@ -623,12 +623,6 @@ class Server(lifecycle.HerePlace):
             pending.extend(Request("", 0, feed) for feed in feeds)
             pending.extend(behind)
 
-    def returned_before(self, requests: list[Request]) -> list[Request]:
-        """These requests behind what was put back."""
-        pending = deque(requests)
-        self.returned_first(pending)
-        return list(pending)
-
     def has_taken(self, request: Request) -> bool:
         """Whether the life has a request without an end: its stash has it, or it is the tick of a cancelled timer."""
         life, number = self.life, request.feed.id

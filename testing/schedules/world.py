@@ -250,7 +250,7 @@ def _given(real: Callable[..., Any], count: int, made: Callable[[], object]) -> 
 def _now(
     wall: Callable[[], float], kind: type[datetime.datetime], tz: datetime.tzinfo | None = None
 ) -> datetime.datetime:
-    """In place of `datetime.now`."""
+    """In place of `datetime.now`: what virtual time shows in the zone `tz`."""
     return kind.fromtimestamp(wall(), tz)
 
 

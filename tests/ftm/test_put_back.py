@@ -224,18 +224,22 @@ async def test_whoever_leads_dies_while_what_was_put_back_is_handled(
     assert sorted(await other.ask(Tags())) == sorted(2 * numbers(messages))
 
 
+@pytest.mark.parametrize("others", [0, 1], ids=["alone", "behind one that asks"])
 @pytest.mark.parametrize("mechanism", ["pbr", "lfr", "tr"])
 async def test_who_dies_of_what_was_put_back_leaves_it_in_no_batch_and_its_heir_handles_it(
-    system: hf.ActorSystem, mechanism: str, tmp_path: Path
+    system: hf.ActorSystem, mechanism: str, others: int, tmp_path: Path
 ) -> None:
     """Home knows that it was put aside, and the heir's state that it was put back."""
+    await system.start(hf.child("other", hf.start(Counter)))
     spec = hf.child("host", hf.start(Mortal), mechanism=MECHANISMS[mechanism](), recovery=hf.hybrid(interval=0.05))
     ref = await system.start(spec)
     if mechanism != "tr":
         await two_again(ref)
+    before = [asyncio.ensure_future(ref.ask(Meet(1, "asks"), timeout=25.0)) for _ in range(others)]
     guest = asyncio.ensure_future(ref.ask(Fatal(str(tmp_path / "killed")), timeout=25.0))
     await ref.ask(Open("asks"), timeout=IN_TIME)
-    assert await guest == 0
+    assert await guest == others
+    assert await asyncio.gather(*before) == [1] * others
     assert (tmp_path / "killed").exists()
 
 
@@ -257,14 +261,18 @@ async def test_what_was_put_back_and_raises_fails_once_and_all_behind_it_is_hand
     assert type(rude) is type(last) is hf.RemoteCrash
 
 
-async def test_what_an_alternate_has_put_back_is_in_no_batch_and_is_handled(system: hf.ActorSystem) -> None:
+@pytest.mark.parametrize("more", [0, 8], ids=["nothing comes", "more comes"])
+async def test_what_an_alternate_has_put_back_is_in_no_batch_and_is_handled(system: hf.ActorSystem, more: int) -> None:
+    """Also if home sends more while the first of them waits for whom it has asked."""
     other = await system.start(hf.child("other", hf.start(Counter)))
     blocks = hf.RB(alternates=(Attentive,), test=(is_not_false,))
     ref = await system.start(hf.child("host", hf.start(Forgetful), mechanism=blocks))
-    guests = [asyncio.ensure_future(ref.ask(Meet(tag, "asks"), timeout=IN_TIME)) for tag in (1, 2, 3)]
-    assert await ref.ask(Welcome(), timeout=IN_TIME)
-    assert await asyncio.gather(*guests) == [1, 2, 3]
-    assert await other.ask(Tags()) == [1, 2, 3]
+    guests = [asyncio.ensure_future(ref.ask(Meet(tag, "asks"), timeout=25.0)) for tag in range(1, 9)]
+    assert await ref.ask(Welcome(), timeout=25.0)
+    guests += [asyncio.ensure_future(ref.ask(Meet(tag, "asks"), timeout=25.0)) for tag in range(9, 9 + more)]
+    assert await asyncio.gather(*guests) == [*range(1, 9 + more)]
+    assert await other.ask(Tags()) == [*range(1, 9 + more)]
+    assert await ref.ask(Tags(), timeout=25.0) == [*range(1, 9 + more)]
 
 
 @pytest.mark.parametrize("spins", range(0, 60, 6))
