@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable
 
-from ...checkpoint.protocol import STASHED, TurnEnd
+from ...checkpoint.protocol import STASHED, Feed, TurnEnd
 from .brick_messages import Logged
 
 CAPACITY = 4096
@@ -53,10 +53,13 @@ class ReplyLog:
             self._floor = min(evicted)
             evicted.discard(self._floor)
 
-    def find(self, number: int) -> TurnEnd | None:
-        """The outcome of a request, if it is there."""
-        entry = self._entries.get(number)
-        return None if entry is None else entry[3]
+    def find(self, feed: Feed) -> TurnEnd | None:
+        """The outcome of a request, if it is there; that of an earlier turn is none of one that is replayed.
+
+        What was put aside in one turn, and handled in another, is replayed for both.
+        """
+        entry = self._entries.get(feed.id)
+        return None if entry is None or entry[3].turn < feed.turn else entry[3]
 
     def was_evicted(self, number: int) -> bool:
         """Whether a request was handled so long ago that its outcome is not kept."""

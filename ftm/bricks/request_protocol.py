@@ -163,7 +163,7 @@ class RequestProtocol(Transfer):
         log = standing.log
         for request in work.requests:
             number = request.feed.id
-            end = log.find(number)
+            end = log.find(request.feed)
             if end is not None:
                 log.duplicates += 1
                 known.append(end)

@@ -7,7 +7,7 @@ import itertools
 from typing import TYPE_CHECKING, Any, Literal
 
 from ...actors.errors import HoldfastError
-from ...checkpoint.protocol import TurnEnd
+from ...checkpoint.protocol import Feed, TurnEnd
 from .brick_messages import FORWARDED, ConfigMismatch, Logged, Request, StaleLeader
 from .reply_log import ReplyLog
 from .state_comparison import Looking
@@ -205,6 +205,11 @@ class Standing:
         if config is not None and config != self.config:
             self.refused += 1
             raise ConfigMismatch(self.path, self.config, config)
+
+    def is_inside(self, feed: Feed) -> bool:
+        """Whether a request is being handled; one that is replayed for two turns is another one for each."""
+        request = self.inside.get(feed.id)
+        return request is not None and request.feed.turn == feed.turn
 
     def entries(self, ends: list[TurnEnd]) -> list[Logged]:
         """Outcomes as the reply log has them."""

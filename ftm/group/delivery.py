@@ -7,6 +7,7 @@ more, and has not ended since, counts as inside.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import deque
 from collections.abc import Callable, Container
 from typing import TYPE_CHECKING, Literal
@@ -33,6 +34,7 @@ class Delivery:
         inward: what goes past the bricks.
         finished: parts whose outcomes somebody waits to be at home.
         fed: what the home has fed and not heard the end of, by number, in that order.
+        earlier: what it has fed again for a later turn, by number: what was put aside is replayed for both turns.
         careful: inputs in whose company a replica has died: each is sent alone.
         inside: inputs that a replica had that does not lead any more, not ended since.
         out: the batch that is out.
@@ -52,6 +54,7 @@ class Delivery:
     inward: list[Outcome | SnapshotNow] = dataclasses.field(default_factory=list)
     finished: list[PartEnded] = dataclasses.field(default_factory=list)
     fed: dict[int, Feed] = dataclasses.field(default_factory=dict)
+    earlier: dict[int, list[Feed]] = dataclasses.field(default_factory=dict)
     careful: set[int] = dataclasses.field(default_factory=set)
     inside: set[int] = dataclasses.field(default_factory=set)
     out: Work | None = None
@@ -85,6 +88,9 @@ class Delivery:
         """Take what the home has for its life; False if it is only for lives that are no group."""
         match record:
             case Feed():
+                before = self.fed.pop(record.id, None)
+                if before is not None:
+                    self.earlier.setdefault(record.id, []).append(before)
                 self.fed[record.id] = record
                 self.waiting.append(record)
             case Go():
@@ -94,6 +100,11 @@ class Delivery:
             case _:
                 return False
         return True
+
+    def come_up(self) -> None:
+        """The life has caught up: what is fed from now on is new."""
+        self.is_live = True
+        self.earlier.clear()
 
     def next_inward(self) -> list[Outcome | SnapshotNow]:
         """Take what goes past the bricks; a snapshot is asked for when the home knows all that a replica does."""
@@ -121,7 +132,7 @@ class Delivery:
                 self.waiting.popleft()
                 break
             is_alone = first.id in self.careful
-            if is_alone and batch:
+            if batch and (is_alone or (first.id in self.earlier and any(one.id == first.id for one in batch))):
                 break
             self.waiting.popleft()
             if self.is_live and first.id not in open_inputs:  # The home has dropped it meanwhile.
@@ -164,6 +175,9 @@ class Delivery:
             self.careful = {one.feed.id for one in out.requests if one.feed.id in self.fed}
         left = [feed for feed in self.fed.values() if not self.is_live or feed.id in open_inputs]
         self.fed = {feed.id: feed for feed in left}
+        if not self.is_live:
+            left += [feed for key, feeds in self.earlier.items() if key in self.fed for feed in feeds]
+            left.sort(key=lambda feed: feed.turn if feed.turn >= 0 else math.inf)
         unsent = {one.id for one in self.waiting if isinstance(one, Feed)} - self.inside
         self.inside = self.fed.keys() - unsent
         left.sort(key=lambda feed: feed.id != begun)

@@ -216,7 +216,7 @@ class Group:
         if not self._take_beside(self.switch.turn if delivery.is_live else None):
             return
         if done.live is not None and not delivery.is_live:
-            delivery.is_live = True
+            delivery.come_up()
             self.owner.life_is_up(self, done.live)
         had_inside = bool(delivery.inside)
         if done.is_last and (out := delivery.end_batch(done.number)) is not None:

@@ -144,8 +144,8 @@ class Handling(Before):
         left = [
             one
             for one in work.requests
-            if one.feed.id not in standing.inside
-            and (log.find(one.feed.id) is None or standing.server.is_returned(one.feed.id))
+            if not standing.is_inside(one.feed)
+            and (log.find(one.feed) is None or standing.server.is_returned(one.feed.id))
         ]
         standing.inside.update((one.feed.id, one) for one in left)
         if message.looks:
