@@ -224,6 +224,38 @@ async def test_whoever_leads_dies_while_what_was_put_back_is_handled(
     assert sorted(await other.ask(Tags())) == sorted(2 * numbers(messages))
 
 
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("mechanism", MECHANISMS)
+async def test_all_that_have_the_state_die_and_what_was_put_back_is_replayed_for_both_of_its_turns(
+    system: hf.ActorSystem, mechanism: str, seed: int
+) -> None:
+    """No snapshot stands behind any of it."""
+    rng = random.Random(f"{SEED} replay {seed}")
+    print(f"HOLDFAST_SEED={SEED}, script {seed}")
+    messages = script(rng, 30)
+    other = await system.start(hf.child("other", hf.start(Counter)))
+    want = await expected(system, messages)
+    spec = hf.child(
+        "host",
+        hf.start(Host),
+        mechanism=MECHANISMS[mechanism](),
+        isolation="process",
+        recovery=hf.hybrid(interval=3600.0),
+    )
+    ref = await system.start(spec)
+    middle = rng.randrange(10, 30)
+    replies = list[asyncio.Future[Any]]()
+    for part in (messages[:middle], messages[middle:]):
+        replies += [asyncio.ensure_future(ref.ask(one, timeout=IN_TIME)) for one in part]
+        await ref.ask(Tags(), timeout=IN_TIME)
+        for path, pid in system._workers.processes().items():
+            if path == ref.path or path.startswith(f"{ref.path}/"):
+                os.kill(pid, signal.SIGKILL)
+    assert await ref.ask(Tags(), timeout=IN_TIME) == want[1]
+    assert await asyncio.gather(*replies) == want[0]
+    assert sorted(await other.ask(Tags())) == sorted(2 * numbers(messages))
+
+
 @pytest.mark.parametrize("others", [0, 1], ids=["alone", "behind one that asks"])
 @pytest.mark.parametrize("mechanism", ["pbr", "lfr", "tr"])
 async def test_who_dies_of_what_was_put_back_leaves_it_in_no_batch_and_its_heir_handles_it(
