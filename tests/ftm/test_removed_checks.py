@@ -112,6 +112,13 @@ CHECKS = {
         PBR,
         "test_a_duplicate_is_answered",
     ),
+    "what was put back and has failed is not put back again": Check(
+        "ftm/bricks/runs.py",
+        " if feed.id not in numbers]  # Else",
+        "]  # Else",
+        PUT_BACK,
+        "no_block_handles and hangs",
+    ),
     "what was put aside in one turn is replayed for the turn in which it was handled": Check(
         "ftm/bricks/reply_log.py",
         " or entry[3].turn < turn ",
