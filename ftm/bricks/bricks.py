@@ -266,20 +266,12 @@ class Proceed(Brick):
             self._task = context.run(self.ctx.create_task, self._run())
 
     async def _run(self) -> None:
-        server = self._standing.server
         try:
             while True:
                 if self._works:
                     self._work_now = self._works.popleft()
                     await self._batch(self._work_now)
-                elif server.reports.more or server.reports.is_snapshot_wanted:
-                    more = server.take_more()
-                    if not more:
-                        break  # A snapshot that has to wait.
-                    behind, config = server.last_ended, self._standing.config
-                    done = Done(self.epoch, config, self._number, [], False, None, more, behind=behind)
-                    await self._pass(done)
-                else:
+                elif not await self._hand_more():
                     break
         finally:
             self._task = self._work_now = None
@@ -297,11 +289,12 @@ class Proceed(Brick):
         brings = bool(pending) or go is not None  # Else home may not have what was handled before.
         if pending and not state.is_over:
             await server.ensure()
-            server.returned_first(pending)
+            pending = server.returned_first(pending)
         while True:
             ends = await server.run_part(pending)
             live = None
-            if go is not None and (not pending or state.is_over):
+            goes = go is not None and not ends and (not pending or state.is_over)  # All that was replayed is decided.
+            if go is not None and goes:
                 is_live = server.life is not None and server.life.is_live
                 live = Live(0.0) if is_live else await server.go(go)
             ends = await server.seal_part(ends, pending)
@@ -309,14 +302,15 @@ class Proceed(Brick):
                 live = None
             if live is not None:
                 go = None
-            if brings and not server.part.is_given_up:
-                server.returned_first(pending)
-            is_last = not pending or state.is_over
-            waits = not is_last and self.leads and server.runs_alone(pending[0])
+            follow = server.returned_first(pending) if brings and not server.part.is_given_up else pending
+            is_last = state.is_over or not (follow or (go is not None and not goes))
+            waits = not is_last and self.leads and bool(follow) and server.runs_alone(follow[0])
             await self._hand(ends, is_last=is_last, live=live, wait=waits)
-            if is_last and brings and not server.part.is_given_up:
-                server.returned_first(pending)  # An alternate that is taken instead may have put back something.
-            if is_last and not pending:
+            left, server.left = server.left, []
+            if brings and not server.part.is_given_up:  # What was taken instead may have put back something.
+                pending.extendleft(reversed(left))
+                pending = server.returned_first(pending)
+            if is_last and (not pending or state.is_over):
                 return
 
     async def hand_over_before(self, ends: list[TurnEnd], wait: bool) -> None:
@@ -327,11 +321,6 @@ class Proceed(Brick):
         server, standing = self._standing.server, self._standing
         server.state.handed = part = server.state.handed + 1
         more, behind = server.take_more(), server.last_ended
-        while len(more) > 1 and any(isinstance(one, Snapshot) and len(one.data) > 1_000_000 for one in more):
-            first, more = more[:1], more[1:]
-            head = Done(standing.epoch, standing.config, self._number, ends, False, None, first, behind=behind)
-            await self._pass(head)
-            ends = []
         done = Done(standing.epoch, standing.config, self._number, ends, is_last, live, more, part, wait, behind)
         if wait:
             self._at_home = standing.node.loop.create_future()
@@ -339,6 +328,22 @@ class Proceed(Brick):
         if self._at_home is not None:
             await self._at_home
             self._at_home = None
+        await self._hand_more()
+
+    async def _hand_more(self) -> bool:
+        """Hand over what stands behind what was handled. Now a snapshot can be taken: the state is decided on."""
+        server, standing = self._standing.server, self._standing
+        if not server.reports.more and not server.reports.is_snapshot_wanted:
+            return False
+        server.take_wanted_snapshot()
+        more, behind = server.take_more(), server.last_ended
+        if not more:
+            return False  # A snapshot that has to wait.
+        while more:
+            count = 1 if any(isinstance(one, Snapshot) and len(one.data) > 1_000_000 for one in more) else len(more)
+            part, more = more[:count], more[count:]
+            await self._pass(Done(standing.epoch, standing.config, self._number, [], False, None, part, behind=behind))
+        return True
 
     async def _pass(self, done: Done) -> None:
         while True:

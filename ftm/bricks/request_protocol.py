@@ -141,9 +141,7 @@ class RequestProtocol(Transfer):
         has_taken_over = self._told < math.inf
         known, left = self._split(work)
         if has_taken_over:  # Home knows of all that came before: what was put back, and is in no batch, comes now.
-            pending = deque(left)
-            self._standing.server.returned_first(pending)
-            left = list(pending)
+            left = list(self._standing.server.returned_first(deque(left)))
         goes_in = bool(left) or work.go is not None
         if known or self._later or not goes_in:
             more, self._later = self._later, []

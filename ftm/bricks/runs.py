@@ -309,7 +309,7 @@ class Deciding(After):
         before = msgspec.structs.replace(before, live=server.life.is_live)
         dropped = {end.id for end in done.ends if end.status == DROPPED}
         inputs = self._standing.server.traces.inputs
-        asked = [inputs.get(one.feed.id, one) for one in asked]
+        asked = [as_it_came(inputs.get(one.feed.id), one) for one in asked]
         requests = [one if one.feed.id in dropped else without_deadline(one) for one in asked]
         first = self._last_run(before, done.ends)
         server.traces.objections = {}
@@ -317,7 +317,12 @@ class Deciding(After):
         if found is first:
             return done
         ends = await self._take(before, requests, found, first)
-        return msgspec.structs.replace(done, ends=ends)
+        known = {end.id for end in ends}
+        if server.state.is_over:
+            return msgspec.structs.replace(done, ends=ends)
+        server.left += [one for one in asked if one.feed.id not in known]  # What was put back before them comes first.
+        goes_on = server.left or server.has_returned  # Home must not take the batch to be over.
+        return msgspec.structs.replace(done, ends=ends, is_last=done.is_last and not goes_on)
 
     def _last_run(self, before: ServerState, ends: list[TurnEnd]) -> Run:
         server = self._standing.server
@@ -350,6 +355,8 @@ class Deciding(After):
                 else:
                     failed, state = self._failed(state, [TurnEnd(0, one.feed.id, FAILED, [], Answer())], run)
                     ends += failed
+                if state.returned and state.live:
+                    break
         if server.points.point is not state or server.life is None:
             await server.adopt(state)
         return ends
@@ -379,6 +386,11 @@ class Deciding(After):
     def heard(self, before: ServerState) -> list[Outcome]:
         """What the actor's asks have come to since a state."""
         return [one for one in self._standing.server.traces.heard.values() if one.turn > before.turn]
+
+
+def as_it_came(came: Request | None, request: Request) -> Request:
+    """A request as it came in; one that was put back since is another, without the turn that it was replayed for."""
+    return came if came is not None and came.feed.turn == request.feed.turn else request
 
 
 def without_deadline(request: Request) -> Request:

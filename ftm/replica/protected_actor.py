@@ -129,6 +129,7 @@ class Server(lifecycle.HerePlace):
         self.state, self.points = ReplicaState(), RewindPoints()
         self.part, self.attempts = BatchPart(deque()), Attempts()
         self.traces, self.reports = Traces(), Reports()
+        self.left: list[Request] = []  # have no end: what was taken in place of their run has put something before them
         self.hooks: list[TurnHook] = []  # see each end while the actor is as the turn has left it; the innermost first
         self.shadows: set[Server] = set()  # more lives of it, which only compute
         self._driver: Driver | None = None  # None: nothing goes home
@@ -609,19 +610,23 @@ class Server(lifecycle.HerePlace):
             return [fed.feed for fed in life.returned.values()] if life.is_live else []
         return point.returned if point is not None and point.live else []
 
+    @property
+    def has_returned(self) -> bool:
+        """Whether something was put aside, is put back, and has not been handled since."""
+        return bool(self._returned())
+
     def is_returned(self, number: int) -> bool:
         """Whether a request was put aside, is put back, and has not been handled since."""
         return any(feed.id == number for feed in self._returned())
 
-    def returned_first(self, pending: deque[Request]) -> None:
-        """Have what was put aside and is put back handled before anything else, each once."""
+    def returned_first(self, pending: deque[Request]) -> deque[Request]:
+        """What was put aside and is put back is handled before anything else, each once."""
         feeds = [] if self.state.is_over else self._returned()
-        if feeds:
-            numbers = {feed.id for feed in feeds}
-            behind = [one for one in pending if one.feed.id not in numbers]
-            pending.clear()
-            pending.extend(Request("", 0, feed) for feed in feeds)
-            pending.extend(behind)
+        if not feeds:
+            return pending
+        numbers = {feed.id for feed in feeds}
+        first = [Request("", 0, feed) for feed in feeds]
+        return deque([*first, *(one for one in pending if one.feed.id not in numbers)])
 
     def has_taken(self, request: Request) -> bool:
         """Whether the life has a request without an end: its stash has it, or it is the tick of a cancelled timer."""
@@ -775,6 +780,8 @@ class Server(lifecycle.HerePlace):
             new = await self.run_part(pending)
             self.points.keep_tail(self.part.begun, new)
             ends += new
+            if self.has_returned:
+                break  # That is to be handled first.
         return ends
 
     # -- as the port home -------------------------------------------------------------------------------------------
@@ -831,14 +838,16 @@ class Server(lifecycle.HerePlace):
 
     def take_more(self) -> list[Beside]:
         """What goes home behind the ends that are handed over now."""
-        reports = self.reports
-        if reports.is_snapshot_wanted:
-            self._take_snapshot()
-        more, reports.more = reports.more, []
+        more, self.reports.more = self.reports.more, []
         return more
 
+    def take_wanted_snapshot(self) -> None:
+        """Save the state for home, if it wants that; only when it is decided that this is the state."""
+        if self.reports.is_snapshot_wanted:
+            self._take_snapshot()
+
     def want_snapshot(self) -> None:
-        """A snapshot goes home with the next part, or at once."""
+        """A snapshot goes home behind the part in hand, or at once."""
         if self._driver is not None:
             self.reports.is_snapshot_wanted = True
             self._driver.go_on()
