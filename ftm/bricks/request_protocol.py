@@ -138,10 +138,9 @@ class RequestProtocol(Transfer):
                     one.set_result(None)
 
     def _begin(self, work: Work) -> None:
-        has_taken_over = self._told < math.inf
         known, left = self._split(work)
-        if has_taken_over:  # Home knows of all that came before: what was put back, and is in no batch, comes now.
-            left = list(self._standing.server.returned_first(deque(left)))
+        # What a leader before us has put back, and is in no batch, comes now: home knows of all that came before.
+        left = list(self._standing.server.returned_first(deque(left)))
         goes_in = bool(left) or work.go is not None
         if known or self._later or not goes_in:
             more, self._later = self._later, []

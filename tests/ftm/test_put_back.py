@@ -353,6 +353,24 @@ async def test_a_life_that_takes_back_in_its_start_handles_it_without_being_aske
     assert await other.ask(Tags()) == [1, 2, 3]
 
 
+@pytest.mark.parametrize("mechanism", [name for name in MECHANISMS if name != "none"])
+async def test_who_comes_when_the_house_has_just_opened_waits_for_those_who_were_put_back(
+    system: hf.ActorSystem, mechanism: str
+) -> None:
+    """The message that opens it has been answered before they are handled."""
+    other = await system.start(hf.child("other", hf.start(Counter)))
+    ref = await system.start(hf.child("host", hf.start(Host), mechanism=MECHANISMS[mechanism]()))
+    want = list[int]()
+    for first in range(0, 100, 10):
+        await ref.ask(Close(), timeout=IN_TIME)
+        guests = [asyncio.ensure_future(ref.ask(Meet(first + more, "asks"), timeout=IN_TIME)) for more in range(4)]
+        await ref.ask(Open("asks"), timeout=IN_TIME)
+        guests += [asyncio.ensure_future(ref.ask(Meet(first + more, "asks"), timeout=IN_TIME)) for more in range(4, 6)]
+        assert await asyncio.gather(*guests) == [*range(len(want) + 1, len(want) + 7)]
+        want += range(first, first + 6)
+    assert await ref.ask(Tags(), timeout=IN_TIME) == await other.ask(Tags()) == want
+
+
 class Second(Host): ...
 
 

@@ -143,7 +143,8 @@ CHECKS = {
     "home gets snapshots of states that were decided on": Check(
         "ftm/bricks/bricks.py",
         "        more, behind = server.take_more(), server.last_ended\n        done =",
-        "        server.take_wanted_snapshot()\n        more, behind = server.take_more(), server.last_ended\n        done =",
+        "        server.take_wanted_snapshot()\n"
+        "        more, behind = server.take_more(), server.last_ended\n        done =",
         PUT_BACK,
         "by_blocks_and_votes_is_replayed",
     ),
@@ -518,14 +519,14 @@ CHECKS = {
         "        if life is self.life and life.feed is not None and not self.state.is_quiet:\n",
         "        if False:\n",
         PUT_BACK,
-        "as_without_a_mechanism and pbr-without",
+        "as_without_a_mechanism and without",
     ),
     "what is put back comes before all else": Check(
         "ftm/bricks/bricks.py",
         "            follow = server.returned_first(pending) if brings and not server.part.is_given_up else pending\n",
         "            follow = pending\n",
         PUT_BACK,
-        "as_without_a_mechanism and pbr-without",
+        "has_just_opened",
     ),
     "what is put back is part of the state until its turn begins": Check(
         "checkpoint/life/recorded_life.py",
@@ -536,17 +537,10 @@ CHECKS = {
     ),
     "whoever leads next handles what is put back": Check(
         "ftm/bricks/request_protocol.py",
-        "            left = list(self._standing.server.returned_first(deque(left)))\n",
-        "            pass\n",
+        "        left = list(self._standing.server.returned_first(deque(left)))\n",
+        "",
         PUT_BACK,
         "leaves_it_in_no_batch and pbr and alone",
-    ),
-    "what is put back while one leads is handled by what runs it, and by no later batch": Check(
-        "ftm/bricks/request_protocol.py",
-        "        has_taken_over = self._told < math.inf\n",
-        "        has_taken_over = True\n",
-        PUT_BACK,
-        "an_alternate_has_put_back",
     ),
     "what was put back, and is in no batch, is handled": Check(
         "ftm/bricks/bricks.py",
