@@ -301,7 +301,9 @@ class Proceed(Brick):
         while True:
             ends = await server.run_part(pending)
             live = None
-            if go is not None and (not pending or state.is_over):
+            # What was handled before is decided as it was: `on_recovered` and what follows from it are no part of that.
+            is_replay = go is not None and not pending and bool(ends) and not state.is_over
+            if go is not None and not is_replay and (not pending or state.is_over):
                 is_live = server.life is not None and server.life.is_live
                 live = Live(0.0) if is_live else await server.go(go)
             ends = await server.seal_part(ends, pending)
@@ -311,8 +313,8 @@ class Proceed(Brick):
                 go = None
             if brings and not server.part.is_given_up:
                 server.returned_first(pending)
-            is_last = not pending or state.is_over
-            waits = not is_last and self.leads and server.runs_alone(pending[0])
+            is_last = (not pending and not is_replay) or state.is_over
+            waits = bool(pending) and not is_last and self.leads and server.runs_alone(pending[0])
             await self._hand(ends, is_last=is_last, live=live, wait=waits)
             if is_last and brings and not server.part.is_given_up:
                 server.returned_first(pending)  # An alternate that is taken instead may have put back something.

@@ -220,7 +220,7 @@ class Shadow(Server):
             return
         await self.drop_life()
         self.install(before)
-        await self.ensure()
+        await self.ensure_as_given()
 
     def _place(self) -> None:
         """The address at which it lives: below the replica's."""

@@ -229,6 +229,17 @@ class Server(lifecycle.HerePlace):
             if self.life is None and not self.state.is_over:
                 await self._begin()
 
+    async def ensure_as_given(self) -> None:
+        """See to it that there is a life; one that begins stands where the point says, for that is where another one is.
+
+        Its hooks are called, as at each life, but what they do to the state is no part of what the other one has done.
+        """
+        is_new = self.life is None
+        await self.ensure()
+        point = self.points.point
+        if is_new and self.life is not None and point is not None and self.state.has_access and not is_blank(point):
+            self.rewind(point)
+
     async def _begin(self) -> None:
         """Begin a life where the point is, and handle again what was handed over since."""
         await self._begin_at_point()

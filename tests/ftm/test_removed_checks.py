@@ -28,6 +28,27 @@ CHECKS = {
         PBR,
         "test_lower_epochs",
     ),
+    "what was replayed is decided before `on_recovered` is called": Check(
+        "ftm/bricks/bricks.py",
+        "            is_replay = go is not None and",
+        "            is_replay = False and go is not None and",
+        "tests/ftm/test_hooks.py",
+        "test_a_hook_that_changes_the_state",
+    ),
+    "a shadow begins where the other life was, whatever its hooks do": Check(
+        "ftm/bricks/runs.py",
+        "        await self.ensure_as_given()\n",
+        "        await self.ensure()\n",
+        "tests/ftm/test_hooks.py",
+        "test_a_hook_that_changes_the_state",
+    ),
+    "a follower begins where the leader is, whatever its hooks do": Check(
+        "ftm/bricks/state_transfer.py",
+        "                await server.ensure_as_given()\n",
+        "                await server.ensure()\n",
+        "tests/ftm/test_hooks.py",
+        "test_a_hook_that_changes_the_state",
+    ),
     "another stack of mechanisms is refused": Check(
         "ftm/bricks/standing.py",
         "        if config is not None and config != self.config:\n",
