@@ -19,7 +19,7 @@ from holdfast.ftm.group.group import KEPT_TURNS, Group
 from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
-from tests.ftm.accounts import Add, Counter, Tags
+from tests.ftm.accounts import Add, Boom, Counter, Tags
 from tests.ftm.test_failover import SEED, group_of, pid_of, two_again
 
 BROUGHT = 1_000
@@ -235,6 +235,24 @@ async def test_what_two_runs_of_a_turn_have_begun_comes_once_however_late_the_se
         for _ in range(KEPT_TURNS + 50):
             await ref.ask(Add(1))
     assert (await ref.ask(Tags())).count(BROUGHT) == 1
+
+
+async def test_what_came_before_the_snapshot_does_not_come_again_behind_a_turn_that_failed(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    """A replica of LFR that goes back behind a failed turn handles again what it has handled, and begins its work."""
+    ref = await system.start(hf.child("alice", hf.start(Worker), mechanism=LFR(), recovery=hf.hybrid(interval=3600.0)))
+    await two_again(ref)
+    for count in (1, 2):
+        await ref.ask(Begin(str(tmp_path)), timeout=25.0)
+        async with asyncio.timeout(25):
+            while len(await ref.ask(Tags())) < count:
+                await asyncio.sleep(0.002)
+        await system.checkpoint(ref)
+        with pytest.raises(hf.RemoteCrash):
+            await ref.ask(Boom(), timeout=25.0)
+    assert await ref.ask(Add(0), timeout=25.0) == 3
+    assert await ref.ask(Tags()) == [BROUGHT, BROUGHT, 0]
 
 
 async def test_what_was_said_to_be_lost_does_not_come(system: hf.ActorSystem, tmp_path: Path) -> None:
