@@ -140,6 +140,7 @@ class GroupPlace(Place):
                 raise
             raise failed from error
         home.clock = None
+        self._starting = None  # It is up: what was put off because it was not is not put off again.
         if self._stop_wanted is not None:
             self.stop(cell, self._stop_wanted)
 

@@ -165,8 +165,8 @@ CHECKS = {
     ),
     "background work of turns that the snapshot contains has its result": Check(
         "checkpoint/home/input_ledger.py",
-        "        if turn <= self.state_turn:\n            return False\n",
-        "",
+        "        if turn <= self.state_turn:\n            return False\n        done =",
+        "        done =",
         "tests/ftm/test_background_order.py",
         "test_what_came_before_the_snapshot",
     ),

@@ -202,3 +202,52 @@ async def test_a_hook_that_changes_the_state_is_no_difference_and_counts_once_fo
         assert (await system.get_status(ref)).life == 2
         told = hf.Masked, hf.Diverged, StatesDiffer
         assert [event for event in events.take() if isinstance(event, told)] == []
+
+
+class Slow(hf.Actor):
+    """Says that it comes back, and does so when nothing named `gate` is there."""
+
+    def __init__(self, folder: str) -> None:
+        self.folder, self.count = folder, 0
+
+    @hf.on(Count)
+    def add(self, message: Count) -> int:
+        self.count += 1
+        return self.count
+
+    async def on_recovered(self) -> None:
+        Path(self.folder, "here").touch()
+        while Path(self.folder, "gate").exists():
+            await asyncio.sleep(0.002)
+
+    def on_stop(self, reason: hf.ExitReason) -> None:
+        Path(self.folder, "stopped").write_text(str(reason))
+
+
+@pytest.mark.parametrize("mechanism", [hf.TR(), hf.PBR(), hf.LFR()], ids=["tr", "pbr", "lfr"])
+async def test_who_is_told_to_stop_while_it_is_recovered_stops_when_it_is_back(
+    mechanism: hf.Mechanism, tmp_path: Path
+) -> None:
+    """In good order, and at once: nobody waits until its time is over and it is killed."""
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        start = hf.start(Slow, str(tmp_path))
+        ref = await system.start(
+            hf.child("it", start, recovery=hf.hybrid(interval=3600.0), mechanism=mechanism, shutdown="infinity")
+        )
+        assert await ref.ask(Count(), timeout=25.0) == 1
+        await two_again(ref)
+        (tmp_path / "here").unlink(missing_ok=True)  # A follower was here, if there is one.
+        (tmp_path / "gate").touch()
+        ref.kill()
+        await until((tmp_path / "here").exists)
+        stopping = asyncio.ensure_future(system.stop(ref))
+        place: Any = ref._cell.host.place
+        await until(lambda: place._stop_wanted is not None)
+        (tmp_path / "gate").unlink()
+        try:
+            async with asyncio.timeout(20.0):
+                await asyncio.shield(stopping)
+        finally:
+            ref.kill()  # It must not keep the system from ending.
+            await stopping
+    assert (tmp_path / "stopped").read_text() == str(hf.SHUTDOWN)

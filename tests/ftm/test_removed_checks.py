@@ -49,6 +49,13 @@ CHECKS = {
         "tests/ftm/test_hooks.py",
         "test_a_hook_that_changes_the_state",
     ),
+    "a stop that came while the life was begun is carried out": Check(
+        "ftm/group/group_place.py",
+        "        self._starting = None  # It is up",
+        "        # It is up",
+        "tests/ftm/test_hooks.py",
+        "test_who_is_told_to_stop_while",
+    ),
     "another stack of mechanisms is refused": Check(
         "ftm/bricks/standing.py",
         "        if config is not None and config != self.config:\n",
