@@ -322,6 +322,11 @@ class Server(lifecycle.HerePlace):
         if life is not None and life.pipes and self.standing.leads:
             self.state.is_work_lost = True
 
+    @property
+    def _has_work(self) -> bool:
+        """Whether background work of a turn is out."""
+        return self.life is not None and self.life.pipes > 0
+
     async def until_work_is_back(self) -> None:
         """Wait until no background work is out: it is part of no state."""
         while self.life is not None and self.life.pipes:
@@ -476,7 +481,7 @@ class Server(lifecycle.HerePlace):
 
     def runs_alone(self, request: Request) -> bool:
         """Whether a request has to stand at the front: it may want something released before its end."""
-        return runs_alone(self.state, request.feed, leads=self.standing.leads)
+        return runs_alone(self.state, request.feed, leads=self.standing.leads, has_work=self._has_work)
 
     async def run_part(self, pending: deque[Request]) -> list[TurnEnd]:
         """Run requests until enough are done; returns their ends. What has not been run is left in `pending`."""
@@ -487,7 +492,7 @@ class Server(lifecycle.HerePlace):
             if self.life is None:  # It was dropped again: another state is put here.
                 part.give_up()
                 break
-            chunk = next_requests(state, part, attempts, leads=self.standing.leads)
+            chunk = next_requests(state, part, attempts, leads=self.standing.leads, has_work=self._has_work)
             if not chunk:
                 break  # It runs alone, when home has all that comes before it.
             part.begun += chunk

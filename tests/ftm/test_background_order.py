@@ -65,6 +65,16 @@ class Worker(Counter):
         return self.total
 
 
+class Call(hf.Message[int]):
+    """Ask the other one in the middle of a turn."""
+
+
+class Asking(Worker):
+    @hf.on(Call)
+    async def call(self, message: Call) -> int:
+        return await self.ctx.find("/app/other", Counter).ask(Add(0), timeout=25.0)
+
+
 class Runner(Counter):
     """Each run of its turn begins work that lasts as long as a file of its own is there."""
 
@@ -253,6 +263,28 @@ async def test_what_came_before_the_snapshot_does_not_come_again_behind_a_turn_t
             await ref.ask(Boom(), timeout=25.0)
     assert await ref.ask(Add(0), timeout=25.0) == 3
     assert await ref.ask(Tags()) == [BROUGHT, BROUGHT, 0]
+
+
+@pytest.mark.parametrize("recovery", [hf.hybrid(interval=3600.0), None], ids=["recorded", "plain"])
+@pytest.mark.parametrize("mechanism", [PBR(), hf.TR(), hf.TMR()], ids=["pbr", "tr", "tmr"])
+async def test_work_goes_on_while_turns_of_a_batch_ask_for_the_first_time(
+    system: hf.ActorSystem, mechanism: Any, recovery: hf.Method | None, tmp_path: Path
+) -> None:
+    """Nobody has died, and no turn has failed: it is not lost, and the life is not begun again for it."""
+    (tmp_path / "work").touch()
+    await system.start(hf.child("other", hf.start(Counter)))
+    ref = await system.start(hf.child("alice", hf.start(Asking), mechanism=mechanism, recovery=recovery))
+    events = system.events()
+    await ref.ask(Begin(str(tmp_path)), timeout=25.0)
+    asks = [ref.ask(one, timeout=25.0) for one in (Add(1), Call(), Add(2), Call())]
+    assert await asyncio.gather(*asks) == [1, 1, 2, 2]
+    (tmp_path / "work").unlink()
+    async with asyncio.timeout(25):
+        while len(await ref.ask(Tags())) < 3:
+            await asyncio.sleep(0.002)
+    assert await ref.ask(Tags()) == [1, 2, BROUGHT]
+    assert (await system.get_status(ref)).life == 1
+    assert [event for event in events.take() if isinstance(event, hf.BackgroundWorkLost)] == []
 
 
 async def test_what_was_said_to_be_lost_does_not_come(system: hf.ActorSystem, tmp_path: Path) -> None:

@@ -56,6 +56,13 @@ CHECKS = {
         "tests/ftm/test_hooks.py",
         "test_who_is_told_to_stop_while",
     ),
+    "who may wait stands alone while background work is out": Check(
+        "ftm/replica/replica_state.py",
+        "    return may_wait and (has_work or not state.has_access)\n",
+        "    return may_wait and not state.has_access\n",
+        "tests/ftm/test_background_order.py",
+        "test_work_goes_on_while_turns_of_a_batch_ask",
+    ),
     "another stack of mechanisms is refused": Check(
         "ftm/bricks/standing.py",
         "        if config is not None and config != self.config:\n",
