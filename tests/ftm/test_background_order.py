@@ -75,6 +75,26 @@ class Asking(Worker):
         return await self.ctx.find("/app/other", Counter).ask(Add(0), timeout=25.0)
 
 
+class Leave(hf.Message[int]):
+    """Ask the other one, and do not wait for the answer: it comes as a message."""
+
+
+class Leaving(Counter):
+    @hf.on(Leave)
+    def leave(self, message: Leave) -> int:
+        asked = self.ctx.find("/app/other", Counter).ask(Add(0), timeout=25.0)
+        self.ctx.pipe_to_self(asked, lambda _: Add(BROUGHT))
+        return self.total
+
+
+class LeavingSecond(Leaving):
+    """Another version of it."""
+
+
+class LeavingThird(Leaving):
+    """One more."""
+
+
 class Runner(Counter):
     """Each run of its turn begins work that lasts as long as a file of its own is there."""
 
@@ -285,6 +305,23 @@ async def test_work_goes_on_while_turns_of_a_batch_ask_for_the_first_time(
     assert await ref.ask(Tags()) == [1, 2, BROUGHT]
     assert (await system.get_status(ref)).life == 1
     assert [event for event in events.take() if isinstance(event, hf.BackgroundWorkLost)] == []
+
+
+@pytest.mark.parametrize("name", ["nvp", "tmr"])
+async def test_a_turn_that_does_not_wait_for_what_it_asks_comes_to_the_same_in_each_run(
+    system: hf.ActorSystem, name: str
+) -> None:
+    mechanism = hf.TMR() if name == "tmr" else hf.NVP(versions=(LeavingSecond, LeavingThird))
+    await system.start(hf.child("other", hf.start(Counter)))
+    events = system.events()
+    ref = await system.start(hf.child("alice", hf.start(Leaving), mechanism=mechanism))
+    for count in (1, 2):
+        await ref.ask(Leave(), timeout=25.0)
+        async with asyncio.timeout(25):
+            while await ref.ask(Tags()) != count * [BROUGHT]:
+                await asyncio.sleep(0.002)
+    assert await system.ref("/app/other", Counter).ask(Tags()) == [0, 0]
+    assert [event for event in events.take() if isinstance(event, (hf.ReplicaLost, hf.Masked))] == []
 
 
 async def test_what_was_said_to_be_lost_does_not_come(system: hf.ActorSystem, tmp_path: Path) -> None:

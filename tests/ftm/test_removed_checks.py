@@ -63,6 +63,13 @@ CHECKS = {
         "tests/ftm/test_background_order.py",
         "test_work_goes_on_while_turns_of_a_batch_ask",
     ),
+    "a run is given up only if its turn waits for what is not known": Check(
+        "ftm/bricks/runs.py",
+        "            life.cell.node.loop.call_soon(self._look, life, life.feed)\n",
+        "            self._look(life, life.feed)\n",
+        "tests/ftm/test_background_order.py",
+        "test_a_turn_that_does_not_wait",
+    ),
     "another stack of mechanisms is refused": Check(
         "ftm/bricks/standing.py",
         "        if config is not None and config != self.config:\n",
