@@ -230,7 +230,7 @@ class Server(lifecycle.HerePlace):
                 await self._begin()
 
     async def ensure_as_given(self) -> None:
-        """See to it that there is a life; one that begins stands where the point says, for that is where another one is.
+        """See to it that there is a life; one that begins stands where the point says, where another one is.
 
         Its hooks are called, as at each life, but what they do to the state is no part of what the other one has done.
         """

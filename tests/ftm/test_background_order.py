@@ -81,7 +81,7 @@ class Leave(hf.Message[int]):
 
 class Leaving(Counter):
     @hf.on(Leave)
-    def leave(self, message: Leave) -> int:
+    def ask_and_go_on(self, message: Leave) -> int:
         asked = self.ctx.find("/app/other", Counter).ask(Add(0), timeout=25.0)
         self.ctx.pipe_to_self(asked, lambda _: Add(BROUGHT))
         return self.total

@@ -149,7 +149,7 @@ CHECKS = {
     ),
     "T5: duplicates are answered from the reply log": Check(
         "ftm/bricks/request_protocol.py",
-        "            end = log.find(number)\n",
+        "            end = log.find(one.feed)\n",
         "            end = None\n",
         PBR,
         "test_a_duplicate_is_answered",
