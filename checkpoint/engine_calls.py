@@ -121,9 +121,13 @@ class Called:
         """Read blocks of a large snapshot back."""
         return self._call(self._engine.read_blocks, self._key(address), number, places)
 
-    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
+    def packs(self, address: str) -> set[int]:
+        """Ask the engine which packs it keeps for an address."""
+        return self._call(self._engine.packs, self._key(address))
+
+    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
         """Have the engine remove packs that nothing needs."""
-        self._write(self._engine.forget_blocks, self._key(address), needed)
+        self._write(self._engine.forget_blocks, self._key(address), numbers)
 
     def addresses(self) -> list[str]:
         """The addresses of which something is stored."""

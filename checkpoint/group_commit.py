@@ -302,9 +302,13 @@ class Commits:
         """Blocks of a pack; see `Journal`."""
         return self.engine.read_blocks(address, number, places)
 
-    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
-        """Remove the packs that are not needed; see `Journal`."""
-        self.engine.forget_blocks(address, needed)
+    def packs(self, address: str) -> set[int]:
+        """Return the packs of an address; see `Journal`."""
+        return self.engine.packs(address)
+
+    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
+        """Remove packs that are not needed; see `Journal`."""
+        self.engine.forget_blocks(address, numbers)
 
     def addresses(self) -> list[str]:
         """Every address that has something stored, sorted."""

@@ -187,8 +187,12 @@ class Journal(Protocol):
         """
         ...
 
-    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
-        """Remove all packs of the address but those that kept snapshots need."""
+    def packs(self, address: str) -> set[int]:
+        """Return the numbers of the packs that are kept for the address."""
+        ...
+
+    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
+        """Remove these packs of the address, which no kept snapshot needs; unknown ones are ignored."""
         ...
 
     def addresses(self) -> list[str]:
@@ -298,7 +302,11 @@ class MemoryJournal:
         """Refuse: nothing is stored in memory."""
         raise DamagedStore("memory", address, None, "nothing is stored in memory")
 
-    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
+    def packs(self, address: str) -> set[int]:
+        """Return nothing: the process keeps nothing beyond itself."""
+        return set()
+
+    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
         """Do nothing: the process keeps nothing beyond itself."""
 
     def erase(self, address: str) -> None:

@@ -45,8 +45,8 @@ def check_system(journal: Journal, system: str) -> None:
 
 
 PARTS = (
-    "append", "sync", "cut", "load", "erase", "keep_blocks", "read_blocks", "forget_blocks", "addresses",
-    "note", "noted", "notes", "close", "durable", "epoch",
+    "append", "sync", "cut", "load", "erase", "keep_blocks", "read_blocks", "packs", "forget_blocks",
+    "addresses", "note", "noted", "notes", "close", "durable", "epoch",
 )  # fmt: skip
 """What an engine has."""
 

@@ -118,7 +118,8 @@ class StoreConformance:
         journal.cut(a, b"state", positions[:1], turn=1)
         journal.keep_blocks(a, 7, [(0, memoryview(b"block"))], False)
         refused(lambda: journal.read_blocks(a, 7, [(0, 5)]), "read_blocks of what keeps nothing", DamagedStore)
-        journal.forget_blocks(a, [])
+        assert journal.packs(a) == set()
+        journal.forget_blocks(a, [7])
         assert journal.load(a) == Saved(None, 0, [])
         assert journal.addresses() == []
         for key, value in (("child b", b"1"), ("child a", b""), ("other", b"3"), ("child b", b"4"), ("other", None)):

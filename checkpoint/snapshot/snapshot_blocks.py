@@ -32,6 +32,7 @@ class SnapshotImages:
         self._home = home
         self._segments: dict[int, Segment] = {}
         self._history: list[set[int]] = []  # segments of the snapshots that are kept, newest first
+        self._packs: set[int] = set()  # what the store may have
         self._marked: Meta | None = None
         self._saving: asyncio.Task[None] | None = None
 
@@ -91,25 +92,31 @@ class SnapshotImages:
         try:
             if own:
                 blocks = [(offset, segment.block(offset, length)) for _, offset, length in own]
+                self._packs.add(shared.number)
                 await asyncio.to_thread(journal.keep_blocks, home.path, shared.number, blocks, home.method.compress)
             if self._saving is not me:
+                await asyncio.to_thread(journal.forget_blocks, home.path, [shared.number])
                 return
             self._saving = None
-            self._finish(meta, record, shared)
-            needed = {number for number, _, _ in meta.blocks}.union(meta.earlier)
-            await asyncio.to_thread(journal.forget_blocks, home.path, needed)
+            if not self._finish(meta, record, shared):
+                return  # The one before it stands, and needs its packs.
+            # By number: the next snapshot may be on its way before the thread has come to that.
+            unneeded = self._packs.difference(meta.earlier, [number for number, _, _ in meta.blocks])
+            await asyncio.to_thread(journal.forget_blocks, home.path, unneeded)
+            self._packs -= unneeded
         except Exception as error:  # Whatever it was: the next snapshot must be possible.
             if self._saving is me:
                 self._saving = None
                 self.refuse(shared, str(error))
 
-    def _finish(self, meta: Meta, record: Snapshot, shared: Shared) -> None:
+    def _finish(self, meta: Meta, record: Snapshot, shared: Shared) -> bool:
+        """Whether it is kept now."""
         home = self._home
         try:
             keep(home, meta)
         except HoldfastError as error:
             self.refuse(shared, str(error))
-            return
+            return False
         size = sum(length for _, _, length in meta.blocks)
         is_full = home.journal.durable and sum(one.size for one in self._segments.values()) > MOST_GARBAGE * size
         if home.life.port is not None:
@@ -119,6 +126,7 @@ class SnapshotImages:
         if home.node.events.has_listeners:
             written = sum(length for number, _, length in meta.blocks if number == shared.number)
             home.node.emit(SnapshotTaken(home.path, record.turn, size, record.pause, written))
+        return True
 
     def refuse(self, shared: Shared, why: str) -> None:
         """It could not be kept: what was there before is still there."""
@@ -186,7 +194,9 @@ class SnapshotImages:
     def loaded(self, meta: Meta) -> None:
         """The store was read: these are the packs it needs."""
         self._history = [set(by_segment(meta.blocks)), set(meta.earlier)]
-        self._home.journal.forget_blocks(self._home.path, self._history[0] | self._history[1])
+        journal, path = self._home.journal, self._home.path
+        self._packs = self._history[0] | self._history[1]
+        journal.forget_blocks(path, journal.packs(path) - self._packs)
 
     def close(self) -> None:
         """The home is given up."""

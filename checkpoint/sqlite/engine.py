@@ -302,7 +302,7 @@ class SqliteJournal:
         with self._store.lock:
             self._store.refresh()
             if address not in self._store.contents.chains:
-                self.forget_blocks(address, ())  # of a snapshot that was never cut
+                self.forget_blocks(address, self.packs(address))  # of a snapshot that was never cut
                 return
             with self._store.transaction(note=True) as db:
                 # From here on it is gone; if we die before the rest is done, the next opening does it.
@@ -325,9 +325,13 @@ class SqliteJournal:
         """Read blocks of a pack, and verify them; see `Journal`."""
         return self._packs.read(address, number, places)
 
-    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
+    def packs(self, address: str) -> set[int]:
+        """Return the packs of an address; see `Journal`."""
+        return self._packs.names(address)
+
+    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
         """Remove packs that no kept snapshot needs; see `Journal`."""
-        unneeded = self._packs.names(address).difference(needed)
+        unneeded = self._packs.names(address).intersection(numbers)
         if not unneeded:
             return
         with self._store.transaction():

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable
 
-from ...checkpoint.protocol import STASHED, Feed, TurnEnd
+from ...checkpoint.protocol import STASHED, TurnEnd
 from .brick_messages import Logged
 
 CAPACITY = 4096
@@ -53,13 +53,13 @@ class ReplyLog:
             self._floor = min(evicted)
             evicted.discard(self._floor)
 
-    def find(self, feed: Feed) -> TurnEnd | None:
-        """The outcome of a request, if it is there; that of an earlier turn is none of one that is replayed.
+    def find(self, number: int, turn: int = -1) -> TurnEnd | None:
+        """The outcome of a request, if it is there; `turn` is the one that it is replayed for.
 
-        What was put aside in one turn, and handled in another, is replayed for both.
+        What was put aside in one turn, and handled in another, is replayed for both: an earlier outcome is not its own.
         """
-        entry = self._entries.get(feed.id)
-        return None if entry is None or entry[3].turn < feed.turn else entry[3]
+        entry = self._entries.get(number)
+        return None if entry is None or entry[3].turn < turn else entry[3]
 
     def was_evicted(self, number: int) -> bool:
         """Whether a request was handled so long ago that its outcome is not kept."""

@@ -163,7 +163,7 @@ class RequestProtocol(Transfer):
         log = standing.log
         for request in work.requests:
             number = request.feed.id
-            end = log.find(request.feed)
+            end = log.find(number, request.feed.turn)
             if end is not None:
                 log.duplicates += 1
                 known.append(end)

@@ -372,7 +372,8 @@ class Deciding(After):
             TurnEnd(turn, number, FAILED, [], answer if self._is_ask(state, number) else Answer())
             for turn, number in enumerate(numbers, state.turn + 1)
         ]
-        return failed, msgspec.structs.replace(state, turn=state.turn + len(failed))
+        left = [feed for feed in state.returned if feed.id not in numbers]  # Else they would be handled once more.
+        return failed, msgspec.structs.replace(state, turn=state.turn + len(failed), returned=left)
 
     def _is_ask(self, state: ServerState, number: int) -> bool:
         request = self._standing.inside.get(number)

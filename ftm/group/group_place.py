@@ -140,9 +140,8 @@ class GroupPlace(Place):
                 raise
             raise failed from error
         home.clock = None
-        self._starting = None  # It is up: what was put off because it was not is not put off again.
         if self._stop_wanted is not None:
-            self.stop(cell, self._stop_wanted)
+            self._begin_to_finish(cell, group, self._stop_wanted)
 
     async def build(self, cell: Cell, switch: Switch) -> Group:
         """Start the parts and the replicas.
@@ -446,7 +445,10 @@ class GroupPlace(Place):
             return
         if group is None or not group.delivery.is_live or (self._starting is not None and not self._starting.done()):
             self._stop_wanted = reason
-            return
+        else:
+            self._begin_to_finish(cell, group, reason)
+
+    def _begin_to_finish(self, cell: Cell, group: Group, reason: ExitReason) -> None:
         group.delivery.is_stopping = True
         context = cell.node.base_context.copy()  # Not in the name of whoever happens to tell us.
         self._ending = lifecycle.outside_turn(cell, self._finish(cell, group, reason), "stop", context)

@@ -145,7 +145,7 @@ class Handling(Before):
             one
             for one in work.requests
             if not standing.is_inside(one.feed)
-            and (log.find(one.feed) is None or standing.server.is_returned(one.feed.id))
+            and (log.find(one.feed.id, one.feed.turn) is None or standing.server.is_returned(one.feed.id))
         ]
         standing.inside.update((one.feed.id, one) for one in left)
         if message.looks:

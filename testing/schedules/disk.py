@@ -88,15 +88,16 @@ class Contents:
         """Forget an address."""
         self.entries.pop(address, None)
         self.snapshots.pop(address, None)
-        self.forget_blocks(address, ())
+        self.blocks = {key: pack for key, pack in self.blocks.items() if key[0] != address}
 
     def keep_blocks(self, address: str, number: int, blocks: dict[tuple[int, int], bytes]) -> None:
         """Add a pack of blocks."""
         self.blocks[address, number] = blocks
 
-    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
-        """Forget the packs of an address but those that are needed."""
-        self.blocks = {key: pack for key, pack in self.blocks.items() if key[0] != address or key[1] in needed}
+    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
+        """Forget packs of an address."""
+        for number in numbers:
+            self.blocks.pop((address, number), None)
 
     def note(self, key: str, value: bytes | None) -> None:
         """Set or forget a note."""
@@ -278,10 +279,14 @@ class SimulatedJournal:
             raise DamagedStore(PATH, address, None, f"pack {number} has no block at {missing[0]}")
         return Segment.of(number, [(place[0], pack[place]) for place in places])
 
-    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
+    def packs(self, address: str) -> set[int]:
+        """See `Journal`."""
+        return {number for owner, number in self._contents.blocks if owner == address}
+
+    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
         """See `Journal`."""
         self._check()
-        self.disk.write("forget_blocks", address, frozenset(needed))
+        self.disk.write("forget_blocks", address, frozenset(numbers))
 
     def addresses(self) -> list[str]:
         """See `Journal`."""

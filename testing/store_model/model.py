@@ -120,10 +120,10 @@ class StoreModel:
         self.place(address).packs[number] = pack
         self.gone.pop((address, number), None)
 
-    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
-        """Forget the packs of an address but these."""
+    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
+        """Forget these packs of an address."""
         place = self.places.get(address, AddressModel())
-        for number in [number for number in place.packs if number not in needed]:
+        for number in place.packs.keys() & set(numbers):
             self.gone[address, number] = place.packs.pop(number)
         self._tidy(address)
 
@@ -208,6 +208,8 @@ class StoreModel:
 
     def _check_packs(self, journal: Journal) -> None:
         for address, place in self.places.items():
+            unsettled = {number for owner, number in self.unsettled if owner == address}
+            expect(journal.packs(address) - unsettled, set(place.packs), f"packs({address!r:.80})")
             for number, pack in place.packs.items():
                 check_pack(journal, address, number, pack)
         for (address, number), pack in self.gone.items():

@@ -136,8 +136,8 @@ class SequenceRun:
                 address,
                 lambda journal, model: keep_blocks(journal, model, address, number, blocks),
             )
-        needed = [number for number in place.packs if draw.random() < 0.5] if place else []
-        return replace(make_forget(address, needed), what=f"forget_blocks {address} but {[f'{n:x}' for n in needed]}")
+        numbers = [number for number in place.packs if draw.random() < 0.5] if place else []
+        return replace(make_forget(address, numbers), what=f"forget_blocks {address} {[f'{n:x}' for n in numbers]}")
 
     def _drawn_append(self, draw: random.Random, address: str) -> Write:
         size = draw.choice([0, 1, 1, 1, 2, 5, 20])

@@ -65,10 +65,10 @@ def erase(journal: Journal, model: StoreModel, address: str) -> None:
     model.erase(address)
 
 
-def forget_blocks(journal: Journal, model: StoreModel, address: str, needed: Collection[int]) -> None:
+def forget_blocks(journal: Journal, model: StoreModel, address: str, numbers: Collection[int]) -> None:
     """Forget packs in both."""
-    journal.forget_blocks(address, needed)
-    model.forget_blocks(address, needed)
+    journal.forget_blocks(address, numbers)
+    model.forget_blocks(address, numbers)
 
 
 def fill(journal: Journal, model: StoreModel) -> None:
@@ -219,7 +219,7 @@ def all_writes() -> list[Write]:
         Write("note", "note", "", lambda journal, model: note(journal, model, "child b", b"newer")),
         Write("note of None", "note", "", lambda journal, model: note(journal, model, "child a", None)),
         Write("keep_blocks", "keep_blocks", A, lambda journal, model: keep_blocks(journal, model, A, 9, blocks)),
-        make_forget(A, [2]),
+        make_forget(A, [1]),
         Write("sync", "sync", "", lambda journal, model: journal.sync()),
         make_erase(A),
     ]
@@ -234,10 +234,10 @@ def make_erase(address: str) -> Write:
     return Write("erase", "erase", address, do, lambda model: model.erase(address))
 
 
-def make_forget(address: str, needed: Collection[int]) -> Write:
+def make_forget(address: str, numbers: Collection[int]) -> Write:
     """A removal of packs."""
 
     def do(journal: Journal, model: StoreModel) -> None:
-        forget_blocks(journal, model, address, needed)
+        forget_blocks(journal, model, address, numbers)
 
-    return Write("forget_blocks", "forget_blocks", address, do, lambda model: model.forget_blocks(address, needed))
+    return Write("forget_blocks", "forget_blocks", address, do, lambda model: model.forget_blocks(address, numbers))

@@ -172,10 +172,13 @@ class OneFile:
         except KeyError as error:
             raise DamagedStore(str(self.path), address, None, f"there is no block at {error}") from error
 
-    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
+    def packs(self, address: str) -> set[int]:
+        return {number for owner, number in self._contents.blocks if owner == address}
+
+    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
         with self._changing() as contents:
             contents.blocks = {
-                key: pack for key, pack in contents.blocks.items() if key[0] != address or key[1] in needed
+                key: pack for key, pack in contents.blocks.items() if key[0] != address or key[1] not in numbers
             }
 
     def addresses(self) -> list[str]:

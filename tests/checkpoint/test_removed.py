@@ -51,6 +51,13 @@ CHECKS = {
         "tests/checkpoint/sqlite/test_power.py",
         "test_a_power_loss",
     ),
+    "a snapshot that was refused takes no packs with it": Check(
+        "checkpoint/snapshot/snapshot_blocks.py",
+        "            if not self._finish(meta, record, shared):\n                return",
+        "            if not self._finish(meta, record, shared):\n                pass",
+        "tests/checkpoint/test_snapshots_damage.py",
+        "test_a_snapshot_that_could_not_be_kept",
+    ),
     "a row is gone for good before its file is": Check(
         "checkpoint/sqlite/engine.py",
         "        if self._packs.names(address):\n            self._store.sync_rows()\n",

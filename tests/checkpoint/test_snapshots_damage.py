@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import sqlite3
+import threading
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import holdfast as hf
+from holdfast.checkpoint.journal import StoreFailed
+from holdfast.checkpoint.sqlite.engine import SqliteJournal
 from tests.checkpoint.image_player import CELLS, Canvas, Digest, Paint, Spoil
 from tests.checkpoint.strikes import NEVER
 
@@ -129,3 +135,70 @@ async def test_a_compressed_state_comes_back_and_is_smaller(tmp_path: Path) -> N
             ref = await begun(system, CELLS, compress=compress)
             assert await ref.ask(Digest(), timeout=20.0) == before
     assert sizes[True] < sizes[False] / 10
+
+
+async def test_a_removal_that_comes_late_leaves_the_packs_of_the_snapshots_since(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The thread that removes packs may come to it when the next snapshot is kept already."""
+    may_remove, remove = threading.Event(), SqliteJournal.forget_blocks
+
+    def remove_late(self: SqliteJournal, address: str, numbers: Collection[int]) -> None:
+        if threading.current_thread() is not threading.main_thread():
+            assert may_remove.wait(20.0)
+        remove(self, address, numbers)
+
+    monkeypatch.setattr(SqliteJournal, "forget_blocks", remove_late)
+    async with running(tmp_path / "app.db") as system:
+        ref = await begun(system, CELLS)
+        for number in range(4):
+            await ref.ask(Paint(number * 10, 5))
+            await system.checkpoint(ref, timeout=20.0)
+        may_remove.set()
+        await ref.ask(Spoil(True))
+        before = await ref.ask(Digest())
+    async with running(tmp_path / "app.db") as system:
+        assert await (await begun(system, CELLS)).ask(Digest(), timeout=20.0) == before
+
+
+class Sheet(hf.Actor):
+    """All of it changes with each message, so that no snapshot needs a pack of those before it."""
+
+    def __init__(self) -> None:
+        self.grid = np.zeros(CELLS)
+
+    @hf.on(Paint)
+    def paint(self, message: Paint) -> int:
+        self.grid += message.by
+        return int(self.grid.sum()) // CELLS
+
+
+@pytest.mark.parametrize("keep", [1, 2])
+async def test_a_snapshot_that_could_not_be_kept_leaves_the_packs_of_those_before_it(
+    tmp_path: Path, keep: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(self: SqliteJournal, *args: Any, **options: Any) -> None:
+        raise StoreFailed("app.db", "the disk is full; nothing has happened")
+
+    spec, store = hf.child("sheet", hf.start(Sheet), recovery=hf.hybrid(interval=NEVER, keep=keep)), tmp_path / "app.db"
+    async with running(store) as system:
+        ref = await system.start(spec)
+        for _ in range(8):  # Now and then an image is written anew, and refers to no pack before it.
+            await ref.ask(Paint(0, 0))
+            await system.checkpoint(ref, timeout=20.0)
+            await saved()
+            kept = packs(store)
+            with monkeypatch.context() as full:
+                full.setattr(SqliteJournal, "cut", refuse)
+                await ref.ask(Paint(0, 0))
+                with pytest.raises(hf.HoldfastError, match="the disk is full"):
+                    await system.checkpoint(ref, timeout=20.0)
+                await saved()
+            assert set(kept) <= set(packs(store))
+    async with running(store) as system:
+        assert await (await system.start(spec)).ask(Paint(0, 0), timeout=20.0) == 17
+
+
+async def saved() -> None:
+    """Wait until snapshots that are on their way are kept, and what no snapshot needs any more is removed."""
+    await asyncio.gather(*(one for one in asyncio.all_tasks() if one.get_name().startswith("snapshot of ")))

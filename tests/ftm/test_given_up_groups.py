@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,7 +14,7 @@ import holdfast as hf
 from holdfast.actors.kernel.cell import Cell
 from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.pbr import PBR
-from tests.ftm.accounts import Counter
+from tests.ftm.accounts import Add, Counter
 
 lead, dismantle = GroupPlace.lead, GroupPlace.dismantle
 
@@ -60,3 +63,45 @@ async def test_the_end_of_a_system_waits_for_the_end_of_a_group(where: str, monk
     assert order == ["group", "system"]
     await asyncio.wait((start,))
     assert (start.exception() is None) == (where == WHERE[2])
+
+
+class Late(Counter):
+    """Comes up when it may, and says when it has stopped."""
+
+    def __init__(self, folder: str) -> None:
+        super().__init__()
+        self.folder = Path(folder)
+
+    async def on_start(self, restored: bool) -> None:
+        while not (self.folder / "may start").exists():
+            await asyncio.sleep(0.01)
+
+    async def on_stop(self, reason: hf.ExitReason) -> None:
+        (self.folder / "stopped").touch()
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("mechanism", [hf.PBR, hf.LFR, hf.TMR, hf.TR])
+async def test_a_stop_that_comes_while_the_next_life_begins_ends_it_when_it_is_up(
+    system: hf.ActorSystem, mechanism: Any, tmp_path: Path
+) -> None:
+    """In good order, and at once."""
+    (tmp_path / "may start").touch()
+    spec = hf.child("alice", hf.start(Late, str(tmp_path)), mechanism=mechanism(), recovery=hf.hybrid(), shutdown=20.0)
+    ref = await system.start(spec)
+    await ref.ask(Add(1))
+    (tmp_path / "may start").unlink()
+    for path, pid in system._workers.processes().items():
+        if path.startswith(f"{ref.path}/"):
+            os.kill(pid, signal.SIGKILL)
+    place = ref._cell.host.place
+    assert isinstance(place, GroupPlace)
+    async with asyncio.timeout(10):
+        while place._starting is None or place._starting.done():
+            await asyncio.sleep(0.005)
+        ending = asyncio.ensure_future(system.terminate(ref))
+        while place._stop_wanted is None:
+            await asyncio.sleep(0.005)
+        (tmp_path / "may start").touch()
+        await ending
+    assert (tmp_path / "stopped").exists()

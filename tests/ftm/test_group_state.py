@@ -281,8 +281,8 @@ def test_who_has_died_while_it_joined_is_forgotten_before_its_next_life_joins() 
     assert next_step(known, lives, 0.0, HOPELESS).kind == "rest"
 
 
-def feed(number: int) -> Feed:
-    return Feed(number, -1, MESSAGE, "Add", b"", 0.0)
+def feed(number: int, turn: int = -1) -> Feed:
+    return Feed(number, turn, MESSAGE, "Add", b"", 0.0)
 
 
 def work(delivery: Delivery, batch: list[Feed], go: Go | None) -> Work:
@@ -439,6 +439,31 @@ def test_each_input_in_whose_company_a_replica_has_died_goes_alone() -> None:
     while delivery.waiting:
         batches.append([one.id for one in sent(delivery, numbers)[0]])
     assert batches == [[4], [0], [1], [2], [3]]
+
+
+@pytest.mark.parametrize("ended", range(5))
+def test_what_is_replayed_for_two_turns_is_in_no_batch_twice_and_comes_again_in_the_order_of_turns(ended: int) -> None:
+    """It was put aside in one turn and handled in another; who leads may die at each of them."""
+    delivery, history = Delivery(), [(0, 1), (1, 2), (2, 3), (0, 4), (1, 5)]
+    for number, turn in history:
+        delivery.put(feed(number, turn))
+    left, done = list(history), 0
+    while left:
+        batch = sent(delivery, {})[0]
+        assert [(one.id, one.turn) for one in batch] == left[: len(batch)]
+        assert len({one.id for one in batch}) == len(batch)
+        delivery.out = work(delivery, batch, None)
+        for one in batch:
+            done += 1
+            left.pop(0)
+            if (one.id, one.turn) not in history[:2]:  # These were put aside.
+                delivery.fed.pop(one.id, None)
+            if done == ended:
+                delivery.send_again((), -1)
+                left = [(number, turn) for number, turn in history if number in delivery.fed]
+                break
+        else:
+            assert delivery.end_batch(delivery.number) is not None
 
 
 def sent(delivery: Delivery, open_inputs: dict[int, None]) -> tuple[list[Feed], Go | None]:

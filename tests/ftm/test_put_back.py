@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.ftm.alarms import Objected
+from holdfast.ftm.mechanisms.rb import NotAccepted
 from tests.ftm.accounts import Add, Counter, Tags
 from tests.ftm.test_failover import group_of, is_complete, pid_of, two_again
 
@@ -224,6 +226,38 @@ async def test_whoever_leads_dies_while_what_was_put_back_is_handled(
     assert sorted(await other.ask(Tags())) == sorted(2 * numbers(messages))
 
 
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("mechanism", MECHANISMS)
+async def test_all_that_have_the_state_die_and_what_was_put_back_is_replayed_for_both_of_its_turns(
+    system: hf.ActorSystem, mechanism: str, seed: int
+) -> None:
+    """No snapshot stands behind any of it."""
+    rng = random.Random(f"{SEED} replay {seed}")
+    print(f"HOLDFAST_SEED={SEED}, script {seed}")
+    messages = script(rng, 30)
+    other = await system.start(hf.child("other", hf.start(Counter)))
+    want = await expected(system, messages)
+    spec = hf.child(
+        "host",
+        hf.start(Host),
+        mechanism=MECHANISMS[mechanism](),
+        isolation="process",
+        recovery=hf.hybrid(interval=3600.0),
+    )
+    ref = await system.start(spec)
+    middle = rng.randrange(10, 30)
+    replies = list[asyncio.Future[Any]]()
+    for part in (messages[:middle], messages[middle:]):
+        replies += [asyncio.ensure_future(ref.ask(one, timeout=IN_TIME)) for one in part]
+        await ref.ask(Tags(), timeout=IN_TIME)
+        for path, pid in system._workers.processes().items():
+            if path == ref.path or path.startswith(f"{ref.path}/"):
+                os.kill(pid, signal.SIGKILL)
+    assert await ref.ask(Tags(), timeout=IN_TIME) == want[1]
+    assert await asyncio.gather(*replies) == want[0]
+    assert sorted(await other.ask(Tags())) == sorted(2 * numbers(messages))
+
+
 @pytest.mark.parametrize("others", [0, 1], ids=["alone", "behind one that asks"])
 @pytest.mark.parametrize("mechanism", ["pbr", "lfr", "tr"])
 async def test_who_dies_of_what_was_put_back_leaves_it_in_no_batch_and_its_heir_handles_it(
@@ -311,3 +345,50 @@ async def test_a_life_that_takes_back_in_its_start_handles_it_without_being_aske
         os.kill(pid_of(system, ref, name), signal.SIGKILL)
     assert await asyncio.gather(*guests) == [2, 3, 4]
     assert await other.ask(Tags()) == [1, 2, 3]
+
+
+class Unwelcome(hf.Message[bool]):
+    """A guest for whom nothing that the host does is right: it waits for ever, or is not what was wanted."""
+
+    waits: bool
+
+
+class Helpless(Forgetful):
+    @hf.on(Unwelcome)
+    async def let_in_unwelcome(self, message: Unwelcome) -> bool:
+        if not self.is_open:
+            self.ctx.stash()
+            return True
+        if message.waits:
+            await asyncio.get_running_loop().create_future()
+        return False
+
+
+class Attending(Helpless):
+    """The same house, run better, and as helpless."""
+
+    @hf.on(Welcome)
+    def welcome(self, message: Welcome) -> bool:
+        self.is_open.update(("asks", "says"))
+        self.ctx.unstash()
+        return True
+
+
+@pytest.mark.parametrize("waits", [True, False], ids=["hangs", "is refused"])
+async def test_what_an_alternate_has_put_back_and_no_block_handles_fails_once_and_all_behind_it_is_handled(
+    system: hf.ActorSystem, waits: bool
+) -> None:
+    await system.start(hf.child("other", hf.start(Counter)))
+    watched = hf.Detection(interval=0.02, watch_turns=0.5)
+    blocks = hf.RB(alternates=(Attending,), test=(is_not_false,), detection=watched)
+    ref = await system.start(hf.child("host", hf.start(Helpless), mechanism=blocks))
+    unwelcome = asyncio.ensure_future(ref.ask(Unwelcome(waits), timeout=25.0))
+    guests = [asyncio.ensure_future(ref.ask(Meet(tag, "asks"), timeout=25.0)) for tag in (1, 2)]
+    with system.events() as stream:
+        assert await ref.ask(Welcome(), timeout=25.0)
+        assert await asyncio.gather(*guests) == [1, 2]
+        with pytest.raises(hf.Quarantined if waits else NotAccepted):
+            await unwelcome
+        assert await ref.ask(Tags(), timeout=25.0) == [1, 2]
+        tried = [one for one in stream.take() if isinstance(one, Objected) and not one.by]
+    assert len(tried) == 1

@@ -49,13 +49,6 @@ CHECKS = {
         "tests/ftm/test_hooks.py",
         "test_a_hook_that_changes_the_state",
     ),
-    "a stop that came while the life was begun is carried out": Check(
-        "ftm/group/group_place.py",
-        "        self._starting = None  # It is up",
-        "        # It is up",
-        "tests/ftm/test_hooks.py",
-        "test_who_is_told_to_stop_while",
-    ),
     "who may wait stands alone while background work is out": Check(
         "ftm/replica/replica_state.py",
         "    return may_wait and (has_work or not state.has_access)\n",
@@ -149,10 +142,38 @@ CHECKS = {
     ),
     "T5: duplicates are answered from the reply log": Check(
         "ftm/bricks/request_protocol.py",
-        "            end = log.find(one.feed)\n",
+        "            end = log.find(number, request.feed.turn)\n",
         "            end = None\n",
         PBR,
         "test_a_duplicate_is_answered",
+    ),
+    "what was put back and has failed is not put back again": Check(
+        "ftm/bricks/runs.py",
+        " if feed.id not in numbers]  # Else",
+        "]  # Else",
+        PUT_BACK,
+        "no_block_handles and hangs",
+    ),
+    "what was put aside in one turn is replayed for the turn in which it was handled": Check(
+        "ftm/bricks/reply_log.py",
+        " or entry[3].turn < turn ",
+        " ",
+        PUT_BACK,
+        "test_all_that_have_the_state_die and pbr-0",
+    ),
+    "what is replayed for two turns is in no batch twice": Check(
+        "ftm/group/delivery.py",
+        "(is_alone or (first.id in self.earlier and any(one.id == first.id for one in batch)))",
+        "is_alone",
+        STATE,
+        "test_what_is_replayed_for_two_turns",
+    ),
+    "who leads next is fed what is replayed in the order of turns": Check(
+        "ftm/group/delivery.py",
+        "            left.sort(key=lambda feed: feed.turn if feed.turn >= 0 else math.inf)\n",
+        "",
+        STATE,
+        "test_what_is_replayed_for_two_turns",
     ),
     "T6: what was evicted from the log is not run again": Check(
         "ftm/bricks/request_protocol.py",

@@ -354,7 +354,7 @@ def test_a_failed_sync_of_the_rows_before_files_are_removed_stops_the_store(
         calls = {
             "cut": lambda: journal.cut("/a", large, [], turn=2, keep=1),
             "erase": lambda: journal.erase("/a"),
-            "forget_blocks": lambda: journal.forget_blocks("/a", []),
+            "forget_blocks": lambda: journal.forget_blocks("/a", [1]),
         }
         with pytest.raises(StoreFailed, match="the disk is gone"):
             calls[what]()

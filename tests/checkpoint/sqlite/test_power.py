@@ -44,8 +44,8 @@ for step in range(120):
             rest = b"%d %d " % (number, step) + b"x" * draw.choice([10, 2 << 20])
             journal.cut(f"/{owner}", rest, live[owner], turn=number)
             live[owner] = []
+            journal.forget_blocks(f"/{owner}", packs[owner][:-1])
             packs[owner] = [*packs[owner][-1:], step]
-            journal.forget_blocks(f"/{owner}", packs[owner])
         if syncs and draw.random() < 0.6:  # Some of what the log has was promised, some not.
             journal.sync()
             assert not refused, "it went on after a failed sync"

@@ -367,21 +367,27 @@ class BorrowsBlocks(OneFile):
 class ForgetsNeededPacks(OneFile):
     """Forgets every pack of an address but the newest one."""
 
-    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
-        newest = [number for owner, number in self._contents.blocks if owner == address][-1:]
-        super().forget_blocks(address, newest)
+    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
+        super().forget_blocks(address, [number for owner, number in self._contents.blocks if owner == address][:-1])
 
 
 class ForgetsPacksOfOthers(OneFile):
     """Forgets by number, whosever a pack is."""
 
-    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
+    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
         with self._changing() as contents:
-            contents.blocks = {key: pack for key, pack in contents.blocks.items() if key[1] in needed}
+            contents.blocks = {key: pack for key, pack in contents.blocks.items() if key[1] not in numbers}
+
+
+class NamesPacksOfOthers(OneFile):
+    """Says that an address has the packs of all."""
+
+    def packs(self, address: str) -> set[int]:
+        return {number for _, number in self._contents.blocks}
 
 
 class NeverForgetsPacks(OneFile):
     """Forgets nothing."""
 
-    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
+    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
         pass
