@@ -293,8 +293,9 @@ class Proceed(Brick):
         while True:
             ends = await server.run_part(pending)
             live = None
-            goes = go is not None and not ends and (not pending or state.is_over)  # All that was replayed is decided.
-            if go is not None and goes:
+            # What was handled before is decided as it was: `on_recovered` and what follows from it are no part of that.
+            is_replay = go is not None and not pending and bool(ends) and not state.is_over
+            if go is not None and not is_replay and (not pending or state.is_over):
                 is_live = server.life is not None and server.life.is_live
                 live = Live(0.0) if is_live else await server.go(go)
             ends = await server.seal_part(ends, pending)
@@ -303,7 +304,7 @@ class Proceed(Brick):
             if live is not None:
                 go = None
             follow = server.returned_first(pending) if brings and not server.part.is_given_up else pending
-            is_last = state.is_over or not (follow or (go is not None and not goes))
+            is_last = state.is_over or not (follow or is_replay)
             waits = not is_last and self.leads and bool(follow) and server.runs_alone(follow[0])
             await self._hand(ends, is_last=is_last, live=live, wait=waits)
             left, server.left = server.left, []

@@ -21,7 +21,7 @@ from ...actors.kernel.address_host import AddressHost
 from ...actors.kernel.cell import Cell
 from ...actors.values import decode_value, state_digest
 from ...checkpoint.life.recorded_life import FED
-from ...checkpoint.protocol import CRASH, DROPPED, FAILED, Answer, Outcome, TurnEnd
+from ...checkpoint.protocol import CRASH, DROPPED, FAILED, Answer, Feed, Outcome, TurnEnd
 from ...supervision.spec import child
 from ..replica.protected_actor import Server
 from ..replica.replica_life import ServerLife
@@ -220,7 +220,7 @@ class Shadow(Server):
             return
         await self.drop_life()
         self.install(before)
-        await self.ensure()
+        await self.ensure_as_given()
 
     def _place(self) -> None:
         """The address at which it lives: below the replica's."""
@@ -256,7 +256,11 @@ class Shadow(Server):
     def wants_out(self, life: ServerLife) -> None:
         if life is not self.life:
             return
-        if not self._hears_as_before(life):
+        if not self._hears_as_before(life):  # A turn that does not wait for what it has asked goes on to its end.
+            life.cell.node.loop.call_soon(self._look, life, life.feed)
+
+    def _look(self, life: ServerLife, feed: Feed | None) -> None:
+        if self.life is life and life.feed is feed:
             self._give_up("it has asked what the first run has not asked")
 
     def _give_up(self, why: str) -> None:

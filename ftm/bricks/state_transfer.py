@@ -191,7 +191,7 @@ class Transfer(SealedGate):
                 standing.log.replace(take.log)
             standing.inside.clear()
             if standing.computes:
-                await server.ensure()
+                await server.ensure_as_given()
         standing.following.ready()
         return server.turn
 

@@ -230,6 +230,17 @@ class Server(lifecycle.HerePlace):
             if self.life is None and not self.state.is_over:
                 await self._begin()
 
+    async def ensure_as_given(self) -> None:
+        """See to it that there is a life; one that begins stands where the point says, where another one is.
+
+        Its hooks are called, as at each life, but what they do to the state is no part of what the other one has done.
+        """
+        is_new = self.life is None
+        await self.ensure()
+        point = self.points.point
+        if is_new and self.life is not None and point is not None and self.state.has_access and not is_blank(point):
+            self.rewind(point)
+
     async def _begin(self) -> None:
         """Begin a life where the point is, and handle again what was handed over since."""
         await self._begin_at_point()
@@ -311,6 +322,11 @@ class Server(lifecycle.HerePlace):
         """A life has ended; its background work has ended with it, and nobody runs its turns again to begin it anew."""
         if life is not None and life.pipes and self.standing.leads:
             self.state.is_work_lost = True
+
+    @property
+    def _has_work(self) -> bool:
+        """Whether background work of a turn is out."""
+        return self.life is not None and self.life.pipes > 0
 
     async def until_work_is_back(self) -> None:
         """Wait until no background work is out: it is part of no state."""
@@ -466,7 +482,7 @@ class Server(lifecycle.HerePlace):
 
     def runs_alone(self, request: Request) -> bool:
         """Whether a request has to stand at the front: it may want something released before its end."""
-        return runs_alone(self.state, request.feed, leads=self.standing.leads)
+        return runs_alone(self.state, request.feed, leads=self.standing.leads, has_work=self._has_work)
 
     async def run_part(self, pending: deque[Request]) -> list[TurnEnd]:
         """Run requests until enough are done; returns their ends. What has not been run is left in `pending`."""
@@ -477,7 +493,7 @@ class Server(lifecycle.HerePlace):
             if self.life is None:  # It was dropped again: another state is put here.
                 part.give_up()
                 break
-            chunk = next_requests(state, part, attempts, leads=self.standing.leads)
+            chunk = next_requests(state, part, attempts, leads=self.standing.leads, has_work=self._has_work)
             if not chunk:
                 break  # It runs alone, when home has all that comes before it.
             part.begun += chunk

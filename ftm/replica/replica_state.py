@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final
 
-from ...checkpoint.protocol import AWAITED, START, Feed, Out, Outcome, PipeDone, TurnEnd
+from ...checkpoint.protocol import AWAITED, DOWN, EXIT, START, Feed, Out, Outcome, PipeDone, TurnEnd
 from ..bricks.brick_messages import Beside, Request
 from .replica_life import ABANDONED
 
@@ -148,19 +148,26 @@ def is_front(state: ReplicaState, part: BatchPart, *, leads: bool) -> bool:
     return leads and not part.ends and state.confirmed >= state.handed
 
 
-def runs_alone(state: ReplicaState, feed: Feed, *, leads: bool) -> bool:
-    """Whether an input has to stand at the front: it may want something released before its end."""
+def runs_alone(state: ReplicaState, feed: Feed, *, leads: bool, has_work: bool) -> bool:
+    """Whether an input has to stand at the front: it may want something released before its end.
+
+    Otherwise the life ends if it does want that, and begins again before the part. While background work is out
+    (`has_work`) that must not be: the work would end with the life.
+    """
     if state.is_again or (state.is_lazy and not leads):
         return False
     if feed.kind == START or (feed.kind, feed.name) in state.alone:
         return True
-    return not state.has_access and feed.name in state.waiting
+    may_wait = feed.name in state.waiting or feed.kind in (DOWN, EXIT)
+    return may_wait and (has_work or not state.has_access)
 
 
-def next_requests(state: ReplicaState, part: BatchPart, attempts: Attempts, *, leads: bool) -> list[Request]:
+def next_requests(
+    state: ReplicaState, part: BatchPart, attempts: Attempts, *, leads: bool, has_work: bool
+) -> list[Request]:
     """Take the next few pending requests that can be given to the life at once; none if they have to wait."""
     pending = part.pending
-    if runs_alone(state, pending[0].feed, leads=leads):
+    if runs_alone(state, pending[0].feed, leads=leads, has_work=has_work):
         is_early = leads and state.confirmed < state.handed
         return [] if part.begun or part.ends or is_early else [pending.popleft()]
     if attempts.singles:
@@ -169,7 +176,9 @@ def next_requests(state: ReplicaState, part: BatchPart, attempts: Attempts, *, l
         attempts.singles -= 1
         return [pending.popleft()]
     chunk = [pending.popleft()]
-    while pending and len(chunk) < attempts.size and not runs_alone(state, pending[0].feed, leads=leads):
+    while pending and len(chunk) < attempts.size:
+        if runs_alone(state, pending[0].feed, leads=leads, has_work=has_work):
+            break
         chunk.append(pending.popleft())
     return chunk
 

@@ -170,6 +170,13 @@ CHECKS = {
         "tests/checkpoint/test_recovery.py",
         "test_what_left_before_the_kill",
     ),
+    "background work of turns that the snapshot contains has its result": Check(
+        "checkpoint/home/input_ledger.py",
+        "        if turn <= self.state_turn:\n            return False\n        done =",
+        "        done =",
+        "tests/ftm/test_background_order.py",
+        "test_what_came_before_the_snapshot",
+    ),
     "T21: a replay that sends something else is stopped": Check(
         "checkpoint/home/input_ledger.py",
         "        if end.state != past.state and end.state and past.state:\n",

@@ -19,7 +19,7 @@ from holdfast.ftm.group.group import KEPT_TURNS, Group
 from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
-from tests.ftm.accounts import Add, Counter, Tags
+from tests.ftm.accounts import Add, Boom, Counter, Tags
 from tests.ftm.test_failover import SEED, group_of, pid_of, two_again
 
 BROUGHT = 1_000
@@ -63,6 +63,36 @@ class Worker(Counter):
         if os.getpid() != message.pid:
             Path(message.folder, "computed").touch()
         return self.total
+
+
+class Call(hf.Message[int]):
+    """Ask the other one in the middle of a turn."""
+
+
+class Asking(Worker):
+    @hf.on(Call)
+    async def call(self, message: Call) -> int:
+        return await self.ctx.find("/app/other", Counter).ask(Add(0), timeout=25.0)
+
+
+class Leave(hf.Message[int]):
+    """Ask the other one, and do not wait for the answer: it comes as a message."""
+
+
+class Leaving(Counter):
+    @hf.on(Leave)
+    def ask_and_go_on(self, message: Leave) -> int:
+        asked = self.ctx.find("/app/other", Counter).ask(Add(0), timeout=25.0)
+        self.ctx.pipe_to_self(asked, lambda _: Add(BROUGHT))
+        return self.total
+
+
+class LeavingSecond(Leaving):
+    """Another version of it."""
+
+
+class LeavingThird(Leaving):
+    """One more."""
 
 
 class Runner(Counter):
@@ -235,6 +265,63 @@ async def test_what_two_runs_of_a_turn_have_begun_comes_once_however_late_the_se
         for _ in range(KEPT_TURNS + 50):
             await ref.ask(Add(1))
     assert (await ref.ask(Tags())).count(BROUGHT) == 1
+
+
+async def test_what_came_before_the_snapshot_does_not_come_again_behind_a_turn_that_failed(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    """A replica of LFR that goes back behind a failed turn handles again what it has handled, and begins its work."""
+    ref = await system.start(hf.child("alice", hf.start(Worker), mechanism=LFR(), recovery=hf.hybrid(interval=3600.0)))
+    await two_again(ref)
+    for count in (1, 2):
+        await ref.ask(Begin(str(tmp_path)), timeout=25.0)
+        async with asyncio.timeout(25):
+            while len(await ref.ask(Tags())) < count:
+                await asyncio.sleep(0.002)
+        await system.checkpoint(ref)
+        with pytest.raises(hf.RemoteCrash):
+            await ref.ask(Boom(), timeout=25.0)
+    assert await ref.ask(Add(0), timeout=25.0) == 3
+    assert await ref.ask(Tags()) == [BROUGHT, BROUGHT, 0]
+
+
+@pytest.mark.parametrize("recovery", [hf.hybrid(interval=3600.0), None], ids=["recorded", "plain"])
+@pytest.mark.parametrize("mechanism", [PBR(), hf.TR(), hf.TMR()], ids=["pbr", "tr", "tmr"])
+async def test_work_goes_on_while_turns_of_a_batch_ask_for_the_first_time(
+    system: hf.ActorSystem, mechanism: Any, recovery: hf.Method | None, tmp_path: Path
+) -> None:
+    """Nobody has died, and no turn has failed: it is not lost, and the life is not begun again for it."""
+    (tmp_path / "work").touch()
+    await system.start(hf.child("other", hf.start(Counter)))
+    ref = await system.start(hf.child("alice", hf.start(Asking), mechanism=mechanism, recovery=recovery))
+    events = system.events()
+    await ref.ask(Begin(str(tmp_path)), timeout=25.0)
+    asks = [ref.ask(one, timeout=25.0) for one in (Add(1), Call(), Add(2), Call())]
+    assert await asyncio.gather(*asks) == [1, 1, 2, 2]
+    (tmp_path / "work").unlink()
+    async with asyncio.timeout(25):
+        while len(await ref.ask(Tags())) < 3:
+            await asyncio.sleep(0.002)
+    assert await ref.ask(Tags()) == [1, 2, BROUGHT]
+    assert (await system.get_status(ref)).life == 1
+    assert [event for event in events.take() if isinstance(event, hf.BackgroundWorkLost)] == []
+
+
+@pytest.mark.parametrize("name", ["nvp", "tmr"])
+async def test_a_turn_that_does_not_wait_for_what_it_asks_comes_to_the_same_in_each_run(
+    system: hf.ActorSystem, name: str
+) -> None:
+    mechanism = hf.TMR() if name == "tmr" else hf.NVP(versions=(LeavingSecond, LeavingThird))
+    await system.start(hf.child("other", hf.start(Counter)))
+    events = system.events()
+    ref = await system.start(hf.child("alice", hf.start(Leaving), mechanism=mechanism))
+    for count in (1, 2):
+        await ref.ask(Leave(), timeout=25.0)
+        async with asyncio.timeout(25):
+            while await ref.ask(Tags()) != count * [BROUGHT]:
+                await asyncio.sleep(0.002)
+    assert await system.ref("/app/other", Counter).ask(Tags()) == [0, 0]
+    assert [event for event in events.take() if isinstance(event, (hf.ReplicaLost, hf.Masked))] == []
 
 
 async def test_what_was_said_to_be_lost_does_not_come(system: hf.ActorSystem, tmp_path: Path) -> None:

@@ -11,7 +11,10 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.ftm.alarms import StatesDiffer
 from tests.checkpoint.players import until
+from tests.ftm.accounts import Boom
+from tests.ftm.test_failover import two_again
 
 
 class Tick(hf.Message): ...
@@ -127,3 +130,75 @@ async def test_what_a_protected_actor_says_when_it_stops_is_heard() -> None:
         ref = await system.start(hf.child("polite", hf.start(Polite), mechanism=hf.PBR()))
         await system.stop(ref)
         assert await listener.ask(Words()) == ["I go", "I am gone"]
+
+
+class Lives(hf.Message[tuple[int, int]]):
+    """Answered with how much was counted, and how often this actor has come back."""
+
+
+class Returning(hf.Actor):
+    """Counts its returns: what its hooks do to the state is done once for each life."""
+
+    def __init__(self) -> None:
+        self.count = self.returns = 0
+
+    def on_recovered(self) -> None:
+        self.returns += 1
+
+    @hf.on(Count)
+    def add(self, message: Count) -> int:
+        self.count += 1
+        return self.count
+
+    @hf.on(Boom)
+    def boom(self, message: Boom) -> None:
+        raise ValueError("boom")
+
+    @hf.on(Lives)
+    def lives(self, message: Lives) -> tuple[int, int]:
+        return self.count, self.returns
+
+
+class ReturningSecond(Returning):
+    """Another version of it."""
+
+
+class ReturningThird(Returning):
+    """One more."""
+
+
+def who_compares() -> dict[str, Any]:
+    return {
+        "tr": hf.TR(),
+        "lfr": hf.LFR(compare_every=0.0),
+        "tmr": hf.TMR(),
+        "nvp": hf.NVP(versions=(ReturningSecond, ReturningThird)),
+        "pbr+tr": hf.compose(hf.PBR(), hf.TR()),
+    }
+
+
+@pytest.mark.parametrize("fails", [False, True], ids=["well", "failed"])
+@pytest.mark.parametrize("name", sorted(who_compares()))
+async def test_a_hook_that_changes_the_state_is_no_difference_and_counts_once_for_a_life(
+    name: str, fails: bool
+) -> None:
+    """Also when the last turn has failed: its number is used, though it is not replayed."""
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        events = system.events()
+        recovery = hf.hybrid(interval=3600.0)
+        ref = await system.start(hf.child("it", hf.start(Returning), recovery=recovery, mechanism=who_compares()[name]))
+        await two_again(ref)
+        assert await ref.ask(Count(), timeout=25.0) == 1
+        assert await ref.ask(Lives(), timeout=25.0) == (1, 0)
+        if fails:
+            with pytest.raises(hf.RemoteCrash):
+                await ref.ask(Boom(), timeout=25.0)
+        ref.kill()
+        assert await ref.ask(Count(), timeout=25.0) == 2
+        await two_again(ref)
+        for count in (3, 4):
+            assert await ref.ask(Count(), timeout=25.0) == count
+        assert await ref.ask(Lives(), timeout=25.0) == (4, 1)
+        assert (await system.get_status(ref)).life == 2
+        told = hf.Masked, hf.Diverged, StatesDiffer
+        assert [event for event in events.take() if isinstance(event, told)] == []

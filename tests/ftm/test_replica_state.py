@@ -173,32 +173,39 @@ def test_what_has_happened_since_an_earlier_turn() -> None:
 
 
 @given(
-    names=st.lists(st.sampled_from(["Add", "Ask"]), min_size=1, max_size=12),
+    names=st.lists(st.sampled_from(["Add", "Ask", "Wait"]), min_size=1, max_size=12),
     size=st.integers(1, 5),
     singles=st.integers(0, 3),
     leads=st.booleans(),
     is_again=st.booleans(),
+    has_work=st.booleans(),
     confirmed=st.integers(0, 2),
 )
 def test_a_batch_is_run_whole_and_in_order(
-    names: list[str], size: int, singles: int, leads: bool, is_again: bool, confirmed: int
+    names: list[str], size: int, singles: int, leads: bool, is_again: bool, has_work: bool, confirmed: int
 ) -> None:
-    """Whoever may ask in its turn is first in a part, and alone; nobody is left out, and nobody overtakes."""
-    state = ReplicaState(is_again=is_again, handed=2, confirmed=confirmed, alone={(MESSAGE, "Ask")})
+    """Whoever may ask in its turn is first in a part, and alone; nobody is left out, and nobody overtakes.
+
+    While background work is out, that is everybody who may wait for something.
+    """
+    state = ReplicaState(
+        is_again=is_again, handed=2, confirmed=confirmed, alone={(MESSAGE, "Ask")}, waiting=frozenset({"Wait"})
+    )
+    alone = {"Ask", "Wait"} if has_work else {"Ask"}
     attempts, done = Attempts(size, singles), list[Request]()
     requests = [request(number, name) for number, name in enumerate(names)]
     part = BatchPart(deque(requests))
     for _ in range(4 * len(requests)):
         if not part.pending:
             break
-        chunk = next_requests(state, part, attempts, leads=leads)
+        chunk = next_requests(state, part, attempts, leads=leads, has_work=has_work)
         if not chunk:
             assert part.begun or (leads and state.confirmed < state.handed)
             state.confirmed = state.handed  # Home has what came before,
             part = BatchPart(part.pending)  # and the next part begins.
             continue
         assert len(chunk) <= size
-        if not is_again and chunk[0].feed.name == "Ask":
+        if not is_again and alone.intersection(one.feed.name for one in chunk):
             assert len(chunk) == 1
             assert not part.begun
             assert not leads or state.confirmed == state.handed
