@@ -93,4 +93,8 @@ def method(kind: Any, name: str) -> Any:
     """A class's own method, or whatever its bases have when it is called: a test may exchange theirs."""
     if name in vars(kind):
         return vars(kind)[name]
-    return lambda loop, *args, **options: getattr(super(kind, loop), name)(*args, **options)
+
+    def inherited(loop: Any, *args: Any, **options: Any) -> Any:
+        return getattr(super(kind, loop), name)(*args, **options)
+
+    return inherited
