@@ -1,7 +1,7 @@
 """What is made in an event loop, told to whoever notes it: futures, tasks, timers, and exceptions that nobody takes.
 
-The methods of the loop's class are exchanged, once, and stay so. To exchange those of each new loop takes longer, in all
-that is done with that loop.
+The methods of the loop's class are exchanged, once, and stay so. To exchange those of each new loop takes longer, in
+all that is done with that loop.
 """
 
 from __future__ import annotations
