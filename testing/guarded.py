@@ -17,7 +17,7 @@ from ..supervision.spec import ChildSpec
 from ..system.system import ActorSystem
 from .clock import RealTimeNeeded, VirtualClockLoop
 from .guard.leaks import Leaks
-from .guard.sends import SendChecks
+from .guard.sends import Reads, SendChecks
 from .schedules.control import ControlledLoop
 from .schedules.processes import SimulatedWorkers
 
@@ -150,6 +150,11 @@ class GuardedSystem(ActorSystem):
     def asks(self) -> Mapping[asyncio.Future[Any], tuple[str, object]]:
         """What was asked, and of whom, by the futures that somebody still holds."""
         return {} if self._checks is None else self._checks.asks
+
+    def read_along(self, reads: Reads) -> None:
+        """Tell of each message and reply that is looked at."""
+        if self._checks is not None:
+            self._checks.reads = reads
 
     def look_away(self) -> None:
         """Do not look at messages from now on: that takes most of the time of a run with many."""

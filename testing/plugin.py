@@ -259,8 +259,9 @@ def _loop_scope_of(request: pytest.FixtureRequest) -> str:
         pytest.fail.Exception: the test does not run in a loop of pytest-asyncio.
     """
     marker = request.node.get_closest_marker("asyncio")
-    if "anyio_backend" in request.fixturenames or request.node.get_closest_marker("anyio") is not None:
-        if marker is None or request.node.get_closest_marker("anyio") is not None:
+    of_anyio = request.node.get_closest_marker("anyio")
+    if of_anyio is not None or "anyio_backend" in request.fixturenames:
+        if marker is None or of_anyio is not None:
             why = "runs this test in another one: mark it with @pytest.mark.asyncio instead of @pytest.mark.anyio"
         else:
             why = "takes the async fixtures of all async tests to another one: set anyio_mode = strict"

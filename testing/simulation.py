@@ -96,6 +96,7 @@ class Simulation:
         faults: those of the seed.
         disk: the simulated store, which outlives the root; None: there is none.
         escaped: what the run has used that no seed decides.
+        world: what the program asks the world for, in this run; None: the real one.
         is_real: whether it is none, but a run on a real loop (`--holdfast-real`).
     """
 
@@ -114,6 +115,7 @@ class Simulation:
         self.trace: list[tuple[str, str]] = []
         self.faults = Faults(choices.seed, choices)
         self.escaped: tuple[str, ...] = ()
+        self.world: World | None = None
         self._control: Control | None = None  # There is none before the system has been started.
         self._log = TurnLog(self.trace)
         self._swaps = Swaps()
@@ -123,7 +125,7 @@ class Simulation:
     def enter(self, loop: asyncio.AbstractEventLoop) -> None:
         """From here to `remove` the world is the seed's."""
         assert isinstance(loop, ControlledLoop)
-        world = self._surroundings.enter_context(World(self.seed, loop))
+        self.world = world = self._surroundings.enter_context(World(self.seed, loop))
         self._surroundings.callback(lambda: setattr(self, "escaped", tuple(world.escaped)))
 
     async def begin(
@@ -175,6 +177,8 @@ class Simulation:
             pool.draw_from(self.choices, self.latency)
         if not self._looks:
             root.system.look_away()
+        elif self.world is not None:
+            root.system.read_along(self.world.look_for_addresses)
         return root
 
     async def end(self, kind: Any = None, error: Any = None, trace: Any = None) -> None:

@@ -45,13 +45,9 @@ class Tracer(TurnWatcher):
 class Watched:
     """The turns of one node under watch."""
 
-    def __init__(self, node: RunLoop) -> None:
-        self.node = node
+    def __init__(self) -> None:
         self.watchers: list[TurnWatcher] = []
         self.substituting: list[TurnWatcher] = []  # those of them that want to hear before a turn
-        self.swaps = Swaps()
-        self._over = node.turn_over
-        self.swaps.put(node, "turn_over", self._turn_over)
 
     def run(self, original: Callable[[Cell, int], int], cell: Cell, most: int) -> int:
         """As `run_turns`, one turn at a time."""
@@ -85,13 +81,6 @@ class Watched:
         self.watchers = watchers
         self.substituting = [watcher for watcher in watchers if type(watcher).begins is not TurnWatcher.begins]
 
-    def _turn_over(self, turn: Suspended, error: BaseException | None) -> None:
-        item = turn.item
-        self._over(turn, error)
-        if item is not None:
-            for watcher in self.watchers:
-                watcher.ended(turn.cell, item)
-
 
 class SubstituteTable(Table):
     """A table for the length of one turn: the handlers of messages are substituted."""
@@ -123,16 +112,28 @@ class Turns:
         self._holds = 0
         self._swaps = Swaps()
         self._swaps.put(run_loop, "run_turns", self.run_turns)
+        self._swaps.put(RunLoop, "turn_over", self._telling(RunLoop.turn_over))
 
     def run_turns(self, cell: Cell, most: int) -> int:
         """Run turns of a cell as its node wants it."""
         watched = self._nodes.get(cell.node)
         return self._original(cell, most) if watched is None else watched.run(self._original, cell, most)
 
+    def _telling(self, over: Callable[[RunLoop, Suspended, BaseException | None], None]) -> Any:
+        def turn_over(node: RunLoop, turn: Suspended, error: BaseException | None) -> None:
+            item = turn.item
+            over(node, turn, error)
+            watched = self._nodes.get(node)
+            if watched is not None and item is not None:
+                for watcher in watched.watchers:
+                    watcher.ended(turn.cell, item)
+
+        return turn_over
+
     def add(self, node: RunLoop, watcher: TurnWatcher) -> None:
         """Let the watcher hear of this node's turns."""
         if node not in self._nodes:
-            self._nodes[node] = Watched(node)
+            self._nodes[node] = Watched()
         watched = self._nodes[node]
         watched.watch([*watched.watchers, watcher])
 
@@ -143,7 +144,6 @@ class Turns:
             return
         watched.watch([other for other in watched.watchers if other is not watcher])
         if not watched.watchers:
-            watched.swaps.undo()
             del self._nodes[node]
         self._close()
 

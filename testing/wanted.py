@@ -52,6 +52,8 @@ class SystemsWanted:
 
     def tell(self, system: GuardedSystem) -> None:
         """Let a system know what it may see."""
+        if not self._expected:
+            return
         for name, expect in (("dead_letters", system.expect_dead_letters), ("crashes", system.expect_crashes)):
             value = self._expected.get(name, False)
             if value is True:

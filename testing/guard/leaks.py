@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import itertools
+import operator
 import os
 import signal
 import sys
@@ -30,6 +31,8 @@ GRACE = 5.0
 SHORT_GRACE = 1.0
 """Real seconds that a process of the test's may take: one that it has told to end, and not waited for."""
 OPEN_FILES = "/proc/self/fd"
+FILE: Callable[[os.stat_result], tuple[int, int]] = operator.attrgetter("st_dev", "st_ino")
+"""Which file a descriptor is of."""
 RANDOM = ("/dev/urandom", "/dev/random")
 PAGES = ("-hands", "-hands (deleted)")
 """Of a SQLite store: mapped until the last life is gone that has a word in it (`checkpoint/sqlite/in_hand.py`)."""
@@ -80,7 +83,10 @@ class Leaks(LoopLeaks):
         return sorted(self._opened().values())
 
     def _opened(self) -> dict[int, str]:
-        new = [number for number, file in identities(self._files).items() if self._files.get(number) != file]
+        found = identities(self._files)
+        if found == self._files:
+            return {}
+        new = [number for number, file in found.items() if self._files.get(number) != file]
         targets = open_files() if new else {}
         opened = {
             number: targets[number] for number in new if number in targets and not is_kept(number, targets[number])
@@ -106,7 +112,7 @@ class Leaks(LoopLeaks):
         self._threads.close()
 
 
-def identities(likely: Iterable[int] = ()) -> dict[int, tuple[int, int]]:
+def identities(likely: Collection[int] = ()) -> dict[int, tuple[int, int]]:
     """Which file is open, by number: its device and inode, which are read in a third of the time of its name.
 
     The likely numbers are tried first: if as many are open as the kernel counts (Linux from 6.2 on), there are no
@@ -115,19 +121,23 @@ def identities(likely: Iterable[int] = ()) -> dict[int, tuple[int, int]]:
     try:
         count = os.stat(OPEN_FILES).st_size
         found = _identified(likely) if count else {}
-        return found if len(found) == count > 0 else _identified(map(int, os.listdir(OPEN_FILES)))
+        return found if len(found) == count > 0 else _identified([*map(int, os.listdir(OPEN_FILES))])
     except FileNotFoundError:  # There is no /proc.
         return {}
 
 
-def _identified(numbers: Iterable[int]) -> dict[int, tuple[int, int]]:
+def _identified(numbers: Collection[int]) -> dict[int, tuple[int, int]]:
+    try:
+        return dict(zip(numbers, map(FILE, map(os.fstat, numbers)), strict=True))
+    except OSError:  # One of them is not open.
+        pass
     found: dict[int, tuple[int, int]] = {}
     for number in numbers:
         try:
             status = os.fstat(number)
         except OSError:  # the descriptor of the listing itself, or it is closed now
             continue
-        found[number] = status.st_dev, status.st_ino
+        found[number] = FILE(status)
     return found
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import weakref
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from ..library_code import is_module_of_library
-from ..swaps import Swaps
+from .loop_methods import LoopMethods
 
 TASK_GRACE = 10
 """Turns of the loop that a cancelled task may take to end."""
@@ -19,9 +19,9 @@ MANY = 1000
 class LoopLeaks:
     """What there was in the running loop at the beginning, so that what is more at the end is a leak.
 
-    Made before the code under test begins, in the same loop. It notes futures, tasks and timers as they are made, by
-    exchanging methods of the loop, which `told` puts back: to look through all objects at the end would take longer
-    than the test. Where no loop runs there is nothing to note.
+    Made before the code under test begins, in the same loop. It notes futures, tasks and timers as they are made, up to
+    `told`: to look through all objects at the end would take longer than the test. Where no loop runs there is nothing
+    to note.
 
     Args:
         allowed: kinds of leaks that are not told.
@@ -29,10 +29,9 @@ class LoopLeaks:
 
     def __init__(self, allowed: Collection[str] = ()) -> None:
         self._allowed = frozenset(allowed)
-        self._swaps = Swaps()
         self._timers: list[tuple[asyncio.Handle, float, Any]] = []  # with when they are due, and what they call
-        self._most = MANY
         self._futures: list[weakref.ref[asyncio.Future[Any]]] = []
+        self._most_timers = self._most_futures = MANY
         self._lost: list[tuple[str, BaseException]] = []
         self._loop: Any = None
         try:
@@ -42,57 +41,28 @@ class LoopLeaks:
             return
         self._tasks = asyncio.all_tasks()
         self._handler = self._loop.get_exception_handler()
-        self._swaps.put(self._loop, "call_at", self._noting_timers(self._loop.call_at, lambda: 0.0))
-        if getattr(type(self._loop), "call_later", None) is not asyncio.BaseEventLoop.call_later:  # It calls `call_at`.
-            self._swaps.put(self._loop, "call_later", self._noting_timers(self._loop.call_later, self._loop.time))
-        self._swaps.put(self._loop, "create_future", self._noting_futures(self._loop.create_future))
-        self._swaps.put(self._loop, "create_task", self._noting_tasks(self._loop.create_task))
-        self._swaps.put(self._loop, "call_exception_handler", self._noting(self._loop.call_exception_handler))
+        self._methods = LoopMethods.of(type(self._loop))
+        self._methods.note(self._loop, self)
 
-    def _noting_timers(self, call: Any, origin: Callable[[], float]) -> Any:
-        timers = self._timers
+    def timer_made(self, handle: asyncio.Handle, when: float, callback: Any) -> None:
+        """A timer is new, due at a time of the loop's clock."""
+        self._timers.append((handle, when, callback))
+        if len(self._timers) > self._most_timers:
+            self._timers = self._waiting()
+            self._most_timers = max(MANY, 2 * len(self._timers))
 
-        def noted(time: float, callback: Any, *args: Any, **options: Any) -> asyncio.Handle:
-            handle: asyncio.Handle = call(time, callback, *args, **options)
-            timers.append((handle, origin() + time, callback))
-            if len(timers) > self._most:
-                timers[:] = self._waiting()
-                self._most = max(MANY, 2 * len(timers))
-            return handle
+    def future_made(self, made: asyncio.Future[Any]) -> None:
+        """A future or task is new."""
+        self._futures.append(weakref.ref(made))  # A WeakSet takes ten times as long.
+        if len(self._futures) > self._most_futures:
+            self._futures = [one for one in self._futures if one() is not None]
+            self._most_futures = max(MANY, 2 * len(self._futures))
 
-        return noted
-
-    def _noting_futures(self, make: Any) -> Any:
-        futures, ref = self._futures, weakref.ref  # A WeakSet takes ten times as long.
-        most = MANY
-
-        def noted() -> Any:
-            nonlocal most
-            futures.append(ref(made := make()))
-            if len(futures) > most:
-                futures[:] = [one for one in futures if one() is not None]
-                most = max(MANY, 2 * len(futures))
-            return made
-
-        return noted
-
-    def _noting_tasks(self, make: Any) -> Any:
-        futures = self._futures
-
-        def noted(coro: Any, **options: Any) -> Any:
-            futures.append(weakref.ref(made := make(coro, **options)))
-            return made
-
-        return noted
-
-    def _noting(self, call: Any) -> Any:
-        def noted(context: dict[str, Any]) -> None:
-            error = context.get("exception")
-            if isinstance(error, BaseException) and self._loop.get_exception_handler() is self._handler:
-                self._lost.append((str(context.get("message", "")), error))
-            call(context)
-
-        return noted
+    def exception_told(self, context: dict[str, Any]) -> None:
+        """The loop's handler of exceptions is about to hear of this."""
+        error = context.get("exception")
+        if isinstance(error, BaseException) and self._loop.get_exception_handler() is self._handler:
+            self._lost.append((str(context.get("message", "")), error))
 
     def _waiting(self) -> list[tuple[asyncio.Handle, float, Any]]:
         now = self._loop.time()
@@ -100,7 +70,7 @@ class LoopLeaks:
 
     async def told(self) -> list[str]:
         """What is left in this loop, as problems. Nothing is noted any more."""
-        self._swaps.undo()
+        self._stop()
         tasks = await self.tasks()
         timers = [] if "timers" in self._allowed else self.timers(of_tasks=not tasks)
         return [
@@ -160,8 +130,12 @@ class LoopLeaks:
 
     def close(self) -> None:
         """Note nothing any more."""
-        self._swaps.undo()
+        self._stop()
         self._timers.clear()
+
+    def _stop(self) -> None:
+        if self._loop is not None:
+            self._methods.stop(self._loop, self)
 
 
 def _unseen(future: asyncio.Future[Any]) -> BaseException | None:

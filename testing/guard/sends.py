@@ -61,12 +61,21 @@ class Handed:
         return TEST if self.giver is None else self.giver.path
 
 
+Reads = Callable[[str, bytes], None]
+"""Is told what is sent or replied, as words and as bytes."""
+
+
 class SendChecks(TurnWatcher):
-    """The checks of one node, from here to `close`."""
+    """The checks of one node, from here to `close`.
+
+    Attributes:
+        reads: is told of each message and reply; None: nobody is.
+    """
 
     def __init__(self, node: Node) -> None:
         self.node = node
         self.is_expected = self.are_replies_expected = self.are_types_expected = False
+        self.reads: Reads | None = None
         # By references, each of which takes itself out: a WeakKeyDictionary takes twice as long.
         self._asks: dict[weakref.ref[asyncio.Future[Any]], tuple[Cell, object]] = {}
         self._images = ValueBytes()
@@ -93,6 +102,8 @@ class SendChecks(TurnWatcher):
             BadMessage: a field has another type than it declares.
         """
         kind = type(message)
+        if self.reads is not None and not is_of_library(kind):
+            self._read(f"{kind.__qualname__} to {cell.path}", message)
         if plain_look(kind)(message) or not isinstance(message, Message) or is_of_library(kind):
             return
         if not self.are_types_expected and (problem := wrong_field(message)) is not None:
@@ -163,6 +174,8 @@ class SendChecks(TurnWatcher):
         """An actor answers, or a test in the name of its probe."""
         if ask.to is None or type(reply) is ReplyHandle or ask.future.done():
             return
+        if self.reads is not None and not is_of_library(type(ask.message)):
+            self._read(f"the reply of {ask.to.path} to {type(ask.message).__qualname__}", reply)
         if ask.to.actor is None:  # It comes from another process: nobody else has it.
             for sent in self._near.get(ask.to, ()):
                 if sent.turns:
@@ -184,6 +197,11 @@ class SendChecks(TurnWatcher):
         self._near[giver].append(given)
         if ask.sender is not None:
             self._near[ask.sender].append(given)
+
+    def _read(self, what: str, value: object) -> None:
+        body = self._images.of(value)
+        if body is not None and self.reads is not None:
+            self.reads(what, body)
 
     # -- what is kept -----------------------------------------------------------------------------------------------
 

@@ -98,7 +98,7 @@ class ActorMachine(RuleBasedStateMachine):
         loop = self._runner.get_loop()
         assert isinstance(loop, ControlledLoop)
         self._loop = loop
-        self._world = World(choices.seed, loop)
+        self._world = self._simulation.world = World(choices.seed, loop)
         self._leaks: LoopLeaks
         self.run(self._begin())
         try:

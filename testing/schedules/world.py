@@ -29,6 +29,7 @@ from anyio._backends._asyncio import CancelScope, WorkerThread
 from ..library_code import is_file_of_library
 from ..swaps import Swaps
 from ..threads import Onlooker
+from .addresses import shown_address
 from .numbered import as_completed, numbering, scope_in_order
 
 if TYPE_CHECKING:
@@ -222,6 +223,12 @@ class World:
         if _is_ours(target) or module.startswith(("concurrent.", "threading", "anyio.")):
             return  # A pool's: whose result comes when nothing else can happen, as the loop sees to.
         self._tell(f"a thread was started ({_name(target)}): what it does by itself comes when the machine lets it")
+
+    def look_for_addresses(self, what: str, body: bytes) -> None:
+        """Tell of what is sent, if the address of an object is shown in it."""
+        shown = shown_address(body)
+        if shown is not None:
+            self._tell(f"{what} shows the address of an object ({shown}): send a name or a number of its own")
 
     def _tell(self, what: str) -> None:
         if what not in self.escaped:

@@ -17,6 +17,7 @@ from hypothesis.stateful import precondition, rule, run_state_machine_as_test
 import holdfast as hf
 from holdfast.testing import ActorMachine, Model, NotLinearizable
 from holdfast.testing.schedules.choices import UnfitSchedule
+from holdfast.testing.schedules.world import EscapesSimulation
 
 STEPS = 6
 QUICK = settings(
@@ -296,3 +297,32 @@ def test_a_machine_that_cannot_be_set_up_leaves_nothing_behind() -> None:
     with pytest.raises(LookupError):
         Broken()
     assert time.time is before
+
+
+class Note(hf.Message):
+    text: str
+
+
+class Reader(hf.Actor):
+    @hf.on(Note)
+    def read(self, message: Note) -> None:
+        pass
+
+
+class Shown:
+    """Has the text of `object`."""
+
+
+class ShowsAnAddress(ActorMachine):
+    def set_up(self) -> None:
+        self.shown = Shown()
+        self.reader = self.start(hf.child("reader", hf.start(Reader)))
+
+    @rule()
+    def read(self) -> None:
+        self.tell(self.reader, Note(f"from {self.shown}"))
+
+
+def test_an_address_in_a_message_is_told() -> None:
+    with pytest.warns(EscapesSimulation, match=r"Note to /app/reader shows the address of an object \(Shown\)"):
+        run_state_machine_as_test(ShowsAnAddress, settings=settings(max_examples=2, stateful_step_count=2))

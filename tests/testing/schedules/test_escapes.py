@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import logging
 import os
 import signal
 import threading
@@ -229,3 +230,76 @@ async def test_a_strict_actor_is_refused_a_simulated_clock_as_it_is_a_real_one(
         await ref.ask(Read(which))
     free = await system.start(hf.child("free", hf.start(Reader), recovery=hf.hybrid()))
     assert await free.ask(Read(which))
+
+
+class Note(hf.Message[str]):
+    """A text."""
+
+    text: str
+
+
+class Describer(hf.Actor):
+    """Describes something by the address of an object."""
+
+    def __init__(self) -> None:
+        self.plain = Plain(1)
+
+    @hf.on(Note)
+    def describe(self, message: Note) -> str:
+        match message.text:
+            case "reply":
+                return f"{self.plain}"
+            case "log":
+                logging.getLogger("describer").info("%s", self.plain)
+                return f"{self.plain}"[:20]
+            case _:
+                return "nothing"
+
+
+async def sends_a_default_text(system: GuardedSystem) -> None:
+    plain = Plain(2)
+    system.spawn(hf.start(Describer), "describer").tell(Note(f"with {plain} in it"))
+    await asyncio.sleep(1)
+
+
+async def is_replied_a_default_text(system: GuardedSystem) -> None:
+    await system.spawn(hf.start(Describer), "describer").ask(Note("reply"))
+
+
+@pytest.mark.parametrize(
+    ("shows", "told"),
+    [
+        (sends_a_default_text, r"Note to /app/describer shows the address of an object \(Plain\)"),
+        (is_replied_a_default_text, r"the reply of /app/describer to Note shows the address of an object \(Plain\)"),
+    ],
+)
+def test_a_default_text_that_is_sent_is_told_in_the_run_in_which_it_is(shows: Any, told: str) -> None:
+    with pytest.warns(EscapesSimulation, match=told):
+        run_schedule(shows, Production(0), {"system"}, {})
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["<Plain object at 0x10>", "we meet at 0x", f"at {0x7F3A_0000_0010:#x} nobody is", "log"],
+)
+def test_texts_that_show_no_living_object_and_what_is_only_logged_are_not_told(text: str) -> None:
+    async def tells(system: GuardedSystem) -> None:
+        await system.spawn(hf.start(Describer), "describer").ask(Note(text))
+
+    simulate(tells, seeds=11)()
+
+
+def test_a_number_from_id_in_a_message_and_an_order_that_changes_no_turn_are_not_found() -> None:
+    """The limits, as docs/testing.md has them."""
+    kept: list[Plain] = []
+    seen: list[str] = []
+
+    async def escapes(system: GuardedSystem) -> None:
+        kept.extend(Plain(number) for number in range(8))
+        ref = system.spawn(hf.start(Describer), "describer")
+        ref.tell(Note(str(id(kept[-1]))))
+        seen.append("".join(str(one.number) for one in set(kept[-8:])))
+        await ref.ask(Note(seen[-1]))
+
+    simulate(escapes, seeds=11)()
+    assert len(seen) == 13

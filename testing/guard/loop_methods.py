@@ -1,0 +1,100 @@
+"""What is made in an event loop, told to whoever notes it: futures, tasks, timers, and exceptions that nobody takes.
+
+The methods of the loop's class are exchanged, once, and stay so. To exchange those of each new loop takes longer, in
+all that is done with that loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from ..swaps import Swaps
+
+
+class LoopNotes(Protocol):
+    """Whoever notes what is made in a loop."""
+
+    def timer_made(self, handle: asyncio.Handle, when: float, callback: Any) -> None:
+        """A timer is new, due at a time of the loop's clock."""
+
+    def future_made(self, made: asyncio.Future[Any]) -> None:
+        """A future or task is new."""
+
+    def exception_told(self, context: dict[str, Any]) -> None:
+        """The loop's handler of exceptions is about to hear of this."""
+
+
+class LoopMethods:
+    """The methods of the loops of one class."""
+
+    def __init__(self, kind: Any) -> None:
+        self._notes: dict[asyncio.AbstractEventLoop, tuple[LoopNotes, ...]] = {}
+        swaps = Swaps()
+        swaps.put(kind, "call_at", self._noting_timers(method(kind, "call_at"), lambda loop: 0.0))
+        if kind.call_later is not asyncio.BaseEventLoop.call_later:  # It calls `call_at`.
+            swaps.put(kind, "call_later", self._noting_timers(method(kind, "call_later"), kind.time))
+        swaps.put(kind, "create_future", self._noting_futures(method(kind, "create_future")))
+        swaps.put(kind, "create_task", self._noting_futures(method(kind, "create_task")))
+        swaps.put(kind, "call_exception_handler", self._noting_exceptions(method(kind, "call_exception_handler")))
+
+    @staticmethod
+    def of(kind: type) -> LoopMethods:
+        """Those that stand at a class, or new ones."""
+        standing = getattr(vars(kind).get("call_at"), "methods", None)
+        return standing if isinstance(standing, LoopMethods) else LoopMethods(kind)
+
+    def note(self, loop: asyncio.AbstractEventLoop, notes: LoopNotes) -> None:
+        """Tell this one, too, what is made in a loop."""
+        self._notes[loop] = *self._notes.get(loop, ()), notes
+
+    def stop(self, loop: asyncio.AbstractEventLoop, notes: LoopNotes) -> None:
+        """Tell it no more; a second call changes nothing."""
+        left = tuple(one for one in self._notes.pop(loop, ()) if one is not notes)
+        if left:
+            self._notes[loop] = left
+
+    def _noting_timers(self, call: Any, origin: Callable[[Any], float]) -> Any:
+        notes = self._notes
+
+        def noted(loop: Any, time: float, callback: Any, *args: Any, **options: Any) -> asyncio.Handle:
+            handle: asyncio.Handle = call(loop, time, callback, *args, **options)
+            for one in notes.get(loop, ()):
+                one.timer_made(handle, origin(loop) + time, callback)
+            return handle
+
+        noted.methods = self  # type: ignore[attr-defined]  # so that the next test finds them
+        return noted
+
+    def _noting_futures(self, make: Any) -> Any:
+        notes = self._notes
+
+        def noted(loop: Any, *args: Any, **options: Any) -> Any:
+            made = make(loop, *args, **options)
+            for one in notes.get(loop, ()):
+                one.future_made(made)
+            return made
+
+        return noted
+
+    def _noting_exceptions(self, call: Any) -> Any:
+        notes = self._notes
+
+        def noted(loop: Any, context: dict[str, Any]) -> None:
+            for one in notes.get(loop, ()):
+                one.exception_told(context)
+            call(loop, context)
+
+        return noted
+
+
+def method(kind: Any, name: str) -> Any:
+    """A class's own method, or whatever its bases have when it is called: a test may exchange theirs."""
+    if name in vars(kind):
+        return vars(kind)[name]
+
+    def inherited(loop: Any, *args: Any, **options: Any) -> Any:
+        return getattr(super(kind, loop), name)(*args, **options)
+
+    return inherited
