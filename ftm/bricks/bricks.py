@@ -307,7 +307,7 @@ class Proceed(Brick):
             is_last = state.is_over or not (follow or is_replay)
             waits = not is_last and self.leads and bool(follow) and server.runs_alone(follow[0])
             await self._hand(ends, is_last=is_last, live=live, wait=waits)
-            left, server.left = server.left, []
+            left, server.left_over = server.left_over, []
             if brings and not server.part.is_given_up:  # What was taken instead may have put back something.
                 pending.extendleft(reversed(left))
                 pending = server.returned_first(pending)

@@ -324,8 +324,8 @@ class Deciding(After):
         known = {end.id for end in ends}
         if server.state.is_over:
             return msgspec.structs.replace(done, ends=ends)
-        server.left += [one for one in asked if one.feed.id not in known]  # What was put back before them comes first.
-        goes_on = server.left or server.has_returned  # Home must not take the batch to be over.
+        server.left_over += [one for one in asked if one.feed.id not in known]  # What was put back before them comes first.
+        goes_on = server.left_over or server.has_returned  # Home must not take the batch to be over.
         return msgspec.structs.replace(done, ends=ends, is_last=done.is_last and not goes_on)
 
     def _last_run(self, before: ServerState, ends: list[TurnEnd]) -> Run:
