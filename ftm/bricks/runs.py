@@ -324,7 +324,7 @@ class Deciding(After):
         known = {end.id for end in ends}
         if server.state.is_over:
             return msgspec.structs.replace(done, ends=ends)
-        server.left_over += [one for one in asked if one.feed.id not in known]  # What was put back before them comes first.
+        server.left_over += [one for one in asked if one.feed.id not in known]  # What was put back comes first.
         goes_on = server.left_over or server.has_returned  # Home must not take the batch to be over.
         return msgspec.structs.replace(done, ends=ends, is_last=done.is_last and not goes_on)
 

@@ -129,7 +129,7 @@ class Server(lifecycle.HerePlace):
         self.state, self.points = ReplicaState(), RewindPoints()
         self.part, self.attempts = BatchPart(deque()), Attempts()
         self.traces, self.reports = Traces(), Reports()
-        self.left_over: list[Request] = []  # have no end: what was taken in place of their run has put something before them
+        self.left_over: list[Request] = []  # what was taken in place of their run comes first
         self.hooks: list[TurnHook] = []  # see each end while the actor is as the turn has left it; the innermost first
         self.shadows: set[Server] = set()  # more lives of it, which only compute
         self._driver: Driver | None = None  # None: nothing goes home
