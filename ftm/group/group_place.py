@@ -228,6 +228,8 @@ class GroupPlace(Place):
             raise CannotAdapt(cell.path, "it is being changed already")
         change = self._change(group, compose(mechanism))
         change.gate, group.adaptation.change, self.on_switched = gate, change, switched
+        if gate is not None:
+            gate.on_closed(change.give_up)
         group.replicas.tell("adapt", LookAgain())
         await asyncio.shield(change.outcome)
         return change
@@ -484,10 +486,6 @@ class GroupPlace(Place):
                 self._starting.cancel()
             elif self.group is not None:  # Else it has ended already.
                 self._begin_end(cell, KILLED, -1, ordered=True)
-
-    def give_up(self, why: str) -> None:
-        if self.group is not None and self.group.adaptation.change is not None:
-            self.group.adaptation.change.give_up(why)
 
     def end(self, cell: Cell, reason: ExitReason) -> None:
         if self._starting is not None and not self._starting.done():
