@@ -479,7 +479,7 @@ class GroupPlace(Place):
         if cell.state is DOWN and self._starting is not None:
             self._starting.cancel()
         elif cell.state is RUNNING:
-            if self._ending is not None:
+            if self._ending is not None and self.group is not None:  # Else its replicas are being ended already.
                 self._ending.cancel()
                 self._ending = None
             if self._starting is not None and not self._starting.done():
