@@ -221,7 +221,8 @@ class Controls:
             isolation: "task" or "process".
             limits: of the process; left out, those of its spec.
             timeout: seconds within which another change of where it lives must be over, within which it must come to
-                the end of its turn and of background work, and within which its new life must be up. (Making the new place ready goes on beside its work.)
+                the end of its turn and of background work, and within which its new life must be up. (Making the new
+                place ready goes on beside its work.)
 
         Whoever cancels this gives up waiting; the move itself comes to its end.
 

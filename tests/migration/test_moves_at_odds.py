@@ -13,9 +13,10 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.migration.subtree_moves import FromSubtree
 from tests.actors.process.waiting import next_event
 from tests.migration.test_far_moves import IN_TIME, Reluctant, pid_of
-from tests.migration.travellers import KINDS, Add, Traveller
+from tests.migration.travellers import KINDS, Add, Seen, Traveller
 from tests.system.trees import Stumble
 
 # A refused or failed transaction ends with its block.
@@ -259,3 +260,31 @@ async def test_a_mechanism_that_gives_way_while_somebody_detaches_it_is_gone_onc
     await asyncio.gather(detach(), gives_way)
     assert await ref.ask(Add(1), IN_TIME) == 2
     assert system.pid_of(ref) == (os.getpid() if old == "near" else pid_of(system, "far"))
+
+
+@pytest.mark.parametrize("overflow", ["block", "reject", "drop_newest", "drop_oldest", "latest"])
+async def test_who_finds_no_room_after_a_move_is_told_so_and_the_move_is_made(
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, overflow: Any
+) -> None:
+    """What is sent while it is on its way out of its supervisor's process comes behind what waits in a full mailbox."""
+    mailbox = hf.bounded(2, overflow=overflow)
+    ref = await supervised(system, child(hf.start(Traveller), mailbox=mailbox), "far")
+    await system.suspend(ref)
+    asks = [ref.ask(Add(n), IN_TIME) for n in (1, 2)]
+    let_go = FromSubtree.let_go
+
+    async def let_go_late(side: FromSubtree) -> None:
+        asks.extend(ref.ask(Add(n), IN_TIME) for n in (3, 4, 5))
+        await let_go(side)
+
+    monkeypatch.setattr(FromSubtree, "let_go", let_go_late)
+    await system.set_isolation(ref, "process", timeout=IN_TIME)
+    await system.resume(ref)
+    async with asyncio.timeout(20.0):
+        told = await asyncio.gather(*asks, return_exceptions=True)
+    assert len(told) == 5
+    assert all(isinstance(one, (int, hf.MailboxFull, hf.AskFailed)) for one in told)
+    added = (await ref.ask(Seen(), IN_TIME))["added"]
+    assert added == [n for n, one in enumerate(told, start=1) if isinstance(one, int)]
+    assert added == [1, 2, 3, 4, 5] if overflow == "block" else 0 < len(added) < 5
+    assert system.pid_of(ref) not in (os.getpid(), pid_of(system, "far"))

@@ -87,6 +87,13 @@ CHECKS = {
         AT_ODDS,
         "test_the_process_of_its_new_supervisor and plain",
     ),
+    "who finds no room after a move is told so": Check(
+        "actors/migration/luggage.py",
+        "        try:\n            cell.admit(cell, item)\n        except HoldfastError as error:\n            refuse(cell, item, error)\n",
+        "        cell.admit(cell, item)\n",
+        AT_ODDS,
+        "test_who_finds_no_room and reject",
+    ),
     "a mechanism that has given way is not detached again": Check(
         "system/live_moves.py",
         "        if not isinstance(cell.host.place, GroupPlace):\n            return  # It was",
