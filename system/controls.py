@@ -220,8 +220,9 @@ class Controls:
             ref: the actor: a child of a supervisor in this process.
             isolation: "task" or "process".
             limits: of the process; left out, those of its spec.
-            timeout: seconds within which it must come to the end of its turn and of background work, and within which
-                its new life must be up. (Making the new place ready goes on beside its work.)
+            timeout: seconds within which another change of where it lives must be over, within which it must come to
+                the end of its turn and of background work, and within which its new life must be up. (Making the new
+                place ready goes on beside its work.)
 
         Whoever cancels this gives up waiting; the move itself comes to its end.
 

@@ -6,18 +6,18 @@ import asyncio
 import dataclasses
 import weakref
 from collections.abc import Callable, Coroutine
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 from ..actors.control.orders import Ready
 from ..actors.control.orders_lane import order
-from ..actors.errors import CannotMove, SpecError
+from ..actors.errors import AskTimeout, CannotMove, HoldfastError, SpecError
 from ..actors.events import Moved
 from ..actors.kernel.actor import Actor
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import cell_kind
 from ..actors.kernel.ref import current
 from ..actors.migration.here import ToHere
-from ..actors.migration.move import Entering, Gate, Move, Pause
+from ..actors.migration.move import UNWANTED, Entering, Gate, Move, Pause
 from ..actors.migration.worker import ToWorker
 from ..actors.ordered import Ordered
 from ..actors.process.process_host import WorkerPlace
@@ -36,6 +36,11 @@ if TYPE_CHECKING:
     from ..checkpoint.home.homes import Homes
 
 
+T = TypeVar("T")
+
+LAST_LOOK = 0.05
+"""Seconds for which a next life is waited for at least, also when the time of a change is nearly over."""
+
 Begun = Callable[[Any], None]
 """Is told of the `Probation` of a stack of mechanisms, which may be over before anybody else could ask for it."""
 
@@ -46,15 +51,15 @@ class Moves:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._turns: weakref.WeakKeyDictionary[Cell, asyncio.Lock] = weakref.WeakKeyDictionary()
-        self._tasks = Ordered[asyncio.Task[None]]()
+        self._tasks = Ordered[asyncio.Task[Any]]()
         self._under_way: dict[Cell, Move] = {}  # of mechanisms
 
     async def move(
         self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float, gate: Gate | None = None
-    ) -> None:
+    ) -> bool:
         """Move an actor; if whoever wants it does not wait any more, the move comes to its end all the same.
 
-        With a gate it waits there when all is ready.
+        With a gate it waits there when all is ready. Returns whether it has been moved: not if it lived there.
 
         Raises:
             CannotMove, ActorStopped, AskTimeout, ProcessUnavailable.
@@ -62,16 +67,10 @@ class Moves:
         caller = current.get(None)
         if caller is not None and caller.cell is cell and caller.in_turn():
             raise CannotMove(cell.path, "a turn of its own waits for it; call this from outside, or from a task")
-        task = self._node.loop.create_task(
-            self._in_turn(cell, isolation, limits, timeout, gate),
-            name=f"move of {cell.path}",
-            context=self._node.base_context.copy(),
-        )
-        self._tasks.add(task)
-        task.add_done_callback(self._over)
-        await to_its_end(cell.path, task)
+        settled = self._moved_there(cell, isolation, limits, timeout, gate)
+        return await self._alone(cell, settled, f"move of {cell.path}", timeout, gate)
 
-    def _over(self, task: asyncio.Task[None]) -> None:
+    def _over(self, task: asyncio.Task[Any]) -> None:
         self._tasks.discard(task)
         if not task.cancelled():
             task.exception()  # Seen: whoever wanted it may not wait any more.
@@ -87,24 +86,24 @@ class Moves:
         """Whoever has it is the only one who changes where an actor lives."""
         return self._turns.setdefault(cell, asyncio.Lock())
 
-    async def _in_turn(
+    async def _moved_there(
         self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float, gate: Gate | None
-    ) -> None:
-        async with self.lock(cell):
-            origin, place = place_of(cell), cell.host.place
-            known = cell.spec if isinstance(cell.spec, ChildSpec) else recipe_spec(cell)
-            if origin == isolation and (known is None or known.mechanism is None):
-                return
-            spec = _spec_there(cell, isolation, limits)
-            if spec.mechanism is not None:  # Its replicas have processes: it lives there when nobody protects it.
-                replace_place(cell, spec)
-                cell.host.parent.respecified(cell, place.spec_data(cell))
-                return
-            move = await self._moved(
-                cell, timeout, lambda: self._made(cell, spec, timeout), lambda: replace_place(cell, spec), gate
-            )
-            if self._node.events.has_listeners:
-                self._node.emit(Moved(cell.path, origin, isolation, move.gone_on_at - move.rest_at))
+    ) -> bool:
+        origin, place = place_of(cell), cell.host.place
+        known = cell.spec if isinstance(cell.spec, ChildSpec) else recipe_spec(cell)
+        if origin == isolation and (known is None or known.mechanism is None):
+            return False
+        spec = _spec_there(cell, isolation, limits)
+        if spec.mechanism is not None:  # Its replicas have processes: it lives there when nobody protects it.
+            replace_place(cell, spec)
+            cell.host.parent.respecified(cell, place.spec_data(cell))
+            return False
+        move = await self._moved(
+            cell, timeout, lambda: self._made(cell, spec, timeout), lambda: replace_place(cell, spec), gate
+        )
+        if self._node.events.has_listeners:
+            self._node.emit(Moved(cell.path, origin, isolation, move.gone_on_at - move.rest_at))
+        return True
 
     async def protect(
         self,
@@ -122,7 +121,8 @@ class Moves:
         Raises:
             CannotMove, ActorStopped, AskTimeout, ProcessUnavailable: it goes on as it was.
         """
-        await self._alone(cell, self._protected(cell, homes, mechanism, timeout, gate, begun), f"attach to {cell.path}")
+        protected = self._protected(cell, homes, mechanism, timeout, gate, begun)
+        await self._alone(cell, protected, f"attach to {cell.path}", timeout, gate)
 
     async def _protected(
         self, cell: Cell, homes: Homes, mechanism: Any, timeout: float, gate: Gate | None, begun: Begun
@@ -145,7 +145,8 @@ class Moves:
         # Without recovery, only what lives in this process has what a group needs of its state.
         is_by_way_of_a_task = place_of(cell) == "process" and not isinstance(cell.host.home, JournalHome)
         if is_by_way_of_a_task:
-            await self._settle_in(cell, "task", before.limits, timeout)
+            way = None if gate is None else gate.passage()
+            await self._settle_in(cell, "task", before.limits, timeout, way)
         try:
             move = await self._moved(
                 cell,
@@ -168,13 +169,17 @@ class Moves:
         Raises:
             CannotMove, ActorStopped, AskTimeout, ProcessUnavailable: it stays protected.
         """
-        await self._alone(cell, self._unprotected(cell, timeout, gate), f"detach from {cell.path}")
+        unprotected = self._unprotected(cell, timeout, gate)
+        await self._alone(cell, unprotected, f"detach from {cell.path}", timeout, gate)
 
     async def _unprotected(self, cell: Cell, timeout: float, gate: Gate | None) -> None:
         from ..ftm.events import MechanismDetached
+        from ..ftm.group.group_place import GroupPlace
         from ..ftm.migration.protection import is_plain, out_of_group
         from ..ftm.model.mechanism import compose
 
+        if not isinstance(cell.host.place, GroupPlace):
+            return  # It was on probation, and has given way by itself meanwhile; or this is the one that comes late.
         before: ChildSpec = cell.spec
         is_by_way_of_a_task = before.isolation == "process" and is_plain(cell)
         wanted = dataclasses.replace(
@@ -217,17 +222,17 @@ class Moves:
         Raises:
             CannotAdapt, ActorStopped, AskTimeout: it stays as it was.
         """
-        await self._alone(cell, self._adapted(cell, mechanism, timeout, gate, begun), f"adaptation of {cell.path}")
+        adapted = self._adapted(cell, mechanism, timeout, gate, begun)
+        await self._alone(cell, adapted, f"adaptation of {cell.path}", timeout, gate)
 
     async def _adapted(self, cell: Cell, mechanism: Any, timeout: float, gate: Gate | None, begun: Begun) -> None:
         from ..ftm.events import MechanismChanged
         from ..ftm.group.group_place import GroupPlace
         from ..ftm.group.reconfiguration import CannotAdapt
 
-        end = self._node.loop.time() + timeout
+        attempts = _Attempts(cell, timeout, gate)
         while True:
-            if not cell.host.is_up(cell):
-                await order(cell, Ready(), timeout)  # It is being recovered: its next life is changed.
+            await attempts.until_up()  # It may be being recovered: its next life is changed.
             host, place = cell.host, cell.host.place
             if not isinstance(place, GroupPlace):
                 raise CannotAdapt(cell.path, "it has no mechanism")
@@ -240,9 +245,10 @@ class Moves:
             try:
                 change = await place.adapt(cell, mechanism, switched, gate=gate)
                 break
-            except CannotAdapt:
-                if (cell.life == life and host.is_up(cell)) or cell.is_dead or self._node.loop.time() > end:
+            except CannotAdapt as error:
+                if (cell.life == life and host.is_up(cell)) or cell.is_dead:
                     raise
+                attempts.life_ended(error)
         if self._node.events.has_listeners:
             was, names = (tuple(layer.name for layer in layers) for layers in (old, change.layers))
             seconds = change.gone_on_at - change.rest_at
@@ -265,36 +271,58 @@ class Moves:
             return rest_of_group(cell, timeout)
 
         pausing = self._moved(cell, timeout, made, lambda: None, gate)
-        await self._alone(cell, pausing, f"pause of {cell.path}")
+        await self._alone(cell, pausing, f"pause of {cell.path}", timeout, gate)
 
-    async def _alone(self, cell: Cell, change: Coroutine[Any, Any, None], name: str) -> None:
-        """Carry out a change of where an actor lives while no other is; it comes to its end in any case."""
+    async def _alone(
+        self, cell: Cell, change: Coroutine[Any, Any, T], name: str, timeout: float, gate: Gate | None
+    ) -> T:
+        """Carry out a change of where an actor lives while no other is; it comes to its end in any case.
 
-        async def in_turn() -> None:
-            async with self.lock(cell):
-                await change
+        If it is not its turn within the time, or the gate is closed before, it is not begun.
+
+        Raises:
+            CannotMove: it was not its turn in time.
+        """
+        is_begun = False
+
+        async def in_turn() -> T:
+            nonlocal is_begun
+            lock = self.lock(cell)
+            try:
+                async with asyncio.timeout(timeout):
+                    await lock.acquire()
+            except TimeoutError as error:
+                raise CannotMove(cell.path, f"another change of it is not over within {timeout:g} s") from error
+            try:
+                is_begun = True
+                return await change
+            finally:
+                lock.release()
+
+        def give_up(why: str) -> None:
+            if not is_begun:
+                task.cancel()
 
         task = self._node.loop.create_task(in_turn(), name=name, context=self._node.base_context.copy())
         self._tasks.add(task)
         task.add_done_callback(self._over)
         task.add_done_callback(lambda done: change.close())  # It may never have begun.
-        await to_its_end(cell.path, task)
+        if gate is not None:
+            gate.on_closed(give_up)
+        return await to_its_end(cell.path, task)
 
-    async def _settle_in(self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float) -> None:
+    async def _settle_in(
+        self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float, gate: Gate | None = None
+    ) -> None:
         spec = _spec_there(cell, isolation, limits)
-        await self._moved(cell, timeout, lambda: self._made(cell, spec, timeout), lambda: replace_place(cell, spec))
+        await self._moved(
+            cell, timeout, lambda: self._made(cell, spec, timeout), lambda: replace_place(cell, spec), gate
+        )
 
     def is_moving(self, cell: Cell) -> bool:
         """Whether an actor is on its way to live elsewhere."""
         move = self._under_way.get(cell)
         return move is not None and not move.stays
-
-    def give_up(self, cell: Cell, why: str) -> None:
-        """What is under way there ends soon, undone, unless it is done already."""
-        move = self._under_way.get(cell)
-        if move is not None:
-            move.give_up(why)
-        cell.host.place.give_up(why)
 
     async def _moved(
         self,
@@ -305,17 +333,17 @@ class Moves:
         gate: Gate | None = None,
     ) -> Any:
         """Carry out a move; if the life ends before it is at rest, its next life is moved."""
-        end = self._node.loop.time() + timeout
+        attempts = _Attempts(cell, timeout, gate)
         while True:
-            if not cell.host.is_up(cell):
-                await order(cell, Ready(), timeout)
+            await attempts.until_up()
             move = self._under_way[cell] = made()
             move.moved, move.gate = moved, gate
             try:
                 await move.run()
-            except CannotMove:
-                if not move.is_late or cell.is_dead or self._node.loop.time() > end:
+            except CannotMove as error:
+                if not move.is_late or cell.is_dead:
                     raise
+                attempts.life_ended(error)
             else:
                 return move
             finally:
@@ -339,6 +367,55 @@ class Moves:
         return ToRecordedHere(host) if is_recorded else ToHere(host)
 
 
+class _Attempts:
+    """The lives of one actor that a change is begun with: if one ends before it is at rest, the next one."""
+
+    def __init__(self, cell: Cell, timeout: float, gate: Gate | None) -> None:
+        self._cell, self._timeout = cell, timeout
+        self._gate = Gate(cell.node.loop) if gate is None else gate
+        self._end = cell.node.loop.time() + timeout
+
+    async def until_up(self) -> None:
+        """Wait until a life is up.
+
+        Raises:
+            CannotMove: the change is not wanted any more, or lives have ended again and again and none is up in time.
+            ActorStopped, AskTimeout.
+        """
+        cell, closed = self._cell, self._gate.closed
+        if cell.host.is_up(cell):
+            return
+        up = order(cell, Ready(), max(self._end - cell.node.loop.time(), LAST_LOOK))
+        try:
+            await asyncio.wait((up, closed), return_when=asyncio.FIRST_COMPLETED)
+            if not up.done():
+                raise CannotMove(cell.path, UNWANTED)
+            up.result()
+        except AskTimeout as error:
+            if self._gate.lives_ended:
+                raise self._too_often() from error
+            raise
+        finally:
+            up.cancel()
+
+    def life_ended(self, error: HoldfastError) -> None:
+        """A life has ended before it was at rest; raises the error if the next one is not tried."""
+        self._gate.lives_ended += 1
+        if self._gate.is_closed:
+            raise error
+        if self._cell.node.loop.time() > self._end:
+            raise self._too_often() from error
+
+    def _too_often(self) -> CannotMove:
+        return CannotMove(self._cell.path, f"not within {self._timeout:g} s: {ended_too_often(self._gate.lives_ended)}")
+
+
+def ended_too_often(lives: int) -> str:
+    """Say what keeps a change from an actor whose lives end too soon for it."""
+    times = "once" if lives == 1 else f"{lives} times"
+    return f"its life has ended {times} meanwhile, before it was at rest; mend what ends it, and try again"
+
+
 def check_isolation(isolation: object, limits: object, timeout: object) -> None:
     """Raises SpecError: what a move is told is not valid."""
     if isolation not in get_args(Isolation):
@@ -349,7 +426,7 @@ def check_isolation(isolation: object, limits: object, timeout: object) -> None:
         raise SpecError("set_isolation", f"timeout must be a number of seconds > 0, not {timeout!r}")
 
 
-async def to_its_end(actor: str, change: asyncio.Future[None]) -> None:
+async def to_its_end(actor: str, change: asyncio.Future[T]) -> T:
     """Wait for a change of where an actor lives, which goes on if whoever waits is cancelled.
 
     Raises:
@@ -357,7 +434,7 @@ async def to_its_end(actor: str, change: asyncio.Future[None]) -> None:
         CancelledError: whoever waits was.
     """
     try:
-        await asyncio.shield(change)
+        return await asyncio.shield(change)
     except asyncio.CancelledError:
         if change.cancelled():
             raise CannotMove(actor, "the system ends") from None

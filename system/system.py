@@ -16,7 +16,7 @@ from ..actors.exit_reasons import SHUTDOWN, ExitReason, pack_exit
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.address_host import AddressHost
-from ..actors.kernel.cell import Cell, Host
+from ..actors.kernel.cell import GONE, Cell, Host
 from ..actors.kernel.lifecycle import LOCAL, NEAR
 from ..actors.kernel.mailbox import Bounded
 from ..actors.kernel.message import Message
@@ -448,7 +448,7 @@ class ActorSystem(Recorded, Controls):
 
         Args:
             dry_run: check only; `change.describe()` then tells what would be done.
-            timeout: seconds from the end of the body until all is done; stopping what was removed is not counted.
+            timeout: seconds from the end of the body until all is in force. (What has to follow then has its own time.)
 
         Raises (at the end of the body):
             TransactionRefused: a check has failed; nothing was done. TransactionFailed: a step has; all was undone.
@@ -506,7 +506,9 @@ class ActorSystem(Recorded, Controls):
         Raises:
             NoSuchActor: it lives nowhere at the moment.
         """
-        cell: Cell | None = ref._cell
+        cell: Cell | None = ref._cell if ref._cell.state is not GONE else self.node.successor(ref._cell)
+        if cell is None:
+            raise NoSuchActor(ref.path)
         while cell is not None:
             place = cell.host.place
             worker = place.process(cell)

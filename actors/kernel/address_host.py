@@ -112,9 +112,6 @@ class Place:
         """What of the spec says how lives are lived here, as data."""
         return {}
 
-    def give_up(self, why: str) -> None:
-        """A change of the place itself is under way, and not wanted any more: it ends soon, undone."""
-
     def end(self, cell: Cell, reason: ExitReason) -> None:
         """Nobody wants the life any more, or the start that is under way: end it."""
         self.kill(cell)
@@ -160,6 +157,11 @@ class Parent:
 
     def retired(self, cell: Cell) -> None:
         """The address is gone for good."""
+
+    @property
+    def has_lost(self) -> bool:
+        """Whether the life here has ended with the supervisor's process, and no other one is wanted here."""
+        return False
 
     def leaves(self, *, is_restarting: bool) -> None:
         """The supervisor gives up the address; it may have been started again by its own (`is_restarting`)."""

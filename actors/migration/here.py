@@ -17,7 +17,7 @@ from ..kernel.envelope import Item
 from ..kernel.lifecycle import Stop
 from ..kernel.mailbox import Bound
 from ..kernel.timers import Timer
-from .luggage import check_sendable, pack_rest
+from .luggage import check_sendable, let_come, pack_rest
 from .move import Entering, Leaving, Move
 from .quiesce import PackLife, Transit, decoded, farewell, now, part, resume, settle, sorted_out, twin
 from .worker_moves import await_up
@@ -208,8 +208,7 @@ class ToHere(Entering):
         for name, body, left, interval in luggage.timers:
             message = cell.node.codec.decode(cell.table.kind_named(name), body)
             Timer.unpacked(cell, message, max(0.0, left), interval or None, False)
-        for ask in luggage.waiting:
-            cell.admit(cell, ask)
+        let_come(cell, luggage.waiting)
         if bound is not None:
             let_in(cell, bound)
         return commands

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, cast
 
 from ..control.live_state import live_state, put_state
@@ -247,3 +247,20 @@ def check_sendable(cell: Cell) -> None:
             cell.node.codec.encode(message, cell.path)
         except BadMessage as error:
             raise Stays(f"a queued message cannot be sent to another process ({error_text(error)})") from error
+
+
+def refuse(cell: Cell, item: Any, error: HoldfastError) -> None:
+    """An item cannot be brought to its actor."""
+    if isinstance(item, Ask):
+        item.fail(error)
+    else:
+        cell.node.dead_letter(cell, item.message if isinstance(item, Envelope) else item, str(error))
+
+
+def let_come(cell: Cell, items: Iterable[Any]) -> None:
+    """Have what has waited on the way come to its actor where it lives now; whoever finds no room there is told so."""
+    for item in items:
+        try:
+            cell.admit(cell, item)
+        except HoldfastError as error:
+            refuse(cell, item, error)

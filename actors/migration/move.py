@@ -31,13 +31,27 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
+UNWANTED = "it is not wanted any more"
+
+
 class Gate:
-    """Where a change that is ready waits for leave to be made, so that several are made at the same instant."""
+    """Where a change that is ready waits for leave to be made, so that several are made at the same instant.
+
+    Whoever has the gate can give up the change for which it was made, and no other one of the same actor.
+    """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.opened: asyncio.Future[None] = loop.create_future()
         self.reached: asyncio.Future[None] = loop.create_future()
-        self.is_waiting = self.is_closed = False
+        self.closed: asyncio.Future[None] = loop.create_future()
+        self.is_waiting = False
+        self.lives_ended = 0
+        """How many lives have ended before they were at rest, so that the change of the next one was begun."""
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the change is not to be."""
+        return self.closed.done()
 
     def open(self) -> None:
         """All that comes may pass from now on."""
@@ -45,9 +59,21 @@ class Gate:
             self.opened.set_result(None)
 
     def close(self) -> None:
-        """Nothing passes any more, also what comes later."""
-        self.is_closed = True
+        """Nothing passes any more, also what comes later; what is on its way here is given up."""
+        if not self.closed.done():
+            self.closed.set_result(None)
         self.open()
+
+    def on_closed(self, give_up: Callable[[str], None]) -> None:
+        """Have a change that is on its way here told when it is not to be."""
+        self.closed.add_done_callback(lambda closed: give_up(UNWANTED))
+
+    def passage(self) -> Gate:
+        """A gate on the way to this one: all may pass, until this one is closed."""
+        before = Gate(self.opened.get_loop())
+        before.open()
+        self.closed.add_done_callback(lambda closed: before.close())
+        return before
 
     @contextlib.contextmanager
     def waiting(self) -> Generator[asyncio.Future[None]]:
@@ -211,6 +237,8 @@ class Move:
         leaving, entering = self.leaving, self.entering
         ended = self.cell.ended()
         ended.add_done_callback(self._life_ended)
+        if self.gate is not None:
+            self.gate.on_closed(self.give_up)
         try:
             await entering.prepare()
             await leaving.quiesce()
@@ -241,7 +269,7 @@ class Move:
             with self.gate.waiting() as opened:
                 await asyncio.wait((opened, self.given_up), return_when=asyncio.FIRST_COMPLETED)
         if self.gate.is_closed:
-            self.give_up("it is not wanted any more")
+            self.give_up(UNWANTED)
         if self.given_up.done():
             raise CannotMove(self.cell.path, self.given_up.result())
 

@@ -17,7 +17,7 @@ from ..kernel.links import Monitor
 from ..process.process_host import Outlet, RemoteBound, WorkerPlace, admit_remote, admit_remote_bounded
 from ..process.wire.start_codec import pack_recipe
 from .here import let_in
-from .luggage import unpack, unpack_items
+from .luggage import let_come, unpack, unpack_items
 from .move import Entering, Leaving
 from .quiesce import carry, now, sorted_out
 
@@ -101,8 +101,7 @@ class ToWorker(Entering):
         carry(luggage.queue)
         cell.queue = deque(luggage.queue)
         send_queue(cell)
-        for item in luggage.waiting:
-            cell.admit(cell, item)
+        let_come(cell, luggage.waiting)
         worker.connection.flush()
         return []
 

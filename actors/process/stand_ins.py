@@ -42,7 +42,9 @@ class Inner:
         """
         cell = self._cells.get(path)
         if cell is None:
-            cell = self._node.cell_below(*self._place(home, path), self._host)
+            parent, name = self._place(home, path)
+            self._free(parent, name)
+            cell = self._node.cell_below(parent, name, self._host)
             self._cells[path] = cell
             cell.state, cell.admit = RUNNING, self._admit
         elif cell.life != life:
@@ -85,6 +87,14 @@ class Inner:
         for watch in ties.monitors:
             if watch.watcher in within:
                 watch.name = cell.path
+
+    @staticmethod
+    def _free(parent: Cell, name: str) -> None:
+        """Give up a life here that ended with the last process, before it had gone where its recipe says: there."""
+        left = (parent.children or {}).get(name)
+        if left is not None and left.host.parent.has_lost:
+            left.host.parent.leaves(is_restarting=True)
+            lifecycle.retire(left, "the process of its supervisor has ended")
 
     def lived_there(self, cell: Cell) -> Host:
         """What is sent to an address goes into the process from now on; returns its host."""

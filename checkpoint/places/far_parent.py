@@ -269,6 +269,10 @@ class FarParent(Parent):
     def is_restarting(self, cell: Cell) -> bool:
         return self._is_restarting
 
+    @property
+    def has_lost(self) -> bool:
+        return self.wanted is None and self._next is None
+
     def leaves(self, *, is_restarting: bool) -> None:
         self._is_restarting = is_restarting
 

@@ -20,6 +20,7 @@ from ...actors.errors import AskTimeout, HoldfastError
 from ...actors.kernel.actor import on
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.message import Message
+from ...actors.migration.move import UNWANTED
 from ...supervision.admin import AlreadyPresent, StartChild
 from ...supervision.spec import ChildSpec
 from ..bricks.brick_messages import ConfigMismatch, StaleLeader
@@ -268,7 +269,7 @@ class AdaptationEngine(GroupPart):
                 if not await self._ends(opened, change, self._now() + ALLOWED_WITHIN, "nobody has said that it may be"):
                     return False
         if change.gate is not None and change.gate.is_closed:
-            change.give_up("it is not wanted any more")
+            change.give_up(UNWANTED)
         return not change.why and self._is_as_prepared(change)
 
     async def _commit(self, change: Reconfiguration) -> None:

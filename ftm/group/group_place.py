@@ -228,6 +228,8 @@ class GroupPlace(Place):
             raise CannotAdapt(cell.path, "it is being changed already")
         change = self._change(group, compose(mechanism))
         change.gate, group.adaptation.change, self.on_switched = gate, change, switched
+        if gate is not None:
+            gate.on_closed(change.give_up)
         group.replicas.tell("adapt", LookAgain())
         await asyncio.shield(change.outcome)
         return change
@@ -480,17 +482,13 @@ class GroupPlace(Place):
         if cell.state is DOWN and self._starting is not None:
             self._starting.cancel()
         elif cell.state is RUNNING:
-            if self._ending is not None:
+            if self._ending is not None and self.group is not None:  # Else its replicas are being ended already.
                 self._ending.cancel()
                 self._ending = None
             if self._starting is not None and not self._starting.done():
                 self._starting.cancel()
             elif self.group is not None:  # Else it has ended already.
                 self._begin_end(cell, KILLED, -1, ordered=True)
-
-    def give_up(self, why: str) -> None:
-        if self.group is not None and self.group.adaptation.change is not None:
-            self.group.adaptation.change.give_up(why)
 
     def end(self, cell: Cell, reason: ExitReason) -> None:
         if self._starting is not None and not self._starting.done():

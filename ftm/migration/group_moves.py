@@ -19,6 +19,7 @@ from ...actors.kernel.envelope import Ask, Envelope, Item
 from ...actors.kernel.links import Down, Exit, Monitor
 from ...actors.kernel.mailbox import Bound
 from ...actors.kernel.message import message_name
+from ...actors.migration.luggage import let_come
 from ...actors.migration.move import Entering, Leaving
 from ...actors.migration.quiesce import Transit, now
 from ...actors.overflow import Overflow
@@ -33,7 +34,7 @@ from ..group.group_place import GroupPlace
 from ..group.membership import LookAgain
 from ..group.steering import AGAIN_AFTER
 from ..group.trial import rehearsed
-from .unrecorded_luggage import refuse, restore_owing, save_owing
+from .unrecorded_luggage import restore_owing, save_owing
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
@@ -156,11 +157,7 @@ class ToGroup(Entering):
         for topic in topics:
             switch.topics[topic] = None
             cell.node.topics.subscribe(topic, cell)
-        for item in waiting:
-            try:
-                cell.admit(cell, item)
-            except HoldfastError as error:
-                refuse(cell, item, error)
+        let_come(cell, waiting)
         if bound is not None:
             bound.release()
         more.stash = None

@@ -20,6 +20,7 @@ from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.mailbox import Bound, Bounded
 from ...actors.kernel.message import message_name
+from ...actors.migration.luggage import let_come
 from ...actors.migration.move import Entering, Leaving, Move
 from ...actors.migration.quiesce import now
 from ...actors.migration.worker import BUSY, ToWorker
@@ -42,7 +43,7 @@ from ..group.group_place import GroupPlace, protected_host
 from ..group.transient_homes import UNKEPT
 from .group_moves import settle_in
 from .subtree_groups import process_below
-from .unrecorded_luggage import pack, pack_owed, refuse, unpack, unpack_owed
+from .unrecorded_luggage import pack, pack_owed, unpack, unpack_owed
 
 if TYPE_CHECKING:
     from ...actors.kernel.address_host import AddressHost
@@ -284,13 +285,8 @@ class FromSubtree(Leaving):
 
     def _let_go(self, held: list[Any]) -> None:
         """What has waited here goes where the actor lives."""
-        cell = self.cell
         self._held = []
-        for item in held:
-            try:
-                cell.admit(cell, item)
-            except HoldfastError as error:
-                refuse(cell, item, error)
+        let_come(self.cell, held)
 
     def _quit(self) -> None:
         self._parent.arriving = self._parent.on_lost = None

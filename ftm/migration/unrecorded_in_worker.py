@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from ...actors.errors import HoldfastError, StartFailed
+from ...actors.errors import StartFailed
 from ...actors.exit_reasons import unpack_exit
 from ...actors.kernel import lifecycle, links
 from ...actors.kernel.cell import RUNNING, Cell
@@ -22,14 +22,14 @@ from ...actors.kernel.mailbox import Bound, Bounded
 from ...actors.kernel.timers import Timer
 from ...actors.kernel.topics import Topics
 from ...actors.migration.here import Arrival
-from ...actors.migration.luggage import check_sendable, pack_rest
+from ...actors.migration.luggage import check_sendable, let_come, pack_rest
 from ...actors.migration.luggage import unpack as unpack_life
 from ...actors.migration.quiesce import PackLife, farewell, now, obey_commands, part, resume, sorted_out
 from ...actors.migration.words import say
 from ...actors.process.wire.frames import BadFrame
 from ...checkpoint.protocol import Respec
 from .protected_stand_ins import ChildAtRoot, child_at_root, respec
-from .unrecorded_luggage import EarlyAsk, pack, pack_owed, refuse, restore_owing, save_owing, unpack
+from .unrecorded_luggage import EarlyAsk, pack, pack_owed, restore_owing, save_owing, unpack
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
@@ -257,11 +257,7 @@ class PlainChild:
             Timer.unpacked(cell, message, max(0.0, left), interval or None, False)
         self._take_ties_over(cell, told)
         respec(cell, Respec([]))
-        for item in held:
-            try:
-                cell.admit(cell, item)
-            except HoldfastError as error:
-                refuse(cell, item, error)
+        let_come(cell, held)
         obey_commands(cell, commands)
         if has_ended:
             lifecycle.ended(cell, arrival.other.extra().reason)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import HoldfastError
 from ...actors.kernel.codec import Parcel
-from ...actors.kernel.envelope import Ask, Envelope, Item, ReplyHandle
+from ...actors.kernel.envelope import Ask, Item, ReplyHandle
 from ...actors.kernel.message import message_name
-from ...actors.migration.luggage import lift, pack_items, unanswerable, unpack_items
+from ...actors.migration.luggage import lift, pack_items, refuse, unanswerable, unpack_items
 from ...actors.process.wire.peer import Peer, RelayedAsk
 from ...actors.values import UnsavableValue
 from ...checkpoint.life.recorded_context import RecordedReplyHandle
@@ -177,11 +177,3 @@ def unpack(peer: Peer, cell: Cell, packed: Iterable[list[Any]]) -> list[Any]:
         except Exception as error:  # The same for a message that nobody waits for.
             node.dead_letter(cell, Parcel(str(entry[1]), bytes(entry[2])), str(error))
     return [item for item in items if not (isinstance(item, Ask) and item.is_done)]
-
-
-def refuse(cell: Cell, item: Any, error: HoldfastError) -> None:
-    """An item cannot be brought to its actor."""
-    if isinstance(item, Ask):
-        item.fail(error)
-    else:
-        cell.node.dead_letter(cell, item.message if isinstance(item, Envelope) else item, str(error))

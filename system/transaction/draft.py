@@ -248,13 +248,15 @@ def rules() -> Any:
 class Draft:
     """All places, as they are at this point of the transaction."""
 
-    def __init__(self, node: Node, arrangement: Arrangement) -> None:
+    def __init__(self, node: Node, arrangement: Arrangement, timeout: float) -> None:
         root = node.root
         assert root is not None
         self.node = node
         self.by_cell: dict[Cell, DraftPlace] = {}
         self._asked: set[DraftPlace] = set()  # supervisors of other processes that have told us whom they have
         self.arrangement = arrangement
+        self.timeout = timeout
+        """Seconds that the transaction may take."""
         self.root = self._survey(root, root.path, None, None)
         for cell, place in list(self.by_cell.items()):
             for port, target in (cell.more.bindings if cell.more is not None else {}).items():

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+import functools
 from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import ActorStopped, HoldfastError
@@ -76,8 +77,8 @@ def check_handing(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> None:
 class Handing:
     """One child that is given to another supervisor."""
 
-    def __init__(self, place: DraftPlace) -> None:
-        self._place = place
+    def __init__(self, place: DraftPlace, timeout: float) -> None:
+        self._place, self._timeout = place, timeout
         self._candidate = next(CANDIDATES)
         self._start: asyncio.Task[Any] | None = None  # by the new supervisor, in its process; over behind the commit
         self._asked: Cell | None = None  # that supervisor
@@ -91,6 +92,11 @@ class Handing:
         above = self._place.parent
         assert above is not None
         return above
+
+    @property
+    def waits_for(self) -> str:
+        """Why it has no process of its own yet, in words; "" if nothing is known."""
+        return self._lodging.waits_for
 
     @property
     def _is_needed(self) -> bool:
@@ -107,8 +113,8 @@ class Handing:
             raise wrong(place.path, "it goes to another process's supervisor: change it in a transaction of its own")
         cell = place.living(system.node)
         if place_of(cell) != "process":
-            self._is_lodged = True
-            await self._lodging.done(system, system._moves.move(cell, "process", None, MOVED_WITHIN))
+            work = functools.partial(system._moves.move, cell, "process", None, MOVED_WITHIN)
+            self._is_lodged |= await self._lodging.done(system, work)
         above = self._above.living(system.node)
         if not is_elsewhere(above) or (self._asked is above and self._life == above.life and not self._has_failed()):
             return
@@ -177,12 +183,12 @@ class Handing:
     async def _settle(self, system: ActorSystem) -> None:
         cell = self._place.now(system.node)
         if self._is_lodged and cell is not None:
-            await system._moves.move(cell, "task", None, MOVED_WITHIN)
+            await system._moves.move(cell, "task", None, self._timeout)
 
     async def release(self, system: ActorSystem) -> None:
         """The new supervisor forgets it, and it lives where it did."""
         try:
-            await self._lodging.give_up(system)
+            self._is_lodged |= await self._lodging.give_up()
             await self._withdraw()
         finally:
             await self._settle(system)

@@ -41,6 +41,10 @@ class OnSharedWork(OnLiving):
         if self._work is not None:
             await self._work.prepare(system)
 
+    @property
+    def waits_for(self) -> str:
+        return "" if self._work is None else self._work.waits_for
+
     def ready(self, system: ActorSystem) -> str:
         return "" if self._work is None else self._work.ready(system)
 

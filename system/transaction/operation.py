@@ -38,6 +38,11 @@ class StagedWork:
             HoldfastError: it cannot be done.
         """
 
+    @property
+    def waits_for(self) -> str:
+        """What its preparation waits for, in words, told when the time is up; "" if nothing is known."""
+        return ""
+
     def ready(self, system: ActorSystem) -> str:
         """What is in the way of a commit at this very instant, in words; "" if nothing is.
 
@@ -74,8 +79,6 @@ class Operation(StagedWork):
     def __init__(self, at: Target, child: str = "") -> None:
         self._at = at
         self.target = f"{text_of(at)}/{child}" if child else text_of(at)
-        self.waiting = ""
-        """What the transaction waits for because of this step, told when the time is up."""
         self.between_turns_of: tuple[DraftPlace, ...] = ()
         """Whose turns have to be over for this; known after the check."""
 

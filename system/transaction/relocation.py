@@ -16,7 +16,7 @@ from ...actors.migration.move import Gate
 from ...supervision.arbiter import Grant, Hand, arbiter_of
 from ...supervision.respec import recipe_spec, replace_mechanism, replace_place
 from ...supervision.spec import ChildSpec
-from ..live_moves import to_its_end
+from ..live_moves import ended_too_often, to_its_end
 from .draft import rules
 from .operation import StagedWork
 
@@ -34,12 +34,20 @@ class Gated:
 
     def __init__(self, place: DraftPlace, text: str) -> None:
         self._place, self._text = place, text
-        self.task: asyncio.Task[None] | None = None
+        self.task: asyncio.Task[Any] | None = None
+        self._path = ""  # of the actor, as it is while this is done
         self._gate: Gate | None = None
 
-    def begin(self, system: ActorSystem, work: Coroutine[Any, Any, None]) -> None:
+    @property
+    def waits_for(self) -> str:
+        """Why it takes so long, in words; "" if nothing is known."""
+        lives = 0 if self._gate is None else self._gate.lives_ended
+        return f"{self._path}: {ended_too_often(lives)}" if lives else ""
+
+    def begin(self, system: ActorSystem, work: Coroutine[Any, Any, object]) -> None:
         """Have it done; with a gate that `work` was given it waits there."""
         cell = self._place.living(system.node)
+        self._path = cell.path
         self.task = system.node.loop.create_task(
             to_its_end(cell.path, asyncio.ensure_future(work)),
             name=self._text,
@@ -47,7 +55,7 @@ class Gated:
         )
         self.task.add_done_callback(_seen)
 
-    async def reach(self, system: ActorSystem, work: Callable[[Gate], Coroutine[Any, Any, None]]) -> None:
+    async def reach(self, system: ActorSystem, work: Callable[[Gate], Coroutine[Any, Any, object]]) -> None:
         """Have it begun, if it is not, and wait until it is ready."""
         if self.task is None:
             self._gate = Gate(system.node.loop)
@@ -60,11 +68,13 @@ class Gated:
         if task.done():
             task.result()
 
-    async def done(self, system: ActorSystem, work: Coroutine[Any, Any, None]) -> None:
-        """Have it done at once, without a gate. Whoever waits no more has to give it up."""
-        self.begin(system, work)
+    async def done(self, system: ActorSystem, work: Callable[[Gate], Coroutine[Any, Any, bool]]) -> bool:
+        """Have it done at once, at an open gate. Whoever waits no more has to give it up."""
+        self._gate = Gate(system.node.loop)
+        self._gate.open()
+        self.begin(system, work(self._gate))
         assert self.task is not None
-        await asyncio.shield(self.task)
+        return bool(await asyncio.shield(self.task))
 
     @property
     def is_waiting(self) -> bool:
@@ -79,17 +89,15 @@ class Gated:
         if self._gate is not None:
             self._gate.open()
 
-    async def give_up(self, system: ActorSystem) -> None:
-        """It is not to be, and can be begun anew."""
-        if self._gate is not None:
-            self._gate.close()
-        task = self.task
-        while task is not None and not task.done():  # What has only begun may not hear it yet.
-            cell = self._place.now(system.node)
-            if cell is not None:
-                system._moves.give_up(cell, "it is not wanted any more")
-            await asyncio.wait((task,), timeout=AGAIN_AFTER)
+    async def give_up(self) -> bool:
+        """It is not to be, and can be begun anew. Returns whether it had been done already."""
+        task, gate = self.task, self._gate
+        if gate is not None:
+            gate.close()
+        if task is not None:
+            await asyncio.wait((task,))
         self.task = self._gate = None
+        return task is not None and task.exception() is None and bool(task.result())
 
 
 class Relocation(StagedWork):
@@ -147,7 +155,7 @@ class Relocation(StagedWork):
         if not self._comes_last:
             await self._move.reach(system, lambda gate: self._work(system, gate))
 
-    def _work(self, system: ActorSystem, gate: Gate | None) -> Coroutine[Any, Any, None]:
+    def _work(self, system: ActorSystem, gate: Gate | None) -> Coroutine[Any, Any, object]:
         cell, moves = self._place.living(system.node), system._moves
         wanted, before = self._after.mechanism, self.before.mechanism
         if not self._adapts:
@@ -160,6 +168,10 @@ class Relocation(StagedWork):
 
     def _begun(self, probation: Probation) -> None:
         self.probation = probation
+
+    @property
+    def waits_for(self) -> str:
+        return self._move.waits_for
 
     def ready(self, system: ActorSystem) -> str:
         """Whether it is at rest, and everything is ready for it."""
@@ -231,7 +243,7 @@ class Relocation(StagedWork):
     async def release(self, system: ActorSystem) -> None:
         """It goes on where it is."""
         try:
-            await self._move.give_up(system)
+            await self._move.give_up()
             if self._grant is not None:
                 system.mechanism_notes.over(self._place.path)
         finally:
@@ -241,10 +253,6 @@ class Relocation(StagedWork):
         grant, self._grant = self._grant, None
         if grant is not None:
             arbiter_of(system.node).release(grant)
-
-
-AGAIN_AFTER = 0.05
-"""Seconds after which a change that is not wanted is told so again."""
 
 
 def _seen(done: asyncio.Future[Any]) -> None:

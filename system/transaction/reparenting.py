@@ -72,7 +72,7 @@ class Reparent(Operation):
         new.children[place.name], place.parent = place, new
         self._found, self._above, self._root = place, new, draft.root
         if not (place.is_moved or place.is_planned):  # Who is added is started where it is to be.
-            self._handing = draft.arrangement.handings[place] = Handing(place)
+            self._handing = draft.arrangement.handings[place] = Handing(place, draft.timeout)
         place.is_moved = True
         self.between_turns_of = (old, new)
         for holder in (old, new):
@@ -86,7 +86,7 @@ class Reparent(Operation):
         waits = bool(self._others_settle(system)) or bool(self._unsteady(system))
         for one, rest in self._resting(system):
             if waits:  # Perhaps for what those here have to answer.
-                await rest.give_up(system)
+                await rest.give_up()
             else:
                 await rest.reach(system, functools.partial(system._moves.pause, one.living(system.node), MOVED_WITHIN))
 
@@ -117,6 +117,11 @@ class Reparent(Operation):
         others = [switch for switch in system.homes if switch not in settled]
         settle_senders(others, self._asked)
         return WAITING if any(map(is_unsettled, others)) else ""
+
+    @property
+    def waits_for(self) -> str:
+        lodging = "" if self._handing is None else self._handing.waits_for
+        return lodging or next((rest.waits_for for rest in self._rests.values() if rest.waits_for), "")
 
     def ready(self, system: ActorSystem) -> str:
         place = self._place
@@ -161,7 +166,7 @@ class Reparent(Operation):
 
     async def release(self, system: ActorSystem) -> None:
         for rest in self._rests.values():
-            await rest.give_up(system)
+            await rest.give_up()
         if self._handing is not None:
             await self._handing.release(system)
 

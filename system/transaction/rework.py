@@ -22,6 +22,7 @@ from ...actors.process.wire.start_codec import unpack_recipe
 from ...checkpoint.home.recorded_home import switch_of
 from ...checkpoint.protocol import Snapshot
 from ...supervision.respec import respec
+from ..live_moves import ended_too_often
 from .arrangement import busy
 from .operation import StagedWork, wrong
 
@@ -52,6 +53,8 @@ class Rework(StagedWork):
         self._saved: list[bytes] = []  # and the new state, as its home is to keep it
         self._concluded: asyncio.Future[Any] | None = None  # there
         self._lock: asyncio.Lock | None = None  # nobody moves it meanwhile
+        self._lives_ended = 0  # before they were held
+        self._trouble = ""
 
     def add(self, wanted: ReplaceState | ReplaceCode) -> None:
         """One more thing.
@@ -87,6 +90,8 @@ class Rework(StagedWork):
             except (AskFailed, ActorStopped):
                 if cell.life == life and cell.host.is_up(cell):
                     raise
+                self._lives_ended += 1
+                self._trouble = f"{cell.path}: {ended_too_often(self._lives_ended)}"
                 await asyncio.sleep(AGAIN_AFTER)  # Its life has ended: the next one is prepared, if there is one.
                 continue
             self._held = (cell, cell.life)
@@ -104,6 +109,10 @@ class Rework(StagedWork):
         lock, self._lock = self._lock, None
         if lock is not None:
             lock.release()
+
+    @property
+    def waits_for(self) -> str:
+        return self._trouble
 
     def ready(self, system: ActorSystem) -> str:
         """Whether the life that was prepared is the one."""

@@ -102,7 +102,7 @@ class Transaction:
     async def _check(self, deadline: float) -> None:
         """All checks of all steps, each against the tree as it will be."""
         change, system = self._change, self._system
-        draft = self._draft = Draft(system.node, self._arrangement)
+        draft = self._draft = Draft(system.node, self._arrangement, self._timeout)
         before = draft.lines()
         for operation in change.operations:
             await self._in_time(operation.text, deadline, lambda one=operation: one.check(system, draft))  # type: ignore[misc]
@@ -121,25 +121,26 @@ class Transaction:
         system, operations = self._system, self._change.operations
         self._emit(TransactionBegan(self._address, self._texts))
         begun: list[Operation] = []
+        at: Operation | None = None  # What is prepared, or what was looked at last.
         failed = "begin"
         waiting = ""
         try:
             async with asyncio.timeout_at(deadline):
                 await system.specifications.prepare()
                 for operation in operations:
-                    failed = operation.text
+                    at, failed = operation, operation.text
                     begun.append(operation)  # Before it is prepared: it may be cancelled in the middle.
                     await operation.prepare(system)
                 while True:
                     late = None
                     for operation in operations:
-                        failed = operation.text
+                        at, failed = operation, operation.text
                         waiting = operation.ready(system)
                         if waiting:
                             late = operation
                             break
                     if late is None:
-                        failed, waiting = "", self._arrangement.ready(system)
+                        at, failed, waiting = None, "", self._arrangement.ready(system)
                         if not waiting:
                             break
                     await asyncio.sleep(LOOK_AGAIN)
@@ -150,7 +151,8 @@ class Transaction:
             self._commit()  # In the same step of the loop in which all were ready.
         except BaseException as error:
             if isinstance(error, TimeoutError):
-                cause = f"not within {self._timeout:g} s{f': {waiting}' if waiting else ''}"
+                waits = "; ".join(filter(None, (waiting, "" if at is None else at.waits_for)))
+                cause = f"not within {self._timeout:g} s{f': {waits}' if waits else ''}"
             else:
                 cause = said(error)
             failed = failed or self._arrangement.step

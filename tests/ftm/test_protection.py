@@ -16,7 +16,7 @@ from holdfast.console.endpoint import control_endpoint
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
-from tests.ftm.accounts import Counter
+from tests.ftm.accounts import Counter, Total
 from tests.ftm.test_failover import pid_of, two_again
 
 # Processes do not care which event loop the root has.
@@ -48,6 +48,21 @@ async def test_it_says_who_leads_and_whether_a_replica_may_die(system: hf.ActorS
 async def test_an_actor_without_a_mechanism_is_not_protected(system: hf.ActorSystem) -> None:
     found = await system.protection(await system.start(hf.child("bob", hf.start(Counter))))
     assert (found.is_protected, found.stack, found.leader, found.is_whole) == (False, (), None, False)
+
+
+@pytest.mark.parametrize("ticks", [0, 1, 2, 5])
+async def test_a_kill_of_a_life_that_is_ending_already_is_no_reason_to_end_it_never(
+    system: hf.ActorSystem, ticks: int
+) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=PBR()))
+    ref.kill()
+    for _ in range(ticks):
+        await asyncio.sleep(0)
+    ref.kill()
+    async with asyncio.timeout(20.0):
+        while (await system.get_status(ref)).life == 1:
+            await asyncio.sleep(0.005)
+    assert await ref.ask(Total(), 20.0) == 0
 
 
 async def test_a_new_stack_is_on_probation(system: hf.ActorSystem) -> None:

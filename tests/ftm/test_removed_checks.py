@@ -472,6 +472,13 @@ CHECKS = {
         "tests/ftm/test_attach.py",
         "test_an_attach_whose_replica_dies",
     ),
+    "a life that is being ended is ended": Check(
+        "ftm/group/group_place.py",
+        "            if self._ending is not None and self.group is not None:",
+        "            if self._ending is not None:",
+        "tests/ftm/test_protection.py",
+        "test_a_kill_of_a_life_that_is_ending",
+    ),
     "a group ends with the process of its supervisor": Check(
         "checkpoint/places/far_parent.py",
         "            self._end_unwanted(reason, recovers=True)\n",

@@ -40,7 +40,7 @@ async def program(store: str) -> AsyncGenerator[hf.ActorSystem]:
 
 def lines(system: hf.ActorSystem) -> list[str]:
     """The tree in words: who is where, in which order, of which class, by which flags and bound to whom."""
-    return ours(Draft(system.node, Arrangement()).lines())
+    return ours(Draft(system.node, Arrangement(), 10.0).lines())
 
 
 def ours(tree: list[str]) -> list[str]:
