@@ -95,7 +95,6 @@ class Simulation:
         choices: what was chosen.
         faults: those of the seed.
         disk: the simulated store, which outlives the root; None: there is none.
-        escaped: what the run has used that no seed decides.
         world: what the program asks the world for, in this run; None: the real one.
         is_real: whether it is none, but a run on a real loop (`--holdfast-real`).
     """
@@ -114,7 +113,6 @@ class Simulation:
         self.choices = choices
         self.trace: list[tuple[str, str]] = []
         self.faults = Faults(choices.seed, choices)
-        self.escaped: tuple[str, ...] = ()
         self.world: World | None = None
         self._control: Control | None = None  # There is none before the system has been started.
         self._log = TurnLog(self.trace)
@@ -125,8 +123,12 @@ class Simulation:
     def enter(self, loop: asyncio.AbstractEventLoop) -> None:
         """From here to `remove` the world is the seed's."""
         assert isinstance(loop, ControlledLoop)
-        self.world = world = self._surroundings.enter_context(World(self.seed, loop))
-        self._surroundings.callback(lambda: setattr(self, "escaped", tuple(world.escaped)))
+        self.world = self._surroundings.enter_context(World(self.seed, loop))
+
+    @property
+    def escaped(self) -> tuple[str, ...]:
+        """What the run has used that no seed decides."""
+        return () if self.world is None else tuple(self.world.escaped)
 
     async def begin(
         self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True

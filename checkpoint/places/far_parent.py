@@ -61,8 +61,7 @@ class FarParent(Parent):
         self._starting: asyncio.Future[None] | None = None
         self._last: tuple[ExitReason, Callable[[bool | None], None]] | None = None  # a life has ended: it was told
         self._is_restarting = False  # it is the supervisor that has ended
-        self._made = AtRoot(b"", [])
-        self._topics: list[str] = []
+        self._beginning: tuple[AtRoot, list[str]] = AtRoot(b"", []), []  # of a life at the root, and the topics of any
         self._visitor: Visitor | None = None  # who may come to live here, with its life
 
     @property
@@ -117,7 +116,7 @@ class FarParent(Parent):
         assert worker is not None
         assert top is not None
         self.wanted, self._last, self._is_restarting = wanted, None, False
-        self._topics = wanted.topics
+        self._beginning = self._beginning[0], wanted.topics
         if self.cell is not None and self.cell.state is GONE:
             self.cell = None
         cell = self.cell = worker.inner.homed(top, self.path, self.cell, self.below)
@@ -155,7 +154,7 @@ class FarParent(Parent):
         if wanted.at_root is None:
             self.home.method = wanted.method
             return self.below
-        self._made = wanted.at_root
+        self._beginning = wanted.at_root, wanted.topics
         return self._lives(self, cell, wanted, cell.host)
 
     def _has_started(self, wanted: Wanted, done: asyncio.Future[None]) -> None:
@@ -261,10 +260,10 @@ class FarParent(Parent):
     # -- what is asked of a parent ----------------------------------------------------------------------------------
 
     def recipe(self, cell: Cell) -> Start[Any] | bytes:
-        return self._made.recipe
+        return self._beginning[0].recipe
 
     def topics(self, cell: Cell) -> Iterable[str]:
-        return self._topics
+        return self._beginning[1]
 
     def is_restarting(self, cell: Cell) -> bool:
         return self._is_restarting
@@ -319,7 +318,7 @@ class FarParent(Parent):
         assert wanted is not None
         assert wanted.at_root is not None
         self.cell, self.wanted, self._last, self._is_restarting = cell, wanted, None, False
-        self._made, self._topics = wanted.at_root, wanted.topics
+        self._beginning = wanted.at_root, wanted.topics
         self.worker.inner.adopt(self.path, cell)
         cell.host.handed_to(self)
         self.port().to_life(Started(wanted.number))
@@ -345,7 +344,7 @@ class FarParent(Parent):
 
     def prepare(self, made: AtRoot, topics: list[str]) -> None:
         """A life is to come to the root, of an actor that begins so."""
-        self._made, self._topics = made, topics
+        self._beginning = made, topics
 
     @property
     def number(self) -> int:
@@ -360,7 +359,7 @@ class FarParent(Parent):
     def comes_to_root(self, cell: Cell, wanted: Wanted) -> None:
         """The life is lived at the root from now on."""
         self.cell = cell
-        self.wanted = msgspec.structs.replace(wanted, at_root=self._made)
+        self.wanted = msgspec.structs.replace(wanted, at_root=self._beginning[0])
 
     def goes_back(self, cell: Cell) -> None:
         """The life is lived in the supervisor's process again, and its home is here."""

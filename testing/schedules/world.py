@@ -29,8 +29,8 @@ from anyio._backends._asyncio import CancelScope, WorkerThread
 from ..library_code import is_file_of_library
 from ..swaps import Swaps
 from ..threads import Onlooker
-from .addresses import shown_address
 from .numbered import as_completed, numbering, scope_in_order
+from .shown_addresses import shown_address
 
 if TYPE_CHECKING:
     from .control import ControlledLoop
