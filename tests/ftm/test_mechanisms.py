@@ -147,7 +147,7 @@ async def test_a_mechanism_from_a_file_that_was_never_seen_is_woven_in(system: h
     seen.clear()
     keys = driver.send(Add(1), Add(2))
     assert await driver.reply(keys[1]) == 3
-    assert seen[:2] == ["heard single 2 in", "2 out"]  # A snapshot may come out behind that.
+    assert "2 out" in seen[seen.index("heard single 2 in") :]  # What stands behind the start may come out before it.
     await driver.stop_replica("r1")
     await driver.fail_over("r2")
     assert await driver.ask(Read()) == [1, 2]
