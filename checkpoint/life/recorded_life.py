@@ -27,6 +27,7 @@ from ..protocol import (
     REPLY,
     START,
     STASHED,
+    TICK,
     Answer,
     Feed,
     Go,
@@ -192,7 +193,7 @@ class Life:
         else:
             sender = None if feed.sender is None else cell.node.cell_at(feed.sender)
             fed = Fed(self, feed, None, sender)
-        if feed.origin and feed.origin in self.timers.cancelled and feed.turn < 0:
+        if feed.kind == TICK and feed.origin in self.timers.cancelled and feed.turn < 0:
             return  # Its timer was cancelled while it was on its way; the home drops it too.
         if feed.id in self.restored.stash_ids and feed.turn < 0 and not self.is_live:
             if self.restored.unstashes:
@@ -291,6 +292,10 @@ class Life:
             self.page[0] = 0
         self.port.to_home(Ignored(why))
 
+    def has_result(self, k: int) -> bool:
+        """Whether the background work that is output k of the turn in hand has its result: it is not begun again."""
+        return self.feed is not None and k in self.feed.pipes
+
     def fail_turn(self, error: BaseException) -> None:
         """The turn raised: what it has not released is dropped, its asker gets the error."""
         feed = self.feed
@@ -342,7 +347,7 @@ class Life:
         self.timers.cancelled.add(key)
         queue = mailbox.queue_of(self.cell)
         for index, item in enumerate(queue):  # Not removed: the run loop has counted them.
-            if type(item) is Fed and item.feed.origin == key and item.feed.turn < 0:
+            if type(item) is Fed and item.feed.kind == TICK and item.feed.origin == key and item.feed.turn < 0:
                 queue[index] = mailbox.NOTHING
 
     def release(self) -> None:

@@ -28,6 +28,7 @@ from ...checkpoint.life.recorded_inbox import Fed, GoLive, StopRecorded
 from ...checkpoint.method import Method
 from ...checkpoint.protocol import (
     FAILED,
+    TICK,
     Answer,
     Closed,
     Feed,
@@ -647,7 +648,7 @@ class Server(lifecycle.HerePlace):
     def has_taken(self, request: Request) -> bool:
         """Whether the life has a request without an end: its stash has it, or it is the tick of a cancelled timer."""
         life, number = self.life, request.feed.id
-        if life is None or request.feed.origin:
+        if life is None or request.feed.kind == TICK:
             return True
         return number in life.returned or any(fed.feed.id == number for fed in life.stash)
 

@@ -127,6 +127,9 @@ class ServerLife(Life):
         """They are requests again, the first of the next part: any of them may have to stand at the front."""
         self.server.puts_back(self)
 
+    def has_result(self, k: int) -> bool:
+        return super().has_result(k) or (self.turn, k) in self.server.traces.results
+
     def release(self) -> None:
         if self.feed is not None and self.outs:
             self.server.wants_out(self)

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final
 
-from ...checkpoint.protocol import AWAITED, DOWN, EXIT, START, Feed, Out, Outcome, PipeDone, TurnEnd
+from ...checkpoint.protocol import AWAITED, DOWN, EXIT, PIPE, START, Feed, Out, Outcome, PipeDone, TurnEnd
 from ..bricks.brick_messages import Beside, Request
 from .replica_life import ABANDONED
 
@@ -100,6 +100,7 @@ class Traces:
     withheld: list[Out] = dataclasses.field(default_factory=list)  # of the turn in hand, on a follower
     inputs: dict[int, Request] = dataclasses.field(default_factory=dict)  # as they came in, for other runs of them
     objections: dict[int, str] = dataclasses.field(default_factory=dict)  # what hooks have against requests
+    results: set[tuple[int, int]] = dataclasses.field(default_factory=set)  # of background work, by turn and output
 
     def begin_anew(self, heard: Iterable[Outcome]) -> None:
         """Nothing is known but what asks came to elsewhere."""
@@ -110,6 +111,13 @@ class Traces:
         """Remember what leaves in the middle of a turn."""
         self.released.setdefault(turn, []).extend(out.digest() for out in outs)
 
+    def note_results(self, requests: Iterable[Request]) -> None:
+        """These have come: the background work whose result they bring is not begun again."""
+        for feed in (one.feed for one in requests):
+            if feed.kind == PIPE and feed.origin:
+                turn, k = map(int, feed.origin.split("."))
+                self.results.add((turn, k))
+
     def go_back_to(self, turn: int) -> None:
         """Nothing has happened behind this turn."""
         self.withheld = []
@@ -119,6 +127,8 @@ class Traces:
         """Turns up to this one are not run again."""
         if self.heard:
             self.heard = {key: one for key, one in self.heard.items() if key[0] > turn}
+        if self.results:
+            self.results = {key for key in self.results if key[0] > turn}
         if len(self.released) > 2 * KEPT_RELEASED:
             self.released = {key: digests for key, digests in self.released.items() if key > turn - KEPT_RELEASED}
 

@@ -56,6 +56,13 @@ CHECKS = {
         "tests/ftm/test_background_order.py",
         "test_work_goes_on_while_turns_of_a_batch_ask",
     ),
+    "work whose result has come is not begun again": Check(
+        "ftm/bricks/bricks.py",
+        "        self._standing.server.traces.note_results(work.requests)\n",
+        "",
+        "tests/ftm/test_background_order.py",
+        "test_work_whose_result_has_come",
+    ),
     "a run is given up only if its turn waits for what is not known": Check(
         "ftm/bricks/runs.py",
         "            life.cell.node.loop.call_soon(self._look, life, life.feed)\n",
