@@ -533,7 +533,7 @@ class Server(lifecycle.HerePlace):
         Somebody else may have begun it already: that one is as good, and it must not be begun twice.
         """
         self.part.take_back()
-        self.traces.go_back_to(self.points.turn)
+        self.traces.withheld = []
         self.reports.take_back(self.points.turn)
 
     def _goes_on(self, chunk: list[Request], why: str) -> bool:
@@ -677,9 +677,8 @@ class Server(lifecycle.HerePlace):
             self._let_out(life)
             return
         if not leads:  # The leader has sent it; we may have to, when we lead.
-            self.traces.release(life.turn, life.outs)
             self.traces.withheld += life.outs
-            life.outs = []
+            life.hold_back()
         life.cell.node.loop.call_soon(self._look, life, life.feed)
 
     def _hears_as_before(self, life: ServerLife) -> bool:
@@ -687,15 +686,13 @@ class Server(lifecycle.HerePlace):
         known = known_outcomes(self.traces, life.turn, life.outs)
         if known is None:
             return False
-        self.traces.release(life.turn, life.outs)
-        life.outs = []
+        life.hold_back()
         for one in known:
             life.to_life(one)
         return True
 
     def _let_out(self, life: ServerLife) -> None:
         """What has left cannot be undone: the part ends with this turn, whatever was to come after it."""
-        self.traces.release(life.turn, life.outs)
         self._cut_part(life)
         life.release_now()
 
@@ -739,8 +736,7 @@ class Server(lifecycle.HerePlace):
                 await self._hand_over_before()
         if standing.leads and self.life is life and life.feed is feed:
             if self.traces.withheld:  # What the last leader may have sent, and may not.
-                self.traces.released.pop(life.turn, None)
-                life.outs = self.traces.withheld + life.outs
+                life.take_again(self.traces.withheld)
                 self.traces.withheld = []
             if life.outs:
                 self._let_out(life)
@@ -771,7 +767,7 @@ class Server(lifecycle.HerePlace):
         previous = self.points.previous
         self.traces.objections.clear()
         await self._go_back_to(before)
-        self.traces.go_back_to(before.turn)
+        self.traces.withheld = []
         self.state.is_again = True
         try:
             ends = await self._run_all(requests, even_stopping=True)
