@@ -67,7 +67,7 @@ class Input(msgspec.Struct, gc=False, eq=False):
         origin = self.origin if self.kind in (TICK, PIPE) else ""
         return Feed(
             self.id, turn, self.kind, self.name, self.body, self.time, self.sender,
-            was_asked or ask is not None, self.chain, pipes, deadline, origin,
+            was_asked or ask is not None, self.chain, pipes, deadline, origin, has_begun,
         )  # fmt: skip
 
 

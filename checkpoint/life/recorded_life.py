@@ -283,6 +283,10 @@ class Life:
         self.outs = []
         if self.page is not None:
             self.page[0] = 0
+        if self.is_live and self.stage.begun >= 0:
+            self.stage.begun = -1
+            if self.returned:
+                self.handle_returned()
 
     def ignore(self, why: str) -> None:
         """The actor does not want to be started: turn 0 stays open for the next start."""
@@ -373,7 +377,8 @@ class Life:
         self.stash = [fed for fed in self.stash if fed.feed.id not in gone]
         for key in gone:
             self.returned.pop(key, None)
-        if self.returned:  # Unstashed under replay, and not handled before the crash: they come first.
+        self._begun_first()
+        if self.returned and stage.begun < 0:  # Unstashed under replay, and not handled before the crash.
             self.handle_returned()
         if stage.begins_suspended:  # Behind what comes first: it is not handled either.
             mailbox.suspend(self.cell)
@@ -387,6 +392,14 @@ class Life:
             self.cell.urge(call)
         if stage.stop_wanted is not None:
             self.cell.request_stop(stage.stop_wanted)
+
+    def _begun_first(self) -> None:
+        """What has sent something comes before all that hooks have put back, also if it was put back itself."""
+        stage = self.stage
+        first = self.returned.pop(stage.begun, None)
+        if first is not None:
+            self.returned = {stage.begun: first} | self.returned
+            stage.begun = -1
 
     def handle_returned(self) -> None:
         """Handle what was put aside and is put back, before anything else."""

@@ -124,7 +124,7 @@ def decided(request: Request, now: float) -> Request:
     past = GONE if feed.deadline <= now else 0.0
     new = type(feed)(
         feed.id, feed.turn, feed.kind, feed.name, feed.body, feed.time, feed.sender,
-        feed.is_ask, feed.chain, feed.pipes, past, feed.origin,
+        feed.is_ask, feed.chain, feed.pipes, past, feed.origin, feed.has_begun,
     )  # fmt: skip
     return Request(request.client, request.incarnation, new)
 

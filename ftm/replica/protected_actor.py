@@ -48,7 +48,7 @@ from ...checkpoint.protocol import (
 )
 from ...checkpoint.snapshot.key_variables import variables
 from ..alarms import ProtectionCostly, ProtectionLost
-from ..bricks.brick_messages import Beside, Request, ServerState, WorkLost
+from ..bricks.brick_messages import Beside, Request, ServerState, Work, WorkLost
 from ..bricks.state_images import Images
 from .actor_state import digest_of_life, names_of_state, point_of, rewind_to, snapshot_of, take_up
 from .replica_life import (
@@ -641,9 +641,21 @@ class Server(lifecycle.HerePlace):
         feeds = [] if self.state.is_over else self._returned()
         if not feeds:
             return pending
-        numbers = {feed.id for feed in feeds}
+        numbers, begun = {feed.id for feed in feeds}, self.state.begun
         first = [Request("", 0, feed) for feed in feeds]
-        return deque([*first, *(one for one in pending if one.feed.id not in numbers)])
+        both = [*first, *(one for one in pending if one.feed.id not in numbers)]
+        if begun >= 0 and all(one.feed.id != begun for one in both):
+            return pending  # It is on its way.
+        return deque(sorted(both, key=lambda one: one.feed.id != begun))  # What has sent something comes before all.
+
+    def note_batch(self, work: Work) -> None:
+        """A batch has come: the results that it brings, and the request that had begun."""
+        self.traces.note_results(work.requests)
+        if work.go is not None and work.go.begun >= 0:
+            self.state.begun = work.go.begun
+        for one in work.requests:
+            if one.feed.has_begun:
+                self.state.begun = one.feed.id
 
     def has_taken(self, request: Request) -> bool:
         """Whether the life has a request without an end: its stash has it, or it is the tick of a cancelled timer."""
@@ -806,6 +818,8 @@ class Server(lifecycle.HerePlace):
                 self.traces.withheld = []
                 if self.state.is_quiet:
                     return
+                if self.life is not None and self.life.is_live and not self.state.is_again:
+                    self.state.begun = -1
                 if record.id not in self.attempts.skips:
                     for hook in self.hooks:
                         record = hook(self, record)

@@ -39,6 +39,7 @@ class ReplicaState:
     start_turn: int = -1  # that a life without a point goes on from
     handed: int = 0  # parts that were handed over
     confirmed: int = 0  # parts that are known to be at home
+    begun: int = -1  # the request that had sent something in a turn without an end, when it came
     alone: set[tuple[str, str]] = dataclasses.field(default_factory=set)  # inputs that have wanted to be at the front
     waiting: frozenset[str] = frozenset()  # messages whose handlers may wait for something
 

@@ -56,6 +56,20 @@ CHECKS = {
         "tests/ftm/test_background_order.py",
         "test_work_goes_on_while_turns_of_a_batch_ask",
     ),
+    "what has sent something comes before what hooks put back": Check(
+        "ftm/replica/protected_actor.py",
+        "sorted(both, key=lambda one: one.feed.id != begun)",
+        "both",
+        "tests/checkpoint/test_begun_first.py",
+        "test_what_has_sent_something",
+    ),
+    "what has sent something is waited for": Check(
+        "ftm/replica/protected_actor.py",
+        "        if begun >= 0 and all(one.feed.id != begun for one in both):\n",
+        "        if False:\n",
+        "tests/checkpoint/test_begun_first.py",
+        "test_what_has_sent_something",
+    ),
     "the end of a turn brings all that it has sent": Check(
         "ftm/replica/replica_life.py",
         "            self.outs = self.let_out + self.outs\n",
@@ -78,8 +92,8 @@ CHECKS = {
         "test_where_a_turn_stood",
     ),
     "work whose result has come is not begun again": Check(
-        "ftm/bricks/bricks.py",
-        "        self._standing.server.traces.note_results(work.requests)\n",
+        "ftm/replica/protected_actor.py",
+        "        self.traces.note_results(work.requests)\n",
         "",
         "tests/ftm/test_background_order.py",
         "test_work_whose_result_has_come",
