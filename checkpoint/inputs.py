@@ -11,7 +11,7 @@ import msgspec
 from ..actors.errors import HoldfastError
 from ..actors.kernel.envelope import Ask
 from .journal import Entry
-from .protocol import TICK, Feed
+from .protocol import PIPE, TICK, Feed
 
 if TYPE_CHECKING:
     from .group_commit import Commits, Unkept
@@ -64,10 +64,10 @@ class Input(msgspec.Struct, gc=False, eq=False):
         """
         ask = self.ask
         deadline = 0.0 if ask is None or has_begun else ask.deadline or EXPIRED
-        origin = self.origin if self.kind == TICK else ""
+        origin = self.origin if self.kind in (TICK, PIPE) else ""
         return Feed(
             self.id, turn, self.kind, self.name, self.body, self.time, self.sender,
-            was_asked or ask is not None, self.chain, pipes, deadline, origin,
+            was_asked or ask is not None, self.chain, pipes, deadline, origin, has_begun,
         )  # fmt: skip
 
 

@@ -69,7 +69,8 @@ class Feed(msgspec.Struct, array_like=True, tag=1, gc=False):
     """An input.
 
     `turn` is the number it had before the crash, -1 if it never ended; `pipes` have their result already; from
-    `deadline` on (on the loop's clock, 0: never) it is not begun any more; `origin` is the timer it comes from.
+    `deadline` on (on the loop's clock, 0: never) it is not begun any more; `origin` is the timer or the background
+    work that it comes from; `has_begun`: its turn has sent something, and has no end.
     """
 
     id: int
@@ -84,6 +85,7 @@ class Feed(msgspec.Struct, array_like=True, tag=1, gc=False):
     pipes: tuple[int, ...] = ()
     deadline: float = 0.0
     origin: str = ""
+    has_begun: bool = False
 
 
 class Outcome(msgspec.Struct, array_like=True, tag=2):
@@ -98,12 +100,14 @@ class Go(msgspec.Struct, array_like=True, tag=3):
     """Replay is over: call `on_recovered` (if anything was recovered), report, then go on after turn `turn`.
 
     Inputs in `gone` were stashed under replay and have ended since, in turns that are not replayed. `timers` run now.
+    The input `begun` has sent something in a turn without an end: it comes first, before what a hook has put back.
     """
 
     recovered: bool
     turn: int
     gone: tuple[int, ...] = ()
     timers: dict[str, Clock] = {}
+    begun: int = -1
 
 
 class SnapshotNow(msgspec.Struct, array_like=True, tag=4):

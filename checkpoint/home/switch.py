@@ -292,7 +292,8 @@ class Switch:
         """All that was handled before has been fed again."""
         if first is not None:
             port.to_life(first.feed())
-        port.to_life(Go(recovered, self.ledger.turn, self.ledger.ended_in_the_stash(), self.timers.running()))
+        gone, begun = self.ledger.ended_in_the_stash(), -1 if first is not None else self.ledger.begun
+        port.to_life(Go(recovered, self.ledger.turn, gone, self.timers.running(), begun))
 
     def let_at(self) -> None:
         """Let the actor at what is new, if nobody else has a say in that."""

@@ -107,6 +107,7 @@ class LifeStage:
         begins_suspended: whether it is suspended when it is live.
         postponed: orders from outside that wait until it is live.
         stop_wanted: why it is to end when it is live.
+        begun: the input that has sent something in a turn without an end: it comes before what hooks have put back.
         is_cut_off: whether it ends by an EXIT that it does not trap.
         ignored_why: why the actor does not want to be started.
         is_over: whether it has ended.
@@ -116,6 +117,7 @@ class LifeStage:
     begins_suspended: bool = False
     postponed: list[Item] = dataclasses.field(default_factory=list)
     stop_wanted: ExitReason | None = None
+    begun: int = -1
     is_cut_off: bool = False
     ignored_why: str | None = None
     is_over: bool = False

@@ -226,7 +226,7 @@ class RecordedContext(ActorContext):
         k = 0  # What a hook begins is begun again by the next life's: no turn has to stay in the journal for it.
         if feed is not None:
             k = life.put("pipe", "")
-            if k in feed.pipes:  # Its result was journaled before the crash: it will be fed.
+            if life.has_result(k):  # That was journaled before the crash: it will be fed.
                 if asyncio.iscoroutine(work):
                     work.close()
                 return

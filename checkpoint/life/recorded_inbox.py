@@ -210,6 +210,7 @@ class GoLive(Hook):
 
     def over(self) -> None:
         super().over()
+        self.life.stage.begun = self.go.begun
         self.life.go_live(self.go.gone)
 
 

@@ -27,6 +27,7 @@ from ..protocol import (
     REPLY,
     START,
     STASHED,
+    TICK,
     Answer,
     Feed,
     Go,
@@ -192,7 +193,7 @@ class Life:
         else:
             sender = None if feed.sender is None else cell.node.cell_at(feed.sender)
             fed = Fed(self, feed, None, sender)
-        if feed.origin and feed.origin in self.timers.cancelled and feed.turn < 0:
+        if feed.kind == TICK and feed.origin in self.timers.cancelled and feed.turn < 0:
             return  # Its timer was cancelled while it was on its way; the home drops it too.
         if feed.id in self.restored.stash_ids and feed.turn < 0 and not self.is_live:
             if self.restored.unstashes:
@@ -282,6 +283,10 @@ class Life:
         self.outs = []
         if self.page is not None:
             self.page[0] = 0
+        if self.is_live and self.stage.begun >= 0:
+            self.stage.begun = -1
+            if self.returned:
+                self.handle_returned()
 
     def ignore(self, why: str) -> None:
         """The actor does not want to be started: turn 0 stays open for the next start."""
@@ -290,6 +295,10 @@ class Life:
         if self.page is not None:
             self.page[0] = 0
         self.port.to_home(Ignored(why))
+
+    def has_result(self, k: int) -> bool:
+        """Whether the background work that is output k of the turn in hand has its result: it is not begun again."""
+        return self.feed is not None and k in self.feed.pipes
 
     def fail_turn(self, error: BaseException) -> None:
         """The turn raised: what it has not released is dropped, its asker gets the error."""
@@ -342,7 +351,7 @@ class Life:
         self.timers.cancelled.add(key)
         queue = mailbox.queue_of(self.cell)
         for index, item in enumerate(queue):  # Not removed: the run loop has counted them.
-            if type(item) is Fed and item.feed.origin == key and item.feed.turn < 0:
+            if type(item) is Fed and item.feed.kind == TICK and item.feed.origin == key and item.feed.turn < 0:
                 queue[index] = mailbox.NOTHING
 
     def release(self) -> None:
@@ -368,7 +377,8 @@ class Life:
         self.stash = [fed for fed in self.stash if fed.feed.id not in gone]
         for key in gone:
             self.returned.pop(key, None)
-        if self.returned:  # Unstashed under replay, and not handled before the crash: they come first.
+        self._begun_first()
+        if self.returned and stage.begun < 0:  # Unstashed under replay, and not handled before the crash.
             self.handle_returned()
         if stage.begins_suspended:  # Behind what comes first: it is not handled either.
             mailbox.suspend(self.cell)
@@ -382,6 +392,14 @@ class Life:
             self.cell.urge(call)
         if stage.stop_wanted is not None:
             self.cell.request_stop(stage.stop_wanted)
+
+    def _begun_first(self) -> None:
+        """What has sent something comes before all that hooks have put back, also if it was put back itself."""
+        stage = self.stage
+        first = self.returned.pop(stage.begun, None)
+        if first is not None:
+            self.returned = {stage.begun: first} | self.returned
+            stage.begun = -1
 
     def handle_returned(self) -> None:
         """Handle what was put aside and is put back, before anything else."""

@@ -218,6 +218,7 @@ class Proceed(Brick):
     def _take(self, work: Work) -> None:
         if self._refuses() or self._knows(work):
             return
+        self._standing.server.note_batch(work)
         self._works.append(work)
         self.go_on()
 

@@ -138,6 +138,7 @@ class RequestProtocol(Transfer):
                     one.set_result(None)
 
     def _begin(self, work: Work) -> None:
+        self._standing.server.note_batch(work)
         known, left = self._split(work)
         # What a leader before us has put back, and is in no batch, comes now: home knows of all that came before.
         left = list(self._standing.server.returned_first(deque(left)))

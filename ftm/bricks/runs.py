@@ -21,7 +21,7 @@ from ...actors.kernel.address_host import AddressHost
 from ...actors.kernel.cell import Cell
 from ...actors.values import decode_value, state_digest
 from ...checkpoint.life.recorded_life import FED
-from ...checkpoint.protocol import CRASH, DROPPED, FAILED, Answer, Feed, Outcome, TurnEnd
+from ...checkpoint.protocol import AWAITED, CRASH, DROPPED, FAILED, Answer, Feed, Outcome, TurnEnd
 from ...supervision.spec import child
 from ..replica.protected_actor import Server
 from ..replica.replica_life import ServerLife
@@ -40,10 +40,9 @@ MOST_INPUTS: Final = 4096
 
 
 class Run(msgspec.Struct):
-    """What requests have come to: how turns ended, what they let out in their middle, and the state they have left."""
+    """What requests have come to: how turns ended, with all that they have sent, and the state they have left."""
 
     ends: list[TurnEnd]
-    released: list[tuple[int, list[int]]]
     state: ServerState | None
     digest: bytes = b""  # of the state, where that has stayed where it is
     objections: list[tuple[int, str]] = []
@@ -60,9 +59,18 @@ class Missing(msgspec.Struct):
     why: str
 
 
+def compared_body(answer: Answer) -> bytes:
+    """What counts of the body of an answer: a traceback tells where it stood, which is no difference between runs."""
+    return b"" if answer.kind == CRASH else answer.body
+
+
+def sent_by(run: Run) -> dict[int, list[int]]:
+    """Digests of all that each turn of a run has sent, in order."""
+    return {end.turn: [out.digest() for out in end.outs] for end in run.ends}
+
+
 def plain(run: Run, *, with_state: bool = True) -> tuple[Any, ...]:
     """What two runs have to have in common to be equal, as it is: cheap to compare."""
-    released = dict(run.released)
     ends = [
         (
             end.id,
@@ -70,8 +78,8 @@ def plain(run: Run, *, with_state: bool = True) -> tuple[Any, ...]:
             end.status,
             end.answer.kind,
             end.answer.name,
-            b"" if end.answer.kind == CRASH else end.answer.body,  # A traceback tells where it stood.
-            (*released.get(end.turn, ()), *(out.digest() for out in end.outs)),
+            compared_body(end.answer),
+            tuple(out.digest() for out in end.outs),
         )
         for end in run.ends
     ]
@@ -84,14 +92,11 @@ def plain(run: Run, *, with_state: bool = True) -> tuple[Any, ...]:
 
 
 def form(run: Run, *, with_state: bool = True) -> Any:
-    """The canonical form of a run: ("run", ends, what was released, state)."""
+    """The canonical form of a run: ("run", ends, state)."""
     ends = ("list", *(end_form(end, with_state=False) for end in run.ends))
-    released = ("list", *(f"{turn}: {digests}" for turn, digests in run.released))
     if not with_state:
-        return ("run", ends, released, "")
-    if run.state is None:
-        return ("run", ends, released, run.digest)
-    return ("run", ends, released, state_form(run.state))
+        return ("run", ends, "")
+    return ("run", ends, run.digest if run.state is None else state_form(run.state))
 
 
 def state_form(state: ServerState) -> Any:
@@ -162,7 +167,8 @@ def turns_of(runs: Sequence[Run | None]) -> str:
 class Shadow(Server):
     """A second life of the protected actor, maybe of another class with the same state: it only computes.
 
-    Its asks get the outcomes that the first run had; one that the first run has not made ends the run.
+    Its asks get the outcomes that the first run had. For one that has none the first run has not waited either; one
+    that the first run has not made ends the run.
     """
 
     def __init__(self, standing: Standing, kind: type[Actor] | None, within: float = 30.0) -> None:
@@ -174,12 +180,15 @@ class Shadow(Server):
         self._recipe: Start[Any] = start if kind is None else Start(kind, start.args, start.kwargs)
         self._within = within
         self._why = ""
+        self._sent: dict[int, list[int]] = {}  # digests of what the first run has sent, by turn
         self.hooks = main.hooks
         self.state.is_again = True
 
-    async def run(self, before: ServerState, requests: list[Request], heard: list[Outcome]) -> Run | Missing:
-        """Run requests from a state."""
-        self._why = ""
+    async def run(
+        self, before: ServerState, requests: list[Request], heard: list[Outcome], sent: dict[int, list[int]]
+    ) -> Run | Missing:
+        """Run requests from a state; `heard` and `sent`: what the first run has heard and sent."""
+        self._why, self._sent = "", sent
         self.traces.begin_anew(heard)
         ends, state = list[TurnEnd](), None
         try:
@@ -194,7 +203,7 @@ class Shadow(Server):
             self.points.point = None
             return Missing(self._why)
         objections = sorted(self.traces.objections.items())
-        return Run(ends, sorted(self.traces.released.items()), state, objections=objections)
+        return Run(ends, state, objections=objections)
 
     async def _run(self, before: ServerState, requests: list[Request]) -> tuple[list[TurnEnd], ServerState | None]:
         self._place()
@@ -256,8 +265,13 @@ class Shadow(Server):
     def wants_out(self, life: ServerLife) -> None:
         if life is not self.life:
             return
-        if not self._hears_as_before(life):  # A turn that does not wait for what it has asked goes on to its end.
+        outs, sent = life.outs, self._sent.get(life.turn, [])
+        known = [one for out in outs if (one := self.traces.heard.get((life.turn, out.k))) is not None]
+        answered = {one.k for one in known}
+        if any(out.verb in AWAITED and out.k not in answered and out.digest() not in sent for out in outs):
             life.cell.node.loop.call_soon(self._look, life, life.feed)
+        for one in known:
+            life.to_life(one)
 
     def _look(self, life: ServerLife, feed: Feed | None) -> None:
         if self.life is life and life.feed is feed:
@@ -315,7 +329,7 @@ class Deciding(After):
         inputs = self._standing.server.traces.inputs
         asked = [as_it_came(inputs.get(one.feed.id), one) for one in asked]
         requests = [one if one.feed.id in dropped else without_deadline(one) for one in asked]
-        first = self._last_run(before, done.ends)
+        first = self._last_run(done.ends)
         server.traces.objections = {}
         found = await self.choose(before, requests, first)
         if found is first:
@@ -328,18 +342,17 @@ class Deciding(After):
         goes_on = server.left_over or server.has_returned  # Home must not take the batch to be over.
         return msgspec.structs.replace(done, ends=ends, is_last=done.is_last and not goes_on)
 
-    def _last_run(self, before: ServerState, ends: list[TurnEnd]) -> Run:
+    def _last_run(self, ends: list[TurnEnd]) -> Run:
         server = self._standing.server
-        released = sorted((turn, one) for turn, one in server.traces.released.items() if turn > before.turn)
         known = {end.id for end in ends}
         objections = sorted((key, why) for key, why in server.traces.objections.items() if key in known)
-        return Run(ends, released, server.capture(), objections=objections)
+        return Run(ends, server.capture(), objections=objections)
 
     async def run_here(self, before: ServerState, requests: list[Request]) -> Run:
         """Have the actor itself run requests, from a state."""
         server = self._standing.server
         ends = await server.run_again(before, requests)
-        return self._last_run(before, ends)
+        return self._last_run(ends)
 
     async def _take(
         self, state: ServerState, requests: list[Request], found: Run | HoldfastError, first: Run
@@ -347,14 +360,14 @@ class Deciding(After):
         """Put what was found in place; one request after the other, if nothing was found for all of them."""
         server, ends = self._standing.server, list[TurnEnd]()
         if isinstance(found, Run):
-            ends, state = self._taken(found), found.state or state
+            ends, state = found.ends, found.state or state
         elif len(requests) == 1:
             ends, state = self._failed(state, first.ends, found)
         else:
             for one in requests:
                 run = await self.choose(state, [one], None)
                 if isinstance(run, Run):
-                    ends += self._taken(run)
+                    ends += run.ends
                     state = run.state or state
                 else:
                     failed, state = self._failed(state, [TurnEnd(0, one.feed.id, FAILED, [], Answer())], run)
@@ -364,10 +377,6 @@ class Deciding(After):
         if server.points.point is not state or server.life is None:
             await server.adopt(state)
         return ends
-
-    def _taken(self, run: Run) -> list[TurnEnd]:
-        self._standing.server.traces.released.update(run.released)
-        return run.ends
 
     def _failed(
         self, state: ServerState, ends: list[TurnEnd], error: HoldfastError

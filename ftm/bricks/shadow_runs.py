@@ -16,7 +16,6 @@ class Computed(msgspec.Struct, array_like=True):
     """What came of it. `problem`: nothing has, and why; NEEDS_STATE: the state to begin from is not here."""
 
     ends: list[TurnEnd]
-    released: list[tuple[int, list[int]]]
     state: ServerState | None
     digest: bytes
     objections: list[tuple[int, str]]
@@ -30,7 +29,7 @@ class Compute(Message[Computed]):
     """Compute these requests, from `state`, or from the one that is here if `base` is its digest.
 
     `keep`: the state that they lead to is the one to begin from next time, and to lead with; else it is sent back.
-    `log`: the reply log that goes with `state`, if that is kept.
+    `log`: the reply log that goes with `state`, if that is kept. `heard` and `sent`: what the first run has.
     """
 
     turn: int
@@ -41,6 +40,7 @@ class Compute(Message[Computed]):
     keep: bool
     live: bool = True
     log: list[Logged] = msgspec.field(default_factory=list)
+    sent: dict[int, list[int]] = msgspec.field(default_factory=dict)
 
 
 class Settled(Message[None]):
@@ -83,23 +83,23 @@ class Helping(Remembering):
         if before is None:
             before = self._base(order)
             if before is None:
-                return Computed([], [], None, b"", [], NEEDS_STATE)
+                return Computed([], None, b"", [], NEEDS_STATE)
         if before.live != order.live:
             before = msgspec.structs.replace(before, live=order.live)
         epoch = self._standing.epoch
-        run: Run | Missing = Run([], [], before)
+        run: Run | Missing = Run([], before)
         if order.requests:
             if self._shadow is None:
                 self._shadow = Shadow(self._standing, None)
-            run = await self._shadow.run(before, order.requests, order.heard)
+            run = await self._shadow.run(before, order.requests, order.heard, order.sent)
         if isinstance(run, Missing) or run.state is None:
-            return Computed([], [], None, b"", [], run.why if isinstance(run, Missing) else "no state")
+            return Computed([], None, b"", [], run.why if isinstance(run, Missing) else "no state")
         digest = b""
         if order.keep:
             digest = self._digests.of(run.state)
             if not self._keep(order, run, digest, epoch):
-                return Computed([], [], None, b"", [], f"{self._standing.path} lives on from another state")
-        return Computed(run.ends, run.released, None if order.keep else run.state, digest, run.objections)
+                return Computed([], None, b"", [], f"{self._standing.path} lives on from another state")
+        return Computed(run.ends, None if order.keep else run.state, digest, run.objections)
 
     def _base(self, order: Compute) -> ServerState | None:
         """The state that is here, if it is the one that is meant."""

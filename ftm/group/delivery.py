@@ -174,6 +174,7 @@ class Delivery:
         if careful and out is not None:
             self.careful = {one.feed.id for one in out.requests if one.feed.id in self.fed}
         left = [feed for feed in self.fed.values() if not self.is_live or feed.id in open_inputs]
+        left = [msgspec.structs.replace(feed, has_begun=False) if feed.has_begun else feed for feed in left]
         self.fed = {feed.id: feed for feed in left}
         if not self.is_live:
             left += [feed for key, feeds in self.earlier.items() if key in self.fed for feed in feeds]
@@ -182,7 +183,7 @@ class Delivery:
         self.inside = self.fed.keys() - unsent
         left.sort(key=lambda feed: feed.id != begun)
         if left and left[0].id == begun:
-            left[0] = self.fed[begun] = msgspec.structs.replace(left[0], deadline=0.0)
+            left[0] = self.fed[begun] = msgspec.structs.replace(left[0], deadline=0.0, has_begun=True)
         gone: list[Go] = [one for one in self.waiting if isinstance(one, Go)]
         if out is not None and out.go is not None and not self.is_live:
             gone = [out.go]

@@ -22,7 +22,7 @@ from ...actors.errors import HoldfastError
 from ...actors.kernel.actor import Actor
 from ..alarms import Objected
 from ..bricks.brick_messages import Request, ServerState
-from ..bricks.runs import Deciding, Run, plain
+from ..bricks.runs import Deciding, Run, plain, sent_by
 from ..bricks.shadow_runs import Compute, Helping
 from ..model.mechanism import Mechanism, Role
 from ..votes.assertions import AssertionFailed, Inspector, check_assertions, names_of
@@ -52,7 +52,7 @@ class Asserting(Deciding):
         own = first or await self.run_here(before, requests)
         if not own.objections:
             return own
-        other = await self._at_peer(before, requests)
+        other = await self._at_peer(before, requests, own)
         alike = isinstance(other, Run) and plain(other) == plain(own)
         if isinstance(other, Run) and (not other.objections or (alike and is_crash(own))):
             standing.node.emit(Objected(standing.address, standing.path, own.objection, standing.other.path or ""))
@@ -61,18 +61,18 @@ class Asserting(Deciding):
         standing.node.emit(Objected(standing.address, standing.path, why, ""))
         return AssertionFailed(standing.address, why)
 
-    async def _at_peer(self, before: ServerState, requests: list[Request]) -> Run | str:
+    async def _at_peer(self, before: ServerState, requests: list[Request], own: Run) -> Run | str:
         standing = self._standing
         if standing.other.path is None:
             return "there is no other replica"
-        order = Compute(before.turn, b"", before, requests, self.heard(before), False, before.live)
+        order = Compute(before.turn, b"", before, requests, self.heard(before), False, before.live, sent=sent_by(own))
         try:
             done = await self.ask_at(standing.other.path, "ad.before", order)
         except HoldfastError as error:
             return f"the other replica cannot compute it: {error}"
         if done.problem or done.state is None:
             return f"the other replica has not computed it: {done.problem}"
-        return Run(done.ends, done.released, done.state, objections=done.objections)
+        return Run(done.ends, done.state, objections=done.objections)
 
 
 def is_crash(run: Run) -> bool:

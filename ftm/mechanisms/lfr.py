@@ -27,7 +27,7 @@ from ...checkpoint.protocol import Outcome, TurnEnd
 from ..alarms import Diverged, NondeterminismFound, ProtectionLost, StatesDiffer
 from ..bricks.brick_messages import FORWARDED, Done, Request, ServerState, Work
 from ..bricks.bricks import After, Before, Brick, Proceed
-from ..bricks.runs import Missing, Shadow, digest_of_state
+from ..bricks.runs import Missing, Shadow, compared_body, digest_of_state
 from ..bricks.standing import PeerLost
 from ..bricks.state_transfer import GoneAstray
 from ..model.mechanism import Mechanism, Role
@@ -59,12 +59,12 @@ class Notify(Message[None]):
     state: bytes = b""
 
 
-def digest(end: TurnEnd, released: list[int]) -> int:
+def digest(end: TurnEnd) -> int:
     """A checksum of the outcome of a turn: how it ended, its answer, and all that it has sent."""
     answer = end.answer
     head = f"{end.turn}|{end.status}|{answer.kind}|{answer.name}".encode()
-    found = zlib.crc32(answer.body, zlib.crc32(head))
-    for sent in (*released, *(out.digest() for out in end.outs)):
+    found = zlib.crc32(compared_body(answer), zlib.crc32(head))
+    for sent in (out.digest() for out in end.outs):
         found = zlib.crc32(sent.to_bytes(4, "little"), found)
     return found
 
@@ -124,7 +124,7 @@ def decided(request: Request, now: float) -> Request:
     past = GONE if feed.deadline <= now else 0.0
     new = type(feed)(
         feed.id, feed.turn, feed.kind, feed.name, feed.body, feed.time, feed.sender,
-        feed.is_ask, feed.chain, feed.pipes, past, feed.origin,
+        feed.is_ask, feed.chain, feed.pipes, past, feed.origin, feed.has_begun,
     )  # fmt: skip
     return Request(request.client, request.incarnation, new)
 
@@ -193,8 +193,7 @@ class Notifying(After, Sender):
             for task in list(standing.other.forwarded):
                 await task
         standing.other.forwarded = [task for task in standing.other.forwarded if not task.done()]
-        released = standing.server.traces.released
-        digests = [(end.id, end.turn, digest(end, released.get(end.turn, []))) for end in done.ends]
+        digests = [(end.id, end.turn, digest(end)) for end in done.ends]
         self.send_peer(Notify(digests, standing.looking.take(standing.server, done)))
         return done
 
@@ -218,11 +217,11 @@ class Comparing(After):
         if done.number <= FORWARDED and done.number != self._standing.following.number:
             return done  # It leads on from a state that is given up.
         self._begin_anew()
-        inside, released = self._standing.inside, self._standing.server.traces.released
+        inside = self._standing.inside
         for end in done.ends:
             request = inside.get(end.id)
             name = "" if request is None else request.feed.name
-            self._ours.append((end.id, end.turn, digest(end, released.get(end.turn, [])), name))
+            self._ours.append((end.id, end.turn, digest(end), name))
         self._compare()
         state = self._standing.looking.take(self._standing.server, done)
         if done.ends:
@@ -299,12 +298,12 @@ class Comparing(After):
         turn = before.turn
         try:
             for _ in range(RUNS_AGAIN):
-                run = await shadow.run(before, requests, heard)
+                run = await shadow.run(before, requests, heard, {})
                 if isinstance(run, Missing) or not run.ends or run.state is None:
                     return  # It cannot be told.
                 end = run.ends[-1]
                 turn = end.turn
-                found.add((digest(end, dict(run.released).get(end.turn, [])), digest_of_state(run.state)))
+                found.add((digest(end), digest_of_state(run.state)))
         finally:
             await shadow.close()
         if len(found) > 1 or (known is not None and known.isdisjoint(outcome for outcome, _ in found)):

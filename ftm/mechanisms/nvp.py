@@ -22,7 +22,7 @@ from ...actors.errors import HoldfastError
 from ...actors.kernel.actor import Actor
 from ..alarms import Masked
 from ..bricks.brick_messages import Request, ServerState
-from ..bricks.runs import Deciding, Remembering, Run, Shadow, turns_of, vote
+from ..bricks.runs import Deciding, Remembering, Run, Shadow, sent_by, turns_of, vote
 from ..model.mechanism import Mechanism, Role
 from ..model.mechanism_declaration import Cost
 from ..votes.assertions import names_of
@@ -56,9 +56,9 @@ class Versions(Deciding):
         assert isinstance(mechanism, NVP)
         own = first or await self.run_here(before, requests)
         runs: list[Run | None] = [own]
-        heard = self.heard(before)
+        heard, sent = self.heard(before), sent_by(own)
         for shadow in self._others:
-            run = await shadow.run(before, requests, heard)
+            run = await shadow.run(before, requests, heard, sent)
             runs.append(run if isinstance(run, Run) else None)
         decided = vote(mechanism.voter, runs, with_state=mechanism.compare_state)
         if isinstance(decided, Undecided):

@@ -19,7 +19,7 @@ from ...actors.errors import HoldfastError
 from ...actors.kernel.actor import Actor
 from ..alarms import Objected
 from ..bricks.brick_messages import Request, ServerState
-from ..bricks.runs import Deciding, Missing, Remembering, Run, Shadow
+from ..bricks.runs import Deciding, Missing, Remembering, Run, Shadow, sent_by
 from ..model.mechanism import Mechanism, Role
 from ..votes.assertions import Inspector, check_assertions, names_of
 from ..votes.versions import version
@@ -63,7 +63,7 @@ class Alternating(Deciding):
             return NotAccepted(standing.address, own.objection)
         refused = [own.objection]
         for name, shadow in self._alternates:
-            run = await shadow.run(before, requests, self.heard(before))
+            run = await shadow.run(before, requests, self.heard(before), sent_by(own))
             if isinstance(run, Run) and not run.objections:
                 standing.node.emit(Objected(standing.address, standing.path, "; ".join(refused), name))
                 return run

@@ -25,7 +25,7 @@ import msgspec
 from ...actors.errors import ActorStopped, HoldfastError
 from ..alarms import Masked, Outvoted, ProtectionLost
 from ..bricks.brick_messages import Done, NotFollowing, Request, ServerState, StaleLeader, Strayed, is_marker
-from ..bricks.runs import Deciding, Digests, Run, turns_of, vote
+from ..bricks.runs import Deciding, Digests, Run, sent_by, turns_of, vote
 from ..bricks.shadow_runs import NEEDS_STATE, Compute, Computed, Helping, Settled
 from ..bricks.standing import PeerLost
 from ..model.mechanism import Mechanism, Role
@@ -95,10 +95,10 @@ class Voting(Deciding):
         assert own.state is not None
         digest = self._digest_of(own.state)
         paths = self._others()
-        order = Compute(before.turn, base, None, requests, self.heard(before), True, before.live)
+        order = Compute(before.turn, base, None, requests, self.heard(before), True, before.live, sent=sent_by(own))
         computed = await asyncio.gather(*(self._at(path, before, order) for path in paths))
-        others = [None if one is None else Run(one.ends, one.released, None, one.digest) for one in computed]
-        runs: list[Run | None] = [Run(own.ends, own.released, None, digest), *others]
+        others = [None if one is None else Run(one.ends, None, one.digest) for one in computed]
+        runs: list[Run | None] = [Run(own.ends, None, digest), *others]
         present = sum(run is not None for run in runs)
         if present == 1:
             if not self._was_alone:

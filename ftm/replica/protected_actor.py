@@ -28,6 +28,7 @@ from ...checkpoint.life.recorded_inbox import Fed, GoLive, StopRecorded
 from ...checkpoint.method import Method
 from ...checkpoint.protocol import (
     FAILED,
+    TICK,
     Answer,
     Closed,
     Feed,
@@ -47,7 +48,7 @@ from ...checkpoint.protocol import (
 )
 from ...checkpoint.snapshot.key_variables import variables
 from ..alarms import ProtectionCostly, ProtectionLost
-from ..bricks.brick_messages import Beside, Request, ServerState, WorkLost
+from ..bricks.brick_messages import Beside, Request, ServerState, Work, WorkLost
 from ..bricks.state_images import Images
 from .actor_state import digest_of_life, names_of_state, point_of, rewind_to, snapshot_of, take_up
 from .replica_life import (
@@ -532,7 +533,7 @@ class Server(lifecycle.HerePlace):
         Somebody else may have begun it already: that one is as good, and it must not be begun twice.
         """
         self.part.take_back()
-        self.traces.go_back_to(self.points.turn)
+        self.traces.withheld = []
         self.reports.take_back(self.points.turn)
 
     def _goes_on(self, chunk: list[Request], why: str) -> bool:
@@ -640,14 +641,26 @@ class Server(lifecycle.HerePlace):
         feeds = [] if self.state.is_over else self._returned()
         if not feeds:
             return pending
-        numbers = {feed.id for feed in feeds}
+        numbers, begun = {feed.id for feed in feeds}, self.state.begun
         first = [Request("", 0, feed) for feed in feeds]
-        return deque([*first, *(one for one in pending if one.feed.id not in numbers)])
+        both = [*first, *(one for one in pending if one.feed.id not in numbers)]
+        if begun >= 0 and all(one.feed.id != begun for one in both):
+            return pending  # It is on its way.
+        return deque(sorted(both, key=lambda one: one.feed.id != begun))  # What has sent something comes before all.
+
+    def note_batch(self, work: Work) -> None:
+        """A batch has come: the results that it brings, and the request that had begun."""
+        self.traces.note_results(work.requests)
+        if work.go is not None and work.go.begun >= 0:
+            self.state.begun = work.go.begun
+        for one in work.requests:
+            if one.feed.has_begun:
+                self.state.begun = one.feed.id
 
     def has_taken(self, request: Request) -> bool:
         """Whether the life has a request without an end: its stash has it, or it is the tick of a cancelled timer."""
         life, number = self.life, request.feed.id
-        if life is None or request.feed.origin:
+        if life is None or request.feed.kind == TICK:
             return True
         return number in life.returned or any(fed.feed.id == number for fed in life.stash)
 
@@ -676,9 +689,8 @@ class Server(lifecycle.HerePlace):
             self._let_out(life)
             return
         if not leads:  # The leader has sent it; we may have to, when we lead.
-            self.traces.release(life.turn, life.outs)
             self.traces.withheld += life.outs
-            life.outs = []
+            life.hold_back()
         life.cell.node.loop.call_soon(self._look, life, life.feed)
 
     def _hears_as_before(self, life: ServerLife) -> bool:
@@ -686,15 +698,13 @@ class Server(lifecycle.HerePlace):
         known = known_outcomes(self.traces, life.turn, life.outs)
         if known is None:
             return False
-        self.traces.release(life.turn, life.outs)
-        life.outs = []
+        life.hold_back()
         for one in known:
             life.to_life(one)
         return True
 
     def _let_out(self, life: ServerLife) -> None:
         """What has left cannot be undone: the part ends with this turn, whatever was to come after it."""
-        self.traces.release(life.turn, life.outs)
         self._cut_part(life)
         life.release_now()
 
@@ -738,8 +748,7 @@ class Server(lifecycle.HerePlace):
                 await self._hand_over_before()
         if standing.leads and self.life is life and life.feed is feed:
             if self.traces.withheld:  # What the last leader may have sent, and may not.
-                self.traces.released.pop(life.turn, None)
-                life.outs = self.traces.withheld + life.outs
+                life.take_again(self.traces.withheld)
                 self.traces.withheld = []
             if life.outs:
                 self._let_out(life)
@@ -770,7 +779,7 @@ class Server(lifecycle.HerePlace):
         previous = self.points.previous
         self.traces.objections.clear()
         await self._go_back_to(before)
-        self.traces.go_back_to(before.turn)
+        self.traces.withheld = []
         self.state.is_again = True
         try:
             ends = await self._run_all(requests, even_stopping=True)
@@ -809,6 +818,8 @@ class Server(lifecycle.HerePlace):
                 self.traces.withheld = []
                 if self.state.is_quiet:
                     return
+                if self.life is not None and self.life.is_live and not self.state.is_again:
+                    self.state.begun = -1
                 if record.id not in self.attempts.skips:
                     for hook in self.hooks:
                         record = hook(self, record)

@@ -14,7 +14,7 @@ from ...checkpoint.life.recorded_context import RecordedContext
 from ...checkpoint.life.recorded_inbox import STARTED, Fed, Hook
 from ...checkpoint.life.recorded_life import Life
 from ...checkpoint.method import Method
-from ...checkpoint.protocol import Answer, Feed, ToHome, TurnEnd
+from ...checkpoint.protocol import FAILED, Answer, Feed, Out, ToHome, TurnEnd
 
 if TYPE_CHECKING:
     from .protected_actor import Server
@@ -106,6 +106,7 @@ class ServerLife(Life):
         super().__init__(cell, server, method, None)
         self.server = server
         self.ended: Feed | None = None  # what the last turn has handled
+        self.let_out: list[Out] = []  # of the turn in hand, beside `outs`: it has left, or is held back
         self.begun_names: set[str] = set()  # the variables of the actor when `__init__` had run
         self.saving.is_needed = server.state.has_access
 
@@ -119,13 +120,23 @@ class ServerLife(Life):
         self.turn, self.stash, self.returned = turn, stash, returned
         self._context_made.draw_anew()
 
+    def open_turn(self, feed: Feed) -> None:
+        super().open_turn(feed)
+        self.let_out = []
+
     def close_turn(self, status: str, answer: Answer) -> None:
+        """All that the turn has sent goes with its end: what left before may have been lost with whoever led then."""
         self.ended = self.feed
+        if status != FAILED:
+            self.outs = self.let_out + self.outs
         super().close_turn(status, answer)
 
     def handle_returned(self) -> None:
         """They are requests again, the first of the next part: any of them may have to stand at the front."""
         self.server.puts_back(self)
+
+    def has_result(self, k: int) -> bool:
+        return super().has_result(k) or (self.turn, k) in self.server.traces.results
 
     def release(self) -> None:
         if self.feed is not None and self.outs:
@@ -133,7 +144,19 @@ class ServerLife(Life):
 
     def release_now(self) -> None:
         """What the turn in hand has sent leaves."""
+        outs = self.outs
         super().release()
+        self.let_out += outs
+
+    def hold_back(self) -> None:
+        """What the turn in hand has sent does not leave before its end."""
+        self.let_out += self.outs
+        self.outs = []
+
+    def take_again(self, held: list[Out]) -> None:
+        """The turn in hand wants to send what was held back last."""
+        del self.let_out[-len(held) :]
+        self.outs = held + self.outs
 
     def take_snapshot(self, *, is_last: bool = False) -> None:
         """Asked for by the end in good order; others are made of points."""

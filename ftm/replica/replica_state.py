@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final
 
-from ...checkpoint.protocol import AWAITED, DOWN, EXIT, START, Feed, Out, Outcome, PipeDone, TurnEnd
+from ...checkpoint.protocol import AWAITED, DOWN, EXIT, PIPE, START, Feed, Out, Outcome, PipeDone, TurnEnd
 from ..bricks.brick_messages import Beside, Request
 from .replica_life import ABANDONED
 
@@ -18,8 +18,6 @@ PART: Final = 0.001
 """Seconds of work after which the outcomes so far are handed over: a slow request does not hold up quick ones."""
 MOST_AT_ONCE: Final = 256
 """Requests that are given to the life at once."""
-KEPT_RELEASED: Final = 256
-"""Turns before the last point of which it is still known what they have let out in their middle."""
 
 # What follows when the life ends in the middle of a part.
 GIVE_UP, STOP, REWIND, GO_ON = "give up", "stop", "rewind", "go on"
@@ -41,6 +39,7 @@ class ReplicaState:
     start_turn: int = -1  # that a life without a point goes on from
     handed: int = 0  # parts that were handed over
     confirmed: int = 0  # parts that are known to be at home
+    begun: int = -1  # the request that had sent something in a turn without an end, when it came
     alone: set[tuple[str, str]] = dataclasses.field(default_factory=set)  # inputs that have wanted to be at the front
     waiting: frozenset[str] = frozenset()  # messages whose handlers may wait for something
 
@@ -96,31 +95,29 @@ class Traces:
     """What turns have asked, heard and let out, as far as they may be run again."""
 
     heard: dict[tuple[int, int], Outcome] = dataclasses.field(default_factory=dict)  # by turn and number of the ask
-    released: dict[int, list[int]] = dataclasses.field(default_factory=dict)  # digests of what left in mid-turn
     withheld: list[Out] = dataclasses.field(default_factory=list)  # of the turn in hand, on a follower
     inputs: dict[int, Request] = dataclasses.field(default_factory=dict)  # as they came in, for other runs of them
     objections: dict[int, str] = dataclasses.field(default_factory=dict)  # what hooks have against requests
+    results: set[tuple[int, int]] = dataclasses.field(default_factory=set)  # of background work, by turn and output
 
     def begin_anew(self, heard: Iterable[Outcome]) -> None:
         """Nothing is known but what asks came to elsewhere."""
         self.heard = {(one.turn, one.k): one for one in heard}
-        self.released, self.withheld, self.objections = {}, [], {}
+        self.withheld, self.objections = [], {}
 
-    def release(self, turn: int, outs: list[Out]) -> None:
-        """Remember what leaves in the middle of a turn."""
-        self.released.setdefault(turn, []).extend(out.digest() for out in outs)
-
-    def go_back_to(self, turn: int) -> None:
-        """Nothing has happened behind this turn."""
-        self.withheld = []
-        self.released = {key: digests for key, digests in self.released.items() if key <= turn}
+    def note_results(self, requests: Iterable[Request]) -> None:
+        """These have come: the background work whose result they bring is not begun again."""
+        for feed in (one.feed for one in requests):
+            if feed.kind == PIPE and feed.origin:
+                turn, k = map(int, feed.origin.split("."))
+                self.results.add((turn, k))
 
     def forget(self, turn: int) -> None:
         """Turns up to this one are not run again."""
         if self.heard:
             self.heard = {key: one for key, one in self.heard.items() if key[0] > turn}
-        if len(self.released) > 2 * KEPT_RELEASED:
-            self.released = {key: digests for key, digests in self.released.items() if key > turn - KEPT_RELEASED}
+        if self.results:
+            self.results = {key for key in self.results if key[0] > turn}
 
 
 @dataclasses.dataclass(slots=True)

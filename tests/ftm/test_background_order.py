@@ -113,6 +113,20 @@ class Runner(Counter):
         (folder / f"done{run}").touch()
 
 
+class Noting(Worker):
+    """Each process that begins work writes its number."""
+
+    @hf.on(Begin)
+    def begin(self, message: Begin) -> int:
+        self.ctx.pipe_to_self(note_pid(Path(message.folder)), lambda _: Add(BROUGHT))
+        return self.total
+
+
+async def note_pid(folder: Path) -> None:
+    with (folder / "begun").open("a") as file:
+        file.write(f"{os.getpid()}\n")
+
+
 async def work(folder: Path) -> None:
     await until_gone(folder / "work")
     (folder / "done").touch()
@@ -283,6 +297,28 @@ async def test_what_came_before_the_snapshot_does_not_come_again_behind_a_turn_t
             await ref.ask(Boom(), timeout=25.0)
     assert await ref.ask(Add(0), timeout=25.0) == 3
     assert await ref.ask(Tags()) == [BROUGHT, BROUGHT, 0]
+
+
+async def test_work_whose_result_has_come_is_not_begun_again_behind_a_turn_that_failed(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    """Each replica of LFR handles again what it has handled since its last point, and begins only what is out."""
+    ref = await system.start(hf.child("alice", hf.start(Noting), mechanism=LFR(), recovery=hf.hybrid(interval=3600.0)))
+    await two_again(ref)
+    group = group_of(ref)
+    await ref.ask(Begin(str(tmp_path)), timeout=25.0)
+    async with asyncio.timeout(25):
+        while BROUGHT not in await ref.ask(Tags()):
+            await asyncio.sleep(0.002)
+    for _ in range(2):
+        with pytest.raises(hf.RemoteCrash):
+            await ref.ask(Boom(), timeout=25.0)
+        assert await ref.ask(Add(0), timeout=25.0)
+    assert group.membership.primary is not None
+    await ref.ask(Mark(str(tmp_path), pid_of(system, ref, group.membership.primary)), timeout=25.0)
+    await until_there(tmp_path / "computed")
+    pids = [pid_of(system, ref, name) for name in group.membership.names]
+    assert sorted((tmp_path / "begun").read_text().split()) == sorted(map(str, pids))
 
 
 @pytest.mark.parametrize("recovery", [hf.hybrid(interval=3600.0), None], ids=["recorded", "plain"])

@@ -11,7 +11,7 @@ from tests.removing import Check, as_tests
 JOINING = "tests/ftm/test_pbr_joining.py"
 PBR, LFR, SEC = "tests/ftm/test_pbr.py", "tests/ftm/test_lfr.py", "tests/ftm/test_sec.py"
 SUBTREE, STATE = "tests/ftm/test_subtree.py", "tests/ftm/test_group_state.py"
-PUT_BACK = "tests/ftm/test_put_back.py"
+PUT_BACK, UNAWAITED = "tests/ftm/test_put_back.py", "tests/ftm/test_unawaited_asks.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 CHECKS = {
     "T36: a batch of an earlier epoch is refused": Check(
@@ -56,12 +56,54 @@ CHECKS = {
         "tests/ftm/test_background_order.py",
         "test_work_goes_on_while_turns_of_a_batch_ask",
     ),
+    "what has sent something comes before what hooks put back": Check(
+        "ftm/replica/protected_actor.py",
+        "sorted(both, key=lambda one: one.feed.id != begun)",
+        "both",
+        "tests/checkpoint/test_begun_first.py",
+        "test_what_has_sent_something",
+    ),
+    "what has sent something is waited for": Check(
+        "ftm/replica/protected_actor.py",
+        "        if begun >= 0 and all(one.feed.id != begun for one in both):\n",
+        "        if False:\n",
+        "tests/checkpoint/test_begun_first.py",
+        "test_what_has_sent_something",
+    ),
+    "the end of a turn brings all that it has sent": Check(
+        "ftm/replica/replica_life.py",
+        "            self.outs = self.let_out + self.outs\n",
+        "            pass\n",
+        UNAWAITED,
+        "test_it_leaves_though",
+    ),
+    "a run goes on where the first run has not waited for an ask either": Check(
+        "ftm/bricks/runs.py",
+        " and out.digest() not in sent for out",
+        " for out",
+        UNAWAITED,
+        "test_its_turn_comes_to_the_same",
+    ),
+    "where a turn stood when it raised does not count": Check(
+        "ftm/mechanisms/lfr.py",
+        "zlib.crc32(compared_body(answer), ",
+        "zlib.crc32(answer.body, ",
+        UNAWAITED,
+        "test_where_a_turn_stood",
+    ),
+    "work whose result has come is not begun again": Check(
+        "ftm/replica/protected_actor.py",
+        "        self.traces.note_results(work.requests)\n",
+        "",
+        "tests/ftm/test_background_order.py",
+        "test_work_whose_result_has_come",
+    ),
     "a run is given up only if its turn waits for what is not known": Check(
         "ftm/bricks/runs.py",
         "            life.cell.node.loop.call_soon(self._look, life, life.feed)\n",
         "            self._look(life, life.feed)\n",
-        "tests/ftm/test_background_order.py",
-        "test_a_turn_that_does_not_wait",
+        UNAWAITED,
+        "test_a_turn_that_fails_behind_it",
     ),
     "another stack of mechanisms is refused": Check(
         "ftm/bricks/standing.py",
