@@ -440,6 +440,26 @@ async def test_what_is_put_back_by_blocks_and_votes_is_replayed_as_it_was(
     assert sorted(await other.ask(Tags())) == sorted(2 * numbers(messages))
 
 
+@pytest.mark.parametrize("mechanism", DECIDING)
+async def test_no_snapshot_is_taken_of_what_blocks_and_votes_have_not_decided_on(
+    system: hf.ActorSystem, mechanism: str
+) -> None:
+    """The state that is rejected would come back at the next crash."""
+    spec = hf.child("host", hf.start(Doubtful), mechanism=DECIDING[mechanism](), recovery=hf.hybrid(every=1))
+    ref = await system.start(spec)
+    await system.start(hf.child("other", hf.start(Counter)))
+    await ref.ask(Open("asks"), timeout=IN_TIME)
+    want = list[int]()
+    for first in range(0, 90, 30):
+        tags = range(first, first + 30, 3)  # The host is wrong about all of them.
+        want += tags
+        await asyncio.gather(*(ref.ask(Meet(tag, "asks"), timeout=IN_TIME) for tag in tags))
+        for path, pid in system._workers.processes().items():
+            if path.startswith(f"{ref.path}/"):
+                os.kill(pid, signal.SIGKILL)
+        assert await ref.ask(Tags(), timeout=IN_TIME) == want
+
+
 class Unwelcome(hf.Message[bool]):
     """A guest for whom nothing that the host does is right: it waits for ever, or is not what was wanted."""
 

@@ -223,7 +223,7 @@ CHECKS = {
         "        server.take_wanted_snapshot()\n"
         "        more, behind = server.take_more(), server.last_ended\n        done =",
         PUT_BACK,
-        "by_blocks_and_votes_is_replayed",
+        "no_snapshot_is_taken",
     ),
     "what was put back and has failed is not put back again": Check(
         "ftm/bricks/runs.py",
