@@ -13,8 +13,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 import holdfast as hf
 from holdfast.actors.errors import AskTimeout, NoSuchActor
-from holdfast.checkpoint.protocol import DROPPED, MESSAGE, OK, Answer, Feed, Go, Outcome, SnapshotNow, TurnEnd
-from holdfast.ftm.bricks.brick_messages import MOST_REQUESTS, Request, Work
+from holdfast.checkpoint.protocol import DROPPED, MESSAGE, OK, Answer, Feed, Go, Outcome, PipeDone, SnapshotNow, TurnEnd
+from holdfast.ftm.bricks.behind import Behind
+from holdfast.ftm.bricks.brick_messages import MOST_REQUESTS, Request, Strayed, Work
 from holdfast.ftm.bricks.replica_orders import Stand
 from holdfast.ftm.group.delivery import Delivery
 from holdfast.ftm.group.hung import STUCK_AFTER
@@ -673,3 +674,13 @@ async def test_what_a_failover_has_left_to_tidy_up_comes_behind_the_change_under
     assert adaptation.gone_back is None
     adaptation.end(back)
     assert adaptation.next_change() is None
+
+
+def test_what_stands_behind_a_turn_waits_for_it() -> None:
+    behind, done = Behind(), [PipeDone(turn, 1, "tests:Done", b"") for turn in (3, 5)]
+    for record in done:
+        behind.put(record.turn, [record])
+    assert [list(behind.due(turn)) for turn in (2, 4, 4)] == [[], done[:1], []]
+    behind.put(7, [Strayed("/app/alice/ftm/r2")])  # It is about no turn.
+    assert [type(one) for one in behind.due(4)] == [Strayed]
+    assert list(behind.due(None)) == done[1:]

@@ -306,15 +306,15 @@ CHECKS = {
         "ftm/bricks/behind.py",
         "        while self._waiting and (turn is None or self._waiting[0][0] <= turn):\n",
         "        while self._waiting:\n",
-        "tests/ftm/test_background_order.py",
-        "test_it_comes_home_behind",
+        STATE,
+        "test_what_stands_behind",
     ),
     "a follower keeps what the leader may not have said": Check(
         "ftm/bricks/request_protocol.py",
         "        else:\n            self._keep(done)\n",
         "",
         "tests/ftm/test_background_order.py",
-        "test_it_comes_home_behind",
+        "test_what_stands_behind",
     ),
     "who only has the state has not begun its background work": Check(
         "ftm/bricks/request_protocol.py",
