@@ -65,8 +65,8 @@ def compared_body(answer: Answer) -> bytes:
 
 
 def sent_by(run: Run) -> dict[int, list[int]]:
-    """Digests of all that each turn of a run has sent, in order."""
-    return {end.turn: [out.digest() for out in end.outs] for end in run.ends}
+    """Digests of all that each turn of a run has sent, in order; of one that has failed, that is not known."""
+    return {end.turn: [out.digest() for out in end.outs] for end in run.ends if end.status != FAILED}
 
 
 def plain(run: Run, *, with_state: bool = True) -> tuple[Any, ...]:
@@ -265,13 +265,14 @@ class Shadow(Server):
     def wants_out(self, life: ServerLife) -> None:
         if life is not self.life:
             return
-        outs, sent = life.outs, self._sent.get(life.turn, [])
-        known = [one for out in outs if (one := self.traces.heard.get((life.turn, out.k))) is not None]
-        answered = {one.k for one in known}
-        if any(out.verb in AWAITED and out.k not in answered and out.digest() not in sent for out in outs):
-            life.cell.node.loop.call_soon(self._look, life, life.feed)
-        for one in known:
-            life.to_life(one)
+        sent, heard = self._sent.get(life.turn), self.traces.heard
+        for out in life.outs:
+            outcome = heard.get((life.turn, out.k))
+            is_alike = outcome is not None if sent is None else sent[out.k - 1 : out.k] == [out.digest()]
+            if is_alike and outcome is not None:
+                life.to_life(outcome)
+            elif out.verb in AWAITED and not is_alike:
+                life.cell.node.loop.call_soon(self._look, life, life.feed)
 
     def _look(self, life: ServerLife, feed: Feed | None) -> None:
         if self.life is life and life.feed is feed:
