@@ -95,15 +95,15 @@ class SnapshotImages:
                 self._packs.add(shared.number)
                 await asyncio.to_thread(journal.keep_blocks, home.path, shared.number, blocks, home.method.compress)
             if self._saving is not me:
-                await asyncio.to_thread(journal.forget_blocks, home.path, [shared.number])
-                return
+                return  # Its pack goes with those that the next snapshot does not need.
             self._saving = None
             if not self._finish(meta, record, shared):
                 return  # The one before it stands, and needs its packs.
             # By number: the next snapshot may be on its way before the thread has come to that.
             unneeded = self._packs.difference(meta.earlier, [number for number, _, _ in meta.blocks])
-            await asyncio.to_thread(journal.forget_blocks, home.path, unneeded)
-            self._packs -= unneeded
+            if unneeded:
+                await asyncio.to_thread(journal.forget_blocks, home.path, unneeded)
+                self._packs -= unneeded
         except Exception as error:  # Whatever it was: the next snapshot must be possible.
             if self._saving is me:
                 self._saving = None

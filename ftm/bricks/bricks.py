@@ -21,7 +21,7 @@ from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message
 from ...actors.kernel.ref import current
 from ...checkpoint.protocol import DROPPED, MESSAGE, REPLY, Answer, Live, Outcome, Released, Snapshot, TurnEnd
-from .brick_messages import FORWARDED, Done, Inward, Outward, PartEnded, Request, StaleLeader, Taken, Work
+from .brick_messages import FORWARDED, Beside, Done, Inward, Outward, PartEnded, Request, StaleLeader, Taken, Work
 from .letters import FOREVER as FOREVER
 from .peer_channel import Inbox, Posting
 
@@ -322,7 +322,8 @@ class Proceed(Brick):
     async def _hand(self, ends: list[TurnEnd], *, is_last: bool, live: Live | None, wait: bool) -> None:
         server, standing = self._standing.server, self._standing
         server.state.handed = part = server.state.handed + 1
-        more, behind = server.take_more(), server.last_ended
+        behind = server.last_ended
+        ends, more = await self._hand_pieces(ends, server.take_more(), behind)
         done = Done(standing.epoch, standing.config, self._number, ends, is_last, live, more, part, wait, behind)
         if wait:
             self._at_home = standing.node.loop.create_future()
@@ -341,11 +342,22 @@ class Proceed(Brick):
         more, behind = server.take_more(), server.last_ended
         if not more:
             return False  # A snapshot that has to wait.
-        while more:
-            count = 1 if any(isinstance(one, Snapshot) and len(one.data) > 1_000_000 for one in more) else len(more)
-            part, more = more[:count], more[count:]
-            await self._pass(Done(standing.epoch, standing.config, self._number, [], False, None, part, behind=behind))
+        _, more = await self._hand_pieces([], more, behind)
+        await self._pass(Done(standing.epoch, standing.config, self._number, [], False, None, more, behind=behind))
         return True
+
+    async def _hand_pieces(
+        self, ends: list[TurnEnd], more: list[Beside], behind: int
+    ) -> tuple[list[TurnEnd], list[Beside]]:
+        """Hand over all pieces of a large snapshot but the last, each by itself; returns what is left to hand over."""
+        standing = self._standing
+        while len(more) > 1 and any(isinstance(one, Snapshot) and len(one.data) > 1_000_000 for one in more):
+            first, more = more[:1], more[1:]
+            await self._pass(
+                Done(standing.epoch, standing.config, self._number, ends, False, None, first, behind=behind)
+            )
+            ends = []
+        return ends, more
 
     async def _pass(self, done: Done) -> None:
         while True:

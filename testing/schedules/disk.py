@@ -280,7 +280,7 @@ class SimulatedJournal:
         return Segment.of(number, [(place[0], pack[place]) for place in places])
 
     def packs(self, address: str) -> set[int]:
-        """See `Journal`."""
+        """Return the packs of an address that the disk has."""
         return {number for owner, number in self._contents.blocks if owner == address}
 
     def forget_blocks(self, address: str, numbers: Collection[int]) -> None:

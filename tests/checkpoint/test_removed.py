@@ -58,6 +58,13 @@ CHECKS = {
         "tests/checkpoint/test_snapshots_damage.py",
         "test_a_snapshot_that_could_not_be_kept",
     ),
+    "the pack of a snapshot that was not kept is known, and goes": Check(
+        "checkpoint/snapshot/snapshot_blocks.py",
+        "                self._packs.add(shared.number)\n",
+        "",
+        "tests/checkpoint/test_snapshots_damage.py",
+        "leaves_no_pack",
+    ),
     "a row is gone for good before its file is": Check(
         "checkpoint/sqlite/engine.py",
         "        if self._packs.names(address):\n            self._store.sync_rows()\n",

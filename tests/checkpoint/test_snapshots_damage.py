@@ -202,3 +202,39 @@ async def test_a_snapshot_that_could_not_be_kept_leaves_the_packs_of_those_befor
 async def saved() -> None:
     """Wait until snapshots that are on their way are kept, and what no snapshot needs any more is removed."""
     await asyncio.gather(*(one for one in asyncio.all_tasks() if one.get_name().startswith("snapshot of ")))
+
+
+class Tear(hf.Message[None]): ...
+
+
+class Brittle(Sheet):
+    @hf.on(Tear)
+    def tear(self, message: Tear) -> None:
+        raise ValueError("torn")
+
+
+async def test_a_snapshot_whose_life_ends_before_it_is_kept_leaves_no_pack(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, may_keep, keep = threading.Event(), threading.Event(), SqliteJournal.keep_blocks
+
+    def keep_late(self: SqliteJournal, *args: Any) -> None:
+        begun.set()
+        assert may_keep.wait(20.0)
+        keep(self, *args)
+
+    spec = hf.child("sheet", hf.start(Brittle), recovery=hf.hybrid(interval=NEVER))
+    async with running(tmp_path / "app.db") as system:
+        ref = await system.start(spec)
+        await ref.ask(Paint(0, 0))
+        monkeypatch.setattr(SqliteJournal, "keep_blocks", keep_late)
+        saving = asyncio.ensure_future(system.checkpoint(ref, timeout=20.0))
+        assert await asyncio.to_thread(begun.wait, 20.0)
+        with pytest.raises(hf.HoldfastError, match="torn"):
+            await ref.ask(Tear())
+        assert await ref.ask(Paint(0, 0)) == 2  # The next life is there.
+        monkeypatch.undo()
+        may_keep.set()
+        await saving  # It is the next life's.
+        await saved()
+        assert len(packs(tmp_path / "app.db")) == 1

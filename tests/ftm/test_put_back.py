@@ -477,14 +477,8 @@ class Helpless(Forgetful):
         return False
 
 
-class Attending(Helpless):
+class Attending(Attentive, Helpless):
     """The same house, run better, and as helpless."""
-
-    @hf.on(Welcome)
-    def welcome(self, message: Welcome) -> bool:
-        self.is_open.update(("asks", "says"))
-        self.ctx.unstash()
-        return True
 
 
 @pytest.mark.parametrize("waits", [True, False], ids=["hangs", "is refused"])

@@ -217,11 +217,18 @@ CHECKS = {
         PUT_BACK,
         "by_blocks_and_votes_is_replayed",
     ),
+    "a large snapshot comes home in pieces, also with the end of a turn": Check(
+        "ftm/bricks/bricks.py",
+        "        ends, more = await self._hand_pieces(ends, server.take_more(), behind)\n",
+        "        more = server.take_more()\n",
+        "tests/ftm/test_large_goodbye.py",
+        "comes_home and PBR",
+    ),
     "home gets snapshots of states that were decided on": Check(
         "ftm/bricks/bricks.py",
-        "        more, behind = server.take_more(), server.last_ended\n        done =",
+        "        ends, more = await self._hand_pieces(ends, server.take_more(), behind)\n",
         "        server.take_wanted_snapshot()\n"
-        "        more, behind = server.take_more(), server.last_ended\n        done =",
+        "        ends, more = await self._hand_pieces(ends, server.take_more(), behind)\n",
         PUT_BACK,
         "no_snapshot_is_taken",
     ),
