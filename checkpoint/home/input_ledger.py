@@ -142,12 +142,7 @@ class InputLedger:
         return True
 
     def admit_result(self, turn: int, k: int) -> bool:
-        """Whether the result of background work, output (turn, k), is the first one: only that is an input.
-
-        Nothing is saved while such work is out: what a turn that the snapshot contains has begun has its result.
-        """
-        if turn <= self.state_turn:
-            return False
+        """Whether the result of background work, output (turn, k), is the first one: only that is an input."""
         done = self.pipes_done.setdefault(turn, set())
         is_first = k not in done
         done.add(k)

@@ -26,12 +26,15 @@ class Background:
         """It has an outcome. Does that count? What was said to be lost does not come, nor what has come before.
 
         More than one run of a turn may have begun it, on one replica or on several, and each is told of. With a replay
-        the ledger knows which have come.
+        the ledger knows which have come behind the snapshot, and what turns that it contains have begun has its result:
+        none is taken while work is out. Without a replay home forgets turns whatever is out.
         """
-        one = record.turn, record.k
+        one, switch = (record.turn, record.k), self._switch
         is_out = one in self._out
         self._out.discard(one)
-        return is_out or not record.k or self._switch.method.replays
+        if switch.method.replays:
+            is_out = record.turn > switch.ledger.state_turn
+        return is_out or not record.k
 
     def is_lost(self, turn: int | None = None) -> bool:
         """What turns up to this one (None: all) have begun has ended without an outcome.

@@ -113,6 +113,19 @@ class Runner(Counter):
         (folder / f"done{run}").touch()
 
 
+class Apart(Counter):
+    """Its work lasts as long as the process has a file of its own; there is another one when it is over."""
+
+    @hf.on(Begin)
+    def begin(self, message: Begin) -> int:
+        self.ctx.pipe_to_self(self.last(Path(message.folder)), lambda _: Add(BROUGHT))
+        return self.total
+
+    async def last(self, folder: Path) -> None:
+        await until_gone(folder / f"work{os.getpid()}")
+        (folder / f"done{os.getpid()}").touch()
+
+
 class Noting(Worker):
     """Each process that begins work writes its number."""
 
@@ -281,6 +294,24 @@ async def test_what_two_runs_of_a_turn_have_begun_comes_once_however_late_the_se
     assert (await ref.ask(Tags())).count(BROUGHT) == 1
 
 
+@pytest.mark.parametrize("mechanism", [PBR(), LFR(), hf.TR(), hf.TMR()], ids=["pbr", "lfr", "tr", "tmr"])
+async def test_what_takes_long_counts_though_home_has_forgotten_its_turn(
+    system: hf.ActorSystem, mechanism: Any, tmp_path: Path
+) -> None:
+    """The home of an actor without recovery forgets turns as they come, also those whose work is out."""
+    (tmp_path / "work").touch()
+    ref = await system.start(hf.child("alice", hf.start(Worker), mechanism=mechanism))
+    await ref.ask(Begin(str(tmp_path)))
+    count = KEPT_TURNS + 50
+    for tag in range(count):
+        await ref.ask(Add(tag))
+    (tmp_path / "work").unlink()
+    async with asyncio.timeout(25):
+        while BROUGHT not in (tags := await ref.ask(Tags())):
+            await asyncio.sleep(0.005)
+    assert sorted(tags) == [*range(count), BROUGHT]
+
+
 async def test_what_came_before_the_snapshot_does_not_come_again_behind_a_turn_that_failed(
     system: hf.ActorSystem, tmp_path: Path
 ) -> None:
@@ -297,6 +328,35 @@ async def test_what_came_before_the_snapshot_does_not_come_again_behind_a_turn_t
             await ref.ask(Boom(), timeout=25.0)
     assert await ref.ask(Add(0), timeout=25.0) == 3
     assert await ref.ask(Tags()) == [BROUGHT, BROUGHT, 0]
+
+
+async def test_what_the_next_leader_still_does_is_not_wanted_if_the_snapshot_has_what_came_of_it(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    """A follower of LFR has begun the work as well, and is slower."""
+    ref = await system.start(hf.child("alice", hf.start(Apart), mechanism=LFR(), recovery=hf.hybrid(interval=3600.0)))
+    await two_again(ref)
+    group = group_of(ref)
+    first, pids = group.membership.primary, [pid_of(system, ref, name) for name in group.membership.names]
+    assert first is not None
+    leads = pid_of(system, ref, first)
+    [follows] = [pid for pid in pids if pid != leads]
+    for pid in pids:
+        (tmp_path / f"work{pid}").touch()
+    await ref.ask(Begin(str(tmp_path)), timeout=25.0)
+    (tmp_path / f"work{leads}").unlink()
+    async with asyncio.timeout(25):
+        while BROUGHT not in await ref.ask(Tags()):
+            await asyncio.sleep(0.002)
+    await system.checkpoint(ref)
+    os.kill(leads, signal.SIGKILL)
+    await ref.ask(Add(0), timeout=25.0)
+    assert group.membership.primary != first
+    (tmp_path / f"work{follows}").unlink()
+    await until_there(tmp_path / f"done{follows}")
+    assert await ref.ask(Add(1), timeout=25.0) == 3
+    assert await ref.ask(Add(2), timeout=25.0) == 4
+    assert await ref.ask(Tags()) == [BROUGHT, 0, 1, 2]
 
 
 async def test_work_whose_result_has_come_is_not_begun_again_behind_a_turn_that_failed(
