@@ -292,6 +292,8 @@ class Proceed(Brick):
             await server.ensure()
             pending = server.returned_first(pending)
         while True:
+            if pending and not state.is_over:
+                await server.take_in_hooks()
             ends = await server.run_part(pending)
             live = None
             # What was handled before is decided as it was: `on_recovered` and what follows from it are no part of that.

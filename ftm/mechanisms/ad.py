@@ -22,10 +22,11 @@ from ...actors.errors import HoldfastError
 from ...actors.kernel.actor import Actor
 from ..alarms import Objected
 from ..bricks.brick_messages import Request, ServerState
-from ..bricks.runs import Deciding, Run, plain, sent_by
+from ..bricks.runs import Deciding, Run, sent_by, vote
 from ..bricks.shadow_runs import Compute, Helping
 from ..model.mechanism import Mechanism, Role
 from ..votes.assertions import AssertionFailed, Inspector, check_assertions, names_of
+from ..votes.voters import MAJORITY, Agreed
 
 
 class Assisting(Helping):
@@ -53,7 +54,7 @@ class Asserting(Deciding):
         if not own.objections:
             return own
         other = await self._at_peer(before, requests, own)
-        alike = isinstance(other, Run) and plain(other) == plain(own)
+        alike = isinstance(other, Run) and isinstance(vote(MAJORITY, [own, other]), Agreed)
         if isinstance(other, Run) and (not other.objections or (alike and is_crash(own))):
             standing.node.emit(Objected(standing.address, standing.path, own.objection, standing.other.path or ""))
             return own if alike else other

@@ -27,10 +27,8 @@ from ..model.mechanism import Mechanism, Role
 from ..model.mechanism_declaration import Cost
 from ..votes.assertions import names_of
 from ..votes.versions import version
-from ..votes.voters import AnyVoter, Custom, Majority, Median, NoMajority, Undecided, Voter
+from ..votes.voters import MAJORITY, AnyVoter, Custom, Median, NoMajority, Undecided, Voter
 from .rb import protected_class
-
-MAJORITY = Majority()
 
 
 class Versions(Deciding):

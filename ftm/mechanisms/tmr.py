@@ -30,10 +30,9 @@ from ..bricks.shadow_runs import NEEDS_STATE, Compute, Computed, Helping, Settle
 from ..bricks.standing import PeerLost
 from ..model.mechanism import Mechanism, Role
 from ..model.mechanism_declaration import Cost
-from ..votes.voters import Majority, Median, NoMajority, Undecided
+from ..votes.voters import MAJORITY, Median, NoMajority, Undecided
 from .nvp import voter_of
 
-MAJORITY = Majority()
 NAMES = ("r1", "r2", "r3")
 TRIES = 4
 """How often a replica is asked, if others join or go meanwhile."""

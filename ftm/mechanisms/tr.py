@@ -18,9 +18,9 @@ from typing import ClassVar
 from ...actors.errors import HoldfastError
 from ..alarms import Masked
 from ..bricks.brick_messages import Request, ServerState
-from ..bricks.runs import Deciding, Run, plain, turns_of
+from ..bricks.runs import Deciding, Run, turns_of, vote
 from ..model.mechanism import Mechanism, Role
-from ..votes.voters import NoMajority
+from ..votes.voters import MAJORITY, Agreed, NoMajority, Undecided
 
 
 class Compare(Deciding):
@@ -29,13 +29,14 @@ class Compare(Deciding):
     async def choose(self, before: ServerState, requests: list[Request], first: Run | None) -> Run | HoldfastError:
         """Run again what has just run, and compare; a third run decides."""
         first = first or await self.run_here(before, requests)
-        second = await self.run_here(before, requests)
-        if plain(first) == plain(second):
+        runs: list[Run | None] = [first, await self.run_here(before, requests)]
+        if isinstance(vote(MAJORITY, runs), Agreed):
             return first
         standing, third = self._standing, await self.run_here(before, requests)
-        if plain(third) not in (plain(first), plain(second)):
-            return NoMajority(standing.address, "three runs have come to three different outcomes")
-        standing.node.emit(Masked(standing.address, standing.path, turns_of([first, second, third])))
+        decided = vote(MAJORITY, [*runs, third])
+        if isinstance(decided, Undecided):
+            return NoMajority(standing.address, decided.why)
+        standing.node.emit(Masked(standing.address, standing.path, turns_of([*runs, third])))
         return third
 
 

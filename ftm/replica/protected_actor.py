@@ -282,6 +282,7 @@ class Server(lifecycle.HerePlace):
         elif state.has_deltas:
             actor.get_delta()
         greets = type(actor).on_start is not Actor.on_start
+        life.is_touched = has_state and (greets or type(actor).on_recovered is not Actor.on_recovered)
         if point is not None and point.live:
             self._put([GoLive(life, Go(has_state, turn))])
         elif point is None and turn >= 0:  # Its state is lost: it begins as without recovery, and is live at once.
@@ -401,15 +402,41 @@ class Server(lifecycle.HerePlace):
             delta = encode_value(actor.get_delta(), where=f"{self.address}.get_delta()")
             made = point_of(life, point.data, [*point.deltas, delta])
         else:
-            data = self._images.take(actor, None if point is None else point.data)
-            if has_deltas:
-                actor.get_delta()
-            made = point_of(life, data, [])
+            made = self._whole(life)
         points.go_on_to(made)
-        points.names = names = names_of_state(actor)
+        self._note_names(life, made)
+        life.is_touched = False
+        return made
+
+    def _whole(self, life: ServerLife) -> ServerState:
+        actor: Any = life.cell.actor
+        point = self.points.point
+        data = self._images.take(actor, None if point is None else point.data)
+        if self.state.has_deltas:
+            actor.get_delta()
+        return point_of(life, data, [])
+
+    def _note_names(self, life: ServerLife, made: ServerState) -> None:
+        self.points.names = names = names_of_state(life.cell.actor)
         if names is not None:
             made.absent = sorted(life.begun_names - names)
-        return made
+
+    async def take_in_hooks(self) -> None:
+        """What the hooks of a new life have done to the state is part of what its next turns begin from, in all runs.
+
+        Only between two parts, when it is decided what the last one has come to.
+        """
+        await self.ensure()
+        life = self.life
+        if life is None or not life.is_touched or self.state.is_lazy:
+            return
+        life.is_touched = False
+        try:
+            made = self._whole(life)
+        except Exception:  # What the user's own values and methods raise: the next turn that leaves it so fails of it.
+            return
+        self.points.stand_changed(made)
+        self._note_names(life, made)
 
     def state_digest(self) -> bytes:
         """A digest of the state after the last turn, the same on each replica. Only between two turns.
@@ -446,6 +473,7 @@ class Server(lifecycle.HerePlace):
         rewind_to(life, point, self.points.names, has_deltas=self.state.has_deltas)
         self.standing.server.took(time.perf_counter() - begin, point.data.size)
         self.points.go_back_to(point)
+        life.is_touched = False
 
     def took(self, seconds: float, size: int) -> None:
         """The state was gone through to compare runs: tell, once, if that takes long."""
@@ -457,7 +485,7 @@ class Server(lifecycle.HerePlace):
         """Have the life stand at a point: the one that there is, or one that begins there."""
         if self.life is None:
             self.points.go_back_to(point)
-            await self.ensure()
+            await self.ensure_as_given()
         else:
             self.rewind(point)
 

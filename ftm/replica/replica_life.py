@@ -108,6 +108,7 @@ class ServerLife(Life):
         self.ended: Feed | None = None  # what the last turn has handled
         self.let_out: list[Out] = []  # of the turn in hand, beside `outs`: it has left, or is held back
         self.begun_names: set[str] = set()  # the variables of the actor when `__init__` had run
+        self.is_touched = False  # by its hooks, since the point at which it has begun
         self.saving.is_needed = server.state.has_access
 
     def _context(self, cell: Cell) -> RecordedContext:

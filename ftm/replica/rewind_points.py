@@ -40,6 +40,7 @@ class RewindPoints:
     tail: list[tuple[Request, TurnEnd | None]] = dataclasses.field(default_factory=list)  # with the end if it failed
     previous: tuple[ServerState, list[Request]] | None = None  # before the last part, and that part
     given: ServerState | None = None  # the point that another replica was told last
+    untraced: int = -2  # hooks have changed the state of this turn: from it, or an earlier one, nothing leads on
 
     @property
     def turn(self) -> int:
@@ -65,6 +66,11 @@ class RewindPoints:
         else:
             self.marks, self.delta_bytes = [], 0
         self.point, self.tail = point, []
+
+    def stand_changed(self, point: ServerState) -> None:
+        """Have a state that differs from the last one though no turn was run: nobody else knows what led to it."""
+        self.go_on_to(point)
+        self.untraced = point.turn
 
     def skip_to(self, turn: int) -> None:
         """Count these turns as used, though they have left nothing."""
@@ -134,6 +140,8 @@ def change_since(points: RewindPoints, turn: int) -> StateDelta | None:
     """
     point = points.point
     assert point is not None
+    if turn <= points.untraced:
+        return None
     patch, deltas = None, point.deltas
     at = _place_of(points, turn, point)
     if at is not None:

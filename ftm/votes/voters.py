@@ -183,6 +183,9 @@ class Custom(msgspec.Struct, frozen=True, tag="custom"):
 
 
 AnyVoter = Exact | Majority | Tolerance | Median | Custom
+
+MAJORITY: Final = Majority()
+"""What most agree on; of two, both."""
 """What a mechanism can have in its settings: it is told apart by its tag."""
 
 

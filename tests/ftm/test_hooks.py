@@ -14,7 +14,7 @@ import holdfast as hf
 from holdfast.ftm.alarms import StatesDiffer
 from tests.checkpoint.players import until
 from tests.ftm.accounts import Boom
-from tests.ftm.test_failover import two_again
+from tests.ftm.test_failover import group_of, pid_of, two_again
 
 
 class Tick(hf.Message): ...
@@ -202,3 +202,97 @@ async def test_a_hook_that_changes_the_state_is_no_difference_and_counts_once_fo
         assert (await system.get_status(ref)).life == 2
         told = hf.Masked, hf.Diverged, StatesDiffer
         assert [event for event in events.take() if isinstance(event, told)] == []
+
+
+class Greeting(Returning):
+    """Counts them in its first hook too."""
+
+    def on_start(self, restored: bool) -> None:
+        if restored:
+            self.returns += 100
+
+
+@pytest.mark.parametrize("kind", [Returning, Greeting])
+@pytest.mark.parametrize("recovery", [None, hf.hybrid(interval=3600.0)], ids=["plain", "hybrid"])
+@pytest.mark.parametrize("name", [*sorted(who_compares()), "pbr"])
+async def test_what_the_hooks_of_the_next_leader_change_is_where_all_runs_of_its_turns_begin(
+    kind: type[Returning], recovery: hf.Method | None, name: str
+) -> None:
+    """Whoever leads next began a life, or has one: no run is masked, and no ask fails for want of a majority."""
+    mechanism = {**who_compares(), "pbr": hf.PBR()}[name]
+    if recovery is None and name in ("tr", "nvp"):
+        recovery = hf.hybrid(interval=0.05)  # There is one replica, which is killed: without recovery it begins afresh.
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        events = system.events()
+        ref = await system.start(hf.child("it", hf.start(kind), recovery=recovery, mechanism=mechanism))
+        await two_again(ref)
+        counts = iter(range(1, 100))
+        for _ in range(3):
+            assert await ref.ask(Count(), timeout=25.0) == next(counts)
+            primary = group_of(ref).membership.primary
+            assert primary is not None
+            os.kill(pid_of(system, ref, primary), signal.SIGKILL)
+            assert await ref.ask(Count(), timeout=25.0) == next(counts)
+            await two_again(ref)
+            for _ in range(3):
+                assert await ref.ask(Count(), timeout=25.0) == next(counts)
+        told = hf.Masked, hf.Diverged, StatesDiffer
+        assert [event for event in events.take() if isinstance(event, told)] == []
+
+
+class Trip(hf.Message):
+    """Have the life end outside of any turn."""
+
+
+class Falling(Returning):
+    """Has a state that is told to the other replica as a patch, and falls when it is told to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ballast = bytes(200_000)
+
+    @hf.on(Trip)
+    def trip(self, message: Trip) -> None:
+        self.ctx.create_task(self._fall())
+
+    async def _fall(self) -> None:
+        raise RuntimeError("fell")
+
+
+class Told(Falling):
+    """Says itself what has changed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._counted = self._returned = 0
+
+    def get_delta(self) -> tuple[int, int]:
+        delta = self.count - self._counted, self.returns - self._returned
+        self._counted, self._returned = self.count, self.returns
+        return delta
+
+    def apply_delta(self, delta: tuple[int, int]) -> None:
+        self.count += delta[0]
+        self.returns += delta[1]
+
+
+@pytest.mark.parametrize("kind", [Falling, Told])
+@pytest.mark.parametrize("name", ["pbr", "tmr", "pbr+tr"])
+async def test_what_hooks_change_between_two_turns_comes_to_the_other_replica(kind: type[Falling], name: str) -> None:
+    """The life of the leader ends without a turn, and its next one begins at the same turn with another state."""
+    mechanism = {**who_compares(), "pbr": hf.PBR()}[name]
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        ref = await system.start(hf.child("it", hf.start(kind), mechanism=mechanism))
+        await two_again(ref)
+        assert await ref.ask(Count(), timeout=25.0) == 1
+        ref.tell(Trip())
+        returns = 0
+        while not returns:
+            _, returns = await ref.ask(Lives(), timeout=25.0)
+        assert await ref.ask(Count(), timeout=25.0) == 2
+        await two_again(ref)
+        primary = group_of(ref).membership.primary
+        assert primary is not None
+        os.kill(pid_of(system, ref, primary), signal.SIGKILL)
+        assert await ref.ask(Count(), timeout=25.0) == 3
+        assert await ref.ask(Lives(), timeout=25.0) == (3, returns + 1)

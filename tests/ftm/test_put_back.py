@@ -353,6 +353,29 @@ async def test_a_life_that_takes_back_in_its_start_handles_it_without_being_aske
     assert await other.ask(Tags()) == [1, 2, 3]
 
 
+@pytest.mark.parametrize("recovery", [None, hf.hybrid(interval=3600.0)], ids=["plain", "hybrid"])
+@pytest.mark.parametrize("mechanism", ["pbr", "tmr", "tr+pbr"])
+async def test_the_next_leader_takes_back_in_its_start_and_all_runs_of_what_follows_agree(
+    system: hf.ActorSystem, mechanism: str, recovery: hf.Method | None
+) -> None:
+    """What its hook has put back is where each run of the turns behind it begins."""
+    events = system.events()
+    other = await system.start(hf.child("other", hf.start(Counter)))
+    spec = hf.child("host", hf.start(Sworn), mechanism=MECHANISMS[mechanism](), recovery=recovery)
+    ref = await system.start(spec)
+    await two_again(ref)
+    guests = [asyncio.ensure_future(ref.ask(Meet(tag, "asks"), timeout=IN_TIME)) for tag in (1, 2, 3)]
+    assert await ref.ask(Add(100), timeout=IN_TIME) == 1
+    primary = group_of(ref).membership.primary
+    assert primary is not None
+    os.kill(pid_of(system, ref, primary), signal.SIGKILL)
+    assert isinstance(await ref.ask(Add(101), timeout=IN_TIME), int)
+    assert await asyncio.gather(*guests) == [2, 3, 4]
+    assert await ref.ask(Tags(), timeout=IN_TIME) == [100, 1, 2, 3, 101]
+    assert await other.ask(Tags()) == [1, 2, 3]
+    assert not [one for one in events.take() if isinstance(one, hf.Masked | hf.Diverged)]
+
+
 @pytest.mark.parametrize("mechanism", [name for name in MECHANISMS if name != "none"])
 async def test_who_comes_when_the_house_has_just_opened_waits_for_those_who_were_put_back(
     system: hf.ActorSystem, mechanism: str

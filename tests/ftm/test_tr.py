@@ -161,3 +161,25 @@ async def test_what_was_begun_in_time_is_not_dropped_by_the_other_runs(system: h
         assert await driver.reply(key) == 1
         assert not [one for one in events.take() if isinstance(one, Masked)]
     assert await driver.ask(Read()) == [1]
+
+
+class Disordered(Total):
+    """Has a set that is gone through in another order each time it is made of what it was gone through before."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.among = set[int]()
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.among.update((7, 15))  # Both belong into the same place of eight: the first one gets it.
+        self.seen.append(message.n)
+        return len(self.seen)
+
+
+async def test_the_order_in_which_a_set_is_gone_through_is_no_difference(system: hf.ActorSystem) -> None:
+    events = system.events()
+    ref = await system.start(hf.child("it", hf.start(Disordered), mechanism=TR()))
+    for count in range(1, 6):
+        assert await ref.ask(Add(1), timeout=25.0) == count
+    assert [one for one in events.take() if isinstance(one, Masked)] == []

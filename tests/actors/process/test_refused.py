@@ -14,7 +14,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.process import worker_pool
-from holdfast.actors.process.fork import fork_server
+from holdfast.actors.process.fork import fork_server, launch
 from tests.actors.process.players import Account, Add, Total, Where
 from tests.actors.process.waiting import until
 from tests.warm import own_children
@@ -108,8 +108,16 @@ async def test_a_process_of_whose_end_nobody_has_told_in_time_leaves_nothing_ope
 
 
 async def test_a_fork_server_whose_start_is_given_up_twice_ends_with_the_system(
-    monkeypatch: pytest.MonkeyPatch,
+    cold_fork_servers: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    start_server = launch.exec_server
+
+    def exec_and_stop(*args: Any) -> Any:
+        process = start_server(*args)
+        os.kill(process.pid, signal.SIGSTOP)  # It does not get ready before it is given up.
+        return process
+
+    monkeypatch.setattr(fork_server, "exec_server", exec_and_stop)
     async with hf.ActorSystem("app", log=False) as system:
         starting = asyncio.ensure_future(system.start(account("first")))
         await until(lambda: bool(servers()))
