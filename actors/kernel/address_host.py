@@ -90,6 +90,11 @@ class Place:
         """Whether a life can take messages here."""
         return True
 
+    @property
+    def is_ending(self) -> bool:
+        """Whether the life has been told to stop."""
+        return False
+
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         """A link, monitor or binding at this cell has changed: whoever lives its life has to know."""
 

@@ -392,7 +392,7 @@ class WorkerPlace(Place):
 
     @property
     def is_ending(self) -> bool:
-        """Whether the life there has been told to stop."""
+        """As of any place."""
         return self.stop_sent is not None or self._stop_wanted is not None
 
     # -- beginning --------------------------------------------------------------------------------------------------

@@ -94,6 +94,15 @@ class GroupPlace(Place):
         self._careful: set[int] = set()
 
     @property
+    def is_ending(self) -> bool:
+        """As of any place."""
+        return self._ending is not None or self._stop_wanted is not None
+
+    def handed_to(self, parent: Parent) -> None:
+        """The replicas stay: another supervisor hears of the end of the life."""
+        self.parent = parent
+
+    @property
     def detection(self) -> Detection:
         """How the replicas are watched: as the outermost mechanism says that says anything about it."""
         return detection_in(self.layers) or Detection()

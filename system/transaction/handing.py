@@ -57,8 +57,6 @@ def check_handing(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> None:
         raise wrong(place.path, "it does not run, and a supervisor lives in another process: start it first")
     if place.is_supervisor:
         raise wrong(place.path, "it is a supervisor: its children live where it does")
-    if place.is_protected:
-        raise wrong(place.path, "a supervisor of its replicas lives in another process: detach its mechanism first")
     if is_far(old) and recipe_spec(cell) is None:
         raise wrong(
             place.path, "no recipe at the root has its spec: its supervisor alone, in another process, knows it"
@@ -112,7 +110,7 @@ class Handing:
         if place.rework is not None or place.relocation is not None:
             raise wrong(place.path, "it goes to another process's supervisor: change it in a transaction of its own")
         cell = place.living(system.node)
-        if place_of(cell) != "process":
+        if not place.is_protected and place_of(cell) != "process":
             work = functools.partial(system._moves.move, cell, "process", None, MOVED_WITHIN)
             self._is_lodged |= await self._lodging.done(system, work)
         above = self._above.living(system.node)
@@ -123,7 +121,9 @@ class Handing:
         self._parent = far_parent(above, place.path)
         self._parent.expect()
         supervisor: ActorRef[Supervisor] = ActorRef(above)
-        spec = dataclasses.replace(planned_spec(place, in_force=True), isolation="process")
+        spec = planned_spec(place, in_force=True)
+        if not place.is_protected:
+            spec = dataclasses.replace(spec, isolation="process")
         asked = supervisor.ask(StartChild(spec, candidate=self._candidate), START_TIMEOUT)
         self._start = system.node.loop.create_task(_reply(asked), name=f"room for {place.path}")
 
@@ -143,7 +143,7 @@ class Handing:
             return ""
         cell = self._place.living(system.node)
         old, at = cell.host.parent, cell.host.place
-        if not isinstance(at, WorkerPlace):
+        if not (self._place.is_protected or isinstance(at, WorkerPlace)):
             return f"{cell.path} has no process of its own"
         if cell.state is not RUNNING or not cell.host.is_up(cell) or at.is_ending:
             return f"{cell.path} is being restarted"

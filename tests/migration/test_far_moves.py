@@ -22,6 +22,7 @@ import pytest
 import holdfast as hf
 from holdfast.actors.kernel.message import message_name
 from holdfast.actors.process.wire import frames
+from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.supervision.admin import RemoveChild
 from tests.actors.process.waiting import next_event
 from tests.migration.travellers import KINDS, TOLD, Add, Luggage, Seen, Stream, Traveller
@@ -32,9 +33,23 @@ IN_TIME = 60.0
 WAYS = {"far to near": ("far", "near"), "near to far": ("near", "far"), "far to far": ("far", "other")}
 
 
-def traveller(kind: str, isolation: Any) -> hf.ChildSpec:
-    recovery = {} if KINDS[kind] is None else {"recovery": KINDS[kind]}
-    return hf.child("one", hf.start(Traveller), isolation=isolation, mailbox=hf.bounded(100_000), **recovery)
+PLACES = ["task", "process", "replicas"]
+
+
+def traveller(kind: str, place: str) -> hf.ChildSpec:
+    more: dict[str, Any] = {} if KINDS[kind] is None else {"recovery": KINDS[kind]}
+    more |= {"mechanism": hf.PBR()} if place == "replicas" else {"isolation": place}
+    return hf.child("one", hf.start(Traveller), mailbox=hf.bounded(100_000), **more)
+
+
+def processes(system: hf.ActorSystem, ref: Any) -> list[int]:
+    """Those in which it lives."""
+    place = ref._cell.host.place
+    if not isinstance(place, GroupPlace):
+        return [system.pid_of(ref)]
+    group = place.group
+    found = [system.pid_of(system.ref(f"{ref.path}/ftm/{name}", hf.Actor)) for name in group.membership.names]
+    return [pid for pid in found if pid is not None]
 
 
 def supervisors(kind: str, at: str, isolation: Any) -> list[hf.ChildSpec]:
@@ -67,7 +82,7 @@ async def system() -> Any:
 
 @pytest.mark.parametrize("way", list(WAYS))
 @pytest.mark.parametrize("kind", list(KINDS))
-@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("isolation", PLACES)
 async def test_it_goes_with_all_it_has(system: hf.ActorSystem, isolation: str, kind: str, way: str) -> None:
     old, new = WAYS[way]
     for spec in supervisors(kind, old, isolation):
@@ -76,11 +91,11 @@ async def test_it_goes_with_all_it_has(system: hf.ActorSystem, isolation: str, k
     luggage, stream = Luggage(system, ref), Stream(ref)
     await luggage.pack()
     await stream.reached(20)
-    own = system.pid_of(ref)
+    own = processes(system, ref)
     for to in (new, old, new):
         await move(system, ref, to)
         assert ref.path == f"/app/{to}/one"
-        assert system.pid_of(ref) == (own if isolation == "process" else pid_of(system, to))
+        assert processes(system, ref) == ([pid_of(system, to)] if isolation == "task" else own)
         await stream.reached(20)
     await stream.stop()
     seen = await luggage.unpack()
@@ -132,7 +147,7 @@ async def is_at_one_place(system: hf.ActorSystem, ref: Any) -> None:
 
 @pytest.mark.pairs
 @pytest.mark.parametrize("way", list(WAYS))
-@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("isolation", PLACES)
 @pytest.mark.parametrize("victim", ["old", "new", "own"])
 @pytest.mark.parametrize("seed", range(6))
 async def test_a_process_that_is_killed_at_any_instant_loses_nothing(
@@ -145,11 +160,14 @@ async def test_a_process_that_is_killed_at_any_instant_loses_nothing(
     pump = Pump(ref)
     await pump.reached(10)
     moving = asyncio.ensure_future(move(system, ref, new))
-    struck = system.node.loop.time() + random.Random(seed).random() * 0.3
+    rng = random.Random(seed)
+    struck = system.node.loop.time() + rng.random() * 0.3
     while not moving.done() and system.node.loop.time() < struck:
         await asyncio.sleep(0)
     with contextlib.suppress(hf.NoSuchActor, ProcessLookupError):  # It lives nowhere just now.
-        pid = system.pid_of(ref) if victim == "own" else pid_of(system, {"old": old, "new": new}[victim])
+        pid = (
+            rng.choice(processes(system, ref)) if victim == "own" else pid_of(system, {"old": old, "new": new}[victim])
+        )
         if pid != os.getpid():
             os.kill(pid, signal.SIGKILL)
     try:
@@ -194,7 +212,7 @@ if __name__ == "__main__":
 
 @pytest.mark.pairs
 @pytest.mark.parametrize("way", list(WAYS))
-@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("isolation", PLACES)
 @pytest.mark.parametrize("when", ["prepare", "commit", "finish", "settled"])
 async def test_a_root_that_is_killed_has_it_at_one_of_the_two(
     tmp_path: Path, when: str, isolation: str, way: str
@@ -211,7 +229,7 @@ async def test_a_root_that_is_killed_has_it_at_one_of_the_two(
         ref = system.ref(f"/app/{at}/one", Traveller)
         assert await ref.ask(Add(1), IN_TIME) == 8
         await is_at_one_place(system, ref)
-        assert (system.pid_of(ref) == pid_of(system, at)) == (isolation == "task")
+        assert (processes(system, ref) == [pid_of(system, at)]) == (isolation == "task")
         if at != old:  # Who knows only the address of before reaches it.
             assert await system.ref(f"/app/{old}/one", Traveller).ask(Add(1), IN_TIME) == 9
 
@@ -343,7 +361,7 @@ async def test_an_end_that_its_old_supervisor_process_has_not_heard_of_is_told_t
             await asyncio.sleep(0.005)
 
 
-@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("isolation", PLACES)
 async def test_a_supervisor_within_a_process_comes_back_with_who_has_come_and_without_who_has_left(
     system: hf.ActorSystem, isolation: str
 ) -> None:
@@ -399,7 +417,7 @@ async def test_who_comes_to_the_address_that_was_left_is_reached_there(busy: hf.
 
 
 @pytest.mark.parametrize("way", list(WAYS))
-@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("isolation", PLACES)
 async def test_a_move_that_is_given_up_leaves_it_where_it_was(system: hf.ActorSystem, isolation: str, way: str) -> None:
     old, new = WAYS[way]
     for spec in supervisors("plain", old, isolation):
@@ -407,13 +425,13 @@ async def test_a_move_that_is_given_up_leaves_it_where_it_was(system: hf.ActorSy
     ref = system.ref(f"/app/{old}/one", Traveller)
     pump = Pump(ref)
     await pump.reached(5)
-    process, tree = system.pid_of(ref), system.tree()
+    own, tree = processes(system, ref), system.tree()
     for _ in range(2):
         with pytest.raises(hf.TransactionFailed, match="there was a stone") as failed:
             await move(system, ref, new, Stumble())
         assert failed.value.kept == ()
         await pump.reached(5)
-        assert (ref.path, system.pid_of(ref), system.tree()) == (f"/app/{old}/one", process, tree)
+        assert (ref.path, processes(system, ref), system.tree()) == (f"/app/{old}/one", own, tree)
         await is_at_one_place(system, ref)
     await move(system, ref, new)
     await pump.judge()

@@ -85,10 +85,7 @@ class Walk:
 
     async def _step(self, stream: Stream) -> None:
         options = [
-            step
-            for place, kind, step in (cell.values for cell in cells())
-            if (place, kind) == (self.place, self._kind)
-            if step != "move" or self.place != "replicas" or not self._is_far  # Replicas live below the root alone.
+            step for place, kind, step in (cell.values for cell in cells()) if (place, kind) == (self.place, self._kind)
         ]
         step = self._draw.choice(options)
         fault = self._draw.choice(("none", "given up", "killed"))
@@ -114,7 +111,9 @@ class Walk:
             self._home = places[step]  # Also of one that is protected: it lives there behind its mechanism.
         if step == "move" and self._is_far:  # Its other supervisor is in the root's process.
             other = {BELOW: "a task", OWN_BELOW: "a process", "a task": BELOW, "a process": OWN_BELOW}
-            self.place = self._home = other[self.place]
+            self._home = other[self._home]
+            if self.place != "replicas":
+                self.place = self._home
         if step != "move" and (self.place != "replicas" or step == "unprotect"):
             self.place = places[step]
 
