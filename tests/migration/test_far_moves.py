@@ -45,11 +45,10 @@ def traveller(kind: str, place: str) -> hf.ChildSpec:
 def processes(system: hf.ActorSystem, ref: Any) -> list[int]:
     """Those in which it lives."""
     place = ref._cell.host.place
-    if not isinstance(place, GroupPlace):
+    if not isinstance(place, GroupPlace) or place.group is None:
         return [system.pid_of(ref)]
-    group = place.group
-    found = [system.pid_of(system.ref(f"{ref.path}/ftm/{name}", hf.Actor)) for name in group.membership.names]
-    return [pid for pid in found if pid is not None]
+    names = place.group.membership.names
+    return [system.pid_of(system.ref(f"{ref.path}/ftm/{name}", hf.Actor)) for name in names]
 
 
 def supervisors(kind: str, at: str, isolation: Any) -> list[hf.ChildSpec]:

@@ -183,19 +183,22 @@ KINDS: dict[str, Any] = {
 }
 STACK = pytest.mark.parametrize("stack", list(STACKS))
 KIND = pytest.mark.parametrize("kind", list(KINDS))
+THERE_IN = pytest.mark.parametrize("there", ["task", "process"])
 HERE, THERE = "/app/here/one", "/app/there/one"
 TROUBLE = (hf.Diverged, hf.FailedOver, ReplicaLost, StatesDiffer, hf.TrustBreached)
 
 
 @asynccontextmanager
-async def program(stack: str | None, kind: str, store: Path | None = None) -> AsyncGenerator[hf.ActorSystem]:
-    """`here` has `one`, which is protected; `there` is where it goes."""
+async def program(
+    stack: str | None, kind: str, store: Path | None = None, there: Any = "task"
+) -> AsyncGenerator[hf.ActorSystem]:
+    """`here` has `one`, which is protected; `there` is where it goes, with a process of its own or without."""
     kept: dict[str, Any] = {} if store is None else {"store": f"sqlite:{store}", "durability": "os"}
     async with hf.ActorSystem("app", log=False, intensity=1000, **kept) as system:
         mechanism = None if stack is None else STACKS[stack]
         one = hf.child("one", hf.start(Resident), mechanism=mechanism, recovery=KINDS[kind])
         await system.start(hf.supervisor("here", intensity=1000, children=[one]))
-        await system.start(hf.supervisor("there", intensity=1000, children=[]))
+        await system.start(hf.supervisor("there", isolation=there, intensity=1000, children=[]))
         yield system
 
 
@@ -270,8 +273,9 @@ def changes(at: list[str]) -> list[str]:
 
 @STACK
 @KIND
-async def test_it_lives_on_in_its_replicas_at_another_address(stack: str, kind: str) -> None:
-    async with program(stack, kind) as system:
+@THERE_IN
+async def test_it_lives_on_in_its_replicas_at_another_address(there: str, stack: str, kind: str) -> None:
+    async with program(stack, kind, there=there) as system:
         one = resident(system)
         await whole(one)
         stream, before = Stream(one), pids(one)
@@ -572,12 +576,13 @@ async def test_certified_replicas_are_refused_by_a_dry_run_too() -> None:
 
 
 @pytest.mark.parametrize("before", [None, "PBR"])
-async def test_a_mechanism_that_fails_behind_the_move_gives_way_there(before: str | None) -> None:
+@THERE_IN
+async def test_a_mechanism_that_fails_behind_the_move_gives_way_there(there: Any, before: str | None) -> None:
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
         mechanism = None if before is None else STACKS[before]
         children = [hf.child("one", hf.start(Resident), mechanism=mechanism, recovery=KINDS["recorded"])]
         await system.start(hf.supervisor("here", intensity=1000, children=children))
-        await system.start(hf.supervisor("there"))
+        await system.start(hf.supervisor("there", isolation=there))
         one = resident(system)
         assert await one.ask(Add(), IN_TIME) == 1
         bad = Wrong("exit", "message", "before", "leader")
@@ -699,9 +704,10 @@ async def test_what_a_replica_says_before_it_has_heard_of_its_address_is_meant_s
 @KIND
 @pytest.mark.parametrize("whom", ["leader", "follower", "all"])
 @pytest.mark.parametrize("when", ["prepare", "commit", "finish"])
-async def test_replicas_that_are_killed_at_a_step_of_the_move(when: str, whom: str, kind: str) -> None:
+@THERE_IN
+async def test_replicas_that_are_killed_at_a_step_of_the_move(there: str, when: str, whom: str, kind: str) -> None:
     """When it is at rest; in the step of the loop in which its address changes; behind that."""
-    async with program("LFR" if when == "commit" else "PBR", kind) as system:
+    async with program("LFR" if when == "commit" else "PBR", kind, there=there) as system:
         one = resident(system)
         await whole(one)
         for count in (1, 2, 3):
