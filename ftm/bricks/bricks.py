@@ -292,7 +292,7 @@ class Proceed(Brick):
             await server.ensure()
             pending = server.returned_first(pending)
         while True:
-            if pending and not state.is_over:
+            if pending and not state.is_over and (server.life is None or server.life.is_touched):
                 await server.take_in_hooks()
             ends = await server.run_part(pending)
             live = None

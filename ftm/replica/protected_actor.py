@@ -447,13 +447,6 @@ class Server(lifecycle.HerePlace):
         assert self.life is not None
         return digest_of_life(self.life)
 
-    def forget_point(self) -> None:
-        """The state was replaced in no turn: no earlier point leads to it."""
-        points = self.points
-        points.point, points.tail, points.previous = None, [], None
-        if self.life is not None and self.state.has_access:
-            self.capture()
-
     def readdress(self, cell: Cell, was: str, now: str) -> None:
         """Take the state down: what was handled before is not run again under another address."""
         life = self.life

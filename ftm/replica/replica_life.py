@@ -172,10 +172,6 @@ class ServerLife(Life):
         if not self.pipes:
             self.server.work_back()
 
-    def replaced(self) -> None:
-        self.server.forget_point()
-        super().replaced()
-
 
 class Nowhere:
     """The way home of a life that does not count any more."""
