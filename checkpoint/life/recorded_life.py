@@ -7,10 +7,11 @@ already. Only time and randomness come from the input instead of the world.
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import time
 import types
 from collections.abc import Callable, Coroutine, Generator
-from typing import Any, NoReturn, Protocol, TypeVar
+from typing import Any, Final, NoReturn, Protocol, TypeVar
 
 from ...actors.errors import ActorStopped, BadMessage, ControlFailed, HoldfastError, StartFailed, remote_crash
 from ...actors.exit_reasons import ExitReason
@@ -58,6 +59,9 @@ from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSna
 from .replay_guard import digest_of
 
 T = TypeVar("T")
+
+NOT_SAVED: Final = -2
+"""In place of the turn after which the last snapshot was made: none has the state as it is."""
 
 
 class HomePort(Protocol):
@@ -140,6 +144,8 @@ class Life:
                 self._give_up(f"its state could not be restored: {error}", error)
             restored.seconds = time.perf_counter() - begin
             self.saving.turn = turn
+            if start.kind.on_recovered is not Actor.on_recovered:
+                self.saving.begun_with = turn, _digest(data)
         restored.stash_ids = frozenset(stash)
         cell.state = RUNNING
         if restored.has_state and start.kind.on_start is not Actor.on_start:
@@ -383,9 +389,11 @@ class Life:
         if stage.begins_suspended:  # Behind what comes first: it is not handled either.
             mailbox.suspend(self.cell)
         self.port.to_home(Live(self.restored.seconds))
-        if (
-            stage.has_replayed and self.method.snapshots
-        ):  # A crash loop must not have to replay the same turns for ever.
+        method = self.method
+        if stage.is_touched and method.snapshots and method.replays:  # No replay leads to what its hook has left.
+            self.saving.turn = NOT_SAVED
+            self.want_snapshot()
+        elif stage.has_replayed and method.snapshots:  # A crash loop must not have to replay the same turns for ever.
             self.port.when_told(self._snapshot_of_replay)  # The actor is released meanwhile.
         postponed, stage.postponed = stage.postponed, []
         for call in postponed:
@@ -427,7 +435,7 @@ class Life:
         actor = self.cell.actor
         assert actor is not None
         assert self.feed is None, "a state is saved between two turns, never in the middle of one"
-        begin = time.perf_counter()
+        begin, begun_with, self.saving.begun_with = time.perf_counter(), self.saving.begun_with, None
         try:
             if not is_last and self.images.suits():
                 self.images.take()
@@ -436,7 +444,16 @@ class Life:
         except BaseException as error:  # What the user's own `get_state` raises is no reason to lose what it has.
             self.port.to_home(Unsaved(str(error)))
             return
+        if begun_with is not None and self._is_as_begun(data, begun_with):
+            self.saving.turn = self.turn
+            return
         self._send_snapshot(data, begin)
+
+    def _is_as_begun(self, data: bytes, begun_with: tuple[int, bytes]) -> bool:
+        """Whether nothing was handled since the life began with a state, and its hook has not changed that."""
+        if begun_with != (self.turn, _digest(data)):
+            return False
+        return self.restored.stash_ids == {fed.feed.id for fed in self.stash}
 
     def pipe_back(self) -> None:
         """Background work has ended: a snapshot that had to wait for it can be taken."""
@@ -457,7 +474,7 @@ class Life:
 
     def image_lost(self) -> None:
         """Its home could not keep the last one."""
-        self.saving.turn = -2
+        self.saving.turn = NOT_SAVED
 
     def last_snapshot(self) -> None:
         """Save the state for a life somewhere else.
@@ -534,6 +551,10 @@ class Life:
             self.cell.urge(call)
         self.port.closed()
         self.feed, self.outs = None, []  # A turn that swallows its cancellation cannot speak for the next life.
+
+
+def _digest(data: bytes) -> bytes:
+    return hashlib.blake2b(data, digest_size=16).digest()
 
 
 class LifePlace(lifecycle.HerePlace):

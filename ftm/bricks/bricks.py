@@ -294,6 +294,7 @@ class Proceed(Brick):
         while True:
             if pending and not state.is_over and (server.life is None or server.life.is_touched):
                 await server.take_in_hooks()
+                await self._hand_more()  # A snapshot of what they have left, before anything that stands on it.
             ends = await server.run_part(pending)
             live = None
             # What was handled before is decided as it was: `on_recovered` and what follows from it are no part of that.

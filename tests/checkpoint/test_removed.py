@@ -177,6 +177,20 @@ CHECKS = {
         "tests/checkpoint/test_recovery.py",
         "test_what_left_before_the_kill",
     ),
+    "what a hook leaves is saved before anything else is handled": Check(
+        "checkpoint/life/recorded_life.py",
+        "        if stage.is_touched and method.snapshots and method.replays:",
+        "        if False:",
+        "tests/checkpoint/test_hook_changes.py",
+        "test_who_dies_again",
+    ),
+    "a state that the hook leaves as it was is not saved again": Check(
+        "checkpoint/life/recorded_life.py",
+        "        if begun_with != (self.turn, _digest(data)):\n            return False\n",
+        "        return False\n",
+        "tests/checkpoint/test_hook_changes.py",
+        "test_a_state_that_the_hook_leaves",
+    ),
     "background work of turns that the snapshot contains has its result": Check(
         "ftm/bricks/background_work.py",
         "            is_out = record.turn > switch.ledger.state_turn\n",

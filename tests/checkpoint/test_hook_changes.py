@@ -1,0 +1,152 @@
+"""What `on_recovered` does to the state is saved before anything else is handled: no replay leads to it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.ftm.test_failover import two_again
+
+IN_TIME = 25.0
+
+
+class Enter(hf.Message[int]):
+    """Answered with how many have entered, when the door is open."""
+
+    tag: int
+
+
+class Fall(hf.Message[None]):
+    """Ends the process of whoever hears it first."""
+
+    note: str
+
+
+class Entered(hf.Message[list[int]]): ...
+
+
+class Hall(hf.Actor):
+    """Is closed until it has come back for the first time."""
+
+    def __init__(self) -> None:
+        self.is_open = False
+        self.tags: list[int] = []
+
+    def on_recovered(self) -> None:
+        self.is_open = True
+        self.ctx.unstash()
+
+    @hf.on(Enter)
+    def enter(self, message: Enter) -> int:
+        if not self.is_open:
+            self.ctx.stash()
+            return 0
+        self.tags.append(message.tag)
+        return len(self.tags)
+
+    @hf.on(Fall)
+    def fall(self, message: Fall) -> None:
+        if not Path(message.note).exists():
+            Path(message.note).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    @hf.on(Entered, readonly=True)
+    def entered(self, message: Entered) -> list[int]:
+        return self.tags
+
+
+class Calm(Hall):
+    """Has nothing to do when it comes back."""
+
+    def on_recovered(self) -> None: ...
+
+
+PLACES: dict[str, dict[str, Any]] = {
+    "task": {},
+    "process": {"isolation": "process"},
+    "pbr": {"mechanism": hf.PBR()},
+    "lfr": {"mechanism": hf.LFR()},
+    "tr": {"mechanism": hf.TR()},
+    "tmr": {"mechanism": hf.TMR()},
+}
+
+
+async def started(system: hf.ActorSystem, place: str, kind: type[Hall] = Hall) -> hf.ActorRef[Any]:
+    spec = hf.child("hall", hf.start(kind), recovery=hf.hybrid(interval=3600.0), **PLACES[place])
+    ref: hf.ActorRef[Any] = await system.start(spec)
+    if "mechanism" in PLACES[place]:
+        await two_again(ref)
+    return ref
+
+
+async def is_up(system: hf.ActorSystem, ref: hf.ActorRef[Any], life: int) -> bool:
+    """Whether that life, or a later one, can answer."""
+    try:
+        status = await system.get_status(ref, timeout=IN_TIME)
+    except hf.AskFailed:  # It has ended just now.
+        return False
+    return status.life >= life and status.state != "recovering"
+
+
+@pytest.fixture
+async def system() -> Any:
+    async with hf.ActorSystem("app", log=False, intensity=1000) as running:
+        yield running
+
+
+@pytest.mark.parametrize("place", list(PLACES))
+@pytest.mark.parametrize("is_saved", [True, False], ids=["from a snapshot", "by a replay"])
+async def test_who_dies_again_comes_back_with_what_stands_on_the_change(
+    system: hf.ActorSystem, is_saved: bool, place: str
+) -> None:
+    """Behind a snapshot there is no replay: the state changes, and the number of the turn does not."""
+    ref = await started(system, place)
+    first = asyncio.ensure_future(ref.ask(Enter(1), IN_TIME))
+    assert await ref.ask(Entered(), IN_TIME) == []
+    if is_saved:
+        await system.checkpoint(ref)
+    ref.kill()
+    assert await first == 1
+    for tag in (2, 3, 4):
+        assert await ref.ask(Enter(tag), IN_TIME) == tag
+        ref.kill()
+    assert await ref.ask(Entered(), IN_TIME) == [1, 2, 3, 4]
+
+
+async def test_who_dies_of_the_first_message_behind_the_change_comes_back_with_it(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    """What is saved goes home before the end of the first turn does."""
+    ref = await started(system, "process")
+    asked: list[Any] = [ref.ask(Enter(1), IN_TIME), ref.ask(Enter(2), IN_TIME)]
+    ref.tell(Fall(str(tmp_path / "first")))
+    asked.append(ref.ask(Enter(3), IN_TIME))
+    ref.tell(Fall(str(tmp_path / "second")))
+    asked.append(ref.ask(Enter(4), IN_TIME))
+    assert await asyncio.gather(*asked) == [1, 2, 3, 4]
+    assert await ref.ask(Entered(), IN_TIME) == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("kind", [Hall, Calm])
+async def test_a_state_that_the_hook_leaves_as_it_was_is_not_saved_again(
+    system: hf.ActorSystem, kind: type[Hall]
+) -> None:
+    ref = await started(system, "process", kind)
+    ref.kill()
+    assert await ref.ask(Entered(), IN_TIME) == []
+    await system.checkpoint(ref)
+    with system.events() as events:
+        life = (await system.get_status(ref)).life
+        for _ in range(3):
+            ref.kill()
+            life += 1
+            async with asyncio.timeout(IN_TIME):
+                while not await is_up(system, ref, life):
+                    await asyncio.sleep(0.005)
+        assert not [one for one in events.take() if isinstance(one, hf.SnapshotTaken)]
