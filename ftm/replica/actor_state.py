@@ -105,7 +105,8 @@ def snapshot_of(life: ServerLife, points: RewindPoints) -> list[Snapshot]:
     """
     begin, point = time.perf_counter(), points.point
     assert life.cell.actor is not None
-    is_known = point is not None and point.turn == life.turn and not point.deltas and not points.tail
+    stands = point is not None and point.turn == life.turn and not point.deltas and not points.tail
+    is_known = stands and not life.is_touched  # Else hooks may have changed it since.
     data = point.data.whole() if point is not None and is_known else save_state(life.cell.actor)
     stash = [fed.feed.id for fed in life.stash]
     parts, pause = pieces(data), time.perf_counter() - begin

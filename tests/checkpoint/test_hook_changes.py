@@ -119,11 +119,12 @@ async def test_who_dies_again_comes_back_with_what_stands_on_the_change(
     assert await ref.ask(Entered(), IN_TIME) == [1, 2, 3, 4]
 
 
+@pytest.mark.parametrize("place", [place for place in PLACES if place != "task"])
 async def test_who_dies_of_the_first_message_behind_the_change_comes_back_with_it(
-    system: hf.ActorSystem, tmp_path: Path
+    system: hf.ActorSystem, tmp_path: Path, place: str
 ) -> None:
     """What is saved goes home before the end of the first turn does."""
-    ref = await started(system, "process")
+    ref = await started(system, place)
     asked: list[Any] = [ref.ask(Enter(1), IN_TIME), ref.ask(Enter(2), IN_TIME)]
     ref.tell(Fall(str(tmp_path / "first")))
     asked.append(ref.ask(Enter(3), IN_TIME))

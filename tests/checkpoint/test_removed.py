@@ -184,6 +184,13 @@ CHECKS = {
         "tests/checkpoint/test_hook_changes.py",
         "test_who_dies_again",
     ),
+    "behind a mechanism, what is saved is the state with what the hook has done to it": Check(
+        "ftm/replica/actor_state.py",
+        "    is_known = stands and not life.is_touched ",
+        "    is_known = stands ",
+        "tests/checkpoint/test_hook_changes.py",
+        "test_who_dies_of_the_first_message",
+    ),
     "a state that the hook leaves as it was is not saved again": Check(
         "checkpoint/life/recorded_life.py",
         "        if begun_with != (self.turn, _digest(data)):\n            return False\n",
