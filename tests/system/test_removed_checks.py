@@ -393,14 +393,14 @@ CHECKS = {
         "            other.name = now + path[len(was) :]\n",
         "",
         REPLICAS,
-        "test_who_comes_to_live and PBR",
+        "test_what_a_replica_says_before_it_has_heard",
     ),
     "an address does not change while a replica is being replaced": Check(
         "system/transaction/reparenting.py",
-        "self._others_settle(system) or self._unsteady(system)",
-        "self._others_settle(system)",
+        '        return f"a replica of {found[0]} is being replaced" if found else ""',
+        '        return ""',
         REPLICAS,
-        "test_replicas_that_are_killed_at_a_step and prepare and follower",
+        "test_replicas_that_are_killed_at_a_step",
     ),
     "what a replica tells of whom it protects is meant as it is now": Check(
         "actors/process/worker_pool.py",
