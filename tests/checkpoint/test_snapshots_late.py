@@ -76,11 +76,10 @@ class Slow(hf.Actor):
     """Its second life cannot be saved before there is a file."""
 
     def __init__(self, path: str) -> None:
-        self._path, self._is_second = path, False
+        begun = Path(f"{path}.begun")
+        self._path, self._is_second = path, begun.exists()
+        begun.touch()
         self.count = 0
-
-    def on_recovered(self) -> None:
-        self._is_second = True
 
     @hf.on(Aside)
     def take(self, message: Aside) -> None:

@@ -198,7 +198,8 @@ async def test_a_hook_that_changes_the_state_is_no_difference_and_counts_once_fo
         await two_again(ref)
         for count in (3, 4):
             assert await ref.ask(Count(), timeout=25.0) == count
-        assert await ref.ask(Lives(), timeout=25.0) == (4, 1)
+        # The life behind the failed turn has come back too. What its hook has done was saved before the kill, or not.
+        assert await ref.ask(Lives(), timeout=25.0) in ([(4, 1), (4, 2)] if fails else [(4, 1)])
         assert (await system.get_status(ref)).life == 2
         told = hf.Masked, hf.Diverged, StatesDiffer
         assert [event for event in events.take() if isinstance(event, told)] == []
