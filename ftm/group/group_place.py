@@ -139,7 +139,7 @@ class GroupPlace(Place):
             await self.protected(group)
         except BaseException as error:
             if isinstance(error, asyncio.CancelledError):
-                error = StartFailed(cell.path, "it was stopped while it started")
+                error = StartFailed(cell.path, home.why_given_up)
             failed = error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error))
             reason = cell.extra().reason if cell.state is not RUNNING else KILLED
             ending = lifecycle.outside_turn(cell, self._end(cell, reason, failed), "end")

@@ -151,3 +151,35 @@ async def test_a_state_that_the_hook_leaves_as_it_was_is_not_saved_again(
                 while not await is_up(system, ref, life):
                     await asyncio.sleep(0.005)
         assert not [one for one in events.take() if isinstance(one, hf.SnapshotTaken)]
+
+
+class Moody(Hall):
+    """Says something else when there is a file."""
+
+    def __init__(self, note: str) -> None:
+        super().__init__()
+        self.note = note
+
+    @hf.on(Enter)
+    def enter(self, message: Enter) -> int:
+        return message.tag + Path(self.note).exists()
+
+
+@pytest.mark.parametrize("place", list(PLACES))
+async def test_a_recovery_that_fails_says_that_the_replay_went_elsewhere(
+    system: hf.ActorSystem, tmp_path: Path, place: str
+) -> None:
+    note = tmp_path / "mood"
+    spec = hf.child("hall", hf.start(Moody, str(note)), recovery=hf.hybrid(interval=3600.0), **PLACES[place])
+    ref: hf.ActorRef[Any] = await system.start(spec)
+    assert await ref.ask(Enter(1), IN_TIME) == 1
+    note.touch()
+    with system.events() as events:
+        ref.kill()
+        async with asyncio.timeout(IN_TIME):
+            async for one in events:
+                if isinstance(one, hf.ChildStartFailed):
+                    assert "diverged" in one.reason
+                    break
+        note.unlink()
+    assert await ref.ask(Enter(2), IN_TIME) == 2
