@@ -392,7 +392,7 @@ class WorkerPlace(Place):
 
     @property
     def is_ending(self) -> bool:
-        """As of any place."""
+        """Whether the life in the process has been told to stop."""
         return self.stop_sent is not None or self._stop_wanted is not None
 
     # -- beginning --------------------------------------------------------------------------------------------------

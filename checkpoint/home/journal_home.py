@@ -288,12 +288,6 @@ class JournalHome(RecordedHome):
             self.switch.attach(port)
         await self.until_live(cell, entered)
 
-    @property
-    def why_given_up(self) -> str:
-        """Why a start that was cancelled has not come to its end."""
-        diverged = None if self.switch is None else self.switch.life.diverged
-        return "it was stopped while it started" if diverged is None else str(diverged)
-
     async def until_live(self, cell: Cell, entered: Entered) -> None:
         """Wait until a life has caught up, and tell of it.
 
@@ -316,7 +310,11 @@ class JournalHome(RecordedHome):
                 node.emit(RecoveryFailed(cell.path, str(error)))
             raise error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error)) from error
         except asyncio.CancelledError:
-            raise StartFailed(cell.path, self.why_given_up) from None
+            diverged = switch.life.diverged
+            if diverged is None:
+                raise StartFailed(cell.path, "it was stopped while it started") from None
+            node.emit(RecoveryFailed(cell.path, str(diverged)))
+            raise StartFailed(cell.path, str(diverged)) from diverged
         if node.events.has_listeners:
             node.emit(ActorStarted(cell.path, cell.life))
         if entered.recovering:

@@ -91,13 +91,15 @@ class SnapshotState:
         is_postponed: whether one is to be taken when background work has come back.
         variables: of the actor, when `__init__` had run; none if it says itself what is saved.
         begun_with: the turn and a digest of the state that the life has begun with, if a hook may change that.
+        is_due: whether a hook may have changed the state: nothing is handled before one is made.
     """
 
     is_needed: bool = True
     turn: int = -1
     is_postponed: bool = False
     variables: list[str] = dataclasses.field(default_factory=list)
-    begun_with: tuple[int, bytes] | None = None
+    begun_with: tuple[int, bytes] = (-1, b"")
+    is_due: bool = False
 
 
 @dataclasses.dataclass(slots=True)
@@ -106,7 +108,6 @@ class LifeStage:
 
     Attributes:
         has_replayed: whether it has handled anything again.
-        is_touched: whether `on_recovered` was called, which may have changed the state.
         begins_suspended: whether it is suspended when it is live.
         postponed: orders from outside that wait until it is live.
         stop_wanted: why it is to end when it is live.
@@ -117,7 +118,6 @@ class LifeStage:
     """
 
     has_replayed: bool = False
-    is_touched: bool = False
     begins_suspended: bool = False
     postponed: list[Item] = dataclasses.field(default_factory=list)
     stop_wanted: ExitReason | None = None

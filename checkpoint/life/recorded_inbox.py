@@ -204,7 +204,7 @@ class GoLive(Hook):
         item.life.turn = max(item.life.turn, item.go.turn)
         item.life.timers.running = dict(item.go.timers)
         if item.go.recovered and type(actor).on_recovered is not Actor.on_recovered:
-            item.life.stage.is_touched = True
+            item.life.hook_changes()
             return Hook.run(actor, item)
         item.over()
         return None

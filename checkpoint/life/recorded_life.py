@@ -144,7 +144,7 @@ class Life:
                 self._give_up(f"its state could not be restored: {error}", error)
             restored.seconds = time.perf_counter() - begin
             self.saving.turn = turn
-            if start.kind.on_recovered is not Actor.on_recovered:
+            if start.kind.on_recovered is not Actor.on_recovered and self._is_replayed_from_snapshots:
                 self.saving.begun_with = turn, _digest(data)
         restored.stash_ids = frozenset(stash)
         cell.state = RUNNING
@@ -389,11 +389,11 @@ class Life:
         if stage.begins_suspended:  # Behind what comes first: it is not handled either.
             mailbox.suspend(self.cell)
         self.port.to_home(Live(self.restored.seconds))
-        method = self.method
-        if stage.is_touched and method.snapshots and method.replays:  # No replay leads to what its hook has left.
-            self.saving.turn = NOT_SAVED
+        if self.saving.is_due:
             self.want_snapshot()
-        elif stage.has_replayed and method.snapshots:  # A crash loop must not have to replay the same turns for ever.
+        elif (
+            stage.has_replayed and self.method.snapshots
+        ):  # A crash loop must not have to replay the same turns for ever.
             self.port.when_told(self._snapshot_of_replay)  # The actor is released meanwhile.
         postponed, stage.postponed = stage.postponed, []
         for call in postponed:
@@ -435,23 +435,33 @@ class Life:
         actor = self.cell.actor
         assert actor is not None
         assert self.feed is None, "a state is saved between two turns, never in the middle of one"
-        begin, begun_with, self.saving.begun_with = time.perf_counter(), self.saving.begun_with, None
+        is_due, self.saving.is_due = self.saving.is_due, False
+        begin = time.perf_counter()
         try:
-            if not is_last and self.images.suits():
+            if not (is_last or is_due) and self.images.suits():  # An image comes when more was handled.
                 self.images.take()
                 return
             data = save_state(actor)
         except BaseException as error:  # What the user's own `get_state` raises is no reason to lose what it has.
             self.port.to_home(Unsaved(str(error)))
             return
-        if begun_with is not None and self._is_as_begun(data, begun_with):
+        if is_due and self._is_as_begun(data):
             self.saving.turn = self.turn
             return
         self._send_snapshot(data, begin)
 
-    def _is_as_begun(self, data: bytes, begun_with: tuple[int, bytes]) -> bool:
+    @property
+    def _is_replayed_from_snapshots(self) -> bool:
+        return self.method.snapshots and self.method.replays
+
+    def hook_changes(self) -> None:
+        """A hook may change the state, and no replay leads to that: it is saved before anything else is handled."""
+        if self._is_replayed_from_snapshots:
+            self.saving.turn, self.saving.is_due = NOT_SAVED, True
+
+    def _is_as_begun(self, data: bytes) -> bool:
         """Whether nothing was handled since the life began with a state, and its hook has not changed that."""
-        if begun_with != (self.turn, _digest(data)):
+        if self.saving.begun_with != (self.turn, _digest(data)):
             return False
         return self.restored.stash_ids == {fed.feed.id for fed in self.stash}
 

@@ -92,8 +92,10 @@ class SnapshotImages:
         try:
             if own:
                 blocks = [(offset, segment.block(offset, length)) for _, offset, length in own]
-                self._packs.add(shared.number)
-                await asyncio.to_thread(journal.keep_blocks, home.path, shared.number, blocks, home.method.compress)
+                try:
+                    await asyncio.to_thread(journal.keep_blocks, home.path, shared.number, blocks, home.method.compress)
+                finally:  # Not before: whoever removes it while it is written has removed nothing.
+                    self._packs.add(shared.number)
             if self._saving is not me:
                 return  # Its pack goes with those that the next snapshot does not need.
             self._saving = None

@@ -95,7 +95,7 @@ class GroupPlace(Place):
 
     @property
     def is_ending(self) -> bool:
-        """As of any place."""
+        """Whether the replicas have been told to end, or are to be."""
         return self._ending is not None or self._stop_wanted is not None
 
     def handed_to(self, parent: Parent) -> None:
@@ -139,7 +139,7 @@ class GroupPlace(Place):
             await self.protected(group)
         except BaseException as error:
             if isinstance(error, asyncio.CancelledError):
-                error = StartFailed(cell.path, home.why_given_up)
+                error = StartFailed(cell.path, "it was stopped while it started")
             failed = error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error))
             reason = cell.extra().reason if cell.state is not RUNNING else KILLED
             ending = lifecycle.outside_turn(cell, self._end(cell, reason, failed), "end")

@@ -183,10 +183,10 @@ class Custom(msgspec.Struct, frozen=True, tag="custom"):
 
 
 AnyVoter = Exact | Majority | Tolerance | Median | Custom
+"""What a mechanism can have in its settings: it is told apart by its tag."""
 
 MAJORITY: Final = Majority()
 """What most agree on; of two, both."""
-"""What a mechanism can have in its settings: it is told apart by its tag."""
 
 
 def custom(function: Callable[[Sequence[object]], Any]) -> Custom:

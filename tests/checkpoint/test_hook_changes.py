@@ -11,7 +11,10 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from tests.ftm.test_failover import two_again
+from holdfast.checkpoint.snapshot.state_image import IMAGE_BYTES
+from holdfast.ftm.bricks.brick_messages import Done
+from holdfast.ftm.group.group import Group
+from tests.ftm.test_failover import group_of, pid_of, two_again
 
 IN_TIME = 25.0
 
@@ -59,6 +62,29 @@ class Hall(hf.Actor):
     @hf.on(Entered, readonly=True)
     def entered(self, message: Entered) -> list[int]:
         return self.tags
+
+
+class Grand(Hall):
+    """Is so large that its snapshots are images, which come home while more is handled."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.space = bytes(2 * IMAGE_BYTES)
+
+
+class Trip(hf.Message[None]):
+    """Have the life end outside of any turn."""
+
+
+class Loose(Hall):
+    """Trips when it is told to."""
+
+    @hf.on(Trip)
+    def trip(self, message: Trip) -> None:
+        self.ctx.create_task(self._fall())
+
+    async def _fall(self) -> None:
+        raise RuntimeError("fell")
 
 
 class Calm(Hall):
@@ -119,12 +145,13 @@ async def test_who_dies_again_comes_back_with_what_stands_on_the_change(
     assert await ref.ask(Entered(), IN_TIME) == [1, 2, 3, 4]
 
 
+@pytest.mark.parametrize("kind", [Hall, Grand])
 @pytest.mark.parametrize("place", [place for place in PLACES if place != "task"])
 async def test_who_dies_of_the_first_message_behind_the_change_comes_back_with_it(
-    system: hf.ActorSystem, tmp_path: Path, place: str
+    system: hf.ActorSystem, tmp_path: Path, place: str, kind: type[Hall]
 ) -> None:
     """What is saved goes home before the end of the first turn does."""
-    ref = await started(system, place)
+    ref = await started(system, place, kind)
     asked: list[Any] = [ref.ask(Enter(1), IN_TIME), ref.ask(Enter(2), IN_TIME)]
     ref.tell(Fall(str(tmp_path / "first")))
     asked.append(ref.ask(Enter(3), IN_TIME))
@@ -132,6 +159,40 @@ async def test_who_dies_of_the_first_message_behind_the_change_comes_back_with_i
     asked.append(ref.ask(Enter(4), IN_TIME))
     assert await asyncio.gather(*asked) == [1, 2, 3, 4]
     assert await ref.ask(Entered(), IN_TIME) == [1, 2, 3, 4]
+
+
+async def test_replicas_that_die_before_they_say_more_than_the_first_end_come_back_with_the_change(
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next life of the leader begins when there is something to handle, and its hook changes the state first."""
+    ref = await started(system, "pbr", Loose)
+    group, take_done = group_of(ref), Group.take_done
+    asked: list[Any] = [ref.ask(Enter(1), IN_TIME)]
+    assert await ref.ask(Entered(), IN_TIME) == []
+    await system.checkpoint(ref)
+    with system.events() as events:
+        ref.tell(Trip())
+        async with asyncio.timeout(IN_TIME):
+            async for one in events:
+                if isinstance(one, hf.ActorCrashed):
+                    break
+    is_over = False
+
+    def take_and_kill(self: Group, done: Done) -> None:
+        nonlocal is_over
+        if is_over and self is group:
+            return  # It was on its way when its sender died.
+        take_done(self, done)
+        if self is group and any(end.turn > 3 for end in done.ends):  # Behind that of `Trip`.
+            is_over = True
+            for name in self.membership.names:
+                os.kill(pid_of(system, ref, name), signal.SIGKILL)
+
+    monkeypatch.setattr(Group, "take_done", take_and_kill)
+    asked.append(ref.ask(Enter(2), IN_TIME))
+    assert await asyncio.gather(*asked) == [1, 2]
+    assert is_over
+    assert await ref.ask(Enter(3), IN_TIME) == 3
 
 
 @pytest.mark.parametrize("kind", [Hall, Calm])
@@ -176,9 +237,12 @@ async def test_a_recovery_that_fails_says_that_the_replay_went_elsewhere(
     note.touch()
     with system.events() as events:
         ref.kill()
+        is_told = False
         async with asyncio.timeout(IN_TIME):
             async for one in events:
+                is_told |= isinstance(one, hf.RecoveryFailed) and "diverged" in one.reason
                 if isinstance(one, hf.ChildStartFailed):
+                    assert is_told
                     assert "diverged" in one.reason
                     break
         note.unlink()

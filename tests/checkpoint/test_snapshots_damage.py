@@ -186,22 +186,22 @@ async def test_a_snapshot_that_could_not_be_kept_leaves_the_packs_of_those_befor
         for _ in range(8):  # Now and then an image is written anew, and refers to no pack before it.
             await ref.ask(Paint(0, 0))
             await system.checkpoint(ref, timeout=20.0)
-            await saved()
+            await asyncio.gather(*saves())
             kept = packs(store)
             with monkeypatch.context() as full:
                 full.setattr(SqliteJournal, "cut", refuse)
                 await ref.ask(Paint(0, 0))
                 with pytest.raises(hf.HoldfastError, match="the disk is full"):
                     await system.checkpoint(ref, timeout=20.0)
-                await saved()
+                await asyncio.gather(*saves())
             assert set(kept) <= set(packs(store))
     async with running(store) as system:
         assert await (await system.start(spec)).ask(Paint(0, 0), timeout=20.0) == 17
 
 
-async def saved() -> None:
-    """Wait until snapshots that are on their way are kept, and what no snapshot needs any more is removed."""
-    await asyncio.gather(*(one for one in asyncio.all_tasks() if one.get_name().startswith("snapshot of ")))
+def saves() -> set[asyncio.Task[Any]]:
+    """What keeps snapshots that are on their way, and removes what no snapshot needs any more."""
+    return {one for one in asyncio.all_tasks() if one.get_name().startswith("snapshot of ")}
 
 
 class Tear(hf.Message[None]): ...
@@ -213,32 +213,43 @@ class Brittle(Sheet):
         raise ValueError("torn")
 
 
+@pytest.mark.parametrize("order", ["before the next one", "behind the next one"])
 async def test_a_snapshot_whose_life_ends_before_it_is_kept_leaves_no_pack(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, order: str
 ) -> None:
+    """What is kept late goes with the next snapshot that is kept behind it."""
     begun, may_keep, is_kept = threading.Event(), threading.Event(), threading.Event()
-    keep = SqliteJournal.keep_blocks
+    keep, numbers = SqliteJournal.keep_blocks, list[int]()
 
-    def keep_late(self: SqliteJournal, *args: Any) -> None:
-        """That of the first life is kept late, and that of the next one behind it."""
-        is_first = not begun.is_set()
+    def keep_late(self: SqliteJournal, address: str, number: int, *args: Any) -> None:
+        numbers.append(number)
+        is_first = number == numbers[0]
         begun.set()
-        assert (may_keep if is_first else is_kept).wait(20.0)
-        keep(self, *args)
+        if is_first or order == "before the next one":
+            assert (may_keep if is_first else is_kept).wait(20.0)
+        keep(self, address, number, *args)
         is_kept.set()
 
-    spec = hf.child("sheet", hf.start(Brittle), recovery=hf.hybrid(interval=NEVER))
+    spec = hf.child("sheet", hf.start(Brittle), recovery=hf.hybrid(interval=NEVER, keep=1))
     async with running(tmp_path / "app.db") as system:
         ref = await system.start(spec)
         await ref.ask(Paint(0, 0))
         monkeypatch.setattr(SqliteJournal, "keep_blocks", keep_late)
         saving = asyncio.ensure_future(system.checkpoint(ref, timeout=20.0))
         assert await asyncio.to_thread(begun.wait, 20.0)
+        (late,) = saves()
         with pytest.raises(hf.HoldfastError, match="torn"):
             await ref.ask(Tear())
         assert await ref.ask(Paint(0, 0)) == 2  # The next life is there.
+        if order == "behind the next one":
+            await saving  # It is the next life's.
+            await asyncio.gather(*(saves() - {late}))
         may_keep.set()
-        await saving  # It is the next life's.
-        await saved()
-        monkeypatch.undo()
-        assert len(packs(tmp_path / "app.db")) == 1
+        await saving
+        await asyncio.gather(*saves())
+        if order == "behind the next one":
+            await ref.ask(Paint(0, 0))
+            await system.checkpoint(ref, timeout=20.0)
+            await asyncio.gather(*saves())
+        assert len(numbers) == (2 if order == "before the next one" else 3)
+        assert numbers[0] not in system.homes.journal.packs("/app/sheet")

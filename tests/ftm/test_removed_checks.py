@@ -49,6 +49,13 @@ CHECKS = {
         "tests/ftm/test_hooks.py",
         "test_what_the_hooks_of_the_next_leader_change",
     ),
+    "what hooks have left is at home before what stands on it": Check(
+        "ftm/bricks/bricks.py",
+        "                await self._hand_more()  # A snapshot",
+        "                pass  # A snapshot",
+        "tests/checkpoint/test_hook_changes.py",
+        "test_replicas_that_die_before",
+    ),
     "no difference leads to what hooks have left": Check(
         "ftm/replica/rewind_points.py",
         "    if turn <= points.untraced:\n",
