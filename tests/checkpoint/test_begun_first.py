@@ -115,6 +115,7 @@ STACKS: dict[str, Any] = {"none": None, "pbr": PBR(), "lfr": LFR(), "tr": TR(), 
 async def test_what_has_sent_something_comes_before_what_a_hook_puts_back(
     system: hf.ActorSystem, stack: str, who: str, hook: str
 ) -> None:
+    events = system.events()
     gate = await system.start(hf.child("gate", hf.start(Gate)))
     ref = await system.start(
         hf.child(
@@ -148,3 +149,4 @@ async def test_what_has_sent_something_comes_before_what_a_hook_puts_back(
         ref.kill()
     assert await asyncio.gather(*put) == [1, 2]
     assert await ref.ask(Read(), timeout=25.0) == [3, 1, 2]
+    assert not [one for one in events.take() if isinstance(one, hf.RecoveryFailed)]

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.checkpoint.snapshot.image_writer import Imaging
 from holdfast.checkpoint.snapshot.state_image import IMAGE_BYTES
 from holdfast.ftm.bricks.brick_messages import Done
 from holdfast.ftm.group.group import Group
@@ -145,13 +146,27 @@ async def test_who_dies_again_comes_back_with_what_stands_on_the_change(
     assert await ref.ask(Entered(), IN_TIME) == [1, 2, 3, 4]
 
 
-@pytest.mark.parametrize("kind", [Hall, Grand])
+async def test_what_a_hook_leaves_of_a_large_state_does_not_wait_for_an_image(
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An image comes home when more was handled; here none does."""
+    monkeypatch.setattr(Imaging, "take", lambda self: None)
+    ref = await started(system, "task", Grand)
+    first = asyncio.ensure_future(ref.ask(Enter(1), IN_TIME))
+    assert await ref.ask(Entered(), IN_TIME) == []
+    ref.kill()
+    assert await first == 1
+    assert await ref.ask(Enter(2), IN_TIME) == 2
+    ref.kill()
+    assert await ref.ask(Entered(), IN_TIME) == [1, 2]
+
+
 @pytest.mark.parametrize("place", [place for place in PLACES if place != "task"])
 async def test_who_dies_of_the_first_message_behind_the_change_comes_back_with_it(
-    system: hf.ActorSystem, tmp_path: Path, place: str, kind: type[Hall]
+    system: hf.ActorSystem, tmp_path: Path, place: str
 ) -> None:
     """What is saved goes home before the end of the first turn does."""
-    ref = await started(system, place, kind)
+    ref = await started(system, place)
     asked: list[Any] = [ref.ask(Enter(1), IN_TIME), ref.ask(Enter(2), IN_TIME)]
     ref.tell(Fall(str(tmp_path / "first")))
     asked.append(ref.ask(Enter(3), IN_TIME))

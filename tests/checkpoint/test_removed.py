@@ -196,7 +196,7 @@ CHECKS = {
         "            if not (is_last or is_due) and self.images.suits():",
         "            if not is_last and self.images.suits():",
         "tests/checkpoint/test_hook_changes.py",
-        "test_who_dies_of_the_first_message and Grand and process",
+        "test_what_a_hook_leaves_of_a_large_state",
     ),
     "a state that the hook leaves as it was is not saved again": Check(
         "checkpoint/life/recorded_life.py",
