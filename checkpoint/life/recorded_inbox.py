@@ -186,7 +186,7 @@ class Hook(Item):
 
     def over(self) -> None:
         """Leave the hook, which has returned."""
-        self.life.hook = ""
+        self.life.leave()
 
 
 class GoLive(Hook):

@@ -347,6 +347,10 @@ class Life:
         """A hook begins that is no turn."""
         self.hook, self.last_k = hook, 0
 
+    def leave(self) -> None:
+        """The hook has returned."""
+        self.hook = ""
+
     def timer_of_hook(self, name: str, body: bytes, interval: float) -> str:
         """The key of a timer that the hook which runs wants."""
         return self.timers.key_for((name, body, interval), f"{self.turn}{self.hook}")

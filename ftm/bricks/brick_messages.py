@@ -144,7 +144,11 @@ class WorkLost(msgspec.Struct, array_like=True, tag=42):
     turn: int
 
 
-Beside = PipeDone | Snapshot | Unsaved | Closed | Ignored | Hooked | Strayed | WorkLost
+class PutBack(msgspec.Struct, array_like=True, tag=43):
+    """From a leader: between two batches, a hook has put back what was put aside; it is handled with the next batch."""
+
+
+Beside = PipeDone | Snapshot | Unsaved | Closed | Ignored | Hooked | Strayed | WorkLost | PutBack
 """What goes home besides the ends of turns, behind them."""
 
 

@@ -267,9 +267,12 @@ class Proceed(Brick):
             self._task = context.run(self.ctx.create_task, self._run())
 
     async def _run(self) -> None:
+        server = self._standing.server
         try:
             while True:
-                if self._works:
+                if server.state.wants_life:
+                    await server.live_on()
+                elif self._works:
                     self._work_now = self._works.popleft()
                     await self._batch(self._work_now)
                 elif not await self._hand_more():
@@ -292,9 +295,9 @@ class Proceed(Brick):
             await server.ensure()
             pending = server.returned_first(pending)
         while True:
-            if pending and not state.is_over and (server.life is None or server.life.is_touched):
-                await server.take_in_hooks()
-                await self._hand_more()  # A snapshot of what they have left, before anything that stands on it.
+            if pending and not state.is_over:
+                await server.ensure()
+                await self._hand_more()  # A snapshot of what its hooks have left, before anything that stands on it.
             ends = await server.run_part(pending)
             live = None
             # What was handled before is decided as it was: `on_recovered` and what follows from it are no part of that.

@@ -171,6 +171,8 @@ class Shadow(Server):
     that the first run has not made ends the run.
     """
 
+    is_trial = True
+
     def __init__(self, standing: Standing, kind: type[Actor] | None, within: float = 30.0) -> None:
         main = standing.server
         super().__init__(standing, main.method)
@@ -217,7 +219,7 @@ class Shadow(Server):
         if self.state.is_over:
             self._why = "it has ended itself"
             return ends, None
-        await self.ensure()
+        await self.ensure_as_given()
         return ends, self.capture()
 
     async def _go_back(self, before: ServerState) -> None:
@@ -315,9 +317,12 @@ class Deciding(After):
     async def after(self, done: Done) -> Done | None:
         """Have the part decided; what was found in place of what had come out goes on."""
         server = self._standing.server
-        if not done.ends or server.state.is_over or server.life is None:
+        life = server.life
+        if not done.ends or server.state.is_over or (life is None and server.points.previous is None):
             return done
-        if server.life.feed is not None:  # A follower's turn waits in the middle: this cannot be decided here.
+        if (
+            life is not None and life.feed is not None
+        ):  # A turn of a follower waits in the middle: it cannot be decided.
             if any(end.id in server.traces.objections for end in done.ends):
                 raise HoldfastError(f"{self._standing.path}: an assertion has failed while a turn waits")
             return done
@@ -325,7 +330,7 @@ class Deciding(After):
             await self.begun(done)
             return done  # The very first turn, `on_start`: there is nothing to begin again from.
         before, asked = server.points.previous
-        before = msgspec.structs.replace(before, live=server.life.is_live)
+        before = before if life is None else msgspec.structs.replace(before, live=life.is_live)
         dropped = {end.id for end in done.ends if end.status == DROPPED}
         inputs = self._standing.server.traces.inputs
         asked = [as_it_came(inputs.get(one.feed.id), one) for one in asked]

@@ -19,7 +19,7 @@ from ...checkpoint.inputs import EXPIRED, Batch
 from ...checkpoint.protocol import FAILED, START, STASHED, Closed, Feed, Live, PipeDone, Released, Snapshot
 from ..bricks.background_work import Background
 from ..bricks.behind import Behind
-from ..bricks.brick_messages import Done, Inward, Outward, PartEnded, Request, Strayed, Work, WorkLost
+from ..bricks.brick_messages import Done, Inward, Outward, PartEnded, PutBack, Request, Strayed, Work, WorkLost
 from ..events import BackgroundWorkLost, ReplicaFaulty
 from .delivery import Delivery
 from .hung import Stuck
@@ -237,6 +237,8 @@ class Group:
                 self.place.has_ended_itself(self, record.reason)
             elif isinstance(record, Strayed):
                 self._has_strayed(record.path)
+            elif isinstance(record, PutBack):
+                self._ask_again()
             elif isinstance(record, Snapshot) and not self.switch.method.snapshots:
                 self.copies.take(record)
             elif isinstance(record, WorkLost):
@@ -258,9 +260,13 @@ class Group:
         """
         future = self.copies.keep(sake)
         if not future.done():
-            self.delivery.is_again = True  # It comes behind a batch, which may be empty.
-            self.poke()
+            self._ask_again()
         return future
+
+    def _ask_again(self) -> None:
+        """What is wanted comes with, or behind, a batch, which may be empty."""
+        self.delivery.is_again = True
+        self.poke()
 
     def quiet(self) -> asyncio.Future[None]:
         """A future that ends when nothing is inside any more; somebody has seen to it that nothing new goes in."""

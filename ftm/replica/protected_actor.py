@@ -48,7 +48,7 @@ from ...checkpoint.protocol import (
 )
 from ...checkpoint.snapshot.key_variables import variables
 from ..alarms import ProtectionCostly, ProtectionLost
-from ..bricks.brick_messages import Beside, Request, ServerState, Work, WorkLost
+from ..bricks.brick_messages import Beside, PutBack, Request, ServerState, Work, WorkLost
 from ..bricks.state_images import Images
 from .actor_state import digest_of_life, names_of_state, point_of, rewind_to, snapshot_of, take_up
 from .replica_life import (
@@ -90,11 +90,15 @@ BEGUN_WITHIN: Final = 60.0
 """Seconds that `on_start` of a life that begins at a point may take; then the replica cannot have one."""
 MOST_CRASHES: Final = 8
 """Ends of the life outside any turn, one after another, after which the replica is given up."""
+CALM: Final = 60.0
+"""Seconds after which such an end is no continuation of the last one."""
 COSTLY: Final = 0.01
 """Seconds from which on it is told what going through the state takes."""
 MOST_COPIED: Final = 16_000_000
 """Bytes of a state that home gets a copy of."""
 
+Tail = list[tuple[Request, TurnEnd | None]]
+"""What was handed over since a point, with the end if it failed."""
 TurnHook = Callable[[Any, TurnEnd], TurnEnd]
 """Takes the server and the end of a turn, and returns what the end is to be."""
 
@@ -122,6 +126,8 @@ def is_dropped(life: ServerLife | None) -> bool:
 
 class Server(lifecycle.HerePlace):
     """The place of the protected actor: its lives, one after the other, what they run, and their port home."""
+
+    is_trial = False  # Its lives are no lives of the actor: they only compute what another one has.
 
     def __init__(self, standing: Standing, method: Method) -> None:
         self.standing, self.method = standing, method
@@ -186,16 +192,17 @@ class Server(lifecycle.HerePlace):
         self.state.is_stopping = True
 
     def _life_ended(self, life: ServerLife, reason: ExitReason) -> None:
-        """The life is over, and nobody here has ended it."""
-        if life is not self.life:
-            return
         self.life = None
         self._note_work(life)
         is_failure = self.state.is_stopping or self.attempts.failed is not None
         if not is_failure and reason.is_clean and life.stage.ignored_why is None:
             self.state.is_over = True
             self.tell_more(Closed(0, pack_exit(reason), False))
+        is_missed = not (is_failure or self._rest.is_awaited or self.state.is_over)
         self._rest.reach(ENDED)
+        if is_missed and self._driver is not None and self.standing.computes:
+            self.state.wants_life = True
+            self._driver.go_on()
 
     # -- lives ------------------------------------------------------------------------------------------------------
 
@@ -223,41 +230,110 @@ class Server(lifecycle.HerePlace):
         gives to that takes the place of what the first one waits for.
 
         Raises:
-            StartFailed: it cannot begin.
+            StartFailed: it cannot begin, or one life after the other ends when it has.
         """
         if self.life is not None and not self._beginning.locked():
             return
         async with self._beginning:
-            if self.life is None and not self.state.is_over:
-                await self._begin()
+            while self.life is None and not self.state.is_over:
+                life = await self._begin()
+                if self.life is not None or is_dropped(life):
+                    return
+                self._note_crash()
 
     async def ensure_as_given(self) -> None:
         """See to it that there is a life; one that begins stands where the point says, where another one is.
 
         Its hooks are called, as at each life, but what they do to the state is no part of what the other one has done.
         """
-        is_new = self.life is None
-        await self.ensure()
-        point = self.points.point
-        if is_new and self.life is not None and point is not None and self.state.has_access and not is_blank(point):
+        is_new, point, tail = self.life is None, self.points.point, self.points.tail
+        self.state.is_as_given = True
+        try:
+            await self.ensure()
+        finally:
+            self.state.is_as_given = False
+        life = self.life
+        if is_new and life is not None and point is not None and self.state.has_access and not is_blank(point):
             self.rewind(point)
+            if tail:
+                await self._begun(life, tail, [], [])
+                self.points.tail = tail
 
-    async def _begin(self) -> None:
-        """Begin a life where the point is, and handle again what was handed over since."""
-        await self._begin_at_point()
-        if not self.points.tail or not self.state.has_access or self.life is None:
+    async def live_on(self) -> None:
+        """Begin the life that follows one that has ended between two turns: what its hooks do waits for no message.
+
+        Raises:
+            StartFailed: it cannot begin, or one life after the other ends like this.
+        """
+        self.state.wants_life = False
+        if self.life is None:
+            self._note_crash()
+        else:
+            await self.drop_life()  # It was begun to compute something again, and has no hooks behind it that count.
+        if not self.standing.leads:
+            await self.ensure_as_given()
             return
+        await self.ensure()
+        if self.has_returned:
+            self.tell_more(PutBack())
+
+    def _note_crash(self) -> None:
+        """A life has ended outside its turns.
+
+        Raises:
+            StartFailed: too many have, one after the other.
+        """
+        attempts, now = self.attempts, self.standing.node.loop.time()
+        attempts.crashes = 1 if now - attempts.crashed > CALM else attempts.crashes + 1
+        attempts.crashed = now
+        if attempts.crashes >= MOST_CRASHES:
+            raise StartFailed(self.address, "its life ends again and again outside its turns")
+
+    async def _begin(self) -> ServerLife:
+        """Begin a life where the point is, have it handle again what was handed over since, and go on from there.
+
+        As in any recovery, `on_start` comes before what is handled again, and `on_recovered` behind it.
+
+        Raises:
+            StartFailed: it cannot.
+        """
+        self.state.wants_life &= self.state.is_as_given
+        point = self.points.point
+        tail = self.points.tail if self.state.has_access else []
+        life = self._begin_at_point(point)
+        has_state = point is not None and not is_blank(point)
+        is_lost = point is None and life.turn >= 0  # It begins as without recovery, and is live at once.
+        greets = type(life.cell.actor).on_start is not Actor.on_start and (has_state or is_lost)
+        first: list[Item] = [BeginAgain(life, "on_start")] if is_lost and greets else []
+        last: list[Item] = []
+        if is_lost or (point is not None and point.live):
+            last.append(GoLive(life, Go(has_state, life.turn)))
+        if greets or tail or last:
+            await self._begun(life, tail, first, last)
+        return life
+
+    async def _begun(self, life: ServerLife, tail: Tail, first: list[Item], last: list[Item]) -> None:
+        """Wait until a new life has handled what it begins with: nobody may count on it before.
+
+        Raises:
+            StartFailed: it cannot, or makes no progress.
+        """
         self.state.is_quiet = True
         try:
-            life = self.life
-            why = await self._give([(one.feed, end) for one, end in self.points.tail])
+            resting = self._give([(one.feed, end) for one, end in tail], first, last)
+            turn = life.turn
+            while not (await asyncio.wait((resting,), timeout=BEGUN_WITHIN))[0] and life.turn != turn:
+                turn = life.turn
         finally:
             self.state.is_quiet = False
-        if why is not OVER and not is_dropped(life):
-            raise StartFailed(self.address, "what it has handled before cannot be handled again")
+        if not resting.done():
+            await self.drop_life()
+            raise StartFailed(self.address, f"it did not go on within {BEGUN_WITHIN:g} s when it began")
+        if resting.result() is not OVER and not is_dropped(life):
+            raise StartFailed(self.address, str(life.cell.extra().reason))
 
-    async def _begin_at_point(self) -> None:
-        cell, point, state = self.cell, self.points.point, self.state
+    def _begin_at_point(self, point: ServerState | None) -> ServerLife:
+        cell, state = self.cell, self.state
         assert cell is not None
         start = cell.extra().start
         assert start is not None
@@ -281,24 +357,7 @@ class Server(lifecycle.HerePlace):
             take_up(life, point, has_deltas=state.has_deltas)
         elif state.has_deltas:
             actor.get_delta()
-        greets = type(actor).on_start is not Actor.on_start
-        life.is_touched = has_state and (greets or type(actor).on_recovered is not Actor.on_recovered)
-        if point is not None and point.live:
-            self._put([GoLive(life, Go(has_state, turn))])
-        elif point is None and turn >= 0:  # Its state is lost: it begins as without recovery, and is live at once.
-            self._put([*([BeginAgain(life, "on_start")] if greets else []), GoLive(life, Go(False, turn))])
-        elif has_state and greets:
-            self._put(())  # `on_start(restored=True)` must have returned before anybody counts on this life.
-        else:
-            return
-        try:
-            async with asyncio.timeout(BEGUN_WITHIN):
-                why = await self._rest.wait()
-        except TimeoutError:
-            await self.drop_life()
-            raise StartFailed(self.address, f"its on_start did not return within {BEGUN_WITHIN:g} s") from None
-        if why is not OVER and not is_dropped(life):
-            raise StartFailed(self.address, str(cell.extra().reason))
+        return life
 
     def abandon(self) -> None:
         """What is being run does not count: another state takes the place of what it leads to."""
@@ -352,17 +411,23 @@ class Server(lifecycle.HerePlace):
         queue.append(PartOver(self._rest))
         cell.schedule()
 
-    def _give(self, feeds: Iterable[tuple[Feed, TurnEnd | None]]) -> asyncio.Future[str]:
-        """Give inputs to the life, with the end of those that fail without being run; the future says how it rests."""
+    def _give(
+        self, feeds: Iterable[tuple[Feed, TurnEnd | None]], first: Iterable[Item] = (), last: Iterable[Item] = ()
+    ) -> asyncio.Future[str]:
+        """Give inputs to the life, with the end of those that fail without being run; the future says how it rests.
+
+        What comes `first` and `last` is handled before and behind them.
+        """
         life = self.life
         assert life is not None
         resting, queue = self._rest.wait(), mailbox.queue_of(life.cell)
+        queue.extend(first)
         for feed, end in feeds:
             if end is None:
                 life.to_life(feed)
             else:
                 queue.append(Skip(life, end))
-        self._put(())
+        self._put(last)
         return resting
 
     async def go(self, go: Go) -> Live | None:
@@ -380,6 +445,16 @@ class Server(lifecycle.HerePlace):
             reason = self.cell.extra().reason if self.cell is not None else ""
             raise StartFailed(self.address, str(reason))
         return self._live
+
+    @property
+    def only_computes(self) -> bool:
+        """Whether what is run is compared with what was run before, and counts for nothing else."""
+        return self.is_trial or self.state.is_again
+
+    def begins_task(self) -> None:
+        """The life begins a task of its own."""
+        if self.life is not None:
+            self.life.has_begun_tasks |= self.life.feed is not None
 
     # -- points -----------------------------------------------------------------------------------------------------
 
@@ -421,20 +496,21 @@ class Server(lifecycle.HerePlace):
         if names is not None:
             made.absent = sorted(life.begun_names - names)
 
-    async def take_in_hooks(self) -> None:
+    def take_in_hooks(self, life: ServerLife) -> None:
         """What the hooks of a new life have done to the state is part of what its next turns begin from, in all runs.
 
-        Only between two parts, when it is decided what the last one has come to.
+        At once, before whatever the hooks have begun can end the life: its next one would come to the same.
         """
-        await self.ensure()
-        life = self.life
-        if life is None or not life.is_touched or self.state.is_lazy:
+        is_before = bool(self.points.tail) and not life.is_live  # What was handed over comes first.
+        if not life.is_touched or is_before or life is not self.life:
             return
-        life.is_touched = False
+        if self.state.is_as_given or not self.state.has_access:
+            return
         try:
             made = self._whole(life)
         except Exception:  # What the user's own values and methods raise: the next turn that leaves it so fails of it.
             return
+        life.is_touched = False
         self.points.stand_changed(made)
         self._note_names(life, made)
 
@@ -511,10 +587,18 @@ class Server(lifecycle.HerePlace):
         begin, state, attempts = time.perf_counter(), self.state, self.attempts
         part = self.part = BatchPart(pending)
         while pending and not state.is_over:
-            await self.ensure()
+            if self.life is None and part.begun and not self._goes_on([], self._rest.missed or ENDED):
+                break  # It has ended between two turns, and with it what the first ones have left.
+            is_new = self.life is None
+            if self.only_computes:  # Hooks have counted in the first run, if they have.
+                await self.ensure_as_given()
+            else:
+                await self.ensure()
             if self.life is None:  # It was dropped again: another state is put here.
                 part.give_up()
                 break
+            if is_new and self.reports.is_snapshot_wanted and not state.is_again:
+                break  # What its hooks have left goes home before anything that stands on it.
             chunk = next_requests(state, part, attempts, leads=self.standing.leads, has_work=self._has_work)
             if not chunk:
                 break  # It runs alone, when home has all that comes before it.
@@ -567,9 +651,9 @@ class Server(lifecycle.HerePlace):
         if then not in (REWIND, GO_ON):
             return False
         if failed is None:
-            attempts.crashes += 1
-            if attempts.crashes >= MOST_CRASHES:
-                raise StartFailed(self.address, "its life ends again and again outside its turns")
+            self._note_crash()
+            attempts.singles = len(part.begun)  # What has ended it may do so again before all of it is sealed.
+            self.state.wants_life |= self.state.is_again
         else:
             attempts.crashes = 0
             attempts.skips[failed] = part.ends[-1]
@@ -591,6 +675,10 @@ class Server(lifecycle.HerePlace):
         """
         while True:
             begun, tail = list(self.part.begun), list(self.points.tail)
+            if begun and self._is_unseen():
+                self._note_crash()
+                ends = await self._run_part_again(pending, single=True)
+                continue
             try:
                 self._seal(ends)
             except Exception as error:  # What the user's own values and methods raise; it is passed on to who asked.
@@ -607,11 +695,21 @@ class Server(lifecycle.HerePlace):
             else:
                 return ends
 
+    def _is_unseen(self) -> bool:
+        """Whether the life has ended since it ran the part, and with it the state that is to be taken."""
+        state = self.state
+        is_needed = state.has_access and not state.is_lazy
+        return self.life is None and is_needed and not (state.is_over or state.is_stopping)
+
     def _seal(self, ends: list[TurnEnd]) -> None:
         life, points = self.life, self.points
         begun, self.part.begun = self.part.begun, []
-        self.attempts.skips.clear()
-        if life is None or self.state.is_over:
+        if begun:  # Else those that have failed are still to be told.
+            self.attempts.skips.clear()
+        if self.state.is_over:
+            return
+        if life is None:
+            points.keep_tail(begun, ends)
             return
         if not self.state.has_access:
             self.state.start_turn = life.turn
@@ -619,8 +717,10 @@ class Server(lifecycle.HerePlace):
             return
         before = points.point
         points.keep_tail(begun, ends)
-        if not needs_point(points, is_lazy=self.state.is_lazy, live=life.is_live):
+        is_lazy = self.state.is_lazy and not life.has_begun_tasks  # They would be begun again with their turns.
+        if not needs_point(points, is_lazy=is_lazy, live=life.is_live):
             return
+        life.has_begun_tasks = False
         handed = [one for one, _ in points.tail]
         self.capture()
         if before is not None and handed:
@@ -646,7 +746,10 @@ class Server(lifecycle.HerePlace):
         life, point = self.life, self.points.point
         if life is not None:
             return [fed.feed for fed in life.returned.values()] if life.is_live else []
-        return point.returned if point is not None and point.live else []
+        if point is None or not point.live:
+            return []
+        handled = {one.feed.id for one, _ in self.points.tail}
+        return [feed for feed in point.returned if feed.id not in handled]
 
     @property
     def has_returned(self) -> bool:
@@ -754,7 +857,7 @@ class Server(lifecycle.HerePlace):
         """The turn in hand waits for what it has not been allowed to send."""
         life, state, standing = self.life, self.state, self.standing
         feed = None if life is None else life.feed
-        if life is None or feed is None or self._rest.is_missed:
+        if life is None or feed is None or self._rest.missed is not None:
             return await self._rest.wait_on()  # It has its outcome meanwhile.
         looks_at_state = standing.leads or not state.is_lazy  # Somebody does, when outcomes are handed over.
         if looks_at_state and self.part.ends and state.has_access and not state.is_again:
@@ -806,7 +909,7 @@ class Server(lifecycle.HerePlace):
             ends = await self._run_all(requests, even_stopping=True)
         finally:
             self.state.is_again = False
-        await self.ensure()
+        await self.ensure_as_given()
         skips, self.attempts.skips = self.attempts.skips, {}
         try:
             self.capture()
@@ -826,7 +929,8 @@ class Server(lifecycle.HerePlace):
             new = await self.run_part(pending)
             self.points.keep_tail(self.part.begun, new)
             ends += new
-            if self.has_returned:
+            asked = {one.feed.id for one in pending}
+            if any(feed.id not in asked for feed in self._returned()):
                 break  # That is to be handled first.
         return ends
 
@@ -862,10 +966,10 @@ class Server(lifecycle.HerePlace):
         then()
 
     def closed(self) -> None:
-        """The life is over; what follows from that comes when all of it has been wound down."""
+        """The life is over, and nobody here has ended it: from now on there is none."""
         life, cell = self.life, self.cell
         if life is not None and cell is not None:
-            cell.node.loop.call_soon(self._life_ended, life, cell.extra().reason)
+            self._life_ended(life, cell.extra().reason)
 
     def inward(self, record: Outcome | SnapshotNow) -> None:
         """Take what came from home past the bricks."""

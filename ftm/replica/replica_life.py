@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable, Coroutine
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.ref import ActorRef
 from ...checkpoint.life.recorded_context import RecordedContext
-from ...checkpoint.life.recorded_inbox import STARTED, Fed, Hook
+from ...checkpoint.life.recorded_inbox import RECOVERED, STARTED, Fed, Hook
 from ...checkpoint.life.recorded_life import Life
 from ...checkpoint.method import Method
 from ...checkpoint.protocol import FAILED, Answer, Feed, Out, ToHome, TurnEnd
@@ -19,6 +19,8 @@ from ...checkpoint.protocol import FAILED, Answer, Feed, Out, ToHome, TurnEnd
 if TYPE_CHECKING:
     from .protected_actor import Server
 
+
+T = TypeVar("T")
 
 # Why the server came to rest.
 OVER, BLOCKED, ENDED, ABANDONED, UNDONE = "over", "blocked", "ended", "abandoned", "undone"
@@ -39,9 +41,9 @@ class Rest:
         return self._waiting is not None
 
     @property
-    def is_missed(self) -> bool:
-        """Whether it has come to rest while nobody waited."""
-        return self._missed is not None
+    def missed(self) -> str | None:
+        """Why it has come to rest while nobody waited; None if it has not."""
+        return self._missed
 
     def next_number(self) -> int:
         """Return the number of what is given now; what was given before is of no concern any more."""
@@ -94,9 +96,22 @@ class ServerContext(RecordedContext):
     def ref(self) -> ActorRef[Any]:
         return self.cell.node.cell_at(self.path).ref
 
+    def create_task(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
+        if self._server.only_computes:  # The run that counts has begun it too: the actor does not end of this one.
+            task = self._beside(work, "task")
+            task.add_done_callback(_seen)
+            return task
+        self._server.begins_task()
+        return super().create_task(work)
+
     def waits_for_room(self, topic: str) -> bool:
         """What is published leaves when the turn's result has been compared, voted on or copied, and not before."""
         return False
+
+
+def _seen(task: asyncio.Task[Any]) -> None:
+    if not task.cancelled():
+        task.exception()
 
 
 class ServerLife(Life):
@@ -109,6 +124,7 @@ class ServerLife(Life):
         self.let_out: list[Out] = []  # of the turn in hand, beside `outs`: it has left, or is held back
         self.begun_names: set[str] = set()  # the variables of the actor when `__init__` had run
         self.is_touched = False  # by its hooks, since the point at which it has begun
+        self.has_begun_tasks = False  # in turns since the last point
         self.saving.is_needed = server.state.has_access
 
     def _context(self, cell: Cell) -> RecordedContext:
@@ -120,6 +136,20 @@ class ServerLife(Life):
         """Go on from after an earlier turn: what was run since is run again, or something else is."""
         self.turn, self.stash, self.returned = turn, stash, returned
         self._context_made.draw_anew()
+
+    def enter(self, hook: str) -> None:
+        super().enter(hook)
+        self.is_touched |= hook in (STARTED, RECOVERED)
+
+    def leave(self) -> None:
+        is_start = self.hook == STARTED
+        super().leave()
+        if is_start:
+            self.server.take_in_hooks(self)
+
+    def go_live(self, gone: tuple[int, ...]) -> None:
+        super().go_live(gone)
+        self.server.take_in_hooks(self)
 
     def open_turn(self, feed: Feed) -> None:
         super().open_turn(feed)

@@ -35,7 +35,9 @@ class ReplicaState:
     is_stopping: bool = False  # it is being ended
     is_quiet: bool = False  # a life handles again what was handed over since its point: nobody hears of it
     is_again: bool = False  # a part is run once more: nothing leaves
+    is_as_given: bool = False  # a life begins that stands as another one does, whatever its hooks do
     is_work_lost: bool = False  # background work has ended with the last life
+    wants_life: bool = False  # the last one has ended between two turns, and nobody waits for the next
     start_turn: int = -1  # that a life without a point goes on from
     handed: int = 0  # parts that were handed over
     confirmed: int = 0  # parts that are known to be at home
@@ -86,6 +88,7 @@ class Attempts:
     size: int = 8  # requests at once
     singles: int = 0  # requests that are run one at a time: one of them has left what cannot be saved
     crashes: int = 0  # ends of the life outside any turn, one after another
+    crashed: float = 0.0  # when it last has, by the loop's clock
     failed: int | None = None  # the request whose turn has failed, and with it the life
     skips: dict[int, TurnEnd] = dataclasses.field(default_factory=dict)  # requests that fail without being run
 

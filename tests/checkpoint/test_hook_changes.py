@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import signal
 from pathlib import Path
@@ -88,6 +89,13 @@ class Loose(Hall):
         raise RuntimeError("fell")
 
 
+class Falling(Loose):
+    """Falls soon after it begins, whatever is done."""
+
+    async def on_start(self, restored: bool) -> None:
+        self.ctx.create_task(self._fall())
+
+
 class Calm(Hall):
     """Has nothing to do when it comes back."""
 
@@ -125,6 +133,31 @@ async def is_up(system: hf.ActorSystem, ref: hf.ActorRef[Any], life: int) -> boo
 async def system() -> Any:
     async with hf.ActorSystem("app", log=False, intensity=1000) as running:
         yield running
+
+
+@pytest.mark.parametrize("place", list(PLACES))
+async def test_what_a_hook_puts_back_between_two_turns_waits_for_no_message(system: hf.ActorSystem, place: str) -> None:
+    ref = await started(system, place, Loose)
+    first = asyncio.ensure_future(ref.ask(Enter(1), IN_TIME))
+    assert await ref.ask(Entered(), IN_TIME) == []
+    ref.tell(Trip())
+    assert await first == 1
+    assert await ref.ask(Entered(), IN_TIME) == [1]
+
+
+@pytest.mark.parametrize("place", [one for one in PLACES if "mechanism" in PLACES[one]])
+async def test_who_falls_again_and_again_between_two_turns_is_given_up(place: str) -> None:
+    """As without a mechanism: its supervisor hears of it, and is no more able to help than to wait for ever."""
+    async with hf.ActorSystem("app", log=False) as system:
+        spec = hf.child("hall", hf.start(Falling), recovery=hf.hybrid(interval=3600.0), **PLACES[place])
+        above = hf.supervisor("above", children=[spec], intensity=2, period=IN_TIME, restart="temporary")
+        events = system.events()
+        with contextlib.suppress(hf.StartFailed):
+            await system.start(above)
+        async with asyncio.timeout(IN_TIME):
+            async for event in events:
+                if isinstance(event, hf.SupervisorGaveUp):
+                    return
 
 
 @pytest.mark.parametrize("place", list(PLACES))

@@ -184,13 +184,6 @@ CHECKS = {
         "tests/checkpoint/test_hook_changes.py",
         "test_who_dies_again",
     ),
-    "behind a mechanism, what is saved is the state with what the hook has done to it": Check(
-        "ftm/replica/actor_state.py",
-        "    is_known = stands and not life.is_touched ",
-        "    is_known = stands ",
-        "tests/checkpoint/test_hook_changes.py",
-        "test_who_dies_of_the_first_message",
-    ),
     "what a hook leaves of a large state does not come when more was handled": Check(
         "checkpoint/life/recorded_life.py",
         "            if not (is_last or is_due) and self.images.suits():",

@@ -12,6 +12,7 @@ JOINING = "tests/ftm/test_pbr_joining.py"
 PBR, LFR, SEC = "tests/ftm/test_pbr.py", "tests/ftm/test_lfr.py", "tests/ftm/test_sec.py"
 SUBTREE, STATE = "tests/ftm/test_subtree.py", "tests/ftm/test_group_state.py"
 PUT_BACK, UNAWAITED = "tests/ftm/test_put_back.py", "tests/ftm/test_unawaited_asks.py"
+RANDOM_HOOKS = "tests/ftm/test_random_hooks.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 CHECKS = {
     "T36: a batch of an earlier epoch is refused": Check(
@@ -37,17 +38,94 @@ CHECKS = {
     ),
     "a shadow begins where the other life was, whatever its hooks do": Check(
         "ftm/bricks/runs.py",
-        "        await self.ensure_as_given()\n",
-        "        await self.ensure()\n",
+        "        self.install(before)\n        await self.ensure_as_given()\n",
+        "        self.install(before)\n        await self.ensure()\n",
         "tests/ftm/test_hooks.py",
         "test_a_hook_that_changes_the_state",
     ),
     "the turns of a new life begin from what its hooks have left, in all runs": Check(
-        "ftm/bricks/bricks.py",
-        "                await server.take_in_hooks()\n",
-        "                await server.ensure()\n",
+        "ftm/replica/protected_actor.py",
+        "        self.points.stand_changed(made)\n",
+        "        pass\n",
         "tests/ftm/test_hooks.py",
         "test_what_the_hooks_of_the_next_leader_change",
+    ),
+    "what a life has put back is handled, though no message comes": Check(
+        "ftm/replica/protected_actor.py",
+        "        if self.has_returned:\n            self.tell_more(PutBack())\n",
+        "        pass\n",
+        "tests/checkpoint/test_hook_changes.py",
+        "test_what_a_hook_puts_back_between_two_turns",
+    ),
+    "the life after one that has ended between two turns begins at once": Check(
+        "ftm/replica/protected_actor.py",
+        "            self.state.wants_life = True\n            self._driver.go_on()\n",
+        "            pass\n",
+        "tests/checkpoint/test_hook_changes.py",
+        "test_what_a_hook_puts_back_between_two_turns",
+    ),
+    "a life that has ended while something was computed again has a next one": Check(
+        "ftm/replica/protected_actor.py",
+        "            self.state.wants_life |= self.state.is_again\n",
+        "            pass\n",
+        "tests/checkpoint/test_hook_changes.py",
+        "test_what_a_hook_puts_back_between_two_turns",
+    ),
+    "who ends again and again between two turns is given up": Check(
+        "ftm/replica/protected_actor.py",
+        "        if attempts.crashes >= MOST_CRASHES:\n",
+        "        if False:\n",
+        "tests/checkpoint/test_hook_changes.py",
+        "test_who_falls_again_and_again",
+    ),
+    "a turn that has failed is told, though nothing else is sealed before": Check(
+        "ftm/replica/protected_actor.py",
+        "        if begun:  # Else those",
+        "        if True:  # Else those",
+        "tests/ftm/test_hooks.py",
+        "test_a_hook_that_changes_the_state",
+    ),
+    "what is computed again has no hooks that count": Check(
+        "ftm/replica/protected_actor.py",
+        "            if self.only_computes:  # Hooks",
+        "            if False:  # Hooks",
+        RANDOM_HOOKS,
+        "test_what_is_acknowledged and stays",
+    ),
+    "what a part has come to ends with its life": Check(
+        "ftm/replica/protected_actor.py",
+        "            if self.life is None and part.begun and not",
+        "            if False and part.begun and not",
+        RANDOM_HOOKS,
+        "test_what_is_acknowledged and falls",
+    ),
+    "what was put back at a point, and handled since, is not handled again": Check(
+        "ftm/replica/protected_actor.py",
+        "        return [feed for feed in point.returned if feed.id not in handled]\n",
+        "        return point.returned\n",
+        RANDOM_HOOKS,
+        "test_what_is_acknowledged and falls",
+    ),
+    "a part that nobody has seen the state of is run again": Check(
+        "ftm/replica/protected_actor.py",
+        "            if begun and self._is_unseen():\n",
+        "            if False:\n",
+        RANDOM_HOOKS,
+        "test_what_is_acknowledged and falls",
+    ),
+    "a turn that has begun a task is behind a point": Check(
+        "ftm/replica/protected_actor.py",
+        "self.state.is_lazy and not life.has_begun_tasks  #",
+        "self.state.is_lazy  #",
+        RANDOM_HOOKS,
+        "test_what_is_acknowledged and falls",
+    ),
+    "what hooks have left in the middle of a part is at home before what stands on it": Check(
+        "ftm/replica/protected_actor.py",
+        "            if is_new and self.reports.is_snapshot_wanted and not state.is_again:\n",
+        "            if False:\n",
+        RANDOM_HOOKS,
+        "test_what_is_acknowledged",
     ),
     "what hooks have left is at home before what stands on it": Check(
         "ftm/bricks/bricks.py",
@@ -219,8 +297,8 @@ CHECKS = {
     ),
     "a run ends where it has put something back": Check(
         "ftm/replica/protected_actor.py",
-        "            if self.has_returned:\n                break",
-        "            if False:\n                break",
+        "            if any(feed.id not in asked for feed in self._returned()):\n",
+        "            if False:\n",
         PUT_BACK,
         "by_blocks_and_votes and without",
     ),
