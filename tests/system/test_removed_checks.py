@@ -14,6 +14,7 @@ MOVED = "tests/system/test_readdressed.py"
 TIES = "tests/system/test_moved_ties.py"
 REPLICAS = "tests/system/test_moved_replicas.py"
 FAR = "tests/migration/test_far_moves.py"
+CERTIFIED = "tests/system/test_moved_certificates.py"
 AT_ODDS = "tests/migration/test_moves_at_odds.py"
 
 CHECKS = {
@@ -409,13 +410,6 @@ CHECKS = {
         REPLICAS,
         "test_what_a_replica_says",
     ),
-    "certified replicas are not moved": Check(
-        "system/transaction/reparenting.py",
-        "    if place.is_protected and cell is not None and any(",
-        "    if False and any(",
-        REPLICAS,
-        "test_certified",
-    ),
     "two looks at threads are alike": Check(
         "testing/threads.py",
         "        if not at_work and before:\n",
@@ -443,6 +437,76 @@ CHECKS = {
         "other.state != STARTING",
         COMMIT,
         "test_who_is_stopped_stays_so",
+    ),
+    "replicas are certified where they go before they go": Check(
+        "system/transaction/reparenting.py",
+        "        await self._certify(system)\n",
+        "        pass\n",
+        CERTIFIED,
+        "test_it_is_certified_at_its_new_address",
+    ),
+    "what was certified for the old address is revoked": Check(
+        "ftm/sec/moved_certificates.py",
+        "                    await self._ask(Revoke(certified(was)), SETTLED_WITHIN)\n",
+        "                    pass\n",
+        CERTIFIED,
+        "test_an_old_certificate",
+    ),
+    "what others had at the new address is revoked": Check(
+        "ftm/sec/moved_certificates.py",
+        "                await self._ask(Revoke(name, until=serial), SETTLED_WITHIN)\n",
+        "                pass\n",
+        CERTIFIED,
+        "test_two_that_exchange",
+    ),
+    "what others have is not revoked with what is given up": Check(
+        "ftm/sec/moved_certificates.py",
+        "                await self._ask(Revoke(name, after=serial), SETTLED_WITHIN)\n",
+        "                await self._ask(Revoke(name), SETTLED_WITHIN)\n",
+        CERTIFIED,
+        "test_two_that_exchange",
+    ),
+    "who has come to the old address keeps its certificates": Check(
+        "ftm/sec/moved_certificates.py",
+        "                if not self._is_taken(was):",
+        "                if True:",
+        CERTIFIED,
+        "test_two_that_exchange",
+    ),
+    "nobody who lives there is robbed of its name": Check(
+        "ftm/sec/moved_certificates.py",
+        "            if not self._settings.is_per_start or self._is_taken(path):\n",
+        "            if False:\n",
+        CERTIFIED,
+        "test_a_name_that_belongs_to_another_key",
+    ),
+    "who was revoked is certified nowhere else": Check(
+        "ftm/sec/moved_certificates.py",
+        "(was in self._enrolled and not await self._newest(certified(was)))",
+        "False",
+        CERTIFIED,
+        "test_who_was_revoked",
+    ),
+    "the sessions of before end with the move": Check(
+        "ftm/sec/link.py",
+        "for path in self._enrolled}\n        self._end_sessions()\n",
+        "for path in self._enrolled}\n",
+        CERTIFIED,
+        "test_it_is_certified_at_its_new_address",
+    ),
+    "the same life speaks behind a move: nothing is handled twice": Check(
+        "ftm/sec/identity.py",
+        "key, certificate, trust, incarnation=self._life,",
+        "key, certificate, trust, incarnation=time.monotonic_ns(),",
+        "tests/ftm/sec/test_link.py",
+        "test_what_is_on_its_way_when_it_moves",
+    ),
+    "no session is kept that was agreed on under another name": Check(
+        "ftm/sec/link.py",
+        "            if me is not self._me:  # Agreed",
+        "            if False:  # Agreed",
+        "tests/ftm/sec/test_link.py",
+        "test_a_hand_shake_that_a_move_comes_into",
     ),
     "a name is not taken from its new holder": Check(
         "system/transaction/arrangement.py",
