@@ -14,6 +14,7 @@ MOVED = "tests/system/test_readdressed.py"
 TIES = "tests/system/test_moved_ties.py"
 REPLICAS = "tests/system/test_moved_replicas.py"
 FAR = "tests/migration/test_far_moves.py"
+BOUNDED = "tests/migration/test_bounded_moves.py"
 CERTIFIED = "tests/system/test_moved_certificates.py"
 AT_ODDS = "tests/migration/test_moves_at_odds.py"
 
@@ -437,6 +438,29 @@ CHECKS = {
         "other.state != STARTING",
         COMMIT,
         "test_who_is_stopped_stays_so",
+    ),
+    "who waits for room waits on at the root": Check(
+        "ftm/migration/subtree_moves.py",
+        '        luggage.queue = unpack(self._worker, cell, told["queue"])\n',
+        '        luggage.queue = unpack(self._worker, cell, [*told["queue"], *told.pop("waiting")])\n'
+        '        told["waiting"] = []\n',
+        BOUNDED,
+        "test_a_suspended_actor and plain and below",
+    ),
+    "who waits for room waits on in the process of its supervisor": Check(
+        "ftm/migration/unrecorded_in_worker.py",
+        "        commands = arrival.take_over(queue, stash, bound,",
+        "        queue, waiting = [*queue, *waiting], list[Any]()\n"
+        "        commands = arrival.take_over(queue, stash, bound,",
+        BOUNDED,
+        "test_a_suspended_actor and plain and below",
+    ),
+    "who was suspended in a group is held where it goes": Check(
+        "ftm/migration/group_moves.py",
+        "        self.cell.extra().suspended = 0  # It is",
+        "        pass  # It is",
+        BOUNDED,
+        "test_a_suspended_actor and plain and task",
     ),
     "replicas are certified where they go before they go": Check(
         "system/transaction/reparenting.py",
