@@ -41,7 +41,8 @@ async def test_a_suspended_actor_has_no_more_in_its_mailbox_after_many_moves(kin
             asks.append(one.ask(Add(len(asks) + 1), IN_TIME))
             status = await system.get_status(one)
             assert (status.state, status.queued) == ("suspended", CAPACITY + has_had_home)
-            assert not [step for done in (*asks, *sends) if done.done()]
+            waiting: list[asyncio.Future[Any]] = [*asks, *sends]
+            assert not [step for done in waiting if done.done()]
         await system.resume(one)
         await asyncio.gather(*asks, *sends)
         added = (await one.ask(Seen(), IN_TIME))["added"]
