@@ -38,6 +38,7 @@ class Child:
     up: asyncio.Future[None] | None = None  # a start that is waited for outside our turn; None once it is known or void
     row: StartRow | None = None  # those that are started one after another, and it is one of them
     candidate: int = 0  # as whose candidate it was started; 0: it is none
+    awaited: str = ""  # the address that its start waits for, because its spec binds it to that
 
     @property
     def is_running(self) -> bool:
@@ -83,10 +84,11 @@ def new_cell(own: Cell, one: Child) -> Cell:
 class StartRow:
     """Children that are started one after another. Each is in one row at most: who is stopped meanwhile is in none."""
 
-    __slots__ = ("_waiting",)
+    __slots__ = ("_waiting", "current")
 
     def __init__(self, children: Iterable[Child], state: str) -> None:
         self._waiting = deque(children)
+        self.current: Child | None = None  # whose turn it is; the others wait
         for one in self._waiting:
             one.state, one.row = state, self
 

@@ -15,6 +15,7 @@ TIES = "tests/system/test_moved_ties.py"
 REPLICAS = "tests/system/test_moved_replicas.py"
 FAR = "tests/migration/test_far_moves.py"
 BOUNDED = "tests/migration/test_bounded_moves.py"
+AWAITED = "tests/supervision/test_awaited.py"
 CERTIFIED = "tests/system/test_moved_certificates.py"
 AT_ODDS = "tests/migration/test_moves_at_odds.py"
 
@@ -438,6 +439,48 @@ CHECKS = {
         "other.state != STARTING",
         COMMIT,
         "test_who_is_stopped_stays_so",
+    ),
+    "a start waits for those that it is bound to": Check(
+        "supervision/supervisor.py",
+        "            await self._await_bound(row, one)\n",
+        "            pass\n",
+        AWAITED,
+        "test_two_that_are_killed_at_once",
+    ),
+    "a start that waits too long fails": Check(
+        "supervision/supervisor.py",
+        "loop.time() - since >= seconds:",
+        "False:",
+        AWAITED,
+        "test_it_waits_no_longer",
+    ),
+    "starts that wait for each other are told": Check(
+        "supervision/awaited.py",
+        "                if wait == first:\n",
+        "                if False:\n",
+        AWAITED,
+        "test_two_that_wait_for_each_other",
+    ),
+    "nobody waits for one that is started behind it": Check(
+        "supervision/awaited.py",
+        "            if circle is None or len(circle) == 1:\n",
+        "            if circle is None:\n",
+        AWAITED,
+        "test_who_is_bound_to_one_that_is_started_behind_it",
+    ),
+    "nobody waits for one that was stopped": Check(
+        "supervision/awaited.py",
+        "            if one is None or (one.row is None and one.state in (STOPPED, STOPPING)):\n",
+        "            if one is None:\n",
+        AWAITED,
+        "test_nobody_waits_for_one_that_was_stopped",
+    ),
+    "a child that was stopped while it waited is not started": Check(
+        "supervision/supervisor.py",
+        "            if one.row is not row:\n                return None\n            await self._come_up(one)\n",
+        "            await self._come_up(one)\n",
+        AWAITED,
+        "test_one_that_waits_can_be_stopped",
     ),
     "who waits for room waits on at the root": Check(
         "ftm/migration/subtree_moves.py",
