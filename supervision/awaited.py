@@ -46,7 +46,7 @@ class Prospects:
         """
         node = self._node
         for port, path in one.spec.bindings.items():
-            if node.find(path) is not None:
+            if port in one.spec.late or node.find(path) is not None:
                 continue
             one.awaited = path
             circle = self._circle(Wait(who, path))

@@ -64,7 +64,9 @@ def new_cell(own: Cell, one: Child) -> Cell:
     """
     node, spec = own.node, complete(own, one.spec)
     one.spec = spec
-    targets = {port: node.find(path) for port, path in spec.bindings.items()}
+    targets = {
+        port: node.cell_at(path) if port in spec.late else node.find(path) for port, path in spec.bindings.items()
+    }
     for port, target in targets.items():  # Before there is a cell: a child that cannot start leaves no name taken.
         if target is None:
             missing = NoSuchActor(spec.bindings[port])
