@@ -549,8 +549,10 @@ async def test_what_is_bound_to_a_later_one_hinders_no_transaction(tmp_path: Pat
             change.add("/app", counter("other"))
         async with system.transaction(timeout=IN_TIME) as change:
             change.bind("/app/above/client", "peer", "/app/above/last")
+        for first in ("last", "client"):
+            async with system.transaction(timeout=IN_TIME) as change:
+                change.reorder("/app/above", [first])
         async with system.transaction(timeout=IN_TIME) as change:
-            change.reorder("/app/above", ["client"])
             change.bind("/app/above/client", "peer", "/app/other")
         async with system.transaction(timeout=IN_TIME) as change:
             change.add("/app", hf.child("client", hf.start(Client)))
