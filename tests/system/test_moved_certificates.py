@@ -126,6 +126,20 @@ async def test_an_old_certificate_opens_nothing_any_more(part: str) -> None:
         assert await one.ask(Add(), IN_TIME) == 2
 
 
+async def test_a_certificate_for_the_old_address_that_nobody_has_revoked_opens_nothing_elsewhere() -> None:
+    """The root was killed before it could say so, and the authority lives on."""
+    async with program("SEC+PBR", "plain") as system:
+        one = resident(system)
+        await whole(one)
+        await moved(system)
+        for part in PARTS:
+            path = f"{HERE}/ftm/{part}"
+            key = SigningKey.from_file(key_file(SEC(CA).folder, path))
+            left = await authority(system).ask(Enrol(make_request(key, path)), IN_TIME)
+            assert await greeted(system, await party(system, path, left), f"{THERE}/ftm/r1") == "wrong_peer"
+        assert await one.ask(Add(), IN_TIME) == 1
+
+
 async def test_what_was_sealed_before_the_move_is_refused_behind_it(monkeypatch: pytest.MonkeyPatch) -> None:
     async with program("SEC+PBR", "plain") as system:
         one = resident(system)
