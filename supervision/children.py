@@ -38,6 +38,7 @@ class Child:
     up: asyncio.Future[None] | None = None  # a start that is waited for outside our turn; None once it is known or void
     row: StartRow | None = None  # those that are started one after another, and it is one of them
     candidate: int = 0  # as whose candidate it was started; 0: it is none
+    awaited: str = ""  # the address that its start waits for, because its spec binds it to that
 
     @property
     def is_running(self) -> bool:
@@ -63,7 +64,9 @@ def new_cell(own: Cell, one: Child) -> Cell:
     """
     node, spec = own.node, complete(own, one.spec)
     one.spec = spec
-    targets = {port: node.find(path) for port, path in spec.bindings.items()}
+    targets = {
+        port: node.cell_at(path) if port in spec.late else node.find(path) for port, path in spec.bindings.items()
+    }
     for port, target in targets.items():  # Before there is a cell: a child that cannot start leaves no name taken.
         if target is None:
             missing = NoSuchActor(spec.bindings[port])
@@ -83,10 +86,11 @@ def new_cell(own: Cell, one: Child) -> Cell:
 class StartRow:
     """Children that are started one after another. Each is in one row at most: who is stopped meanwhile is in none."""
 
-    __slots__ = ("_waiting",)
+    __slots__ = ("_waiting", "current")
 
     def __init__(self, children: Iterable[Child], state: str) -> None:
         self._waiting = deque(children)
+        self.current: Child | None = None  # whose turn it is; the others wait
         for one in self._waiting:
             one.state, one.row = state, self
 

@@ -50,6 +50,23 @@ def replace_mechanism(cell: Cell, spec: ChildSpec) -> None:
     )  # fmt: skip
 
 
+def rebind(cell: Cell, port: str, target: str | None) -> None:
+    """The next lives at `cell` have a port bound to this address, also those under supervisors that are started anew.
+
+    None: to nobody. Nothing is waited for: where nobody lives yet it leads to whoever comes to live there.
+    """
+
+    def change(known: ChildSpec) -> ChildSpec:
+        if known.bindings.get(port) == target:
+            return known
+        left = {name: path for name, path in known.bindings.items() if name != port}
+        if target is None:
+            return dataclasses.replace(known, bindings=left, late=known.late - {port})
+        return dataclasses.replace(known, bindings={**left, port: target}, late=known.late | {port})
+
+    _change(cell, change(cell.spec) if isinstance(cell.spec, ChildSpec) else cell.spec, change)
+
+
 def _change(cell: Cell, spec: ChildSpec | None, change: Change) -> None:
     cell.spec = spec
     _tell_parent(cell)

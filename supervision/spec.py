@@ -96,6 +96,7 @@ class ChildSpec(Generic[A_co]):
     made_up: bool = False  # whether its supervisor has made its id up
     start_timeout: StartTimeout | None = None  # None becomes what the kind of child has by default
     autostart: bool = True  # whether its supervisor starts it with the others, or only by order
+    late: frozenset[str] = frozenset()  # ports that transactions have bound: whom they lead to may be started later
 
     def __post_init__(self) -> None:
         where = f"child {self.id!r}"

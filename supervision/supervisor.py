@@ -31,6 +31,7 @@ from .admin import (
     TerminateChild,
     opened,
 )
+from .awaited import LOOK_AGAIN, Prospects
 from .children import (
     RECOVERING,
     RESTARTING,
@@ -166,7 +167,11 @@ class Supervisor(Inquiries):
         Raises:
             StartFailed, or another HoldfastError: naming the child and why.
         """
+        row.current = one
         try:
+            await self._await_bound(row, one)
+            if one.row is not row:
+                return None
             await self._come_up(one)
         except StartIgnored:
             if one.row is not row:
@@ -185,6 +190,24 @@ class Supervisor(Inquiries):
         if cell is not None and cell.state is DOWN:  # It ended before we heard that it was up: its end in our queue
             self.ctx.cell.push(lifecycle.ChildExit(cell, cell.life, cell.extra().reason))  # may be passed over already.
         return True
+
+    async def _await_bound(self, row: StartRow, one: Child) -> None:
+        """Wait until those are there that the child's spec binds it to, if they are being started.
+
+        Raises:
+            StartFailed: they cannot come, or have not come within the time that the start may take.
+        """
+        if one.cell is not None and one.cell.state is not GONE:
+            return  # It has been bound: the address is there since.
+        loop, who, seconds = self.ctx.cell.node.loop, self._path_of(one), one.spec.start_timeout or "infinity"
+        prospects, since = Prospects(self.ctx.cell.node, listed_at), loop.time()
+        try:
+            while one.row is row and (missing := prospects.missing(who, one)):
+                if not isinstance(seconds, str) and loop.time() - since >= seconds:
+                    raise StartFailed(who, f"{missing}, to which it is bound, was not there within {seconds:g} s")
+                await asyncio.sleep(LOOK_AGAIN)
+        finally:
+            one.awaited = ""
 
     async def _come_up(self, one: Child) -> None:
         """Launch a child and wait for it. Raises what `_launch` does, or how the start ended."""
@@ -688,6 +711,12 @@ class Supervisor(Inquiries):
     def _specs(self) -> tuple[ChildSpec, ...]:
         """The specs as they are now."""
         return tuple(one.spec for one in self._children.values())
+
+
+def listed_at(cell: Cell) -> dict[str, Child] | None:
+    """The children of a supervisor that lives in this process; None if there is none, or it has not begun."""
+    actor = cell.actor
+    return actor._listed() if isinstance(actor, Supervisor) and "_children" in actor.__dict__ else None
 
 
 def kill_starting(top: Cell) -> None:

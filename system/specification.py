@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import hashlib
 from collections.abc import Awaitable, Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import msgspec
 
@@ -23,7 +23,7 @@ from ..actors.kernel.actor import Start
 from ..actors.process.wire.start_codec import pack_data, unpack_data
 from ..supervision.children import Child
 from ..supervision.respec import rebuilt
-from ..supervision.spec import ChildSpec
+from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor
 from ..supervision.supervisor_changes import everything
 
@@ -31,8 +31,10 @@ if TYPE_CHECKING:
     from ..checkpoint.home.homes import Homes
     from .transaction.draft import DraftPlace
 
+T = TypeVar("T")
+
 KEPT = "specification "
-"""How the notes begin; the address of a child of the root follows."""
+"""How the notes begin; the address of a child of the root follows, or that of the root itself."""
 TOGETHER = 50
 """So many specs are packed before others have their turn."""
 
@@ -60,9 +62,41 @@ class Specifications:
         self._declared: dict[str, ChildSpec] = {}  # as the program says
         self._seen: dict[str, ChildSpec] = {}  # the specs of which it is known what is to be kept
         self._packer = Packer()
+        self._root, self._root_flags = "", Flags()  # as the program says
+        self._order: list[str] = []  # of the children of the root, if that is not the one in which they are started
         self._added: set[str] = set()  # children of the root that no program has started
         self.brought: set[str] = set()
         """Those of them that were brought back; a program that starts one itself means another one."""
+
+    def root_in_force(self, address: str, declared: Flags) -> Flags:
+        """The flags with which the root is to begin, where the program says `declared`."""
+        self._root, self._root_flags = address, declared
+        digest, data = self._loaded.pop(address, (None, b""))
+        if digest is None:
+            return declared
+        flags, self._order = unpack_data(data)
+        if digest == _digest(pack_data(declared, address)):
+            return cast("Flags", flags)
+        self._keep_root(declared, self._order)
+        if flags != declared:
+            self._homes.node.emit(SpecificationSuperseded(address))
+        return declared
+
+    def _keep_root(self, flags: Flags, order: list[str]) -> None:
+        self._order = order
+        if flags == self._root_flags and not order:
+            self._keep(self._root, None)
+            return
+        digest = _digest(pack_data(self._root_flags, self._root))
+        self._keep(self._root, msgspec.msgpack.encode((digest, pack_data((flags, order), self._root))))
+
+    def _arrange(self) -> None:
+        """Have the children of the root stand as transactions have ordered them, as far as they are there."""
+        cell = self._homes.node.root
+        supervisor = cell.actor if cell is not None else None
+        if cell is not None and isinstance(supervisor, Supervisor) and self._order:
+            supervisor._children = in_order(supervisor._listed(), self._order)
+            cell.children = in_order(cell.children or {}, self._order)
 
     def in_force(self, address: str, declared: ChildSpec, *, fresh: bool) -> ChildSpec:
         """What is to be started where the program starts `declared`.
@@ -86,6 +120,7 @@ class Specifications:
         if is_newer and not fresh:
             self._homes.node.emit(SpecificationSuperseded(address))
         self._see(address)
+        self._arrange()
 
     def _see(self, address: str) -> None:
         one = self._children().get(address.rpartition("/")[2])
@@ -125,7 +160,7 @@ class Specifications:
                 node.emit(SpecificationNotKept(address, str(error)))
                 continue
             below = f"{address}/"
-            led = [path for one in everything((spec,)) for path in one.bindings.values()]
+            led = [path for one in everything((spec,)) for port, path in one.bindings.items() if port not in one.late]
             if all(path.startswith(below) or node.find(path) is not None for path in led):
                 del self._loaded[address]
                 self._added.add(address)
@@ -135,6 +170,7 @@ class Specifications:
                 except HoldfastError:
                     continue  # Its supervisor has told so; the others are started all the same.
                 self._see(address)
+                self._arrange()
                 has_started = True
         return has_started
 
@@ -148,7 +184,8 @@ class Specifications:
             return
         tops = [one for one in root.children.values() if not one.is_leaving]
         added = [one for one in tops if one.is_planned or one.has_moved or one.path in self._added]
-        declared = [one for one in tops if one not in added and one.path in self._declared]
+        by_path = {one.path: one for one in tops if one not in added}
+        declared = [by_path[path] for path in self._declared if path in by_path]
         led = [one for top in (*declared, *added) for one in _led_outside(top) if one[2] in (*declared, *added)]
         order: list[DraftPlace] = []
         waiting = list(added)
@@ -207,7 +244,18 @@ class Specifications:
             elif spec is not self._seen.get(address):
                 self._seen[address] = spec
                 self._note(address, spec, before)
+        self._note_root(removed)
         self._packer.forget()
+
+    def _note_root(self, removed: set[str]) -> None:
+        root = self._homes.node.root
+        supervisor = root.actor if root is not None else None
+        if isinstance(supervisor, Supervisor):
+            known = {address.rpartition("/")[2]: None for address in self._declared if address not in removed}
+            added = {address.rpartition("/")[2] for address in self._added - removed}
+            order = [name for name in supervisor._listed() if name in known or name in added]
+            started = [name for name in known if name in order]
+            self._keep_root(supervisor._flags, order if order != started else [])
 
     def _note(self, address: str, spec: ChildSpec, before: Mapping[str, Any]) -> None:
         declared = None if address in self._added else self._declared[address]
@@ -244,7 +292,7 @@ def _led_outside(top: DraftPlace) -> list[tuple[DraftPlace, str, DraftPlace]]:
     for place in top.walk():
         if place.spec is None or place.is_leaving or (place is not top and not place.comes_back_with(top)):
             continue
-        for port in place.spec.bindings:
+        for port in place.spec.bindings.keys() - place.spec.late:
             target = (place.bindings if place.is_planned else place.was.bound).get(port)
             if target is not None and _top(target) is not top:
                 found.append((place, port, _top(target)))
@@ -256,6 +304,18 @@ def _top(place: DraftPlace) -> DraftPlace:
     while place.parent is not None and place.parent.parent is not None:
         place = place.parent
     return place
+
+
+def in_order(children: dict[str, T], order: list[str]) -> dict[str, T]:
+    """The same, those that are named in this order where they stand; all others stay at their places.
+
+    >>> list(in_order({"first": 1, "a": 2, "new": 3, "b": 4}, ["b", "gone", "a"]))
+    ['first', 'b', 'new', 'a']
+    """
+    wanted = set(order)
+    named = iter([name for name in order if name in children])
+    names = [next(named) if name in wanted else name for name in children]
+    return {name: children[name] for name in names}
 
 
 class Packer:

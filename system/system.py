@@ -182,7 +182,8 @@ class ActorSystem(Recorded, Controls):
         )
         self._body = asyncio.current_task()
         root = self._root = node.root = node.cell_below(None, f"/{self.name}")
-        up = lifecycle.begin(root, Start(Supervisor, (options.flags, ())))
+        flags = self.specifications.root_in_force(root.path, options.flags)
+        up = lifecycle.begin(root, Start(Supervisor, (flags, ())))
         if up is not None:
             await up
         root.ended().add_done_callback(self._root_ended)
@@ -486,7 +487,10 @@ class ActorSystem(Recorded, Controls):
         await publish(self.node, topic, message, lambda cell: cell.ref.send(message))
 
     def bind(self, ref: ActorRef[Any], port: str, target: ActorRef[Any]) -> None:
-        """Point a binding elsewhere; the owner sees it from its next turn on. Raises SpecError."""
+        """Point a binding elsewhere; the owner sees it from its next turn on. Raises SpecError.
+
+        It lasts until the supervisor of the owner is restarted. `change.bind`, in a transaction, is for good.
+        """
         self.node.bind(ref._cell, port, target._cell)
 
     # -- looking at it ----------------------------------------------------------------------------------------------

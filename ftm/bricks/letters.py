@@ -16,6 +16,7 @@ from .sealed_frames import Back, Call, LinkLost, Part, Refused, Sealed
 from .standing import PeerLost
 
 if TYPE_CHECKING:
+    from ...actors.kernel.cell import Cell
     from .sealed_frames import SecuredLink
     from .standing import Standing
 
@@ -111,14 +112,16 @@ class Letters(Actor):
     async def _ask_sealed(
         self,
         link: SecuredLink,
-        path: str,
+        replica: Cell,
         slot: str,
         part: Part,
         find: Callable[[], Awaitable[ActorRef[Any]]],
         failed: Callable[[HoldfastError], None],
         still: Callable[[], bool],
     ) -> bytes:
-        """Ask a brick over a secured link, which does again what has to be; `failed` hears when it is not there.
+        """Ask a brick of a replica over a secured link, which does again what has to be.
+
+        `failed` hears when it is not there.
 
         Raises:
             PeerLost: nobody waits any longer. What the brick has raised.
@@ -130,7 +133,7 @@ class Letters(Actor):
                 raise PeerLost("it does not count any more")
             try:
                 if not isinstance(said, Sealed):
-                    ref, out = standing.node.cell_at(f"{path}/protocol").ref, said
+                    ref, out = standing.node.cell_at(f"{replica.path}/protocol").ref, said
                 else:
                     ref = await find()
                     number, frame = tell_in_sheets(ref, said.frame, self._numbers)
@@ -143,7 +146,7 @@ class Letters(Actor):
                 raise
 
         try:
-            back = await link.call(path, slot, part, reach, still, standing.epoch, standing.config)
+            back = await link.call(replica.path, slot, part, reach, still, standing.epoch, standing.config)
         except LinkLost:
             raise PeerLost("it was replaced, or is gone") from None
         if back.kind == "reply":

@@ -24,6 +24,7 @@ from .sealed_frames import OpenNumbers, Part, Refused
 from .standing import PeerLost
 
 if TYPE_CHECKING:
+    from ...actors.kernel.cell import Cell
     from ...actors.kernel.ref import ActorRef
     from .sealed_frames import SecuredLink
     from .standing import Standing
@@ -197,7 +198,7 @@ class Posting(Letters):
         if standing.link is not None:
             if peer is None:
                 raise PeerLost("there is none")
-            sealed = self._ask_peer_sealed(standing.link, peer.path, message, body)
+            sealed = self._ask_peer_sealed(standing.link, peer, message, body)
             return codec.decode_reply(type(message), await sealed)  # type: ignore[no-any-return]
         while True:
             if peer is None or standing.other.cell is not peer:
@@ -229,17 +230,17 @@ class Posting(Letters):
             posted.close()
         return reply
 
-    async def _ask_peer_sealed(self, link: SecuredLink, peer: str, message: Message[Any], body: bytes) -> bytes:
+    async def _ask_peer_sealed(self, link: SecuredLink, peer: Cell, message: Message[Any], body: bytes) -> bytes:
         standing, part = self._standing, Part(message_name(type(message)), body)
 
         async def find() -> ActorRef[Any]:
-            return (await self._find_peer(peer)).ref
+            return (await self._find_peer(peer.path)).ref
 
         while True:
             try:
                 return await self._ask_sealed(
                     link, peer, self.slot, part, find, lambda error: standing.other.lose_brick(self.slot),
-                    lambda: standing.other.path == peer,
+                    lambda: standing.other.cell is peer,
                 )  # fmt: skip
             except NotFollowing:  # It is told soon that it follows.
                 await standing.other.changes(AGAIN)
@@ -255,14 +256,15 @@ class Posting(Letters):
         body = codec.encoder.encode(message)
         if standing.link is not None:
             errors: list[HoldfastError] = []
+            replica = standing.node.cell_at(path)
             part = Part(message_name(type(message)), body)
 
             async def find() -> ActorRef[Any]:
-                return (await self._find(path, slot, key)).ref
+                return (await self._find(replica.path, slot, key)).ref
 
             try:
                 back = await self._ask_sealed(
-                    standing.link, path, slot, part, find, errors.append, lambda: not errors
+                    standing.link, replica, slot, part, find, errors.append, lambda: not errors
                 )  # fmt: skip
             except PeerLost as lost:
                 standing.other.lose_brick(key)

@@ -141,6 +141,18 @@ class LinkLost(Exception):
     """Nobody waits for it any longer."""
 
 
+class MovedCertificates(Protocol):
+    """What a move of a protected actor needs of the links of its replicas."""
+
+    async def prepare(self) -> None:
+        """Have all that take part be certified under their new addresses. Raises HoldfastError."""
+        ...
+
+    async def settle(self, *, is_moved: bool) -> None:
+        """Have what is certified under the addresses where they are not be revoked. Raises HoldfastError."""
+        ...
+
+
 class SecuredLink(Protocol):
     """What replicas and groups need of a link."""
 
@@ -174,6 +186,14 @@ class SecuredLink(Protocol):
 
     async def ready(self) -> None:
         """Get all certificates. Raises HoldfastError."""
+        ...
+
+    def moved_certificates(self, address: str) -> MovedCertificates:
+        """What has to be certified before the protected actor goes to another address. For the root's end."""
+        ...
+
+    def readdress(self, address: str) -> None:
+        """Go on at another address of the protected actor, under the names that are certified there."""
         ...
 
     def close(self) -> None:

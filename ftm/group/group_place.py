@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from ...actors.control.orders_lane import QueuedOrder
     from ...checkpoint.home.switch import Switch
     from ...checkpoint.protocol import Live, TurnEnd
+    from ..bricks.sealed_frames import SecuredLink
     from ..model.mechanism import Mechanism
 
 LED_WITHIN = 60.0
@@ -578,6 +579,15 @@ class GroupPlace(Place):
         if verb == "bind" and self.group is not None:
             for name in self.group.membership.names:
                 bind(self.group.replicas, name, data)
+
+    def readdress(self, cell: Cell, was: str, now: str) -> None:
+        if self.link is not None:
+            self.link.readdress(cell.path)
+
+    @property
+    def link(self) -> SecuredLink | None:
+        """The root's end of the links to its replicas, if they are secured, and it lives."""
+        return None if self.group is None else self.group.replicas.link
 
     def is_steady(self, cell: Cell) -> bool:
         group = self.group

@@ -274,8 +274,8 @@ class SEC(Mechanism):
         enrols: Callable[[], list[str]] | None = None,
     ) -> SecuredLink:
         """This participant's end of its links."""
-        from ..sec.identity import LinkEnd
         from ..sec.link import Link
+        from ..sec.participants import LinkEnd
 
         return Link(LinkEnd(node, address, path, self, epoch, enrols))
 

@@ -265,6 +265,7 @@ class FromRecordedGroup(Leaving):
 
     def part(self) -> list[Item]:
         self.move.luggage.suspended = self._group.delivery.is_suspended
+        self.cell.extra().suspended = 0  # It is suspended where it goes, and not known as that already.
         return []
 
     def retire(self) -> None:

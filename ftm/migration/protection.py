@@ -12,7 +12,7 @@ from ...checkpoint.home.journal_home import JournalHome
 from ...checkpoint.places.far_parent import FarParent, SlotPlace
 from ...checkpoint.places.recorded_moves import ToRecordedWorker, leaving
 from ...supervision.respec import recipe_spec
-from ..group.group_place import protected_host
+from ..group.group_place import GroupPlace, protected_host
 from ..group.transient_homes import UNKEPT, TransientHome
 from .group_moves import AtRest, FromGroup, FromRecordedGroup, ToGroup
 from .subtree_moves import (
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
     from ...actors.migration.move import Entering
     from ...checkpoint.home.homes import Homes
+    from ..bricks.sealed_frames import MovedCertificates
 
 PART = ("ftm",)
 """What a group's parts are children of: no children of the actor's own."""
@@ -84,6 +85,13 @@ def rest_of_group(cell: Cell, timeout: float) -> Move:
         CannotMove: it is being recovered.
     """
     return Pause(cell, AtRest(cell), timeout)
+
+
+def moved_certificates(cell: Cell, now: str) -> MovedCertificates | None:
+    """What has to be certified before a protected actor goes to the address `now`; None: its links are not secured."""
+    place = cell.host.place
+    link = place.link if isinstance(place, GroupPlace) else None
+    return None if link is None else link.moved_certificates(now)
 
 
 def is_plain(cell: Cell) -> bool:

@@ -263,7 +263,7 @@ class FromSubtree(Leaving):
             more.bound = Bound(chosen.capacity, chosen.overflow)
         luggage.queue = unpack(self._worker, cell, told["queue"])
         luggage.owed.update(unpack_owed(self._worker, cell, told["owed"]))
-        luggage.waiting, self._held = self._held, []
+        luggage.waiting, self._held = [*unpack(self._worker, cell, told["waiting"]), *self._held], []
         self._keep_watches([(str(path), bool(for_good)) for path, for_good in told["watches"]])
         kind = self._spec.start.kind
         wanted = Wanted(NUMBER, message_name(kind), list(kind._topics), UNKEPT, chosen)
@@ -445,7 +445,8 @@ class ToSubtree(IntoSubtree):
             bound.waiting = deque()
         told = {
             "stash": pack(worker, cell, luggage.stash),
-            "queue": pack(worker, cell, [*luggage.queue, *luggage.waiting]),
+            "queue": pack(worker, cell, luggage.queue),
+            "waiting": pack(worker, cell, luggage.waiting),
             "owed": pack_owed(worker, luggage.owed),
             "timers": luggage.timers,
             "is_suspended": luggage.suspended,

@@ -132,10 +132,10 @@ class PlainChild:
             waiting, bound.waiting = list(bound.waiting), deque()
         old = part(cell)
         items, commands = sorted_out(cell)
-        queue = pack(guest, cell, (*items, *waiting))
+        queue, waiting = pack(guest, cell, items), pack(guest, cell, waiting)
         watches = self._hand_ties_over(cell)
         owed = [] if self._expected else pack_owed(guest, self._owed)
-        self._say("left", queue=queue, owed=owed, watches=watches)
+        self._say("left", queue=queue, waiting=waiting, owed=owed, watches=watches)
         respec(cell, Respec(**told["spec"]))
         guest.recovery.begins(cell.path)
         place = child_at_root(guest, cell.spec)
@@ -248,7 +248,7 @@ class PlainChild:
         guest.recovery.port_of(self._path).place = None
         cell.host = guest.node.ports.here
         bound = None if chosen is None else Bound(chosen.capacity, chosen.overflow)
-        queue, stash = unpack(guest, cell, told["queue"]), unpack(guest, cell, told["stash"])
+        queue, stash, waiting = (unpack(guest, cell, told[name]) for name in ("queue", "stash", "waiting"))
         commands = arrival.take_over(queue, stash, bound, suspended=bool(told["is_suspended"]))
         for number, key, _ in told["owed"]:
             self._owed[number].is_ours(key)
@@ -257,7 +257,7 @@ class PlainChild:
             Timer.unpacked(cell, message, max(0.0, left), interval or None, False)
         self._take_ties_over(cell, told)
         respec(cell, Respec([]))
-        let_come(cell, held)
+        let_come(cell, (*waiting, *held))
         obey_commands(cell, commands)
         if has_ended:
             lifecycle.ended(cell, arrival.other.extra().reason)

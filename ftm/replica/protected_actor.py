@@ -525,6 +525,8 @@ class Server(lifecycle.HerePlace):
 
     def readdress(self, cell: Cell, was: str, now: str) -> None:
         """Take the state down: what was handled before is not run again under another address."""
+        if self.standing.link is not None:
+            self.standing.link.readdress(self.standing.address)
         life = self.life
         if life is None or life.feed is not None or not self.points.tail:
             return

@@ -46,12 +46,16 @@ class GetCertificate(Message[bytes]):
 
 
 class Revoke(RuntimeOrder[int]):
-    """Revoke all certificates of a participant; the reply is how many that were. Its name is free for another key.
+    """Revoke the certificates of a participant; the reply is how many that were.
 
-    Who may enrol may revoke.
+    All of them, if nothing else is said: then its name is free for another key. Who may enrol may revoke.
     """
 
     name: str
+    after: int = 0
+    """Only those that were issued after the one with this serial number; 0: from the first one on."""
+    until: int = 0
+    """And not after the one with this serial number; 0: to the last one."""
 
 
 class GetRevocations(Message[bytes]):
@@ -151,9 +155,11 @@ class CertificationAuthority(Actor):
 
     @on(Revoke)
     def _revoke(self, message: Revoke) -> int:
-        valid = self._valid(message.name)
-        for serial, _, _ in valid:
-            self.revoked[serial] = self.ctx.now()
+        issued = [serial for serial, _, _ in self.issued.get(message.name, [])]
+        begin = issued.index(message.after) + 1 if message.after in issued else 0
+        end = issued.index(message.until) + 1 if message.until in issued else 0 if message.until else len(issued)
+        valid = {serial for serial, _, _ in self._valid(message.name)}.intersection(issued[begin:end])
+        self.revoked |= dict.fromkeys(valid, self.ctx.now())
         self._tell_all()
         return len(valid)
 

@@ -7,40 +7,23 @@ import hashlib
 import os
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
-from ...actors.errors import ActorStopped, HoldfastError
+from ...actors.errors import HoldfastError
 from ...actors.kernel.message import Message
 from ..bricks.sealed_frames import FrameRefused
-from ..model.mechanism import MechanismRefused
 from .authority import Enrol, GetCertificate, GetRevocations, GetRoot, Revoke
-from .certificates import MOST_NAME, Trust, about, make_request, public_of
+from .certificates import Trust, about, make_request, public_of
 from .handshake import Participant
 from .keys import Secret, SigningKey, raw_public, read_own, write_own
+from .moved_certificates import CertifiedMove
+from .participants import LinkEnd, ask_authority, certified, key_file
 from .sec_errors import UNTRUSTED, EnrolmentRefused, NoCertificate, Rejected, UnsafeKeyFile
 from .session import SessionLimits
 
-if TYPE_CHECKING:
-    from ...actors.kernel.node import Node
-    from ..mechanisms.sec import SEC
-
 AUTHORITY_WITHIN = 5.0
 """Seconds in which the authority has to answer."""
-
-
-def certified(path: str) -> str:
-    """The name of a participant in certificates: its address; of a long one, its end and a digest."""
-    if len(path) <= MOST_NAME:
-        return path
-    digest = hashlib.sha256(path.encode()).hexdigest()[:32]
-    return f"{digest}…{path[-(MOST_NAME - 33) :]}"
-
-
-def key_file(folder: str, path: str) -> Path:
-    """Where the key of a participant is."""
-    return Path(folder) / f"{hashlib.sha256(path.encode()).hexdigest()[:32]}.key"
 
 
 def root_file(folder: str, authority: str) -> Path:
@@ -48,33 +31,18 @@ def root_file(folder: str, authority: str) -> Path:
     return Path(folder) / f"{hashlib.sha256(authority.encode()).hexdigest()[:32]}.root"
 
 
-class LinkEnd(NamedTuple):
-    """Whose end of secured links it is."""
-
-    node: Node
-    """Of this process."""
-    address: str
-    """The protected actor's."""
-    path: str
-    """This participant's."""
-    mechanism: SEC
-    """Its settings."""
-    epoch: Callable[[], int]
-    """The present one."""
-    enrols: Callable[[], list[str]] | None = None
-    """Of whom this one orders certificates; None: it is enrolled by another."""
-
-
 class Identity(Secret):
     """One participant. Its key and certificate are got when they are needed, and renewed in time."""
 
     def __init__(self, end: LinkEnd) -> None:
         self.mechanism, self.path = end.mechanism, end.path
-        self._node, self._address, self._epoch, self._enrols = end.node, end.address, end.epoch, end.enrols
+        self._life = time.monotonic_ns()
+        self._end, self._node, self._address, self._epoch = end, end.node, end.address, end.epoch
+        self._enrols = end.enrols
         self.rejected: Counter[str] = Counter()
         self._me: Participant | None = None
         self._lock = asyncio.Lock()
-        self._enrolled: set[str] = set()
+        self._enrolled: set[str] = set()  # by address
 
     async def ready(self) -> None:
         """Get all certificates.
@@ -86,8 +54,10 @@ class Identity(Secret):
 
     async def _identity(self) -> Participant:
         async with self._lock:
-            if self._me is None or self._is_due(self._me.certificate):
-                self._me = await self._identify()
+            while self._me is None or self._is_due(self._me.certificate):
+                path, me = self.path, await self._identify()
+                if path == self.path:  # Else it has moved meanwhile.
+                    self._me = me
             me = self._me
         try:
             me.take_list(await self._authority(GetRevocations()))
@@ -99,7 +69,7 @@ class Identity(Secret):
         return me
 
     async def _identify(self) -> Participant:
-        settings, old = self.mechanism, self._me
+        settings = self.mechanism
         if self._enrols is not None:
             root = await self._authority(GetRoot())
             self._check_root(root)
@@ -112,14 +82,19 @@ class Identity(Secret):
         key = SigningKey.from_file(key_file(settings.folder, self.path))
         certificate = await self._authority(GetCertificate(certified(self.path)))
         limits = SessionLimits(settings.rotate_messages, settings.rotate_seconds, lifetime=settings.lifetime)
-        life = time.monotonic_ns() if old is None else old.incarnation
         trust = Trust(root, needs_list=True)  # Who cannot know whether somebody was revoked believes nobody.
         trust.take_list(await self._authority(GetRevocations()), time.time())
         me = Participant(
-            key, certificate, trust, incarnation=life, epoch=self._epoch(), suites=settings.suites, limits=limits
+            key, certificate, trust, incarnation=self._life, epoch=self._epoch(), suites=settings.suites, limits=limits
         )
         me.rejected = self.rejected
         return me
+
+    def moved_certificates(self, address: str) -> CertifiedMove:
+        """What has to be certified before the protected actor goes to another address."""
+        assert self._enrols is not None
+        paths = [(path, address + path[len(self._address) :]) for path in (self.path, *self._enrols())]
+        return CertifiedMove(self._end, paths, self._enrolled)
 
     def _check_root(self, root: bytes) -> None:
         """The authority must be the one that everybody knows (A70)."""
@@ -136,29 +111,23 @@ class Identity(Secret):
         try:
             certificate = await self._authority(GetCertificate(name))
             if public_of(certificate) == raw_public(key.public) and not self._is_due(certificate):
-                self._enrolled.add(name)
+                self._enrolled.add(path)
                 return
         except NoCertificate:
-            if name in self._enrolled:
+            if path in self._enrolled:
                 return
         request = make_request(key, name)
         try:
             await self._authority(Enrol(request))
         except EnrolmentRefused:
-            if not self.mechanism.is_per_start or name in self._enrolled:
+            if not self.mechanism.is_per_start or path in self._enrolled:
                 raise
             await self._authority(Revoke(name))  # It was that of an earlier start.
             await self._authority(Enrol(request))
-        self._enrolled.add(name)
+        self._enrolled.add(path)
 
     async def _authority(self, message: Message[Any], within: float = AUTHORITY_WITHIN) -> Any:
-        where = self.mechanism.authority
-        try:
-            return await self._node.cell_at(where).ref.ask(message, timeout=within)
-        except ActorStopped as error:
-            raise MechanismRefused(
-                "sec", f"no authority lives at {where}: start a CertificationAuthority there"
-            ) from error
+        return await ask_authority(self._node, self.mechanism.authority, message, within)
 
     def _refuse(self, reason: str) -> None:
         self._node.emit(FrameRefused(self._address, self.path, reason, self.rejected[reason]))

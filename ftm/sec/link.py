@@ -36,8 +36,9 @@ from ..bricks.sealed_frames import (
 from .authority import AwaitRevocations
 from .certificates import HEARTBEAT
 from .handshake import Participant, Response
-from .identity import Identity, LinkEnd, certified, root_file
+from .identity import Identity, root_file
 from .keys import Secret
+from .participants import LinkEnd, certified
 from .sec_errors import (
     CLOSED,
     MALFORMED,
@@ -79,10 +80,10 @@ class Stream:
 class Partner(Secret):
     """Another participant, as this one knows it."""
 
-    __slots__ = ("inward", "life", "lock", "name", "outward", "pump", "queue", "session")
+    __slots__ = ("inward", "life", "lock", "name", "outward", "path", "pump", "queue", "session")
 
     def __init__(self, path: str) -> None:
-        self.name = certified(path)
+        self.path, self.name = path, certified(path)
         self.session: Session | None = None
         self.lock = asyncio.Lock()
         self.outward: dict[str, OpenNumbers] = {}
@@ -97,13 +98,43 @@ class Link(Identity):
 
     def __init__(self, end: LinkEnd) -> None:
         super().__init__(end)
-        self._proxy = certified(f"{end.address}/ftm/proxy")
-        self._replicas = frozenset(certified(f"{end.address}/ftm/r{number}") for number in range(1, MOST_REPLICAS + 1))
+        self._know_names(end.address)
         self._partners: dict[str, Partner] = {}
         self._sessions: dict[bytes, Session] = {}
         self._responses: dict[bytes, Response] = {}
         self._is_closed = False
         self._watcher: asyncio.Task[None] | None = None
+
+    # -- where it is ------------------------------------------------------------------------------------------------
+
+    def _know_names(self, address: str) -> None:
+        """Know by their names in certificates those who take part at an address."""
+        self._proxy = certified(f"{address}/ftm/proxy")
+        below = (f"{address}/ftm/r{number}" for number in range(1, MOST_REPLICAS + 1))
+        self._replicas = {certified(path): path for path in below}
+
+    def readdress(self, address: str) -> None:
+        """Go on at another address, under the names that are certified there; sessions are agreed on anew.
+
+        What is on its way is sealed anew and sent again, and what has come before is known: it is handled once.
+        """
+        was, self._address = self._address, address
+        self._know_names(address)
+        self.path, self._me = address + self.path[len(was) :], None
+        self._enrolled = {address + path[len(was) :] for path in self._enrolled}
+        self._end_sessions()
+        for partner in self._partners.values():
+            partner.path = address + partner.path[len(was) :]
+            partner.name = certified(partner.path)
+        self._partners = {partner.name: partner for partner in self._partners.values()}
+
+    def _end_sessions(self) -> None:
+        for session in self._sessions.values():
+            session.close()
+        self._sessions.clear()
+        self._responses.clear()
+        for partner in self._partners.values():
+            partner.session = None
 
     # -- revocation -------------------------------------------------------------------------------------------------
 
@@ -145,20 +176,22 @@ class Link(Identity):
             found = self._partners[name] = Partner(path)
         return found
 
-    async def _session(self, partner: Partner, path: str, reach: Reach) -> Session:
+    async def _session(self, partner: Partner, reach: Reach) -> Session:
         """A session of this epoch and these lives."""
         epoch = self._epoch()
         async with partner.lock:
             session = partner.session
             if session is not None and session.is_open and session.epoch == epoch:
                 return session
-            if self._enrols is not None and partner.name not in self._enrolled:
-                await self._enrol(path)
+            if self._enrols is not None and partner.path not in self._enrolled:
+                await self._enrol(partner.path)
             me = await self._identity()
             begun = me.begin(partner.name)
             answer = await reach(Greet(begun.hello), FIRST_WAIT)
             session, finish = begun.finish(answer)
             await reach(Agree(digest_of(begun.hello), finish), FIRST_WAIT)
+            if me is not self._me:  # Agreed on under another name, or another certificate.
+                raise Refused(path=self.path, reason=CLOSED)
             self._keep(partner, session)
             return session
 
@@ -225,10 +258,9 @@ class Link(Identity):
         except Rejected as error:
             raise self._refused(error.reason) from None
         name = session.peer.name
-        partner = self._partners.get(name)
-        if partner is None:
-            partner = self._partners[name] = Partner(name)
-        self._keep(partner, session)
+        if name != self._proxy and name not in self._replicas:  # It was greeted where we were before.
+            raise self._refused(WRONG_PEER, counts=True)
+        self._keep(self._partner(self._replicas.get(name, f"{self._address}/ftm/proxy")), session)
 
     # -- out --------------------------------------------------------------------------------------------------------
 
@@ -239,12 +271,12 @@ class Link(Identity):
         partner = self._partner(path)
         partner.queue.append((self._part(message), reach, still))
         if partner.pump is None:
-            partner.pump = self._node.loop.create_task(self._send_all(partner, path), context=contextvars.Context())
+            partner.pump = self._node.loop.create_task(self._send_all(partner), context=contextvars.Context())
 
     def _part(self, message: Message[Any]) -> Part:
         return Part(message_name(type(message)), self._node.codec.encode(message, self._address))
 
-    async def _send_all(self, partner: Partner, path: str) -> None:
+    async def _send_all(self, partner: Partner) -> None:
         queue = partner.queue
         try:
             while queue and not self._is_closed:
@@ -255,7 +287,7 @@ class Link(Identity):
                     parts.append(part)
                     size += len(part.body)
                 try:
-                    await self._call(partner, path, TELLS, parts, reach, still)
+                    await self._call(partner, TELLS, parts, reach, still)
                 except LinkLost:
                     continue
         finally:
@@ -269,12 +301,11 @@ class Link(Identity):
         Raises:
             LinkLost: nobody waits for it any longer.
         """
-        return await self._call(self._partner(path), path, stream, [part], reach, still, epoch, config)
+        return await self._call(self._partner(path), stream, [part], reach, still, epoch, config)
 
     async def _call(
         self,
         partner: Partner,
-        path: str,
         name: str,
         parts: list[Part],
         reach: Reach,
@@ -289,7 +320,7 @@ class Link(Identity):
             while still() and not self._is_closed:
                 session: Session | None = None
                 try:
-                    session = await self._session(partner, path, reach)
+                    session = await self._session(partner, reach)
                     text = msgspec.msgpack.encode(Call(name, number, numbers.floor, parts, epoch, config))
                     reply = await reach(Sealed(session.seal(text, CALL)), wait)
                     opened = session.open(reply, BACK + number.to_bytes(8, "big"))
@@ -306,7 +337,7 @@ class Link(Identity):
                     pass  # It is between two lives, or at its end, which whoever asks is told.
                 await asyncio.sleep(pause)
                 pause = min(2 * pause, LONGEST_PAUSE)
-            raise LinkLost(path)
+            raise LinkLost(partner.path)
         finally:
             numbers.close(number)
 
@@ -388,12 +419,8 @@ class Link(Identity):
         self._is_closed = True
         if self._watcher is not None:
             self._watcher.cancel()
-        for session in self._sessions.values():
-            session.close()
-        self._sessions.clear()
-        self._responses.clear()
+        self._end_sessions()
         for partner in self._partners.values():
-            partner.session = None
             partner.queue.clear()
 
 

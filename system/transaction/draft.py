@@ -400,7 +400,7 @@ class Draft:
         seen: set[DraftPlace] = set()
         for place in self.staying():
             seen.add(place)
-            for port in place.spec.bindings if place.spec is not None else ():
+            for port in place.spec.bindings.keys() - place.spec.late if place.spec is not None else ():
                 target = (place.bindings if place.is_planned else place.was.bound).get(port)
                 if target is not None and target not in seen:
                     both = next((above for above in target.upwards() if above in set(place.upwards())), self.root)

@@ -63,7 +63,9 @@ def check_handing(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> None:
         )
     if is_far(new):
         for one in (recipe_specs(new.cell) or ()) if new.cell is not None else ():
-            if port := next((port for port, path in one.bindings.items() if cell.node.find(path) is cell), ""):
+            if port := next(
+                (port for port in one.bindings.keys() - one.late if cell.node.find(one.bindings[port]) is cell), ""
+            ):
                 why = f"it is started before the one to which its spec binds {port!r}"
                 raise wrong(f"{new.path}/{one.id}", f"{why}: a restart of its supervisor would fail")
         if place.name in new.was.children:

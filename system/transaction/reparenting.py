@@ -8,14 +8,14 @@ import functools
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, ClassVar
 
-from ...actors.errors import HoldfastError
+from ...actors.errors import ControlFailed, HoldfastError
 from ...checkpoint.home.recorded_home import switch_of
 from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import SnapshotNow
 from ...supervision.children import STOPPED, UP
 from ...supervision.respec import recipe_spec
 from .arrangement import busy, child_of
-from .draft import Draft, DraftPlace, Target, is_elsewhere, rules
+from .draft import Draft, DraftPlace, Target, is_elsewhere
 from .handing import Handing, check_handing, is_far
 from .operation import Operation, text_of, wrong
 from .relocation import MOVED_WITHIN, Gated
@@ -23,6 +23,7 @@ from .structure import check_child, check_not_uniform
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
+    from ...ftm.bricks.sealed_frames import MovedCertificates
     from ..system import ActorSystem
 
 
@@ -38,6 +39,7 @@ class Reparent(Operation):
         self._root: DraftPlace | None = None
         self._asked: dict[Switch, int] = {}  # who was asked for a snapshot, behind which turn
         self._rests: dict[DraftPlace, Gated] = {}
+        self._certificates: dict[DraftPlace, MovedCertificates] = {}
         self._handing: Handing | None = None  # by the first step that moves this actor, to where the last one wants it
 
     @property
@@ -83,12 +85,44 @@ class Reparent(Operation):
         if self._found is None or self._handing is None or not self._place.has_moved:
             return
         await self._handing.prepare(system)
+        await self._certify(system)
         waits = bool(self._others_settle(system)) or bool(self._unsteady(system))
         for one, rest in self._resting(system):
             if waits:  # Perhaps for what those here have to answer.
                 await rest.give_up()
             else:
                 await rest.reach(system, functools.partial(system._moves.pause, one.living(system.node), MOVED_WITHIN))
+
+    async def _certify(self, system: ActorSystem) -> None:
+        """Have those whose links are secured be certified where they go; requests flow meanwhile."""
+        for one in addressed(self._place):
+            cell = one.now(system.node) if one.is_protected and not one.is_planned else None
+            if cell is None or (one is not self._place and one.has_moved):  # That is another step's.
+                continue
+            if one not in self._certificates:
+                from ...ftm.migration.protection import moved_certificates
+
+                certificates = moved_certificates(cell, one.path)
+                if certificates is None:
+                    continue
+                self._certificates[one] = certificates
+            await self._certificates[one].prepare()
+
+    async def _settle_certificates(self, *, is_moved: bool) -> None:
+        """Have what is certified under the addresses where they are not be revoked.
+
+        Raises:
+            ControlFailed: of whom it could not.
+        """
+        failed = list[str]()
+        for one, certificates in self._certificates.items():
+            try:
+                await certificates.settle(is_moved=is_moved)
+            except HoldfastError as error:
+                failed.append(f"{one.path}: {error}")
+        if failed:
+            why = "certificates under the addresses where its replicas are not could not be revoked"
+            raise ControlFailed(self.target, self.verb, f"{why}: {'; '.join(failed)}")
 
     def _resting(self, system: ActorSystem) -> list[tuple[DraftPlace, Gated]]:
         """Those that run turns again, of the actor and all below it, and how each comes to rest."""
@@ -157,18 +191,24 @@ class Reparent(Operation):
             rest.open()
 
     async def finish(self, system: ActorSystem) -> None:
-        if self._handing is not None:
-            await self._handing.finish(system)
-        for rest in self._rests.values():
-            if rest.task is not None:
-                with contextlib.suppress(HoldfastError):  # Its life has ended: the next one begins where it is now.
-                    await asyncio.shield(rest.task)
+        try:
+            if self._handing is not None:
+                await self._handing.finish(system)
+            for rest in self._rests.values():
+                if rest.task is not None:
+                    with contextlib.suppress(HoldfastError):  # Its life has ended: the next one begins where it is now.
+                        await asyncio.shield(rest.task)
+        finally:
+            await self._settle_certificates(is_moved=True)
 
     async def release(self, system: ActorSystem) -> None:
-        for rest in self._rests.values():
-            await rest.give_up()
-        if self._handing is not None:
-            await self._handing.release(system)
+        try:
+            for rest in self._rests.values():
+                await rest.give_up()
+            if self._handing is not None:
+                await self._handing.release(system)
+        finally:
+            await self._settle_certificates(is_moved=False)
 
 
 def addressed(place: DraftPlace) -> Iterator[DraftPlace]:
@@ -186,8 +226,6 @@ def check_movable(place: DraftPlace) -> None:
         SpecError: something that cannot be told knows it by its address.
     """
     cell, spec = place.cell, place.spec
-    if place.is_protected and cell is not None and any(one.secures for one in rules().layers_of(cell.spec.mechanism)):
-        raise wrong(place.path, "its replicas are certified under its address: detach the mechanism that secures them")
     if place.is_supervisor and (
         (spec is not None and spec.isolation == "process") or (cell is not None and is_elsewhere(cell))
     ):

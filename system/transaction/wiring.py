@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.errors import ActorStopped, NameTaken, NoSuchActor, type_name
 from ...actors.kernel.cell import RUNNING
+from ...supervision.respec import rebind
 from .draft import Draft, DraftPlace, Target
 from .operation import Operation, text_of, wrong
 
@@ -52,7 +53,9 @@ class Bind(Operation):
     def commit(self, system: ActorSystem) -> None:
         assert self._owner is not None
         assert self._bound is not None
-        system.node.bind(self._owner.living(system.node), self._port, self._bound.living(system.node))
+        owner, target = self._owner.living(system.node), self._bound.living(system.node)
+        system.node.bind(owner, self._port, target)
+        rebind(owner, self._port, target.path)
 
 
 class Unbind(Operation):
@@ -75,8 +78,6 @@ class Unbind(Operation):
         owner.check_lived_in(system.node)
         if self._port not in owner.bindings:
             raise wrong(owner.path, f"its binding {self._port!r} points nowhere already, as far as is known here")
-        if owner.spec is not None and self._port in owner.spec.bindings:
-            raise wrong(owner.path, f"its spec binds {self._port!r}: a restart would bind it again")
         if owner.cell is not None and not owner.cell.host.place.is_here:
             raise wrong(owner.path, "it lives in another process, which keeps a binding: bind it to somebody else")
         del owner.bindings[self._port]
@@ -88,8 +89,10 @@ class Unbind(Operation):
 
     def commit(self, system: ActorSystem) -> None:
         assert self._owner is not None
-        more = self._owner.living(system.node).extra()
+        owner = self._owner.living(system.node)
+        more = owner.extra()
         more.bindings.pop(self._port, None)
+        rebind(owner, self._port, None)
         if more.turn is not None and more.turn.rebinds is not None:
             more.turn.rebinds.pop(self._port, None)
 

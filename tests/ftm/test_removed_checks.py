@@ -657,8 +657,8 @@ CHECKS = {
     ),
     "what waits in the mailbox of a life that leaves its process goes along": Check(
         "ftm/migration/unrecorded_in_worker.py",
-        "        queue = pack(guest, cell, (*items, *waiting))\n",
-        "        queue: list[Any] = []\n",
+        "        queue, waiting = pack(guest, cell, items), pack(guest, cell, waiting)\n",
+        "        queue, waiting = list[Any](), list[Any]()\n",
         "tests/ftm/test_subtree_handing.py",
         "test_what_waits_goes_along",
     ),

@@ -371,7 +371,7 @@ def test_at_the_end_only_the_keys_of_the_start_are_removed(tmp_path: Path) -> No
     program = """
 import pathlib, sys
 import holdfast as hf
-from holdfast.ftm.sec.identity import key_file
+from holdfast.ftm.sec.participants import key_file
 from holdfast.ftm.sec.keys import SigningKey
 folder = pathlib.Path(hf.SEC("/app/authority").folder)
 SigningKey.from_file(key_file(str(folder), "/app/c"))
@@ -393,7 +393,7 @@ def test_keys_of_killed_processes_are_removed_by_the_next_that_has_some(tmp_path
     """Of none that lives, and nothing that a process of another machine, or somebody else, has put there."""
     program = """
 import holdfast as hf
-from holdfast.ftm.sec.identity import key_file
+from holdfast.ftm.sec.participants import key_file
 from holdfast.ftm.sec.keys import SigningKey
 sec = hf.SEC("/app/authority")
 input()

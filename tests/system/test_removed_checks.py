@@ -14,6 +14,9 @@ MOVED = "tests/system/test_readdressed.py"
 TIES = "tests/system/test_moved_ties.py"
 REPLICAS = "tests/system/test_moved_replicas.py"
 FAR = "tests/migration/test_far_moves.py"
+BOUNDED = "tests/migration/test_bounded_moves.py"
+AWAITED = "tests/supervision/test_awaited.py"
+CERTIFIED = "tests/system/test_moved_certificates.py"
 AT_ODDS = "tests/migration/test_moves_at_odds.py"
 
 CHECKS = {
@@ -409,13 +412,6 @@ CHECKS = {
         REPLICAS,
         "test_what_a_replica_says",
     ),
-    "certified replicas are not moved": Check(
-        "system/transaction/reparenting.py",
-        "    if place.is_protected and cell is not None and any(",
-        "    if False and any(",
-        REPLICAS,
-        "test_certified",
-    ),
     "two looks at threads are alike": Check(
         "testing/threads.py",
         "        if not at_work and before:\n",
@@ -443,6 +439,204 @@ CHECKS = {
         "other.state != STARTING",
         COMMIT,
         "test_who_is_stopped_stays_so",
+    ),
+    "what a transaction has bound is in the spec": Check(
+        "system/transaction/wiring.py",
+        "        rebind(owner, self._port, target.path)\n",
+        "        pass\n",
+        KEPT,
+        "test_a_binding_that_a_transaction_has_made_outlives_the_supervisor and other and task",
+    ),
+    "what a transaction has unbound is not in the spec": Check(
+        "system/transaction/wiring.py",
+        "        rebind(owner, self._port, None)\n",
+        "        pass\n",
+        KEPT,
+        "test_what_a_transaction_has_unbound",
+    ),
+    "nobody waits for whom a transaction has bound it to": Check(
+        "supervision/awaited.py",
+        "            if port in one.spec.late or node.find(path) is not None:\n",
+        "            if node.find(path) is not None:\n",
+        KEPT,
+        "test_a_binding_that_a_transaction_has_made_outlives_the_supervisor and last and task",
+    ),
+    "a tree is not refused for what transactions have bound": Check(
+        "system/transaction/draft.py",
+        "            for port in place.spec.bindings.keys() - place.spec.late if",
+        "            for port in place.spec.bindings.keys() if",
+        KEPT,
+        "test_what_is_bound_to_a_later_one_hinders_no_transaction",
+    ),
+    "the next root does not wait for what transactions have bound": Check(
+        "system/specification.py",
+        "for port, path in one.bindings.items() if port not in one.late]\n",
+        "for port, path in one.bindings.items()]\n",
+        KEPT,
+        "test_what_is_bound_to_a_later_one_hinders_no_transaction",
+    ),
+    "the next root has the flags of the last one": Check(
+        "system/system.py",
+        "Start(Supervisor, (flags, ()))",
+        "Start(Supervisor, (options.flags, ()))",
+        KEPT,
+        "test_the_program_has_the_last_word",
+    ),
+    "the next root has the order of the last one": Check(
+        "system/specification.py",
+        "            supervisor._children = in_order(supervisor._listed(), self._order)\n",
+        "            pass\n",
+        KEPT,
+        "test_the_order_of_the_root",
+    ),
+    "flags of the program that are new are newer": Check(
+        "system/specification.py",
+        "        if digest == _digest(pack_data(declared, address)):\n",
+        "        if True:\n",
+        KEPT,
+        "test_the_program_has_the_last_word",
+    ),
+    "the next root starts its children as the program does": Check(
+        "system/specification.py",
+        "        declared = [by_path[path] for path in self._declared if path in by_path]\n",
+        "        declared = [one for one in by_path.values() if one.path in self._declared]\n",
+        KEPT,
+        "test_the_order_of_the_root",
+    ),
+    "a start waits for those that it is bound to": Check(
+        "supervision/supervisor.py",
+        "            await self._await_bound(row, one)\n",
+        "            pass\n",
+        AWAITED,
+        "test_two_that_are_killed_at_once",
+    ),
+    "a start that waits too long fails": Check(
+        "supervision/supervisor.py",
+        "loop.time() - since >= seconds:",
+        "False:",
+        AWAITED,
+        "test_it_waits_no_longer",
+    ),
+    "starts that wait for each other are told": Check(
+        "supervision/awaited.py",
+        "                if wait == first:\n",
+        "                if False:\n",
+        AWAITED,
+        "test_two_that_wait_for_each_other",
+    ),
+    "nobody waits for one that is started behind it": Check(
+        "supervision/awaited.py",
+        "            if circle is None or len(circle) == 1:\n",
+        "            if circle is None:\n",
+        AWAITED,
+        "test_who_is_bound_to_one_that_is_started_behind_it",
+    ),
+    "nobody waits for one that was stopped": Check(
+        "supervision/awaited.py",
+        "            if one is None or (one.row is None and one.state in (STOPPED, STOPPING)):\n",
+        "            if one is None:\n",
+        AWAITED,
+        "test_nobody_waits_for_one_that_was_stopped",
+    ),
+    "a child that was stopped while it waited is not started": Check(
+        "supervision/supervisor.py",
+        "            if one.row is not row:\n                return None\n            await self._come_up(one)\n",
+        "            await self._come_up(one)\n",
+        AWAITED,
+        "test_one_that_waits_can_be_stopped",
+    ),
+    "who waits for room waits on at the root": Check(
+        "ftm/migration/subtree_moves.py",
+        '        luggage.queue = unpack(self._worker, cell, told["queue"])\n',
+        '        luggage.queue = unpack(self._worker, cell, [*told["queue"], *told.pop("waiting")])\n'
+        '        told["waiting"] = []\n',
+        BOUNDED,
+        "test_a_suspended_actor and plain and below",
+    ),
+    "who waits for room waits on in the process of its supervisor": Check(
+        "ftm/migration/unrecorded_in_worker.py",
+        "        commands = arrival.take_over(queue, stash, bound,",
+        "        queue, waiting = [*queue, *waiting], list[Any]()\n"
+        "        commands = arrival.take_over(queue, stash, bound,",
+        BOUNDED,
+        "test_a_suspended_actor and plain and below",
+    ),
+    "who was suspended in a group is held where it goes": Check(
+        "ftm/migration/group_moves.py",
+        "        self.cell.extra().suspended = 0  # It is",
+        "        pass  # It is",
+        BOUNDED,
+        "test_a_suspended_actor and plain and task",
+    ),
+    "replicas are certified where they go before they go": Check(
+        "system/transaction/reparenting.py",
+        "        await self._certify(system)\n",
+        "        pass\n",
+        CERTIFIED,
+        "test_it_is_certified_at_its_new_address",
+    ),
+    "what was certified for the old address is revoked": Check(
+        "ftm/sec/moved_certificates.py",
+        "                    await self._ask(Revoke(certified(was)), SETTLED_WITHIN)\n",
+        "                    pass\n",
+        CERTIFIED,
+        "test_an_old_certificate",
+    ),
+    "what others had at the new address is revoked": Check(
+        "ftm/sec/moved_certificates.py",
+        "                await self._ask(Revoke(name, until=serial), SETTLED_WITHIN)\n",
+        "                pass\n",
+        CERTIFIED,
+        "test_two_that_exchange",
+    ),
+    "what others have is not revoked with what is given up": Check(
+        "ftm/sec/moved_certificates.py",
+        "                await self._ask(Revoke(name, after=serial), SETTLED_WITHIN)\n",
+        "                await self._ask(Revoke(name), SETTLED_WITHIN)\n",
+        CERTIFIED,
+        "test_two_that_exchange",
+    ),
+    "who has come to the old address keeps its certificates": Check(
+        "ftm/sec/moved_certificates.py",
+        "                if not self._is_taken(was):",
+        "                if True:",
+        CERTIFIED,
+        "test_two_that_exchange",
+    ),
+    "nobody who lives there is robbed of its name": Check(
+        "ftm/sec/moved_certificates.py",
+        "            if not self._settings.is_per_start or self._is_taken(path):\n",
+        "            if False:\n",
+        CERTIFIED,
+        "test_a_name_that_belongs_to_another_key",
+    ),
+    "who was revoked is certified nowhere else": Check(
+        "ftm/sec/moved_certificates.py",
+        "(was in self._enrolled and not await self._newest(certified(was)))",
+        "False",
+        CERTIFIED,
+        "test_who_was_revoked",
+    ),
+    "the sessions of before end with the move": Check(
+        "ftm/sec/link.py",
+        "for path in self._enrolled}\n        self._end_sessions()\n",
+        "for path in self._enrolled}\n",
+        CERTIFIED,
+        "test_it_is_certified_at_its_new_address",
+    ),
+    "the same life speaks behind a move: nothing is handled twice": Check(
+        "ftm/sec/identity.py",
+        "key, certificate, trust, incarnation=self._life,",
+        "key, certificate, trust, incarnation=time.monotonic_ns(),",
+        "tests/ftm/sec/test_link.py",
+        "test_what_is_on_its_way_when_it_moves",
+    ),
+    "no session is kept that was agreed on under another name": Check(
+        "ftm/sec/link.py",
+        "            if me is not self._me:  # Agreed",
+        "            if False:  # Agreed",
+        "tests/ftm/sec/test_link.py",
+        "test_a_hand_shake_that_a_move_comes_into",
     ),
     "a name is not taken from its new holder": Check(
         "system/transaction/arrangement.py",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import os
 import signal
 import sys
@@ -54,9 +55,8 @@ def shape(system: hf.ActorSystem) -> dict[str, Any]:
         actor: Any = cell.actor
         if isinstance(actor, hf.Supervisor):
             children = [(name, one.state, one.spec.start.kind) for name, one in actor._children.items()]
-            if cell is root:
-                children.sort(key=lambda one: one[0])  # Their order is that in which the program starts them.
-            found[cell.path] = (actor._flags if cell is not root else None, children)
+            below = [name for name in cell.children or () if name != "recovery"]  # It comes with the first home.
+            found[cell.path] = (actor._flags, children, below)
             waiting += (cell.children or {}).values()
         else:
             bindings = {} if cell.more is None else {port: to.path for port, to in cell.more.bindings.items()}
@@ -77,6 +77,8 @@ def much(change: hf.Change) -> None:
     change.replace_state("/app/right/s", lambda state: plus(1000, state))
     change.stop("/app/right/d")
     change.add("/app", hf.supervisor("top", children=[counter("y", recovery=RECORDED)]))
+    change.reorder("/app", ["top", "right"])
+    change.intensity("/app", 88, 8.0)
 
 
 def move(change: hf.Change) -> None:
@@ -94,6 +96,12 @@ CHANGES: dict[str, Callable[[hf.Change], object]] = {
     "code": lambda change: change.replace_code("/app/left/r", Double),
     "process": lambda change: change.isolation("/app/left/r", "process"),
     "at the top": lambda change: change.add("/app", counter("x")),
+    "bind": lambda change: change.bind("/app/right/client", "peer", "/app/right/d"),
+    "bind to a later one": lambda change: change.bind("/app/right/client", "peer", "/app/right/s"),
+    "unbind": lambda change: change.unbind("/app/right/client", "peer"),
+    "flags of the root": lambda change: change.intensity("/app", 77, 7.0),
+    "strategy of the root": lambda change: change.strategy("/app", "rest_for_one"),
+    "order at the top": lambda change: change.reorder("/app", ["right", "left"]),
     "to the top": lambda change: change.move("/app/left/a", "/app"),
     "much": much,
 }
@@ -129,6 +137,8 @@ async def test_a_transaction_on_top_of_another_one_is_kept_too(tmp_path: Path) -
     async with program(tmp_path / "store", fresh=True) as system:
         async with system.transaction(timeout=IN_TIME) as change:
             change.remove("/app/a")
+            change.intensity("/app", 3, 5.0)  # No child that begins afresh takes back what the root was given.
+            change.reorder("/app", ["left", "right"])
         assert shape(system) == before
     async with program(tmp_path / "store") as system:
         assert shape(system) == before
@@ -392,3 +402,213 @@ async def test_a_root_that_is_killed_comes_back_as_the_old_specification_or_the_
         assert children == [["a", "b", "c", "r"], ["d", "client", "s"]]
         assert amounts == (0, 600)
         assert kind is Counter
+
+
+# -- bindings ---------------------------------------------------------------------------------------------------------
+
+BOUND: dict[str, dict[str, Any]] = {
+    "task": {},
+    "process": {"isolation": "process"},
+    "recorded": {"recovery": RECORDED},
+    "protected": {"mechanism": PBR()},
+}
+
+
+def above(path: str, **options: Any) -> hf.ChildSpec:
+    """A supervisor that has a client, bound to a counter outside, and one that comes behind it."""
+    client = hf.child("client", hf.start(Client), bindings={"peer": path}, **options)
+    return hf.supervisor("above", intensity=9, children=[counter("first"), client, counter("last", 300)])
+
+
+async def restarted(system: hf.ActorSystem, path: str, below: str) -> hf.ActorRef[Client]:
+    """The supervisor at an address has been restarted: one of those below it in its next life."""
+    before = system.node.find(below)
+    system.ref(path, hf.Actor).kill()
+    async with asyncio.timeout(IN_TIME):
+        while (cell := system.node.find(below)) in (None, before) or cell.state != "running":
+            await asyncio.sleep(0.002)
+    return hf.ActorRef(cell)
+
+
+@pytest.mark.parametrize("to", ["/app/other", "/app/above/first", "/app/above/last"])
+@pytest.mark.parametrize("kind", list(BOUND))
+async def test_a_binding_that_a_transaction_has_made_outlives_the_supervisor(kind: str, to: str) -> None:
+    async with hf.ActorSystem("app", log=False, intensity=9) as system:
+        for name in ("one", "other"):
+            await system.start(counter(name, 500))
+        await system.start(above("/app/one", **BOUND[kind]))
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.bind("/app/above/client", "peer", to)
+        await restarted(system, "/app/above", "/app/above/client")
+        client = await restarted(system, "/app/above", "/app/above/client")
+        assert await client.ask(Where(), IN_TIME) == to
+        async with asyncio.timeout(IN_TIME):
+            while (cell := system.node.find(to)) is None or cell.state != "running":
+                await asyncio.sleep(0.002)
+        bound = client._cell.extra().bindings["peer"].ref
+        assert isinstance(await bound.ask(Add(1), IN_TIME), int)
+        await bound.send(Add(1))
+
+
+async def test_a_binding_that_a_transaction_has_made_outlives_the_process_of_the_supervisor() -> None:
+    async with hf.ActorSystem("app", log=False, intensity=9) as system:
+        for name in ("one", "other"):
+            await system.start(counter(name, 500))
+        await system.start(dataclasses.replace(above("/app/one"), isolation="process"))
+        for to in ("/app/other", "/app/above/last"):
+            async with system.transaction(timeout=IN_TIME) as change:
+                change.bind("/app/above/client", "peer", to)
+            client = await restarted(system, "/app/above", "/app/above/client")
+            assert await client.ask(Where(), IN_TIME) == to
+
+
+async def test_a_binding_outside_of_a_transaction_lasts_for_the_life_of_the_supervisor() -> None:
+    async with hf.ActorSystem("app", log=False, intensity=9) as system:
+        one, other = [await system.start(counter(name, 500)) for name in ("one", "other")]
+        await system.start(above("/app/one"))
+        client = system.ref("/app/above/client", Client)
+        system.bind(client, "peer", other)
+        client.kill()
+        assert await client.ask(Where(), IN_TIME) == "/app/other"
+        client = await restarted(system, "/app/above", "/app/above/client")
+        assert await client.ask(Where(), IN_TIME) == one.path
+
+
+async def test_what_a_transaction_has_unbound_stays_so_and_can_be_bound_again() -> None:
+    async with hf.ActorSystem("app", log=False, intensity=9) as system:
+        await system.start(counter("one", 500))
+        await system.start(above("/app/one"))
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.unbind("/app/above/client", "peer")
+        client = await restarted(system, "/app/above", "/app/above/client")
+        with pytest.raises(hf.RemoteCrash, match="is not bound"):
+            await client.ask(Where(), IN_TIME)
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.remove("/app/one")  # Nobody is bound to it any more, and no restart would be.
+            change.bind("/app/above/client", "peer", "/app/above/first")
+        client = await restarted(system, "/app/above", "/app/above/client")
+        assert await client.ask(Where(), IN_TIME) == "/app/above/first"
+
+
+async def test_a_binding_of_a_transaction_that_gives_up_is_in_no_spec() -> None:
+    async with hf.ActorSystem("app", log=False, intensity=9) as system:
+        for name in ("one", "other"):
+            await system.start(counter(name, 500))
+        await system.start(above("/app/one"))
+
+        async def given_up() -> None:
+            async with system.transaction(timeout=IN_TIME) as change:
+                change.bind("/app/above/client", "peer", "/app/other")
+                change.step(Stumble())
+
+        with pytest.raises(hf.TransactionFailed):
+            await given_up()
+        client = await restarted(system, "/app/above", "/app/above/client")
+        assert await client.ask(Where(), IN_TIME) == "/app/one"
+
+
+async def test_a_binding_that_a_transaction_has_made_follows_who_is_moved() -> None:
+    async with hf.ActorSystem("app", log=False, intensity=9) as system:
+        await system.start(counter("one", 500))
+        await system.start(above("/app/one"))
+        await system.start(hf.supervisor("there", children=[counter("other", 500)]))
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.bind("/app/above/client", "peer", "/app/there/other")
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.move("/app/there/other", "/app")
+        client = await restarted(system, "/app/above", "/app/above/client")
+        assert await client.ask(Where(), IN_TIME) == "/app/other"
+
+
+async def test_two_that_transactions_have_bound_to_each_other_come_back() -> None:
+    """Neither of them is waited for."""
+    async with hf.ActorSystem("app", log=False, intensity=2, period=60.0) as system:
+        for name in ("here", "there"):
+            await system.start(hf.supervisor(name, children=[hf.child("client", hf.start(Client))]))
+        here, there = "/app/here/client", "/app/there/client"
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.bind(here, "peer", there)
+            change.bind(there, "peer", here)
+        before = [system.node.find(path) for path in (here, there)]
+        for path in ("/app/here", "/app/there"):
+            system.ref(path, hf.Actor).kill()
+        async with asyncio.timeout(IN_TIME):
+            while any((cell := system.node.find(path)) in (None, *before) for path in (here, there)):
+                await asyncio.sleep(0.002)
+        assert cell is not None
+        for path, to in ((here, there), (there, here)):
+            assert await system.ref(path, Client).ask(Where(), IN_TIME) == to
+
+
+async def test_what_is_bound_to_a_later_one_hinders_no_transaction(tmp_path: Path) -> None:
+    """Neither the next ones, whose trees are looked at anew, nor the start of the next root."""
+    store = f"sqlite:{tmp_path / 'store'}"
+    async with hf.ActorSystem("app", store=store, durability="os", log=False) as system:
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.add("/app", hf.supervisor("above", children=[hf.child("client", hf.start(Client)), counter("last")]))
+            change.add("/app", counter("other"))
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.bind("/app/above/client", "peer", "/app/above/last")
+        for first in ("last", "client"):
+            async with system.transaction(timeout=IN_TIME) as change:
+                change.reorder("/app/above", [first])
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.bind("/app/above/client", "peer", "/app/other")
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.add("/app", hf.child("client", hf.start(Client)))
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.bind("/app/client", "peer", "/app/above/last")
+            change.bind("/app/above/client", "peer", "/app/client")
+    async with hf.ActorSystem("app", store=store, durability="os", log=False) as system:
+        assert await system.ref("/app/client", Client).ask(Where(), IN_TIME) == "/app/above/last"
+        assert await system.ref("/app/above/client", Client).ask(Where(), IN_TIME) == "/app/client"
+
+
+# -- the root itself --------------------------------------------------------------------------------------------------
+
+
+async def test_the_program_has_the_last_word_on_the_flags_of_the_root(tmp_path: Path) -> None:
+    store = f"sqlite:{tmp_path / 'store'}"
+
+    async def begun(changed: bool = False, **flags: Any) -> tuple[int, list[str], list[str]]:
+        async with hf.ActorSystem("app", store=store, durability="os", log=False, **flags) as system:
+            with system.events() as stream:
+                for name in ("a", "b", "c"):
+                    await system.start(counter(name))
+                superseded = [one.address for one in stream.take() if isinstance(one, SpecificationSuperseded)]
+            if changed:
+                async with system.transaction(timeout=IN_TIME) as change:
+                    change.intensity("/app", 77, 7.0)
+                    change.reorder("/app", ["c", "a"])
+            root: Any = system.node.root
+            names = [name for name in root.actor._children if name in "abc"]
+            return root.actor._flags.intensity, names, superseded
+
+    assert await begun(changed=True) == (77, ["c", "a", "b"], [])
+    assert await begun() == (77, ["c", "a", "b"], [])
+    # What it says now is newer; it says nothing of the order.
+    assert (await begun(intensity=5))[:2] == (5, ["c", "a", "b"])
+    assert (await begun())[:2] == (3, ["c", "a", "b"])
+
+
+async def test_the_order_of_the_root_is_that_of_the_last_transaction_without_those_that_are_gone(
+    tmp_path: Path,
+) -> None:
+    def order(system: hf.ActorSystem) -> list[str]:
+        root: Any = system.node.root
+        listed = [name for name in root.actor._children if name not in ("left", "right")]
+        assert [name for name in root.children if name in listed] == listed
+        return listed
+
+    async with program(tmp_path / "store") as system:
+        async with system.transaction(timeout=IN_TIME) as change:
+            for name in ("x", "y", "z"):
+                change.add("/app", counter(name))
+            change.reorder("/app", ["z", "y", "x", "right", "left"])
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.remove("/app/y")
+        assert order(system) == ["z", "x"]
+    async with program(tmp_path / "store") as system:
+        root: Any = system.node.root
+        assert list(root.actor._children)[-4:] == ["z", "x", "right", "left"]
+        assert order(system) == ["z", "x"]

@@ -14,7 +14,7 @@ from holdfast.ftm.sec.authority import (
     GetRoot,
     Revoke,
 )
-from holdfast.ftm.sec.certificates import Trust, make_request
+from holdfast.ftm.sec.certificates import Trust, about, make_request
 from holdfast.ftm.sec.handshake import Participant
 from holdfast.ftm.sec.keys import SigningKey
 from holdfast.ftm.sec.sec_errors import EnrolmentRefused, NoCertificate, Rejected
@@ -54,6 +54,21 @@ async def test_a_name_belongs_to_one_key_until_it_is_revoked() -> None:
         with pytest.raises(NoCertificate):
             await authority.ask(GetCertificate("a"))
         assert (await enrol(authority, "a")).name == "a"
+
+
+async def test_only_those_are_revoked_that_were_issued_between_two() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        authority = system.spawn(hf.start(CertificationAuthority), name="ca")
+        key = SigningKey.per_start()
+        issued = [(await enrol(authority, "a", key)).certificate for _ in range(5)]
+        serials = [about(one)[0] for one in issued]
+        assert await authority.ask(Revoke("a", after=serials[3])) == 1
+        assert await authority.ask(GetCertificate("a")) == issued[3]
+        assert await authority.ask(Revoke("a", until=serials[0])) == 1
+        assert await authority.ask(Revoke("a", after=serials[0], until=serials[1])) == 1
+        assert await authority.ask(Revoke("a", until=1)) == 0, "of one that it does not know"
+        assert await authority.ask(GetCertificate("a")) == issued[3]
+        assert await authority.ask(Revoke("a")) == 2
 
 
 async def test_what_was_revoked_is_on_its_list() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.bricks.sealed_frames import TELLS, Agree, Back, Call, Greet, LinkLost, Part, Refused, SecuredLink
+from holdfast.ftm.bricks.sealed_frames import TELLS, Agree, Back, Call, Greet, LinkLost, Part, Refused, Sealed
 from holdfast.ftm.mechanisms.sec import SEC
 from holdfast.ftm.sec.authority import CertificationAuthority, GetRoot, Revoke
 from holdfast.ftm.sec.certificates import make_list
@@ -25,10 +25,8 @@ class Wire:
     def __init__(self, system: hf.ActorSystem) -> None:
         self.epochs = {PROXY: 1, REPLICA: 1}
         sec = SEC(CA)
-        self.inner: SecuredLink = sec.open_link(system.node, "/app/c", REPLICA, lambda: self.epochs[REPLICA])
-        self.outer: SecuredLink = sec.open_link(
-            system.node, "/app/c", PROXY, lambda: self.epochs[PROXY], lambda: [REPLICA]
-        )
+        self.inner: Any = sec.open_link(system.node, "/app/c", REPLICA, lambda: self.epochs[REPLICA])
+        self.outer: Any = sec.open_link(system.node, "/app/c", PROXY, lambda: self.epochs[PROXY], lambda: [REPLICA])
         self.done: list[bytes] = []
         self.refused: list[str] = []
         self.on_frame = lambda: None
@@ -122,6 +120,68 @@ async def test_an_end_that_is_closed_takes_nothing_and_begins_nothing() -> None:
             one.close()
         assert wire.done == [b"before"]
         assert other.done == []
+
+
+@pytest.mark.parametrize("first", ["outer", "inner"])
+@pytest.mark.parametrize("at", range(6))
+async def test_what_is_on_its_way_when_it_moves_is_done_once_in_order(at: int, first: str) -> None:
+    """One end knows of it before the other one does; what was answered, and the answer lost, is not done again."""
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.child("ca", hf.start(CertificationAuthority)))
+        wire = Wire(system)
+        await wire.outer.ready()
+        await wire.outer.moved_certificates("/app/other/c").prepare()
+        ends = [wire.outer, wire.inner] if first == "outer" else [wire.inner, wire.outer]
+        tried = 0
+
+        async def reach(message: Any, seconds: float) -> Any:
+            nonlocal tried
+            tried += isinstance(message, Sealed)
+            if tried > at and ends:
+                ends.pop(0).readdress("/app/other/c")
+            reply = await wire._reach(message, seconds)
+            if isinstance(message, Sealed) and tried % 2:
+                raise hf.AskTimeout(REPLICA, seconds)
+            return reply
+
+        asked = [wire.outer.call(REPLICA, TELLS, Part("", b"%d" % n), reach, lambda: True) for n in range(5)]
+        async with asyncio.timeout(25.0):
+            backs = await asyncio.gather(*asked)
+        assert [back.body for back in backs] == [b"%d" % n for n in range(5)] == wire.done
+        assert not ends
+        assert {one.peer.name for one in wire.inner._sessions.values()} == {"/app/other/c/ftm/proxy"}
+        wire.close()
+
+
+@pytest.mark.parametrize("kind", [Greet, Agree])
+async def test_a_hand_shake_that_a_move_comes_into_makes_no_session(kind: type[Any]) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.child("ca", hf.start(CertificationAuthority)))
+        wire = Wire(system)
+        await wire.outer.ready()
+        await wire.outer.moved_certificates("/app/other/c").prepare()
+        kept = list[str]()
+        real = wire.outer._keep
+
+        def keep(partner: Any, session: Any) -> None:
+            kept.append(session.peer.name)
+            real(partner, session)
+
+        wire.outer._keep = keep
+
+        async def reach(message: Any, seconds: float) -> Any:
+            reply = await wire._reach(message, seconds)
+            if isinstance(message, kind) and not kept:
+                for end in (wire.outer, wire.inner):
+                    if end.path.startswith("/app/c/"):
+                        end.readdress("/app/other/c")
+            return reply
+
+        async with asyncio.timeout(25.0):
+            asked = wire.outer.call(REPLICA, TELLS, Part("", b"x"), reach, lambda: True)
+            assert (await asked).body == b"x"
+        assert kept == ["/app/other/c/ftm/r1"]
+        wire.close()
 
 
 class Late(CertificationAuthority):

@@ -1,0 +1,59 @@
+"""How the participants of secured links are named and known, and how their authority is asked."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ...actors.errors import ActorStopped
+from ..model.mechanism import MechanismRefused
+from .certificates import MOST_NAME
+
+if TYPE_CHECKING:
+    from ...actors.kernel.message import Message
+    from ...actors.kernel.node import Node
+    from ..mechanisms.sec import SEC
+
+
+class LinkEnd(NamedTuple):
+    """Whose end of secured links it is."""
+
+    node: Node
+    """Of this process."""
+    address: str
+    """The protected actor's."""
+    path: str
+    """This participant's."""
+    mechanism: SEC
+    """Its settings."""
+    epoch: Callable[[], int]
+    """The present one."""
+    enrols: Callable[[], list[str]] | None = None
+    """Of whom this one orders certificates; None: it is enrolled by another."""
+
+
+def certified(path: str) -> str:
+    """The name of a participant in certificates: its address; of a long one, its end and a digest."""
+    if len(path) <= MOST_NAME:
+        return path
+    digest = hashlib.sha256(path.encode()).hexdigest()[:32]
+    return f"{digest}…{path[-(MOST_NAME - 33) :]}"
+
+
+def key_file(folder: str, path: str) -> Path:
+    """Where the key of a participant is."""
+    return Path(folder) / f"{hashlib.sha256(path.encode()).hexdigest()[:32]}.key"
+
+
+async def ask_authority(node: Node, where: str, message: Message[Any], within: float) -> Any:
+    """What the authority that lives at `where` answers.
+
+    Raises:
+        HoldfastError: it refuses, does not answer within so many seconds, or nobody lives there (MechanismRefused).
+    """
+    try:
+        return await node.cell_at(where).ref.ask(message, timeout=within)
+    except ActorStopped as error:
+        raise MechanismRefused("sec", f"no authority lives at {where}: start a CertificationAuthority there") from error

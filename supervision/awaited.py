@@ -1,0 +1,115 @@
+"""Children whose specs bind them to somebody who is being started: they wait, and find out whether that can ever be.
+
+Whoever waits keeps those waiting that are started behind it. If that leads back to itself, nobody in the circle can be
+up before another one is: it is told as an error, which names them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
+
+from ..actors.errors import NoSuchActor, StartFailed
+from ..actors.kernel.cell import DOWN, GONE, Cell
+from ..actors.kernel.node import Node
+from .children import STOPPED, STOPPING, Child
+
+LOOK_AGAIN = 0.02
+"""Seconds between two looks at whether somebody is there."""
+Listed = Callable[[Cell], Mapping[str, Child] | None]
+"""The children of a supervisor that lives in this process; None if there is none at a cell."""
+
+
+class Wait(NamedTuple):
+    """A child that waits, and the address that it waits for."""
+
+    who: str
+    target: str
+
+
+class Prospects:
+    """Who is about to be started in this process, and who stands in front of whom.
+
+    Args:
+        node: of this process.
+        listed: how the children of a supervisor are found.
+    """
+
+    def __init__(self, node: Node, listed: Listed) -> None:
+        self._node, self._listed = node, listed
+
+    def missing(self, who: str, one: Child) -> str:
+        """The first address that a child is bound to and where nobody lives yet, but will; "" if there is none.
+
+        Raises:
+            StartFailed: nobody is about to come there, or not before this child is up.
+        """
+        node = self._node
+        for port, path in one.spec.bindings.items():
+            if port in one.spec.late or node.find(path) is not None:
+                continue
+            one.awaited = path
+            circle = self._circle(Wait(who, path))
+            if circle is None or len(circle) == 1:
+                raise StartFailed(who, f"binding {port!r}: {NoSuchActor(path)}")
+            if circle:
+                chain = ", ".join(f"{wait.who} waits for {wait.target}" for wait in circle)
+                raise StartFailed(who, f"binding {port!r}: nobody of these can begin before another one: {chain}")
+            return path
+        return ""
+
+    def _circle(self, first: Wait) -> list[Wait] | None:
+        """Those who keep each other, and at last `first`, waiting; none if that is nobody. None: nobody will come."""
+        if self._in_front(first.target) is None:
+            return None
+        trails, seen = [[first]], set[Wait]()
+        while trails:
+            trail = trails.pop()
+            if trail[-1] in seen:
+                continue
+            seen.add(trail[-1])
+            for wait in self._in_front(trail[-1].target) or ():
+                if wait == first:
+                    return trail
+                trails.append([*trail, wait])
+        return []
+
+    def _in_front(self, path: str) -> list[Wait] | None:
+        """Who waits, and has to be up before somebody comes to live at an address. None: nobody will come."""
+        at = self._node.root
+        if at is None or not path.startswith(f"{at.path}/"):
+            return None
+        names = path[len(at.path) + 1 :].split("/")
+        while names:
+            children = self._listed(at)
+            if children is None:  # It is between two lives, or lives in another process.
+                return [] if at.state is DOWN or _is_named(at, names) else None
+            one = children.get(names[0])
+            if one is None or (one.row is None and one.state in (STOPPED, STOPPING)):
+                return None
+            if one.row is not None and one.row.current is not one:
+                current = one.row.current
+                return [] if current is None else list(self._waiting(f"{at.path}/{current.spec.id}", current))
+            if one.awaited:
+                return [Wait(f"{at.path}/{one.spec.id}", one.awaited)]
+            if one.cell is None or one.cell.state is GONE:
+                return []
+            at = one.cell
+            del names[0]
+        return []
+
+    def _waiting(self, path: str, one: Child) -> Iterator[Wait]:
+        """A child that waits, or those below it that do."""
+        if one.awaited:
+            yield Wait(path, one.awaited)
+        elif one.cell is not None:
+            for name, below in (self._listed(one.cell) or {}).items():
+                yield from self._waiting(f"{path}/{name}", below)
+
+
+def _is_named(supervisor: Cell, names: list[str]) -> bool:
+    """Whether the recipe of a supervisor names such a descendant."""
+    from .respec import spec_below  # It knows the supervisor, which asks here.
+
+    start = supervisor.more.start if supervisor.more is not None else None
+    return start is not None and spec_below(start, names) is not None
