@@ -11,6 +11,7 @@ import contextlib
 import os
 import random
 import signal
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -53,6 +54,14 @@ class Fail(hf.Message[None]):
 
 class Fall(hf.Message[None]):
     """Have the life end soon, outside of any turn."""
+
+    ticks: int = 0
+
+
+class Note(hf.Message[None]):
+    """Have a task write down, in a file for each process, that it was begun."""
+
+    folder: str
 
 
 class Entered(hf.Message[list[int]]): ...
@@ -100,10 +109,20 @@ class Room(hf.Actor):
 
     @hf.on(Fall)
     def fall(self, message: Fall) -> None:
-        self.ctx.create_task(self._fall())
+        self.ctx.create_task(self._fall(message.ticks))
 
-    async def _fall(self) -> None:
+    async def _fall(self, ticks: int) -> None:
+        for _ in range(ticks):
+            await asyncio.sleep(0)
         raise RuntimeError("fell")
+
+    @hf.on(Note)
+    def note(self, message: Note) -> None:
+        self.ctx.create_task(self._note(Path(message.folder)))
+
+    async def _note(self, folder: Path) -> None:
+        with (folder / str(os.getpid())).open("a") as file:
+            file.write("noted\n")
 
     @hf.on(Entered)
     def entered(self, message: Entered) -> list[int]:
@@ -175,10 +194,44 @@ def mechanisms() -> dict[str, hf.Mechanism | None]:
     }
 
 
+@pytest.mark.parametrize("name", ["pbr", "lfr", "tr", "tmr"])
+async def test_a_life_that_ends_at_any_moment_of_a_batch_keeps_what_is_acknowledged(name: str) -> None:
+    """Also between two of the pieces in which the batch is given to it: what the first ones have left ends with it."""
+    async with hf.ActorSystem("app", log=False, intensity=100_000) as system:
+        ref = await system.start(hf.child("room", hf.start(Room), recovery=hf.hybrid(), mechanism=mechanisms()[name]))
+        await two_again(ref)
+        tags = iter(range(10_000))
+        for ticks in range(12):
+            ref.tell(Fall(ticks))
+            asked = [asyncio.ensure_future(ref.ask(Enter(next(tags)), IN_TIME)) for _ in range(40)]
+            assert await asyncio.gather(*asked) == list(range(ticks * 40 + 1, ticks * 40 + 41))
+        assert await ref.ask(Entered(), IN_TIME) == list(range(480))
+
+
+@pytest.mark.parametrize("name", ["lfr", "tmr"])
+async def test_a_task_is_not_begun_again_by_a_turn_that_was_handed_over(name: str, tmp_path: Path) -> None:
+    async with hf.ActorSystem("app", log=False, intensity=100_000) as system:
+        ref = await system.start(hf.child("room", hf.start(Room), mechanism=mechanisms()[name]))
+        await two_again(ref)
+        await ref.ask(Note(str(tmp_path)), IN_TIME)
+        for tag in range(3):
+            with pytest.raises(hf.RemoteCrash):
+                await ref.ask(Fail(), IN_TIME)
+            assert await ref.ask(Enter(tag), IN_TIME) == tag + 1
+        for one in tmp_path.iterdir():
+            assert one.read_text() == "noted\n"
+        assert list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("seed", range(SEED, SEED + PROGRAMS))
 @pytest.mark.parametrize("falls", [False, True], ids=["stays up", "falls"])
 @pytest.mark.parametrize("name", sorted(mechanisms()))
 async def test_what_is_acknowledged_is_in_the_state_once(name: str, falls: bool, seed: int) -> None:
+    await run_program(name, seed, falls=falls)
+
+
+async def run_program(name: str, seed: int, *, falls: bool) -> None:
+    """Run a program, and see what has become of what it said."""
     mechanism = mechanisms()[name]
     recovery = hf.hybrid(interval=0.05 if seed % 2 else 3600.0)
     async with hf.ActorSystem("app", log=False, intensity=100_000) as system:

@@ -92,13 +92,6 @@ CHECKS = {
         RANDOM_HOOKS,
         "test_what_is_acknowledged and stays",
     ),
-    "what a part has come to ends with its life": Check(
-        "ftm/replica/protected_actor.py",
-        "            if self.life is None and part.begun and not",
-        "            if False and part.begun and not",
-        RANDOM_HOOKS,
-        "test_what_is_acknowledged and falls",
-    ),
     "what was put back at a point, and handled since, is not handled again": Check(
         "ftm/replica/protected_actor.py",
         "        return [feed for feed in point.returned if feed.id not in handled]\n",
@@ -118,19 +111,12 @@ CHECKS = {
         "self.state.is_lazy and not life.has_begun_tasks  #",
         "self.state.is_lazy  #",
         RANDOM_HOOKS,
-        "test_what_is_acknowledged and falls",
+        "test_a_task_is_not_begun_again",
     ),
-    "what hooks have left in the middle of a part is at home before what stands on it": Check(
+    "what hooks have left is at home before what stands on it": Check(
         "ftm/replica/protected_actor.py",
         "            if is_new and self.reports.is_snapshot_wanted and not state.is_again:\n",
         "            if False:\n",
-        RANDOM_HOOKS,
-        "test_what_is_acknowledged",
-    ),
-    "what hooks have left is at home before what stands on it": Check(
-        "ftm/bricks/bricks.py",
-        "                await self._hand_more()  # A snapshot",
-        "                pass  # A snapshot",
         "tests/checkpoint/test_hook_changes.py",
         "test_replicas_that_die_before",
     ),
