@@ -48,6 +48,7 @@ from .children import (
 )
 from .decisions import affected, decide, is_reported
 from .errands import Errand, answered
+from .handover import Account, StandDown, TakeOver, stand_down, take_over
 from .inquiries import Inquiries
 from .intensity import admit_restart, recent_restarts
 from .spec import ChildSpec, Flags, Plan, check_spec
@@ -679,6 +680,16 @@ class Supervisor(Inquiries):
         except HoldfastError as error:
             return self._fail(error)
         return None
+
+    @on(StandDown)
+    def _stand_down(self, message: StandDown) -> Account | None:
+        """Hold still, for another supervisor is to take our place."""
+        return stand_down(self, message.attempt)
+
+    @on(TakeOver)
+    def _take_over(self, message: TakeOver) -> None:
+        """Take the place of another supervisor."""
+        take_over(self, message.account)
 
     def _take(self, plan: Plan) -> None:
         """Follow another plan from now on; raises SpecError if that cannot be."""

@@ -383,14 +383,15 @@ class ActorSystem(Recorded, Controls):
         Raises:
             SpecError: it is a part of a mechanism, which would go on without it: `terminate` ends its life alone.
         """
-        check_no_part(ref._cell)
+        cell = ref._cell.living
+        check_no_part(cell)
         caller = current.get(None)
-        if caller is None or not is_below(caller.cell, ref._cell):
-            await self._stop(ref._cell, reason, deadline if drain else None)
+        if caller is None or not is_below(caller.cell, cell):
+            await self._stop(cell, reason, deadline if drain else None)
             return
         node = self.node  # In nobody's name: it has to go on when the caller's life is over.
         task = node.loop.create_task(
-            self._stop(ref._cell, reason, deadline if drain else None),
+            self._stop(cell, reason, deadline if drain else None),
             name=f"stop of {ref.path}",
             context=node.base_context.copy(),
         )
@@ -468,7 +469,7 @@ class ActorSystem(Recorded, Controls):
 
     def register(self, name: str, ref: ActorRef[Any]) -> None:
         """Give an actor a name beside its address. Raises NameTaken."""
-        self.node.register(name, ref._cell)
+        self.node.register(name, ref._cell.living)
 
     def unregister(self, name: str) -> None:
         """Free a name; unknown ones are fine."""
@@ -487,7 +488,7 @@ class ActorSystem(Recorded, Controls):
 
     def bind(self, ref: ActorRef[Any], port: str, target: ActorRef[Any]) -> None:
         """Point a binding elsewhere; the owner sees it from its next turn on. Raises SpecError."""
-        self.node.bind(ref._cell, port, target._cell)
+        self.node.bind(ref._cell.living, port, target._cell.living)
 
     # -- looking at it ----------------------------------------------------------------------------------------------
 
@@ -506,8 +507,8 @@ class ActorSystem(Recorded, Controls):
         Raises:
             NoSuchActor: it lives nowhere at the moment.
         """
-        cell: Cell | None = ref._cell if ref._cell.state is not GONE else self.node.successor(ref._cell)
-        if cell is None:
+        cell: Cell | None = ref._cell.living
+        if cell is None or cell.state is GONE:
             raise NoSuchActor(ref.path)
         while cell is not None:
             place = cell.host.place

@@ -1,32 +1,27 @@
-"""Moving a child to another supervisor: its life goes on, only its address changes."""
+"""Moving a child to another supervisor: its life goes on, only its address changes.
+
+So does that of a supervisor, with all below it, if all its supervisors live in the root's process, and stay there. Else
+another one takes its place (`succession.py`).
+"""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-import functools
-from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, ClassVar
 
-from ...actors.errors import HoldfastError
-from ...checkpoint.home.recorded_home import switch_of
-from ...checkpoint.home.switch import Switch
-from ...checkpoint.protocol import SnapshotNow
-from ...supervision.children import STOPPED, UP
 from ...supervision.respec import recipe_spec
-from .arrangement import busy, child_of
 from .draft import Draft, DraftPlace, Target, is_elsewhere, rules
-from .handing import Handing, check_handing, is_far
-from .operation import Operation, text_of, wrong
-from .relocation import MOVED_WITHIN, Gated
+from .handing import check_handing, is_far
+from .living import OnSharedWork
+from .operation import text_of, wrong
+from .regrouping import Regrouping, addressed, successors
 from .structure import check_child, check_not_uniform
+from .succession import Elsewhere
 
 if TYPE_CHECKING:
-    from ...actors.kernel.cell import Cell
     from ..system import ActorSystem
 
 
-class Reparent(Operation):
+class Reparent(OnSharedWork):
     """Put a child under another supervisor."""
 
     verb: ClassVar[str] = "move"
@@ -35,10 +30,6 @@ class Reparent(Operation):
         super().__init__(target)
         self._to = supervisor
         self._above: DraftPlace | None = None  # the new supervisor, at this point
-        self._root: DraftPlace | None = None
-        self._asked: dict[Switch, int] = {}  # who was asked for a snapshot, behind which turn
-        self._rests: dict[DraftPlace, Gated] = {}
-        self._handing: Handing | None = None  # by the first step that moves this actor, to where the last one wants it
 
     @property
     def text(self) -> str:
@@ -55,6 +46,8 @@ class Reparent(Operation):
         if new in place.walk():
             raise wrong(place.path, f"it cannot be moved below itself, to {new.path}")
         check_not_uniform(old)
+        if any(one.place is place for one in draft.arrangement.successions):
+            raise wrong(place.path, "it begins anew there by this very transaction: move it once")
         if is_far(old) or is_far(new):
             await draft.supervisor(old.path)  # It tells whom it has before it has one less in the draft.
             check_handing(place, old, new)
@@ -65,118 +58,28 @@ class Reparent(Operation):
                 )
         if new.is_dynamic and place.is_stopped:
             raise wrong(place.path, f"it is stopped, and {new.path} is dynamic: it keeps nobody who does not run")
+        anew: list[DraftPlace] = []
+        if begins_anew(place, old, new):
+            if place.name in new.was.children:
+                why = f"it has a child {place.name!r} until this transaction is in force: use the next one"
+                raise wrong(new.path, why)
+            anew = await successors(draft, place, new, is_given=is_far(old) or is_far(new))
         for one in addressed(place):
             check_movable(one)
         check_child(new, place.spec)
         del old.children[place.name]
         new.children[place.name], place.parent = place, new
-        self._found, self._above, self._root = place, new, draft.root
-        if not (place.is_moved or place.is_planned):  # Who is added is started where it is to be.
-            self._handing = draft.arrangement.handings[place] = Handing(place, draft.timeout)
+        self._found, self._above = place, new
+        if anew:
+            work = self._work = Regrouping(place, draft)
+            work.begin_anew(anew, Elsewhere(place), self)
+        elif not (place.is_moved or place.is_planned):  # Who is added is started where it is to be.
+            work = self._work = Regrouping(place, draft)
+            work.hand(place)  # By the first step that moves it, to where the last one wants it.
         place.is_moved = True
         self.between_turns_of = (old, new)
         for holder in (old, new):
             draft.arrangement.touch(holder, self)
-
-    async def prepare(self, system: ActorSystem) -> None:
-        """Have recorded and protected actors rest: no turn of theirs is to be repeated under another address."""
-        if self._found is None or self._handing is None or not self._place.has_moved:
-            return
-        await self._handing.prepare(system)
-        waits = bool(self._others_settle(system)) or bool(self._unsteady(system))
-        for one, rest in self._resting(system):
-            if waits:  # Perhaps for what those here have to answer.
-                await rest.give_up()
-            else:
-                await rest.reach(system, functools.partial(system._moves.pause, one.living(system.node), MOVED_WITHIN))
-
-    def _resting(self, system: ActorSystem) -> list[tuple[DraftPlace, Gated]]:
-        """Those that run turns again, of the actor and all below it, and how each comes to rest."""
-        for one in addressed(self._place):
-            # Who is reworked rests for that, and is saved; replicas are only told.
-            rests = not one.is_planned and (one.rework is None or one.is_protected)
-            cell = one.now(system.node) if rests else None
-            switch = switch_of(cell) if cell is not None else None
-            runs_again = switch is not None and (switch.method.replays or one.is_protected)
-            if runs_again and one not in self._rests:
-                self._rests[one] = Gated(one, f"pause of {one.path}")
-        return list(self._rests.items())
-
-    def _unsteady(self, system: ActorSystem) -> str:
-        """Why replicas that are to rest cannot hear of another address just now."""
-        cells = [one.now(system.node) for one, _ in self._resting(system)]
-        found = [cell.path for cell in cells if cell is not None and not cell.host.place.is_steady(cell)]
-        return f"a replica of {found[0]} is being replaced" if found else ""
-
-    def _others_settle(self, system: ActorSystem) -> str:
-        """Why the others are not so far that addresses can change; they are asked for what is missing."""
-        assert self._root is not None
-        reworked = [place for place in self._root.walk() if place.rework is not None]  # They are saved at the commit.
-        own = [place.now(system.node) for place in (*reworked, *(one for one, _ in self._resting(system)))]
-        settled = {switch_of(cell) for cell in own if cell is not None}
-        others = [switch for switch in system.homes if switch not in settled]
-        settle_senders(others, self._asked)
-        return WAITING if any(map(is_unsettled, others)) else ""
-
-    @property
-    def waits_for(self) -> str:
-        lodging = "" if self._handing is None else self._handing.waits_for
-        return lodging or next((rest.waits_for for rest in self._rests.values() if rest.waits_for), "")
-
-    def ready(self, system: ActorSystem) -> str:
-        place = self._place
-        if self._handing is None or not place.has_moved:
-            return ""
-        assert place.was.below is not None
-        old = place.was.below.living(system.node)
-        if why := self._handing.ready(system) or (self._is_busy(old, place.name) if not is_elsewhere(old) else ""):
-            return why
-        if why := self._others_settle(system) or self._unsteady(system):
-            return why
-        for resting, rest in self._resting(system):
-            switch = switch_of(resting.living(system.node))
-            if not rest.is_waiting:
-                return f"{resting.path} is not at rest"
-            if switch is not None and switch.method.replays and not is_saved(switch):
-                return f"the last snapshot of {resting.path} is not in the store yet"
-        return ""
-
-    def _is_busy(self, old: Cell, name: str) -> str:
-        """Why a supervisor of this process cannot let its child go at this instant; "" if it can."""
-        if why := busy(old):
-            return why
-        one = child_of(old, name)
-        if one is None:
-            raise wrong(old.path, f"it has no child {name!r} any more")
-        if one.state not in (UP, STOPPED) or one.row is not None or one.up is not None:
-            return f"{self.target} is being restarted"
-        return ""
-
-    def commit(self, system: ActorSystem) -> None:
-        for rest in self._rests.values():
-            rest.open()
-
-    async def finish(self, system: ActorSystem) -> None:
-        if self._handing is not None:
-            await self._handing.finish(system)
-        for rest in self._rests.values():
-            if rest.task is not None:
-                with contextlib.suppress(HoldfastError):  # Its life has ended: the next one begins where it is now.
-                    await asyncio.shield(rest.task)
-
-    async def release(self, system: ActorSystem) -> None:
-        for rest in self._rests.values():
-            await rest.give_up()
-        if self._handing is not None:
-            await self._handing.release(system)
-
-
-def addressed(place: DraftPlace) -> Iterator[DraftPlace]:
-    """An actor and all below it, but the parts of mechanisms: these go with whom they protect."""
-    yield place
-    if not place.is_protected:
-        for child in place.children.values():
-            yield from addressed(child)
 
 
 def check_movable(place: DraftPlace) -> None:
@@ -188,37 +91,20 @@ def check_movable(place: DraftPlace) -> None:
     cell, spec = place.cell, place.spec
     if place.is_protected and cell is not None and any(one.secures for one in rules().layers_of(cell.spec.mechanism)):
         raise wrong(place.path, "its replicas are certified under its address: detach the mechanism that secures them")
-    if place.is_supervisor and (
-        (spec is not None and spec.isolation == "process") or (cell is not None and is_elsewhere(cell))
-    ):
-        raise wrong(place.path, "its process knows all below it by their addresses")
     method = spec.recovery if spec is not None else None
     if method is not None and method.replays and not method.snapshots:
         why = "it takes no snapshots, so all its turns would be repeated under another address"
         raise wrong(place.path, f"{why}: use hybrid(...)")
 
 
-WAITING = "recorded actors may have to repeat what they sent to it: their snapshots are waited for"
+def begins_anew(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> bool:
+    """Whether another supervisor takes the place of this one, for some of it is in another process, or will be."""
+    if not place.is_supervisor or place.is_planned:
+        return False
+    return is_far(old) or is_far(new) or any(one.is_supervisor and has_process(one) for one in addressed(place))
 
 
-def is_unsettled(switch: Switch) -> bool:
-    """Whether what it has sent may be sent again, to be compared."""
-    ledger, method = switch.ledger, switch.method
-    if not (method.replays or method.snapshots):  # Protected, without recovery: only the turn in hand is made again.
-        return bool(ledger.released)
-    return ledger.has_sent
-
-
-def is_saved(switch: Switch) -> bool:
-    """Whether a replay would compare nothing: all that it has done is in its snapshot."""
-    compared = any(turn.digests or turn.reply or turn.state for turn in switch.turns.values())
-    return not (compared or switch.ledger.released or switch.images.is_saving)
-
-
-def settle_senders(homes: Iterable[Switch], asked: dict[Switch, int]) -> None:
-    """Have recorded actors take a snapshot, so that no replay sends to an address of before; each turn once."""
-    for switch in homes:
-        life = switch.life
-        if is_unsettled(switch) and asked.get(switch) != switch.turn and life.port is not None and life.is_released:
-            asked[switch] = switch.turn
-            life.port.to_life(SnapshotNow(urgent=True))  # also if it is suspended
+def has_process(place: DraftPlace) -> bool:
+    """Whether a supervisor has a process of its own, or is below one that has."""
+    cell, spec = place.cell, place.spec
+    return (spec is not None and spec.isolation == "process") or (cell is not None and is_elsewhere(cell))
