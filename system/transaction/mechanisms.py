@@ -14,8 +14,8 @@ from .draft import Draft, DraftPlace, Target, is_elsewhere, rules
 from .handing import is_far
 from .living import OnSharedWork
 from .operation import wrong
-from .regrouping import Regrouping, successors
 from .relocation import Relocation, described
+from .reparenting import Regrouping, successors
 from .succession import Beside
 
 if TYPE_CHECKING:

@@ -1,23 +1,35 @@
 """Moving a child to another supervisor: its life goes on, only its address changes.
 
 So does that of a supervisor, with all below it, if all its supervisors live in the root's process, and stay there. Else
-another one takes its place (`succession.py`).
+another one takes its place (`succession.py`). Actors come to rest where a turn could be repeated under another address;
+supervisors that begin anew stand down when all else is ready.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import functools
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, ClassVar
 
+from ...actors.errors import HoldfastError
+from ...checkpoint.home.recorded_home import switch_of
+from ...checkpoint.home.switch import Switch
+from ...checkpoint.protocol import SnapshotNow
+from ...supervision.children import STOPPED, UP
 from ...supervision.respec import recipe_spec
+from .arrangement import busy, child_of
 from .draft import Draft, DraftPlace, Target, is_elsewhere, rules
-from .handing import check_handing, is_far
+from .handing import Handing, check_handed, check_handing, is_far
 from .living import OnSharedWork
-from .operation import text_of, wrong
-from .regrouping import Regrouping, addressed, successors
+from .operation import Operation, StagedWork, text_of, wrong
+from .relocation import MOVED_WITHIN, Gated
 from .structure import check_child, check_not_uniform
-from .succession import Elsewhere
+from .succession import Candidate, Elsewhere, Succession, check_succession
 
 if TYPE_CHECKING:
+    from ...actors.kernel.cell import Cell
     from ..system import ActorSystem
 
 
@@ -82,6 +94,164 @@ class Reparent(OnSharedWork):
             draft.arrangement.touch(holder, self)
 
 
+class Regrouping(StagedWork):
+    """An actor, with all below it, that gets another supervisor, or whose own supervisors begin anew."""
+
+    def __init__(self, top: DraftPlace, draft: Draft) -> None:
+        self._top, self._draft = top, draft
+        self._asked: dict[Switch, int] = {}  # who was asked for a snapshot, behind which turn
+        self._rests: dict[DraftPlace, Gated] = {}
+        self._handings: list[tuple[DraftPlace, Handing]] = []
+        self._successions: list[Succession] = []  # from above
+        self._candidate: Candidate | None = None  # the uppermost supervisor that begins anew
+
+    def hand(self, place: DraftPlace) -> None:
+        """Have this actor be given to the supervisor that it has in the draft in the end."""
+        handing = self._draft.arrangement.handings[place] = Handing(place, self._draft.timeout)
+        self._handings.append((place, handing))
+
+    def begin_anew(self, places: Iterable[DraftPlace], candidate: Candidate, step: Operation) -> None:
+        """Have these supervisors begin anew, the uppermost as this candidate, and get all that are below them."""
+        self._candidate = candidate
+        for place in places:
+            succession = Succession(place, self._draft)
+            self._successions.append(succession)
+            arrangement = self._draft.arrangement
+            arrangement.successions.append(succession)
+            for holder in (succession.left, place):
+                arrangement.touch(holder, step)
+            for child in place.children.values():
+                if not (child.is_supervisor or child.is_moved):
+                    self.hand(child)
+                    child.is_moved = True
+
+    async def prepare(self, system: ActorSystem) -> None:
+        """Have recorded and protected actors rest: no turn of theirs is to be repeated under another address."""
+        if not (self._candidate or self._moved):
+            return
+        if self._candidate is not None:
+            await self._candidate.prepare(system)
+        for _, handing in self._moved:
+            await handing.prepare(system)
+        waits = bool(self._others_settle(system)) or bool(self._unsteady(system))
+        for one, rest in self._resting(system):
+            if waits:  # Perhaps for what those here have to answer.
+                await rest.give_up()
+            else:
+                await rest.reach(system, functools.partial(system._moves.pause, one.living(system.node), MOVED_WITHIN))
+        for succession in self._successions:  # Last, and from above: whoever has stood down restarts nobody.
+            if waits or self._why_not_moved(system):
+                await succession.let_go(system)
+            else:
+                await succession.hold(system)
+
+    @property
+    def _moved(self) -> list[tuple[DraftPlace, Handing]]:
+        """Those of its actors that have another supervisor in the end, and how each is given to that."""
+        return [(place, handing) for place, handing in self._handings if place.has_moved]
+
+    def _why_not_moved(self, system: ActorSystem) -> str:
+        """Why somebody cannot be given away at this instant; "" if everybody can."""
+        if self._candidate is not None and (why := self._candidate.ready(system)):
+            return why
+        for place, handing in self._moved:
+            assert place.was.below is not None
+            old = place.was.below.living(system.node)
+            if why := handing.ready(system) or ("" if is_elsewhere(old) else self._is_busy(old, place)):
+                return why
+        return ""
+
+    def _resting(self, system: ActorSystem) -> list[tuple[DraftPlace, Gated]]:
+        """Those that run turns again, of the actor and all below it, and how each comes to rest."""
+        for one in addressed(self._top):
+            # Who is reworked rests for that, and is saved; replicas are only told.
+            rests = not one.is_planned and (one.rework is None or one.is_protected)
+            cell = one.now(system.node) if rests else None
+            switch = switch_of(cell) if cell is not None else None
+            runs_again = switch is not None and (switch.method.replays or one.is_protected)
+            if runs_again and one not in self._rests:
+                self._rests[one] = Gated(one, f"pause of {one.path}")
+        return list(self._rests.items())
+
+    def _unsteady(self, system: ActorSystem) -> str:
+        """Why replicas that are to rest cannot hear of another address just now."""
+        cells = [one.now(system.node) for one, _ in self._resting(system)]
+        found = [cell.path for cell in cells if cell is not None and not cell.host.place.is_steady(cell)]
+        return f"a replica of {found[0]} is being replaced" if found else ""
+
+    def _others_settle(self, system: ActorSystem) -> str:
+        """Why the others are not so far that addresses can change; they are asked for what is missing."""
+        # Those that are reworked are saved at the commit.
+        reworked = [place for place in self._draft.places() if place.rework is not None]
+        own = [place.now(system.node) for place in (*reworked, *(one for one, _ in self._resting(system)))]
+        settled = {switch_of(cell) for cell in own if cell is not None}
+        others = [switch for switch in system.homes if switch not in settled]
+        settle_senders(others, self._asked)
+        return WAITING if any(map(is_unsettled, others)) else ""
+
+    @property
+    def waits_for(self) -> str:
+        lodgings, rests = (handing for _, handing in self._handings), self._rests.values()
+        said = (*(one.waits_for for one in lodgings), *(one.waits_for for one in rests))
+        return next(filter(None, said), "")
+
+    def ready(self, system: ActorSystem) -> str:
+        if not (self._candidate or self._moved):
+            return ""
+        if why := self._why_not_moved(system):
+            return why
+        if why := self._others_settle(system) or self._unsteady(system):
+            return why
+        for resting, rest in self._resting(system):
+            switch = switch_of(resting.living(system.node))
+            if not rest.is_waiting:
+                return f"{resting.path} is not at rest"
+            if switch is not None and switch.method.replays and not is_saved(switch):
+                return f"the last snapshot of {resting.path} is not in the store yet"
+        return next((why for one in self._successions if (why := one.ready(system))), "")
+
+    def _is_busy(self, old: Cell, place: DraftPlace) -> str:
+        """Why a supervisor of this process cannot let its child go at this instant; "" if it can."""
+        if why := busy(old):
+            return why
+        one = child_of(old, place.name)
+        if one is None:
+            raise wrong(old.path, f"it has no child {place.name!r} any more")
+        if one.state not in (UP, STOPPED) or one.row is not None or one.up is not None:
+            return f"{old.path}/{place.name} is being restarted"
+        return ""
+
+    def commit(self, system: ActorSystem) -> None:
+        for rest in self._rests.values():
+            rest.open()
+
+    async def finish(self, system: ActorSystem) -> None:
+        for _, handing in self._handings:
+            await handing.finish(system)
+        for rest in self._rests.values():
+            if rest.task is not None:
+                with contextlib.suppress(HoldfastError):  # Its life has ended: the next one begins where it is now.
+                    await asyncio.shield(rest.task)
+
+    async def release(self, system: ActorSystem) -> None:
+        for succession in self._successions:
+            await succession.let_go(system)
+        for rest in self._rests.values():
+            await rest.give_up()
+        for _, handing in self._handings:
+            await handing.release(system)
+        if self._candidate is not None:
+            await self._candidate.release(system)
+
+
+def addressed(place: DraftPlace) -> Iterator[DraftPlace]:
+    """An actor and all below it, but the parts of mechanisms: these go with whom they protect."""
+    yield place
+    if not place.is_protected:
+        for child in place.children.values():
+            yield from addressed(child)
+
+
 def check_movable(place: DraftPlace) -> None:
     """Whether an actor can have another address.
 
@@ -108,3 +278,54 @@ def has_process(place: DraftPlace) -> bool:
     """Whether a supervisor has a process of its own, or is below one that has."""
     cell, spec = place.cell, place.spec
     return (spec is not None and spec.isolation == "process") or (cell is not None and is_elsewhere(cell))
+
+
+async def successors(draft: Draft, place: DraftPlace, new: DraftPlace, *, is_given: bool) -> list[DraftPlace]:
+    """The supervisors at and below a place that begin anew, from above.
+
+    Args:
+        draft: as it is at this point.
+        place: the uppermost.
+        new: the supervisor below which all of it will be.
+        is_given: whether any of them leaves a process, or comes to one.
+
+    Raises:
+        SpecError: they cannot, or somebody below them cannot be given to another supervisor.
+    """
+    await draft.supervisor(place.path)  # It tells whom it has.
+    check_succession(place)
+    found = [place]
+    for child in list(place.children.values()):
+        if child.spec is None and child.cell is not None:
+            child.spec = recipe_spec(child.cell)
+        if is_given or is_far(place):
+            check_handed(child, place, new)
+        if child.is_supervisor:
+            found += await successors(draft, child, new, is_given=is_given)
+    return found
+
+
+WAITING = "recorded actors may have to repeat what they sent to it: their snapshots are waited for"
+
+
+def is_unsettled(switch: Switch) -> bool:
+    """Whether what it has sent may be sent again, to be compared."""
+    ledger, method = switch.ledger, switch.method
+    if not (method.replays or method.snapshots):  # Protected, without recovery: only the turn in hand is made again.
+        return bool(ledger.released)
+    return ledger.has_sent
+
+
+def is_saved(switch: Switch) -> bool:
+    """Whether a replay would compare nothing: all that it has done is in its snapshot."""
+    compared = any(turn.digests or turn.reply or turn.state for turn in switch.turns.values())
+    return not (compared or switch.ledger.released or switch.images.is_saving)
+
+
+def settle_senders(homes: Iterable[Switch], asked: dict[Switch, int]) -> None:
+    """Have recorded actors take a snapshot, so that no replay sends to an address of before; each turn once."""
+    for switch in homes:
+        life = switch.life
+        if is_unsettled(switch) and asked.get(switch) != switch.turn and life.port is not None and life.is_released:
+            asked[switch] = switch.turn
+            life.port.to_life(SnapshotNow(urgent=True))  # also if it is suspended
