@@ -5,11 +5,10 @@ Of the old one it has the children, in their order, the flags, and the restarts 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ..actors.kernel import mailbox
 from ..actors.kernel.message import RuntimeOrder
 from .children import STOPPED, UP
 
@@ -25,18 +24,19 @@ class Account(msgspec.Struct, frozen=True):
     restarts: tuple[float, ...]
     """How many seconds ago each restart was that may still count, the oldest first."""
 
+    def data(self) -> list[Any]:
+        """The same as plain data."""
+        return [list(self.children), list(self.restarts)]
 
-class StandDown(RuntimeOrder[Account | None]):
-    """Handle nothing from now on, until the transaction of this attempt is over; the reply is None if that cannot be.
-
-    It cannot while children are being started or stopped: then all goes on.
-    """
-
-    attempt: int
+    @classmethod
+    def of(cls, data: list[Any]) -> Account:
+        """An account from such data."""
+        children, restarts = data
+        return cls(tuple(children), tuple(restarts))
 
 
 class TakeOver(RuntimeOrder[None]):
-    """Go on where another supervisor has stood down, whose children are yours by now."""
+    """Go on in the place of another supervisor, whose children are yours by now."""
 
     account: Account
 
@@ -53,18 +53,6 @@ def account_of(supervisor: Supervisor) -> Account:
     """What a supervisor leaves to the one that takes its place."""
     now = supervisor.ctx.cell.node.loop.time()
     return Account(tuple(supervisor._listed()), tuple(now - at for at in supervisor._restarts))
-
-
-def stand_down(supervisor: Supervisor, attempt: int) -> Account | None:
-    """Have a supervisor handle nothing behind this turn; None if it cannot stand down now."""
-    if why_occupied(supervisor):
-        return None
-    cell = supervisor.ctx.cell
-    mailbox.suspend(cell, mailbox.BY_TRANSACTION)
-    hold = mailbox.held(cell)
-    assert hold is not None
-    hold.attempt = attempt
-    return account_of(supervisor)
 
 
 def take_over(supervisor: Supervisor, account: Account) -> None:

@@ -48,7 +48,7 @@ from .children import (
 )
 from .decisions import affected, decide, is_reported
 from .errands import Errand, answered
-from .handover import Account, StandDown, TakeOver, stand_down, take_over
+from .handover import TakeOver, account_of, take_over, why_occupied
 from .inquiries import Inquiries
 from .intensity import admit_restart, recent_restarts
 from .spec import ChildSpec, Flags, Plan, check_spec
@@ -681,10 +681,8 @@ class Supervisor(Inquiries):
             return self._fail(error)
         return None
 
-    @on(StandDown)
-    def _stand_down(self, message: StandDown) -> Account | None:
-        """Hold still, for another supervisor is to take our place."""
-        return stand_down(self, message.attempt)
+    def _stand_down(self) -> Any:
+        return None if why_occupied(self) else account_of(self).data()
 
     @on(TakeOver)
     def _take_over(self, message: TakeOver) -> None:

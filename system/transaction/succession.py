@@ -12,27 +12,26 @@ import contextlib
 import dataclasses
 from typing import TYPE_CHECKING
 
-from ...actors.control.orders import Conclude
+from ...actors.control.orders import Conclude, StandDown
 from ...actors.control.orders_lane import order
 from ...actors.errors import ActorStopped, AskFailed
 from ...actors.exit_reasons import SHUTDOWN, Shutdown
 from ...actors.kernel import lifecycle, links, mailbox
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import GONE, RUNNING, Cell
-from ...actors.kernel.ref import ActorRef
 from ...actors.migration.quiesce import ATTEMPTS, farewell, handed_on, part, sorted_out
 from ...actors.process.process_host import FLIGHT, WorkerPlace
 from ...actors.process.wire.peer import OutsideHost
 from ...actors.process.worker_pool import Worker
 from ...supervision.children import complete
-from ...supervision.handover import Account, StandDown, TakeOver, account_of, take_over, why_occupied
+from ...supervision.handover import Account, TakeOver, account_of, take_over, why_occupied
 from ...supervision.services.partition import UniformSupervisor
 from ...supervision.spec import Flags
 from ...supervision.supervisor import Supervisor
 from .arrangement import busy, child_of, planned_spec
-from .draft import START_TIMEOUT, DraftPlace, check_awake, is_elsewhere
+from .draft import DraftPlace, check_awake, is_elsewhere
 from .operation import wrong
-from .rework import CONCLUDED_WITHIN
+from .rework import CONCLUDED_WITHIN, PREPARED_WITHIN
 from .structure import Newcomer, fill
 
 if TYPE_CHECKING:
@@ -113,7 +112,7 @@ class Beside(Candidate):
         self._cell: Cell | None = None
 
     async def prepare(self, system: ActorSystem) -> None:
-        if self._is_up():
+        if self._settle():
             return
         await self.release(system)
         assert self._place.parent is not None
@@ -126,10 +125,10 @@ class Beside(Candidate):
         up = cell.host.start(cell)
         if up is not None:
             await up
-        self._is_up()
+        self._settle()
 
-    def _is_up(self) -> bool:
-        """Whether it is up, below its supervisor as that lives now; its place is that of the two then."""
+    def _settle(self) -> bool:
+        """Have it, and those below it, be found by the draft; returns whether it is up."""
         cell = self._cell
         if cell is None or cell.state is not RUNNING or not cell.host.is_up(cell):
             return False
@@ -137,7 +136,7 @@ class Beside(Candidate):
         return cell.parent is not None and cell.parent.state is not GONE
 
     def ready(self, system: ActorSystem) -> str:
-        return "" if self._is_up() else f"{self._place.path} is being started"
+        return "" if self._settle() else f"{self._place.path} is being started"
 
     async def release(self, system: ActorSystem) -> None:
         cell, self._cell = self._cell, None
@@ -157,7 +156,8 @@ class Succession:
         self.left = DraftPlace(place.name, place.was.below, place.cell, place.spec)
         """What is left of the old one."""
         self._attempt = next(ATTEMPTS)
-        self._held: tuple[Cell, int] | None = None  # which life has stood down, in another process
+        self._is_asked = False  # to stand down, in another process
+        self._held: tuple[Cell, int] | None = None  # which life has done so
         self._account: Account | None = None
         for one in draft.places():
             if one.was.below is place:
@@ -177,16 +177,17 @@ class Succession:
         cell = self.left.living(system.node)
         if not is_elsewhere(cell) or self._held == (cell, cell.life):
             return
-        life, old = cell.life, ActorRef[Supervisor](cell)
+        life, self._is_asked = cell.life, True
         with contextlib.suppress(AskFailed, ActorStopped):  # It has ended: its next life is asked.
-            self._account = await old.ask(StandDown(self._attempt), START_TIMEOUT)
-            self._held = None if self._account is None else (cell, life)
+            told = await order(cell, StandDown(self._attempt), PREPARED_WITHIN)
+            if told is not None:
+                self._held, self._account = (cell, life), Account.of(told)
 
     async def let_go(self, system: ActorSystem) -> None:
         """It goes on."""
-        held, self._held = self._held, None
+        is_asked, self._is_asked, self._held = self._is_asked, False, None
         cell = self.left.now(system.node)
-        if held is not None and cell is not None:
+        if is_asked and cell is not None:  # Also if its answer was not waited for.
             with contextlib.suppress(AskFailed, ActorStopped):  # It is another life by now.
                 await order(cell, Conclude(self._attempt, False, None), CONCLUDED_WITHIN)
 
