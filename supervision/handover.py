@@ -5,7 +5,7 @@ Of the old one it has the children, in their order, the flags, and the restarts 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -23,16 +23,6 @@ class Account(msgspec.Struct, frozen=True):
     """The ids of its children, in start order."""
     restarts: tuple[float, ...]
     """How many seconds ago each restart was that may still count, the oldest first."""
-
-    def data(self) -> list[Any]:
-        """The same as plain data."""
-        return [list(self.children), list(self.restarts)]
-
-    @classmethod
-    def of(cls, data: list[Any]) -> Account:
-        """An account from such data."""
-        children, restarts = data
-        return cls(tuple(children), tuple(restarts))
 
 
 class TakeOver(RuntimeOrder[None]):

@@ -10,6 +10,8 @@ import asyncio
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, ClassVar
 
+import msgspec
+
 from ..actors.errors import HoldfastError, SpecError, StartFailed, StartIgnored
 from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
 from ..actors.exit_reasons import SHUTDOWN, ExitReason, crash, unpack_exit
@@ -545,6 +547,14 @@ class Supervisor(Inquiries):
         """A child is to be started for the first time. Raises HoldfastError if that cannot be."""
         self._children[one.spec.id] = one
 
+    def _give_away(self, name: str) -> Child:
+        """Another supervisor has this child from now on, and its life goes on."""
+        return self._children.pop(name)
+
+    def _welcome(self, one: Child) -> None:
+        """A child that another supervisor has had is ours from now on."""
+        self._children[one.spec.id] = one
+
     def _check_free(self, spec: ChildSpec) -> None:
         """Refuse a child whose id is known."""
         known = self._children.get(spec.id)
@@ -682,7 +692,7 @@ class Supervisor(Inquiries):
         return None
 
     def _stand_down(self) -> Any:
-        return None if why_occupied(self) else account_of(self).data()
+        return None if why_occupied(self) else msgspec.to_builtins(account_of(self))
 
     @on(TakeOver)
     def _take_over(self, message: TakeOver) -> None:

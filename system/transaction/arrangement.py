@@ -249,7 +249,7 @@ def _taken(
 ) -> Child:
     """The child as its new supervisor has it from now on; the old one, if it lives in this process, has it no more."""
     if _left(child) in here:
-        one = here[_left(child)]._children.pop(child.name)
+        one = here[_left(child)]._give_away(child.name)
         one.spec = handing.spec(one.spec)
         return one
     cell, above = child.cell, cells[_below(child)]
@@ -266,6 +266,9 @@ def _taken(
 def _arrange(place: DraftPlace, supervisor: Supervisor, taken: dict[DraftPlace, Child]) -> None:
     """The children in the order of the draft; those that came meanwhile, and are not known there, behind them."""
     known, children = supervisor._children, dict[str, Child]()
+    for child in place.children.values():
+        if child in taken:
+            supervisor._welcome(taken[child])
     for name, child in place.children.items():
         one = taken.get(child) or known.get(name)
         if one is None and child.comes_last:

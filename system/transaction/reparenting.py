@@ -293,7 +293,7 @@ async def successors(draft: Draft, place: DraftPlace, new: DraftPlace, *, is_giv
         SpecError: they cannot, or somebody below them cannot be given to another supervisor.
     """
     await draft.supervisor(place.path)  # It tells whom it has.
-    check_succession(place)
+    check_succession(place, new)
     found = [place]
     for child in list(place.children.values()):
         if child.spec is None and child.cell is not None:

@@ -324,6 +324,7 @@ def named_spec(supervisor: Target, spec: ChildSpec | Start[Any], taken: set[str]
     made = child(None, spec) if isinstance(spec, Start) else spec
     if not isinstance(made, ChildSpec):
         raise wrong("add", f"takes child(...), start(...) or supervisor(...), not {spec!r}")
+    made = dataclasses.replace(made, comes_back=True, made_up=False)  # As it was told of another child, perhaps.
     if made.id != NAMELESS:
         return made
     path = text_of(supervisor)

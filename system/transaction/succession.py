@@ -12,6 +12,8 @@ import contextlib
 import dataclasses
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from ...actors.control.orders import Conclude, StandDown
 from ...actors.control.orders_lane import order
 from ...actors.errors import ActorStopped, AskFailed
@@ -42,12 +44,14 @@ ENDS_WITHIN = 5.0
 """Seconds that the process of a supervisor may take to end when it has none any more."""
 
 
-def check_succession(place: DraftPlace) -> None:
-    """Whether another supervisor can take the place of this one.
+def check_succession(place: DraftPlace, above: DraftPlace) -> None:
+    """Whether another supervisor, which will be below `above`, can take the place of this one.
 
     Raises:
         SpecError: why not.
     """
+    if above.flags is not None and above.flags.journal:
+        raise wrong(above.path, "its journal would say that this one begins without children")
     spec, kind = place.spec, place.kind
     if spec is None or kind is None or place.cell is None or place.is_planned:
         raise wrong(place.path, "it has begun, or moved, by this very transaction: use the next one")
@@ -181,7 +185,7 @@ class Succession:
         with contextlib.suppress(AskFailed, ActorStopped):  # It has ended: its next life is asked.
             told = await order(cell, StandDown(self._attempt), PREPARED_WITHIN)
             if told is not None:
-                self._held, self._account = (cell, life), Account.of(told)
+                self._held, self._account = (cell, life), msgspec.convert(told, Account)
 
     async def let_go(self, system: ActorSystem) -> None:
         """It goes on."""

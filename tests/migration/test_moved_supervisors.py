@@ -23,6 +23,9 @@ from tests.migration.travellers import KINDS, Add, Luggage, Stream, Traveller
 from tests.system.test_transaction_commit import Die
 from tests.system.trees import Stumble
 
+# A refused or failed transaction ends with its block, which collects several steps.
+# ruff: noqa: PT012
+
 HOMES: dict[str, Any] = {"near": "task", "next": "task", "far": "process", "other": "process"}
 WAYS = {
     "far to near": ("far", "near"),
@@ -516,6 +519,31 @@ async def test_a_dynamic_supervisor_goes_with_those_that_the_root_knows(system: 
     assert three.path == "/app/far/team/three"
 
 
+async def test_a_dynamic_supervisor_goes_with_its_template(system: hf.ActorSystem) -> None:
+    template = hf.child(None, hf.start(Traveller), recovery=KINDS["recorded"])
+    await system.start(hf.supervisor("near", children=[hf.dynamic("team", template=template)], intensity=99))
+    await system.start(hf.supervisor("far", isolation="process", intensity=99))
+    supervisor = team_of(system)
+    one = await supervisor.ask(hf.StartChild(), IN_TIME)
+    assert await one.ask(Add(2), IN_TIME) == 2
+    await move(system, "far")
+    assert (one.path, await one.ask(Add(2), IN_TIME)) == ("/app/far/team/traveller-1", 4)
+    assert (await supervisor.ask(hf.StartChild(), IN_TIME)).path == "/app/far/team/traveller-2"
+
+
+async def test_a_journal_says_who_has_come_and_not_who_has_gone(system: hf.ActorSystem) -> None:
+    for name in ("pool", "other"):
+        await system.start(hf.dynamic(name, journal=True))
+    one = await system.ref("/app/pool", hf.Supervisor).ask(hf.StartChild(traveller("recorded", "task")), IN_TIME)
+    assert await one.ask(Add(2), IN_TIME) == 2
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.move(one, "/app/other")
+    for name in ("pool", "other"):
+        await system.ref("/app", hf.Supervisor).ask(hf.RestartChild(name, running=True), IN_TIME)
+    assert [path for path in system.tree() if path.endswith("/one")] == ["/app/other/one"]
+    assert await one.ask(Add(2), IN_TIME) == 4
+
+
 async def test_who_has_left_the_address_is_found_by_it_when_nobody_stays_there(system: hf.ActorSystem) -> None:
     """A supervisor that goes back, and does not: whoever knows only its first address reaches it as before."""
     await plant(system, "near", team("plain", "task"), "near", "far")
@@ -579,3 +607,35 @@ async def test_its_old_life_ends_and_tells_nobody_else(system: hf.ActorSystem, w
                 await asyncio.sleep(0.005)
         told = [event for event in events.take() if isinstance(event, (hf.ChildTerminated, hf.ChildRestarted))]
     assert told == []
+
+
+@pytest.mark.parametrize("way", list(WAYS))
+async def test_who_has_come_meanwhile_is_not_left_behind(system: hf.ActorSystem, way: str) -> None:
+    old, new = WAYS[way]
+    await plant(system, old, spec_for(way, "plain", "task"), old, new)
+    supervisor = team_of(system)
+
+    async def come(system: hf.ActorSystem) -> None:
+        await supervisor.ask(hf.StartChild(hf.child("late", hf.start(Traveller))), IN_TIME)
+
+    with pytest.raises(hf.TransactionFailed, match="another child by now, 'late'"):
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.step(Stumble(come))
+            put(system, change, new, way)
+    assert await below(system, supervisor.path) == [*RUNNING, ("late", "running")]
+    assert await system.ref(f"/app/{old}/team/late", Traveller).ask(Add(1), IN_TIME) == 1
+
+
+@pytest.mark.parametrize("way", list(WAYS))
+async def test_a_ref_from_before_means_the_one_that_is_there_now(system: hf.ActorSystem, way: str) -> None:
+    old, new = WAYS[way]
+    await plant(system, old, spec_for(way, "plain", "task"), old, new)
+    supervisor, friend = team_of(system), await system.start(hf.child("friend", hf.start(Friend)))
+    await move(system, new, way=way)
+    assert await friend.ask(Know(supervisor), IN_TIME)
+    system.register("the team", supervisor)
+    assert system.whereis("the team").path == f"/app/{new}/team"
+    assert await friend.ask(Heard(), IN_TIME) == []
+    supervisor.kill()
+    await hears(friend, ["down", "exit"])
+    await is_whole(system, new, (old, new))
