@@ -65,6 +65,8 @@ class Supervisor(Inquiries):
 
     _supervises: ClassVar[bool] = True
     _is_dynamic: ClassVar[bool] = False
+    _irreplaceable: ClassVar[str] = ""
+    """Why no other one can take the place of one of this class, and begin without children; "" if one can."""
 
     _flags: Flags
     _restarts: tuple[float, ...]

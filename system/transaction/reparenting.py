@@ -26,7 +26,7 @@ from .living import OnSharedWork
 from .operation import Operation, StagedWork, text_of, wrong
 from .relocation import MOVED_WITHIN, Gated
 from .structure import check_child, check_not_uniform
-from .succession import Candidate, Elsewhere, Succession, check_succession
+from .succession import Elsewhere, NewSupervisor, Succession, check_succession
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
@@ -103,14 +103,14 @@ class Regrouping(StagedWork):
         self._rests: dict[DraftPlace, Gated] = {}
         self._handings: list[tuple[DraftPlace, Handing]] = []
         self._successions: list[Succession] = []  # from above
-        self._candidate: Candidate | None = None  # the uppermost supervisor that begins anew
+        self._candidate: NewSupervisor | None = None  # the uppermost supervisor that begins anew
 
     def hand(self, place: DraftPlace) -> None:
         """Have this actor be given to the supervisor that it has in the draft in the end."""
         handing = self._draft.arrangement.handings[place] = Handing(place, self._draft.timeout)
         self._handings.append((place, handing))
 
-    def begin_anew(self, places: Iterable[DraftPlace], candidate: Candidate, step: Operation) -> None:
+    def begin_anew(self, places: Iterable[DraftPlace], candidate: NewSupervisor, step: Operation) -> None:
         """Have these supervisors begin anew, the uppermost as this candidate, and get all that are below them."""
         self._candidate = candidate
         for place in places:
@@ -129,6 +129,8 @@ class Regrouping(StagedWork):
         """Have recorded and protected actors rest: no turn of theirs is to be repeated under another address."""
         if not (self._candidate or self._moved):
             return
+        if self._why_not_moved(system):
+            await self._let_go(system)  # Whoever has stood down restarts nobody.
         if self._candidate is not None:
             await self._candidate.prepare(system)
         for _, handing in self._moved:
@@ -139,11 +141,16 @@ class Regrouping(StagedWork):
                 await rest.give_up()
             else:
                 await rest.reach(system, functools.partial(system._moves.pause, one.living(system.node), MOVED_WITHIN))
-        for succession in self._successions:  # Last, and from above: whoever has stood down restarts nobody.
-            if waits or self._why_not_moved(system):
-                await succession.let_go(system)
-            else:
-                await succession.hold(system)
+        if waits or self._why_not_moved(system):
+            await self._let_go(system)
+            return
+        for succession in self._successions:
+            await succession.hold(system)
+
+    async def _let_go(self, system: ActorSystem) -> None:
+        """Supervisors that have stood down go on."""
+        for succession in self._successions:
+            await succession.let_go(system)
 
     @property
     def _moved(self) -> list[tuple[DraftPlace, Handing]]:
@@ -234,8 +241,7 @@ class Regrouping(StagedWork):
                     await asyncio.shield(rest.task)
 
     async def release(self, system: ActorSystem) -> None:
-        for succession in self._successions:
-            await succession.let_go(system)
+        await self._let_go(system)
         for rest in self._rests.values():
             await rest.give_up()
         for _, handing in self._handings:

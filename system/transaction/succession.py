@@ -27,7 +27,6 @@ from ...actors.process.wire.peer import OutsideHost
 from ...actors.process.worker_pool import Worker
 from ...supervision.children import complete
 from ...supervision.handover import Account, TakeOver, account_of, take_over, why_occupied
-from ...supervision.services.partition import UniformSupervisor
 from ...supervision.spec import Flags
 from ...supervision.supervisor import Supervisor
 from .arrangement import busy, child_of, planned_spec
@@ -58,10 +57,11 @@ def check_succession(place: DraftPlace, above: DraftPlace) -> None:
     if place.is_stopped:
         raise wrong(place.path, "it does not run: start it first")
     check_awake(place)
-    if issubclass(kind, UniformSupervisor):
-        raise wrong(place.path, "it cannot begin without its children, which are all alike: remove it, and add it")
+    assert issubclass(kind, Supervisor)
+    if kind._irreplaceable:
+        raise wrong(place.path, kind._irreplaceable)
     args = spec.start.args
-    if not issubclass(kind, Supervisor) or kind.init is not Supervisor.init:
+    if kind.init is not Supervisor.init:
         raise wrong(place.path, "its class has an init of its own, which alone says with which children it begins")
     if len(args) != 2 or not isinstance(args[0], Flags) or place.flags is None:
         raise wrong(place.path, "its recipe does not say its flags and children")
@@ -72,7 +72,7 @@ def check_succession(place: DraftPlace, above: DraftPlace) -> None:
         raise wrong(one.path, "it is changed by this very transaction: move its supervisor in the next one")
 
 
-class Candidate:
+class NewSupervisor:
     """A supervisor that begins before the commit, with no children but supervisors like itself; it may be given up."""
 
     async def prepare(self, system: ActorSystem) -> None:
@@ -88,7 +88,7 @@ class Candidate:
         raise NotImplementedError
 
 
-class Elsewhere(Candidate):
+class Elsewhere(NewSupervisor):
     """A candidate at another address, which its supervisor starts as one more child."""
 
     def __init__(self, place: DraftPlace) -> None:
@@ -108,7 +108,7 @@ class Elsewhere(Candidate):
         system.homes.addresses.put_back(self._forwarded or {})
 
 
-class Beside(Candidate):
+class Beside(NewSupervisor):
     """A candidate at the address of the one whose place it takes, where nobody finds it: it is to live elsewhere."""
 
     def __init__(self, place: DraftPlace) -> None:

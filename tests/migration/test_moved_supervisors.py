@@ -448,6 +448,7 @@ async def test_what_cannot_begin_anew_is_refused_before_anything_is_done(system:
     specs = {
         "which are all alike": hf.pool("pool", hf.start(Traveller), 2),
         "all alike": hf.partitions("parts", hf.start(Traveller), 2),
+        "its jobs are of those": hf.tasks("jobs"),
         "an init of its own": hf.child("own", hf.start(Own)),
         "its journal is kept under its address": hf.dynamic("noted", journal=True),
         "it does not run": hf.supervisor("idle", children=[hf.child("no", hf.start(Traveller), autostart=False)]),
@@ -638,4 +639,20 @@ async def test_a_ref_from_before_means_the_one_that_is_there_now(system: hf.Acto
     assert await friend.ask(Heard(), IN_TIME) == []
     supervisor.kill()
     await hears(friend, ["down", "exit"])
+    await is_whole(system, new, (old, new))
+
+
+@pytest.mark.parametrize("way", list(WAYS))
+async def test_who_falls_when_its_supervisor_has_stood_down_is_restarted(system: hf.ActorSystem, way: str) -> None:
+    """Its supervisor goes on for that, and stands down again."""
+    old, new = WAYS[way]
+    await plant(system, old, spec_for(way, "recorded", "task"), old, new)
+    one = system.ref(f"/app/{old}/team/one", Traveller)
+    assert await one.ask(Add(3), IN_TIME) == 3
+
+    async def fall(system: hf.ActorSystem) -> None:
+        one.kill()
+
+    await move(system, new, Stumble(fall), way=way)
+    assert await one.ask(Add(3), IN_TIME) == 6
     await is_whole(system, new, (old, new))

@@ -529,6 +529,13 @@ CHECKS = {
         SUPERVISORS,
         "test_a_journal_says_who",
     ),
+    "whoever has stood down goes on while somebody has to be restarted": Check(
+        "system/transaction/reparenting.py",
+        "            await self._let_go(system)  # Whoever has stood down restarts nobody.\n",
+        "            pass\n",
+        SUPERVISORS,
+        "test_who_falls_when_its_supervisor",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
