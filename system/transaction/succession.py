@@ -17,12 +17,12 @@ import msgspec
 from ...actors.control.orders import Conclude, StandDown
 from ...actors.control.orders_lane import order
 from ...actors.errors import ActorStopped, AskFailed
-from ...actors.exit_reasons import SHUTDOWN, Shutdown
+from ...actors.exit_reasons import Shutdown
 from ...actors.kernel import lifecycle, links, mailbox
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import GONE, RUNNING, Cell
 from ...actors.migration.quiesce import ATTEMPTS, farewell, handed_on, part, sorted_out
-from ...actors.process.process_host import FLIGHT, WorkerPlace
+from ...actors.process.process_host import WorkerPlace
 from ...actors.process.wire.peer import OutsideHost
 from ...actors.process.worker_pool import Worker
 from ...supervision.children import complete
@@ -283,13 +283,15 @@ def _end(old: Cell, new: Cell, was: str) -> list[object]:
             command.undelivered(old, str(reason))
         farewell(life, lifecycle.Stop(reason))
     elif isinstance(host.place, WorkerPlace):
-        worker = host.place.process(old)
-        FLIGHT.lost(old, worker, SHUTDOWN)
-        items = list(old.queue or ())
+        worker, outlet = host.place.process(old), old.extra().outlet
+        _, queued = outlet.close()
+        items = [*queued, *(old.queue or ())]
         if worker is not None:
+            again = set(map(id, queued))
+            worker.pending = {key: ask for key, ask in worker.pending.items() if id(ask) not in again}
             if was != new.path:
                 worker.readdress(was, new.path)  # It hears of its end by the address that its actor has here.
-            worker.leave(old, reason, ENDS_WITHIN)
+            worker.leave(old, reason, ENDS_WITHIN, answers=True)
     else:
         assert isinstance(host, OutsideHost)
         assert isinstance(host.peer, Worker)

@@ -18,8 +18,8 @@ import pytest
 
 import holdfast as hf
 from tests.actors.process.waiting import next_event
-from tests.migration.far_places import IN_TIME, PLACES, Pump, pid_of, processes, traveller
-from tests.migration.travellers import KINDS, Add, Luggage, Stream, Traveller
+from tests.migration.far_places import IN_TIME, PLACES, Pump, processes, traveller
+from tests.migration.travellers import KINDS, Add, Give, Later, Luggage, Stream, Traveller
 from tests.system.test_transaction_commit import Die
 from tests.system.trees import Stumble
 
@@ -142,7 +142,7 @@ async def test_all_below_it_go_with_all_they_have(system: hf.ActorSystem, place:
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("victim", ["old", "new", "own", "team"])
 @pytest.mark.parametrize("seed", range(6))
-async def test_a_process_that_is_killed_at_any_instant_loses_nothing(
+async def test_who_is_killed_at_any_instant_loses_nothing(
     system: hf.ActorSystem, seed: int, victim: str, place: str, way: str
 ) -> None:
     old, new = WAYS[way]
@@ -156,17 +156,14 @@ async def test_a_process_that_is_killed_at_any_instant_loses_nothing(
     struck = system.node.loop.time() + rng.random() * 0.4
     while not moving.done() and system.node.loop.time() < struck:
         await asyncio.sleep(0)
+    paths = [path for path in system.tree() if path.endswith("/team")]
+    struck_at = {"own": rng.choice(refs).path, "team": rng.choice(paths), "old": f"/app/{old}", "new": f"/app/{new}"}
     with contextlib.suppress(hf.NoSuchActor, ProcessLookupError):  # It lives nowhere just now.
-        match victim:
-            case "own":
-                pid = rng.choice(processes(system, rng.choice(refs)))
-            case "team":
-                pid = system.pid_of(
-                    system.ref(rng.choice([one for one in system.tree() if one.endswith("/team")]), hf.Actor)
-                )
-            case _:
-                pid = pid_of(system, {"old": old, "new": new}[victim])
-        if pid != os.getpid():
+        ref = system.ref(struck_at[victim], hf.Actor)
+        pid = rng.choice(processes(system, ref))
+        if pid == os.getpid():
+            ref.kill()
+        else:
             os.kill(pid, signal.SIGKILL)
     try:
         await moving
@@ -656,3 +653,54 @@ async def test_who_falls_when_its_supervisor_has_stood_down_is_restarted(system:
     await move(system, new, Stumble(fall), way=way)
     assert await one.ask(Add(3), IN_TIME) == 6
     await is_whole(system, new, (old, new))
+
+
+class Strike(hf.Operation):
+    """Kills the process of a supervisor at the commit."""
+
+    verb = "strike"
+
+    def __init__(self, path: str) -> None:
+        super().__init__(path)
+        self.path = path
+
+    async def check(self, system: hf.ActorSystem, draft: Any) -> None: ...
+
+    def commit(self, system: hf.ActorSystem) -> None:
+        os.kill(system.pid_of(system.ref(self.path, hf.Supervisor)), signal.SIGKILL)
+
+
+@pytest.mark.parametrize("what", ["team", "one"])
+async def test_who_has_come_to_a_process_that_dies_at_once_begins_with_it(system: hf.ActorSystem, what: str) -> None:
+    """Also below a supervisor that is itself below the one whose process it is."""
+    await plant(system, "near", team("plain", "task"), "near")
+    await system.start(hf.supervisor("far", children=[hf.supervisor("deep")], isolation="process", intensity=99))
+    one = system.ref("/app/near/team/one", Traveller)
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.move(one if what == "one" else "/app/near/team", "/app/far/deep")
+        change.step(Strike("/app/far"))
+    async with asyncio.timeout(IN_TIME):
+        while True:
+            with contextlib.suppress(hf.AskFailed, hf.ActorStopped):
+                assert await one.ask(Add(1), IN_TIME) == 1
+                break
+            await asyncio.sleep(0.005)
+
+
+@pytest.mark.parametrize("way", ["with its process", "to a task"])
+async def test_a_promised_reply_comes_through_the_process_that_was_left_and_ends_it(
+    system: hf.ActorSystem, way: str
+) -> None:
+    old, new = WAYS[way]
+    await plant(system, old, spec_for(way, "plain", "task"), old, new)
+    one, process = system.ref(f"/app/{old}/team/one", Traveller), Path(f"/proc/{system.pid_of(team_of(system))}")
+    reply = one.ask(Later(), timeout=IN_TIME)
+    assert await one.ask(Add(1), IN_TIME) == 1
+    await move(system, new, way=way)
+    assert await one.ask(Add(1), IN_TIME) == 2
+    assert process.exists()
+    assert await one.ask(Give(9), IN_TIME)
+    assert await reply == 9
+    async with asyncio.timeout(IN_TIME):
+        while process.exists():
+            await asyncio.sleep(0.005)

@@ -536,6 +536,20 @@ CHECKS = {
         SUPERVISORS,
         "test_who_falls_when_its_supervisor",
     ),
+    "a life that ended with a process gives way to who is started there, however deep": Check(
+        "checkpoint/places/subtree_place.py",
+        "        return None if parent is None else parent.cell\n",
+        "        return None\n",
+        SUPERVISORS,
+        "test_who_has_come_to_a_process_that_dies",
+    ),
+    "a process answers what others still wait for from there": Check(
+        "actors/process/worker_pool.py",
+        "        if answers and any(map(_is_awaited, self.pending.values())):",
+        "        if False:",
+        SUPERVISORS,
+        "test_a_promised_reply",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
