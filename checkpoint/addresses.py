@@ -88,6 +88,8 @@ class Addresses:
         left = dict(self._left)
         for old, now in left.items():
             self._put(old, renamed(names, now))
+            if (again := renamed(names, old)) != old:  # Refs to who had left an address below know it by this now.
+                self._put(again, renamed(names, now))
         for was, now in names.items():
             self._put(was, now)
         for path in list(self._left):

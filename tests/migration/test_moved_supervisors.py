@@ -704,3 +704,20 @@ async def test_a_promised_reply_comes_through_the_process_that_was_left_and_ends
     async with asyncio.timeout(IN_TIME):
         while process.exists():
             await asyncio.sleep(0.005)
+
+
+async def test_a_ref_to_who_had_left_it_before_means_that_one(system: hf.ActorSystem) -> None:
+    """Also if that has begun anew since, so that its ref knows it by whom it was below."""
+    await plant(system, "near", team("plain", "task", "process"), "near", "next", "far")
+    one = system.ref("/app/near/team/one", Traveller)
+    os.kill(system.pid_of(one), signal.SIGKILL)
+    async with asyncio.timeout(IN_TIME):
+        while True:
+            with contextlib.suppress(hf.AskFailed, hf.ActorStopped):
+                assert await one.ask(Add(1), IN_TIME) == 1
+                break
+            await asyncio.sleep(0.005)
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.move(one, "/app/far")
+    await move(system, "next")
+    assert await one.ask(Add(1), IN_TIME) == 2

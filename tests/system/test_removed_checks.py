@@ -550,6 +550,13 @@ CHECKS = {
         SUPERVISORS,
         "test_a_promised_reply",
     ),
+    "who had left an address below one that moves is known by the new one too": Check(
+        "checkpoint/addresses.py",
+        "                self._put(again, renamed(names, now))\n",
+        "                pass\n",
+        SUPERVISORS,
+        "test_a_ref_to_who_had_left",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
