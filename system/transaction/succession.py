@@ -229,7 +229,7 @@ class Succession:
         if new.parent is above and new.name == old.name:
             above.children = {**(above.children or {}), old.name: new}
             if one is not None:
-                one.cell = new
+                one.cell, one.ignored_life = new, 0  # Its lives are counted anew.
         else:
             (above.children or {}).pop(old.name, None)
             if one is not None and isinstance(above.actor, Supervisor):

@@ -721,3 +721,15 @@ async def test_a_ref_to_who_had_left_it_before_means_that_one(system: hf.ActorSy
         change.move(one, "/app/far")
     await move(system, "next")
     assert await one.ask(Add(1), IN_TIME) == 2
+
+
+@pytest.mark.parametrize("way", list(WAYS))
+async def test_the_new_one_is_restarted_however_often_the_old_one_was(system: hf.ActorSystem, way: str) -> None:
+    old, new = WAYS[way]
+    await plant(system, old, spec_for(way, "plain", "task"), old, new)
+    for _ in range(3):
+        await system.ref(f"/app/{old}", hf.Supervisor).ask(hf.RestartChild("team", running=True), IN_TIME)
+    await move(system, new, way=way)
+    team_of(system).kill()
+    await is_whole(system, new, (old, new))
+    assert await system.ref(f"/app/{new}/team/one", Traveller).ask(Add(1), IN_TIME) == 1

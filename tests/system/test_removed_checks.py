@@ -557,6 +557,13 @@ CHECKS = {
         SUPERVISORS,
         "test_a_ref_to_who_had_left",
     ),
+    "the lives of a supervisor that takes another one's place are counted anew": Check(
+        "system/transaction/succession.py",
+        "one.cell, one.ignored_life = new, 0",
+        "one.cell = new",
+        SUPERVISORS,
+        "test_the_new_one_is_restarted and to",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
