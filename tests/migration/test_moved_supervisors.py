@@ -93,7 +93,8 @@ async def is_whole(system: hf.ActorSystem, at: str, homes: tuple[str, ...]) -> N
     """All of it is there and nothing of it elsewhere, in the end."""
     async with asyncio.timeout(IN_TIME):
         while True:
-            with contextlib.suppress(hf.NoSuchActor, hf.ActorStopped, hf.AskFailed):
+            # In a process an address has no class between two lives: the last of these is said there then.
+            with contextlib.suppress(hf.NoSuchActor, hf.ActorStopped, hf.AskFailed, hf.UnknownMessage):
                 told = {name: await below(system, f"/app/{name}") for name in homes}
                 if told == {name: [("team", "running")] if name == at else [] for name in homes}:
                     inner = await below(system, f"/app/{at}/team/inner")
@@ -643,7 +644,7 @@ async def test_a_ref_from_before_means_the_one_that_is_there_now(system: hf.Acto
 async def test_who_falls_when_its_supervisor_has_stood_down_is_restarted(system: hf.ActorSystem, way: str) -> None:
     """Its supervisor goes on for that, and stands down again."""
     old, new = WAYS[way]
-    await plant(system, old, spec_for(way, "recorded", "task"), old, new)
+    await plant(system, old, spec_for(way, "plain", "task"), old, new)
     one = system.ref(f"/app/{old}/team/one", Traveller)
     assert await one.ask(Add(3), IN_TIME) == 3
 
@@ -651,7 +652,7 @@ async def test_who_falls_when_its_supervisor_has_stood_down_is_restarted(system:
         one.kill()
 
     await move(system, new, Stumble(fall), way=way)
-    assert await one.ask(Add(3), IN_TIME) == 6
+    assert await one.ask(Add(3), IN_TIME) == 3
     await is_whole(system, new, (old, new))
 
 
