@@ -49,6 +49,20 @@ class Addresses:
         """The addresses below another one whose actors live elsewhere now."""
         return [path for path in self._left if path.startswith(f"{above}/")]
 
+    def left(self, top: str) -> dict[str, str]:
+        """Where those live now who have left an address, or one below it."""
+        return {path: now for path, now in self._left.items() if path == top or path.startswith(f"{top}/")}
+
+    def put_back(self, left: Mapping[str, str]) -> None:
+        """Whoever came to live at these addresses has not stayed: those are meant again who had left them.
+
+        Raises:
+            HoldfastError: the store refused.
+        """
+        for path, now in left.items():
+            if self._at(path) is None:
+                self._put(path, now)
+
     def find(self, path: str) -> Cell | None:
         """Who lives at an address where the node has nobody: one that waits for its next life, or has moved."""
         found = self._recorded(path)
@@ -74,6 +88,8 @@ class Addresses:
         left = dict(self._left)
         for old, now in left.items():
             self._put(old, renamed(names, now))
+            if (again := renamed(names, old)) != old:  # Refs to who had left an address below know it by this now.
+                self._put(again, renamed(names, now))
         for was, now in names.items():
             self._put(was, now)
         for path in list(self._left):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 from ..actors import exit_reasons
@@ -103,13 +104,33 @@ class DynamicSupervisor(Supervisor):
         return dataclasses.replace(_filled(self._template, args, kwargs), id=name, made_up=made_up == [True])
 
     def _enlist(self, one: Child) -> None:
-        if self._flags.journal:  # First: what is started must come back, also if we die in the middle of the start.
-            given = one.spec if self._template is None else (*_added(self._template, one.spec), one.spec.made_up)
-            data = pack_data(given, f"child {one.spec.id!r}")
-            self.ctx.cell.node.ports.keeper.note(child_key(self.ctx.path, one.spec.id), data)
-        elif one.spec.made_up and self._is_recorded(one):
-            self.ctx.cell.node.ports.keeper.note(child_key(self.ctx.path, one.spec.id), MADE_UP)
+        self._note(one)  # First: what is started must come back, also if we die in the middle of the start.
         super()._enlist(one)
+
+    def _note(self, one: Child) -> None:
+        """Note what becomes of a child when we are started again. Raises HoldfastError if that cannot be."""
+        key, keeper = child_key(self.ctx.path, one.spec.id), self.ctx.cell.node.ports.keeper
+        if self._flags.journal:
+            given = one.spec if self._template is None else (*_added(self._template, one.spec), one.spec.made_up)
+            keeper.note(key, pack_data(given, f"child {one.spec.id!r}"))
+        elif one.spec.made_up and self._is_recorded(one):
+            keeper.note(key, MADE_UP)
+
+    def _give_away(self, name: str) -> Child:
+        one = super()._give_away(name)
+        self._try_to_note(one, lambda: self.ctx.cell.node.ports.keeper.note(child_key(self.ctx.path, name), None))
+        return one
+
+    def _welcome(self, one: Child) -> None:
+        super()._welcome(one)
+        self._try_to_note(one, lambda: self._note(one))
+
+    def _try_to_note(self, one: Child, note: Callable[[], None]) -> None:
+        """A child has come, or gone, whatever the store says."""
+        try:
+            note()
+        except HoldfastError as error:
+            self.ctx.cell.node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
 
     def _is_recorded(self, one: Child) -> bool:
         """Whether something may be recorded of a child, or below it."""
@@ -142,7 +163,9 @@ class DynamicSupervisor(Supervisor):
     def _spec_in(self, message: StartChild) -> ChildSpec:
         own = self.ctx.cell
         given = opened(message.spec, own.node)
-        if self._template is not None:
+        if message.candidate and isinstance(given, ChildSpec):  # It may be the child of another one that we shall have.
+            spec = given
+        elif self._template is not None:
             if given is not None:
                 raise SpecError("StartChild", f"{self.ctx.path} has a template: give args and kwargs only")
             spec = _filled(self._template, message.args, message.kwargs)
@@ -160,7 +183,7 @@ class DynamicSupervisor(Supervisor):
         check_place("StartChild", (spec,), own.node)
         if message.id is not None:
             return dataclasses.replace(spec, id=message.id)
-        if spec.id != NAMELESS and self._template is None:
+        if spec.id != NAMELESS and (self._template is None or message.candidate):
             return spec
         # Without a journal nobody knows this id when we have been restarted: what waits for it waits for nobody.
         return dataclasses.replace(spec, id=self._new_id(spec), comes_back=self._flags.journal, made_up=True)

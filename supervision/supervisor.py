@@ -10,6 +10,8 @@ import asyncio
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, ClassVar
 
+import msgspec
+
 from ..actors.errors import HoldfastError, SpecError, StartFailed, StartIgnored
 from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
 from ..actors.exit_reasons import SHUTDOWN, ExitReason, crash, unpack_exit
@@ -49,6 +51,7 @@ from .children import (
 )
 from .decisions import affected, decide, is_reported
 from .errands import Errand, answered
+from .handover import TakeOver, account_of, take_over, why_occupied
 from .inquiries import Inquiries
 from .intensity import admit_restart, recent_restarts
 from .spec import ChildSpec, Flags, Plan, check_spec
@@ -63,6 +66,8 @@ class Supervisor(Inquiries):
 
     _supervises: ClassVar[bool] = True
     _is_dynamic: ClassVar[bool] = False
+    _irreplaceable: ClassVar[str] = ""
+    """Why no other one can take the place of one of this class, and begin without children; "" if one can."""
 
     _flags: Flags
     _restarts: tuple[float, ...]
@@ -567,6 +572,14 @@ class Supervisor(Inquiries):
         """A child is to be started for the first time. Raises HoldfastError if that cannot be."""
         self._children[one.spec.id] = one
 
+    def _give_away(self, name: str) -> Child:
+        """Another supervisor has this child from now on, and its life goes on."""
+        return self._children.pop(name)
+
+    def _welcome(self, one: Child) -> None:
+        """A child that another supervisor has had is ours from now on."""
+        self._children[one.spec.id] = one
+
     def _check_free(self, spec: ChildSpec) -> None:
         """Refuse a child whose id is known."""
         known = self._children.get(spec.id)
@@ -702,6 +715,14 @@ class Supervisor(Inquiries):
         except HoldfastError as error:
             return self._fail(error)
         return None
+
+    def _stand_down(self) -> Any:
+        return None if why_occupied(self) else msgspec.to_builtins(account_of(self))
+
+    @on(TakeOver)
+    def _take_over(self, message: TakeOver) -> None:
+        """Take the place of another supervisor."""
+        take_over(self, message.account)
 
     def _take(self, plan: Plan) -> None:
         """Follow another plan from now on; raises SpecError if that cannot be."""

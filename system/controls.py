@@ -22,11 +22,12 @@ from ..actors.control.orders import (
 )
 from ..actors.control.orders_lane import ask_status, order
 from ..actors.control.tracing import Statistics, tap_of
-from ..actors.errors import ActorStopped, AskTimeout, ControlFailed, HoldfastError, SpecError
+from ..actors.errors import ActorStopped, AskTimeout, CannotMove, ControlFailed, HoldfastError, SpecError
 from ..actors.events import EventStream
 from ..actors.exit_reasons import SHUTDOWN, ExitReason
 from ..actors.kernel.actor import Actor, Start
-from ..actors.kernel.cell import GONE, Cell
+from ..actors.kernel.cell import Cell
+from ..actors.kernel.node import cell_kind
 from ..actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
 from ..actors.process.process_host import WorkerPlace
 from ..actors.process.resource_limits import Limits
@@ -37,11 +38,15 @@ from ..checkpoint.home.switch import Switch
 from ..checkpoint.places.far_parent import SlotPlace
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Isolation
+from ..supervision.supervisor import Supervisor
 from .live_moves import Moves, check_isolation
+from .transaction.errors import TransactionFailed
+from .transaction.mechanisms import Isolate
 
 if TYPE_CHECKING:
     from ..actors.kernel.node import Node
     from ..ftm.group.protected import ProtectionStatus
+    from .transaction.transaction import Transaction
 
 A = TypeVar("A", bound=Actor)
 
@@ -58,6 +63,10 @@ class Controls:
     @property
     def node(self) -> Node:
         """The node that hosts this process's actors."""
+        raise NotImplementedError
+
+    def transaction(self, *, dry_run: bool = False, timeout: float = 10.0) -> Transaction:
+        """Several changes of the running tree as one."""
         raise NotImplementedError
 
     async def suspend(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> None:
@@ -215,6 +224,7 @@ class Controls:
 
         Its next lives begin there too. Nothing is lost or doubled, asks are answered, and nobody hears of an end; the
         actor begins with `__init__`, its state, and `on_start(restored=True)`. Where it lives already, nothing is done.
+        A supervisor goes with all below it, by a transaction of this one step: see `docs/control.md`.
 
         Args:
             ref: the actor: a child of a supervisor in this process.
@@ -224,14 +234,23 @@ class Controls:
                 the end of its turn and of background work, and within which its new life must be up. (Making the new
                 place ready goes on beside its work.)
 
-        Whoever cancels this gives up waiting; the move itself comes to its end.
+        Whoever cancels this gives up waiting; the move itself comes to its end, but that of a supervisor is given up.
 
         Raises:
             CannotMove: why it stays where it was, as it was. ActorStopped: nobody lives there.
             ProcessUnavailable: no process could be had.
         """
         check_isolation(isolation, limits, timeout)
-        await self._moves.move(self._living(ref), isolation, limits, timeout)
+        cell = self._living(ref)
+        kind = cell_kind(cell)
+        if kind is None or not issubclass(kind, Supervisor):
+            await self._moves.move(cell, isolation, limits, timeout)
+            return
+        try:
+            async with self.transaction(timeout=timeout) as change:
+                change.step(Isolate(ref, isolation, limits))
+        except TransactionFailed as error:
+            raise CannotMove(ref.path, error.cause) from error
 
     async def terminate(
         self, ref: ActorRef[Any], reason: ExitReason = SHUTDOWN, *, timeout: float = DEFAULT_TIMEOUT
@@ -253,9 +272,8 @@ class Controls:
     # -- how --------------------------------------------------------------------------------------------------------
 
     def _living(self, ref: ActorRef[Any]) -> Cell:
-        cell = ref._cell
-        living = cell if cell.state is not GONE else self.node.successor(cell)
-        if living is None or living.is_dead:
+        living = ref._cell.living
+        if living.is_dead:
             raise ActorStopped(ref.path, "nobody lives there")
         return living
 
@@ -281,7 +299,7 @@ class Controls:
 
     async def _replace(self, ref: ActorRef[Any], wanted: Order, timeout: float) -> Any:
         """Carry out an order that gives a recorded actor another state; raises ControlFailed if that is not kept."""
-        switch = switch_of(ref._cell)
+        switch = switch_of(ref._cell.living)
         before = 0 if switch is None else len(switch.arrival.unsaved)
         try:
             result = await self._order(ref, wanted, timeout)

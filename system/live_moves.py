@@ -463,9 +463,7 @@ def _spec_there(cell: Cell, isolation: Isolation, limits: Limits | None) -> Chil
     Raises:
         CannotMove: it cannot.
     """
-    spec, kind = _spec_of(cell), cell_kind(cell)
-    if kind is not None and issubclass(kind, Supervisor):
-        raise CannotMove(cell.path, "it is a supervisor: its children live where it does")
+    spec = _spec_of(cell)
     try:
         return dataclasses.replace(spec, isolation=isolation, limits=limits if limits is not None else spec.limits)
     except SpecError as error:

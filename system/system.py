@@ -182,8 +182,7 @@ class ActorSystem(Recorded, Controls):
         )
         self._body = asyncio.current_task()
         root = self._root = node.root = node.cell_below(None, f"/{self.name}")
-        flags = self.specifications.root_in_force(root.path, options.flags)
-        up = lifecycle.begin(root, Start(Supervisor, (flags, ())))
+        up = lifecycle.begin(root, Start(Supervisor, (options.flags, ())))
         if up is not None:
             await up
         root.ended().add_done_callback(self._root_ended)
@@ -384,14 +383,15 @@ class ActorSystem(Recorded, Controls):
         Raises:
             SpecError: it is a part of a mechanism, which would go on without it: `terminate` ends its life alone.
         """
-        check_no_part(ref._cell)
+        cell = ref._cell.living
+        check_no_part(cell)
         caller = current.get(None)
-        if caller is None or not is_below(caller.cell, ref._cell):
-            await self._stop(ref._cell, reason, deadline if drain else None)
+        if caller is None or not is_below(caller.cell, cell):
+            await self._stop(cell, reason, deadline if drain else None)
             return
         node = self.node  # In nobody's name: it has to go on when the caller's life is over.
         task = node.loop.create_task(
-            self._stop(ref._cell, reason, deadline if drain else None),
+            self._stop(cell, reason, deadline if drain else None),
             name=f"stop of {ref.path}",
             context=node.base_context.copy(),
         )
@@ -469,7 +469,7 @@ class ActorSystem(Recorded, Controls):
 
     def register(self, name: str, ref: ActorRef[Any]) -> None:
         """Give an actor a name beside its address. Raises NameTaken."""
-        self.node.register(name, ref._cell)
+        self.node.register(name, ref._cell.living)
 
     def unregister(self, name: str) -> None:
         """Free a name; unknown ones are fine."""
@@ -491,7 +491,7 @@ class ActorSystem(Recorded, Controls):
 
         It lasts until the supervisor of the owner is restarted. `change.bind`, in a transaction, is for good.
         """
-        self.node.bind(ref._cell, port, target._cell)
+        self.node.bind(ref._cell.living, port, target._cell.living)
 
     # -- looking at it ----------------------------------------------------------------------------------------------
 
@@ -510,8 +510,8 @@ class ActorSystem(Recorded, Controls):
         Raises:
             NoSuchActor: it lives nowhere at the moment.
         """
-        cell: Cell | None = ref._cell if ref._cell.state is not GONE else self.node.successor(ref._cell)
-        if cell is None:
+        cell: Cell | None = ref._cell.living
+        if cell is None or cell.state is GONE:
             raise NoSuchActor(ref.path)
         while cell is not None:
             place = cell.host.place

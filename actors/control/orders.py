@@ -272,6 +272,33 @@ class Conclude(Order):
         return cls(data["attempt"], data["is_in_force"], data["suspended"])
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class StandDown(Order):
+    """Handle no message from now on, until `Conclude`: another actor is to take this one's place.
+
+    Returns what it leaves to that one; None: nobody can take its place now, and it goes on.
+    """
+
+    verb: ClassVar[str] = "stand_down"
+    attempt: int
+
+    def run(self, cell: Cell, actor: Actor) -> Any:
+        left = actor._stand_down()
+        if left is not None:
+            mailbox.suspend(cell, mailbox.BY_TRANSACTION)
+            hold = mailbox.held(cell)
+            assert hold is not None
+            hold.attempt = self.attempt
+        return left
+
+    def pack(self, where: str) -> dict[str, Any]:
+        return {"attempt": self.attempt}
+
+    @classmethod
+    def unpack(cls, data: dict[str, Any]) -> StandDown:
+        return cls(data["attempt"])
+
+
 def go_on_with(cell: Cell, actor: Actor, prepared: Prepared) -> None:
     """Have an actor between two turns go on with what was prepared for it. Raises ControlFailed."""
     old, start = type(actor), prepared.start
@@ -325,7 +352,19 @@ class Ready(Order):
 
 ORDERS: dict[str, type[Order]] = {
     kind.verb: kind
-    for kind in (Suspend, Resume, GetState, ReplaceState, ReplaceCode, Prepare, Conclude, ObserveTurns, Mark, Ready)
+    for kind in (
+        Suspend,
+        Resume,
+        GetState,
+        ReplaceState,
+        ReplaceCode,
+        Prepare,
+        StandDown,
+        Conclude,
+        ObserveTurns,
+        Mark,
+        Ready,
+    )
 }
 
 

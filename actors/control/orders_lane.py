@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 from ..errors import ActorStopped, ControlFailed, HoldfastError, error_text, type_name
-from ..kernel.cell import GONE, Cell
+from ..kernel.cell import Cell
 from ..kernel.envelope import Ask, Item
 from ..kernel.message import Message
 from ..process.wire import frames
@@ -109,8 +109,8 @@ def order(cell: Cell, wanted: Order, timeout: float) -> asyncio.Future[Any]:
     """
     node = cell.node
     future: asyncio.Future[Any] = node.loop.create_future()
-    living = cell if cell.state is not GONE else node.successor(cell)
-    if living is None or living.is_dead:
+    living = cell.living
+    if living.is_dead:
         future.set_exception(ActorStopped(cell.path, "nobody lives there"))
         return future
     ask = OrderAsk(ORDERED, None, (), timeout, node.loop.time() + timeout, future, living)

@@ -223,6 +223,10 @@ class Actor:
     def _child_lost(self, cell: Cell) -> None:
         """A child that lives on in another process has another supervisor from now on."""
 
+    def _stand_down(self) -> Any:
+        """What it leaves to another one that takes its place, as plain data; None: nobody can take it now."""
+        return None
+
     async def _stop_children(self) -> None:
         """The life ends: its children go first, newest first."""
         for child in reversed(list((self.ctx.cell.children or {}).values())):

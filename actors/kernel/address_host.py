@@ -95,6 +95,10 @@ class Place:
         """Whether the life has been told to stop."""
         return False
 
+    def lived_at(self, path: str) -> Cell | None:
+        """Who is known here at an address below, though the process of its supervisor may have ended."""
+        return None
+
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         """A link, monitor or binding at this cell has changed: whoever lives its life has to know."""
 

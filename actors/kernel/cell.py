@@ -242,9 +242,11 @@ class Cell(_Hot):
 
     @property
     def path(self) -> str:
-        """The address in full, from the root down."""
+        """The address in full, from the root down; without a name of its own it is that of the cell above it."""
         parent = self.parent
-        return self.name if parent is None else f"{parent.path}/{self.name}"
+        if parent is None:
+            return self.name
+        return f"{parent.path}/{self.name}" if self.name else parent.path
 
     @property
     def ref(self) -> ActorRef[Any]:
@@ -255,6 +257,11 @@ class Cell(_Hot):
     def is_dead(self) -> bool:
         """Nobody lives here and nobody will be restarted here."""
         return self.state is GONE or (self.state is DOWN and self.spec is None)
+
+    @property
+    def living(self) -> Cell:
+        """Who lives at this address: this one, or who has followed it there when it had ended; itself if nobody has."""
+        return self if self.state is not GONE else self.node.successor(self) or self
 
     def extra(self) -> More:
         """The rarely needed part, made now if it was not."""

@@ -371,21 +371,21 @@ class ActorContext:
     def link(self, other: ActorRef[Any]) -> None:
         """Link two lives: an abnormal end of one ends the other."""
         self._alive()
-        links.link(self.cell, other._cell)
+        links.link(self.cell, other._cell.living)
 
     def unlink(self, other: ActorRef[Any]) -> None:
         """Remove a link; nothing more comes from it."""
-        links.unlink(self.cell, other._cell)
+        links.unlink(self.cell, other._cell.living)
 
     def monitor(self, other: ActorRef[Any]) -> Monitor:
         """`on_down` hears of the end of the present life there."""
         self._alive()
-        return links.monitor(self.cell, other._cell, for_good=False)
+        return links.monitor(self.cell, other._cell.living, for_good=False)
 
     def watch(self, other: ActorRef[Any]) -> Monitor:
         """`on_down` hears once, when the address is gone for good."""
         self._alive()
-        return links.monitor(self.cell, other._cell, for_good=True)
+        return links.monitor(self.cell, other._cell.living, for_good=True)
 
     def subscribe(self, topic: str) -> None:
         """Get what is published there from now on."""

@@ -88,6 +88,42 @@ def drop_watch(watch: Monitor) -> None:
     watch.target.extra().ties.monitors.remove(watch)
 
 
+def hand_over(old: Cell, new: Cell) -> set[str]:
+    """The actor at `new` takes the place of that at `old`: who is tied to the old one is tied to the new one.
+
+    Nobody hears of an end. What the old one watches is not watched any more. Returns the addresses by which the other
+    process in which the new one lives knows the old one: those ties are to be handed over there too, and only there.
+    """
+    known: set[str] = set()
+    if old.more is None or not old.more.has_more:
+        return known
+    ties, its = old.more.ties, new.extra().ties
+    for peer, name in ties.links.items():
+        theirs = peer.extra().ties.links
+        called = theirs.pop(old, new.path)
+        if _are_elsewhere_together(peer, new):
+            known.add(called)
+            continue
+        its.links[peer], theirs[new] = name, called
+        new.host.told(new, "link", {"peer": peer.path})
+    for watch in ties.monitors:
+        if _are_elsewhere_together(watch.watcher, new):
+            known.add(watch.name)
+            watch.forget()
+            continue
+        watch.target = new
+        its.monitors.append(watch)
+        new.host.told(new, "monitor", {"watcher": watch.watcher.path, "for_good": watch.for_good})
+    ties.links, ties.monitors = {}, []
+    for watch in list(ties.watching):
+        watch.cancel()
+    return known
+
+
+def _are_elsewhere_together(one: Cell, other: Cell) -> bool:
+    return one.host is other.host and not one.host.place.is_here
+
+
 def demonitor(watcher: Cell, target: Cell, *, for_good: bool) -> None:
     """Cancel one such watch, whichever: they are alike."""
     for watch in target.more.ties.monitors if target.more is not None else ():

@@ -125,12 +125,12 @@ class ActorRef(Generic[A_co]):
     def stop(self) -> None:
         """Ask the actor to stop after what it has begun; a second stop is no error."""
         self._cell.node.check_thread(self.path)
-        self._cell.request_stop()
+        self._cell.living.request_stop()
 
     def kill(self) -> None:
         """End this life at once, without its hooks. A supervisor treats it as a crash."""
         self._cell.node.check_thread(self.path)
-        self._cell.kill()
+        self._cell.living.kill()
 
     def __repr__(self) -> str:
         return f"<ActorRef {self.path}>"

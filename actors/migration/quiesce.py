@@ -316,6 +316,11 @@ def sorted_out(cell: Cell, *, ticks: bool = False) -> tuple[list[Any], list[Item
     return items, commands
 
 
+def handed_on(items: Iterable[Any]) -> list[Any]:
+    """The messages among what has waited for a life; the rest was of that life alone."""
+    return [item for item in items if not isinstance(item, Item) or isinstance(item, (Ask, Envelope))]
+
+
 def obey_commands(cell: Cell, commands: list[Item]) -> None:
     """What had been ordered of a life before it was moved is ordered of it now."""
     for command in commands:

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ..errors import HoldfastError, error_text
-from ..exit_reasons import ExitReason, unpack_exit
+from ..exit_reasons import ExitReason, Shutdown, unpack_exit
 from ..kernel import lifecycle, links, mailbox
 from ..kernel.actor import Actor, Start
-from ..kernel.cell import RUNNING, Cell
+from ..kernel.cell import RUNNING, Cell, Host
 from ..kernel.context import ActorContext
 from ..kernel.envelope import Ask, Item
 from ..kernel.links import Monitor
@@ -19,7 +19,7 @@ from ..process.wire.frames import BadFrame
 from ..process.wire.peer import Arrived, RelayedAsk
 from ..process.wire.start_codec import unpack_recipe
 from .luggage import pack_items, pack_rest, unpack
-from .quiesce import PackLife, Settle, now, resume
+from .quiesce import PackLife, Settle, farewell, handed_on, now, part, resume, sorted_out
 from .words import Incoming, say
 
 if TYPE_CHECKING:
@@ -228,6 +228,27 @@ class GuestMove:
         take.is_void = True
         if take.is_done and cell.state is RUNNING:
             resume(cell)
+
+
+class Replaced:
+    """The life of an actor whose place another one takes, which lives outside; its cell stands for that from now on."""
+
+    def __init__(self, cell: Cell) -> None:
+        self._cell, self._life = cell, part(cell)
+        self._items, self._commands = sorted_out(cell)
+
+    def hand_on(self, outside: Host) -> None:
+        """End, and give the other one, at host `outside`, what waits; the ties that only this process has stay."""
+        cell = self._cell
+        ties, why = cell.extra().ties, f"moved to {cell.path}"
+        ties.monitors = [one for one in ties.monitors if one.watcher.host is not outside]
+        for peer in [one for one in ties.links if one.host is outside]:
+            links.sever(cell, peer)
+        for command in self._commands:
+            command.undelivered(cell, why)
+        for item in handed_on(self._items):
+            cell.admit(cell, item)
+        farewell(self._life, lifecycle.Stop(Shutdown(why)))
 
 
 def _leave(cell: Cell, reason: ExitReason) -> None:

@@ -567,7 +567,8 @@ def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
 def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
     """What an actor process wants done to an address, or tells of its own."""
     path = worker.connection.names.from_wire(frame.to)
-    cell = node.cell_at(path)
+    own = worker.cell if path == worker.home else None  # Perhaps nobody else finds it: it may not be the one yet.
+    cell = node.cell_at(path) if own is None else own
     match frame.verb:
         case "subscribe":
             node.topics.subscribe(frame.data["topic"], cell)

@@ -43,7 +43,7 @@ class Inner:
         cell = self._cells.get(path)
         if cell is None:
             parent, name = self._place(home, path)
-            self._free(parent, name)
+            self._free(home, path)
             cell = self._node.cell_below(parent, name, self._host)
             self._cells[path] = cell
             cell.state, cell.admit = RUNNING, self._admit
@@ -89,9 +89,12 @@ class Inner:
                 watch.name = cell.path
 
     @staticmethod
-    def _free(parent: Cell, name: str) -> None:
-        """Give up a life here that ended with the last process, before it had gone where its recipe says: there."""
-        left = (parent.children or {}).get(name)
+    def _free(home: Cell, path: str) -> None:
+        """Give up a life here that ended with the last process, before it had gone where its recipe says: there.
+
+        Its supervisor may have been another one of that process, which is gone.
+        """
+        left = home.host.place.lived_at(path)
         if left is not None and left.host.parent.has_lost:
             left.host.parent.leaves(is_restarting=True)
             lifecycle.retire(left, "the process of its supervisor has ended")
@@ -125,6 +128,8 @@ class Inner:
         more.reason = reason
         for topic in list(more.belongings.topics):
             self._node.topics.unsubscribe(topic, cell)
+        for name in list(more.belongings.names):
+            self._node.unregister(name)
         lifecycle.retire(cell, reason)
         links.announce(cell, reason, recovering=False)
         lifecycle.tell_enders(more, reason)

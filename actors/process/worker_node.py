@@ -20,7 +20,7 @@ from ..errors import HoldfastError, NotGranted, StartFailed, StartIgnored
 from ..events import ActorStarted, Event, event_data
 from ..exit_reasons import ExitReason, pack_exit
 from ..fast_loop import new_event_loop
-from ..kernel import lifecycle
+from ..kernel import lifecycle, links
 from ..kernel.actor import Start
 from ..kernel.address_host import AddressHost
 from ..kernel.cell import RUNNING, Cell
@@ -30,7 +30,7 @@ from ..kernel.message import Message, RuntimeOrder, message_name
 from ..kernel.node import Node, Ports
 from ..kernel.ref import current
 from ..kernel.topics import Topics
-from ..migration.worker_moves import Attempt, GuestMoves
+from ..migration.worker_moves import Attempt, GuestMoves, Replaced
 from ..persistence import Keeper
 from .wire import frames
 from .wire.connection import Connection
@@ -461,19 +461,28 @@ class Guest(Peer):
         self.command(cell, "readdressed", {})
 
     def _disown(self, cell: Cell, old: str, path: str, life: int) -> None:
-        """A child that is lived elsewhere has a supervisor elsewhere, too: its cell stands for one outside."""
+        """A child has a supervisor elsewhere, and is lived elsewhere: its cell stands for one outside."""
         self._has_heard(old)
         self._outside[path] = self._outside[old] = cell
         self._left.add(old)
+        left = None if cell.actor is None else Replaced(cell)  # A supervisor: another one takes its place.
         if cell.parent is not None:
             lifecycle.disown(cell)
         cell.name, cell.state = path, RUNNING
         cell.host, cell.admit, cell.table = self._host, self._host.home.admit, OUTSIDE
         more = cell.extra()
         more.start = more.outlet = None
+        if left is not None:
+            left.hand_on(self._host)
+        here = self.node.find(path)
+        if here is not None and here is not cell:  # Its other supervisor is in this process too.
+            links.hand_over(cell, here)
         for watch in more.ties.monitors:  # The root was not told of these, for whoever watches it was told here.
             data = {"watcher": watch.watcher.path, "for_good": watch.for_good, "life": life}
             cell.host.told(cell, "monitor", data)
+        if left is not None:
+            for peer in more.ties.links:  # Nor of these.
+                cell.host.told(cell, "link", {"peer": peer.path})
 
     # -- the end ----------------------------------------------------------------------------------------------------
 

@@ -29,16 +29,19 @@ from .stand_ins import Inner
 from .wire import frames
 from .wire.connection import Connection
 from .wire.frames import BadFrame
-from .wire.peer import Peer
+from .wire.peer import Peer, RelayedAsk
 from .wire.worker_gate import WorkerGate
 
 if TYPE_CHECKING:
+    from ..kernel.envelope import Ask
     from ..kernel.node import Node
 
 REAPED_WITHIN = 2.0
 """Seconds to wait for the exit status after a process's socket has ended, before it is killed and called lost."""
 AGAIN_AFTER = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 """Seconds between attempts to fork a process for an actor that is restarted."""
+ANSWERED_LOOK = 0.05
+"""Seconds between two looks at whether all is answered that an actor which has left has been asked."""
 ORDER_TIMEOUT = 60.0
 """Seconds until it does not matter any more whether a new process counts for whoever wanted to know."""
 
@@ -199,8 +202,11 @@ class Worker(Peer):
         """
         await self._ask_launch(cell, recipe, {"prepare": True})
 
-    def leave(self, cell: Cell, reason: ExitReason, seconds: float) -> None:
-        """The actor lives elsewhere now: what is left of it ends in good order, within `seconds`, and tells nobody."""
+    def leave(self, cell: Cell, reason: ExitReason, seconds: float, *, answers: bool = False) -> None:
+        """The actor lives elsewhere now: what is left of it ends in good order, within `seconds`, and tells nobody.
+
+        With `answers` not before all is answered that others wait for, and that is answered through this process.
+        """
         self._died = None
         if self._workers.by_cell.get(cell) is self:
             del self._workers.by_cell[cell]
@@ -209,12 +215,19 @@ class Worker(Peer):
             self._watch = None
         self.movers.clear()
         self.ignore_records()
+        self._end_left(cell.path, reason, seconds, answers=answers)
+
+    def _end_left(self, path: str, reason: ExitReason, seconds: float, *, answers: bool) -> None:
         if self.end.is_buried:
             return
-        connection = self.connection
-        say(connection, cell.path, NO_ATTEMPT, "leave", reason=pack_exit(reason))
+        loop, connection = self.node.loop, self.connection
+        if answers and any(map(_is_awaited, self.pending.values())):
+            again = functools.partial(self._end_left, path, reason, seconds, answers=True)
+            loop.call_later(ANSWERED_LOOK, again)
+            return
+        say(connection, path, NO_ATTEMPT, "leave", reason=pack_exit(reason))
         connection.flush()
-        late = self.node.loop.call_later(seconds, self.kill, KILLED)
+        late = loop.call_later(seconds, self.kill, KILLED)
         self._grave.add_done_callback(lambda _: late.cancel())
 
     def kill(self, why: ExitReason) -> None:
@@ -394,6 +407,11 @@ def _limit_options(limits: Limits | None) -> dict[str, Any]:
         "niceness": limits.niceness,
         "beat": None if limits.hung_after is None else limits.hung_after / LOOKS,
     }
+
+
+def _is_awaited(ask: Ask) -> bool:
+    """Whether anybody waits for the answer of an ask: if it came from another process, as long as that is there."""
+    return not ask.is_done and (not isinstance(ask, RelayedAsk) or bool(ask.peer.connection.is_open))
 
 
 class Workers:

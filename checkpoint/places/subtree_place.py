@@ -69,6 +69,10 @@ class SubtreePlace(WorkerPlace):
             parent = self._below[path] = FarParent(self._homes, self.workers, path, self._lives, self._vacated)
         return parent
 
+    def lived_at(self, path: str) -> Cell | None:
+        parent = self._below.get(path)
+        return None if parent is None else parent.cell
+
     def _vacated(self, parent: FarParent) -> None:
         """Nobody lives at an address below any more: what is known of it here goes, and its place on the page."""
         if self._below.get(parent.path) is not parent:

@@ -121,6 +121,8 @@ def _in_thread(threaded: ThreadContext, function: Callable[..., Any], args: tupl
 class TaskSupervisor(DynamicSupervisor):
     """Keeps jobs: a dynamic supervisor that does not wait until they are up. Started by `tasks(...)`."""
 
+    _irreplaceable = "its jobs are of those who have started them, and wait for them here"
+
     def _new_id(self, spec: ChildSpec) -> str:
         if not issubclass(spec.start.kind, JobActor):
             return super()._new_id(spec)

@@ -60,6 +60,7 @@ def partition_of(key: object, count: int) -> int:
 class UniformSupervisor(Supervisor):
     """Base of supervisors whose children are all alike: none of them is started or removed alone."""
 
+    _irreplaceable = "it is never without its children, which are all alike: remove it, and add it"
     instead: ClassVar[str]
     """What to do instead."""
 

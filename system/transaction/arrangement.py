@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from ...actors.kernel.node import Node
     from ..system import ActorSystem
     from .handing import Handing
+    from .succession import Succession
 
 
 class Arrangement:
@@ -46,6 +47,8 @@ class Arrangement:
         ] = {}  # the step; who had it, who has it
         self.handings: dict[DraftPlace, Handing] = {}
         """Of each child that is moved, how it is given to a supervisor, or by one, in another process."""
+        self.successions: list[Succession] = []
+        """The supervisors that begin anew, from above."""
         self.step = ""
         """The step that is in the way, or has failed."""
 
@@ -118,33 +121,39 @@ class Arrangement:
         changed = [place for place in cells if place in self._rearranged]
         moved = [child for place in changed for child in place.children.values() if child.has_moved]
         was = {child: f"{cells[_left(child)].path}/{child.name}" for child in moved}
-        if moved:
+        if moved or self.successions:
             settle_bindings(system.node.root)
         taken = {child: _taken(child, self.handings[child], here, cells) for child in moved}
         for place, supervisor in here.items():
             _arrange(place, supervisor, taken)
         _readdress(cells, here, taken)
         now = {path: f"{cells[_below(child)].path}/{child.name}" for child, path in was.items()}
-        if moved and system.node.root is not None:  # First: what comes now is called by addresses as they are now.
+        now |= dict(one.leave_tree(system) for one in reversed(self.successions))
+        now = {old: new for old, new in now.items() if old != new}
+        left = {one.left for one in self.successions}
+        if now and system.node.root is not None:  # First: what comes now is called by addresses as they are now.
             Renamed(now).keep(system.node.root)
         for place, supervisor in here.items():
             _respecify(place, supervisor)
-        for place, cell in cells.items():
+        for place, cell in [(place, cell) for place, cell in cells.items() if place not in left]:
             keep(cell, lambda flags, specs, place=place: _edited(place, flags, specs, taken))  # type: ignore[misc]
-        if moved:
+        if now:
             system.homes.move(now)
             system.mechanism_notes.moved(now)
         for child in moved:  # Before anything else is said to their processes.
-            for cell in every_cell(taken[child].cell):
+            for cell in every_cell(taken[child].cell) if was[child] in now else ():
                 cell.host.place.readdress(cell, was[child], now[was[child]])
             top = taken[child].cell
             if top is not None:
                 self.handings[child].commit(top)
-        for cell in map(cells.__getitem__, changed):  # Its next life may begin in the process that it is in.
+        for one in reversed(self.successions):
+            one.commit(system)
+        for cell in [cells[place] for place in changed if place not in left]:
+            # Its next life may begin in the process that it is in.
             start = recipe(cell) if isinstance(cell.host.place, OutsidePlace) else None
             if start is not None:
                 cell.host.told(cell, "recipe", {"start": pack_recipe(start, cell.path)})
-        if moved:
+        if now:
             tell_bindings(system.node.root, {new: old for old, new in now.items()})
 
     async def finish(self, system: ActorSystem) -> None:
@@ -240,7 +249,7 @@ def _taken(
 ) -> Child:
     """The child as its new supervisor has it from now on; the old one, if it lives in this process, has it no more."""
     if _left(child) in here:
-        one = here[_left(child)]._children.pop(child.name)
+        one = here[_left(child)]._give_away(child.name)
         one.spec = handing.spec(one.spec)
         return one
     cell, above = child.cell, cells[_below(child)]
@@ -257,6 +266,9 @@ def _taken(
 def _arrange(place: DraftPlace, supervisor: Supervisor, taken: dict[DraftPlace, Child]) -> None:
     """The children in the order of the draft; those that came meanwhile, and are not known there, behind them."""
     known, children = supervisor._children, dict[str, Child]()
+    for child in place.children.values():
+        if child in taken:
+            supervisor._welcome(taken[child])
     for name, child in place.children.items():
         one = taken.get(child) or known.get(name)
         if one is None and child.comes_last:

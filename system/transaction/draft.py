@@ -189,7 +189,7 @@ class DraftPlace:
     def now(self, node: Node) -> Cell | None:
         """The cell that lives here now, if one does: that of before, or the one that has followed it."""
         if self.cell is not None and self.cell.state is GONE:
-            self.cell = node.successor(self.cell) or self.cell
+            self.cell = self.cell.living
         return None if self.cell is None or self.cell.is_dead else self.cell
 
     def living(self, node: Node) -> Cell:
@@ -324,9 +324,7 @@ class Draft:
 
     def _of(self, cell: Cell) -> DraftPlace | None:
         """Where an actor is at this point, whose life may be over: then it is who has followed it before all steps."""
-        if cell not in self.by_cell and cell.state is GONE:
-            cell = self.node.successor(cell) or cell
-        return self.by_cell.get(cell)
+        return self.by_cell.get(cell) or self.by_cell.get(cell.living)
 
     def _check_no_part(self, path: str, above: DraftPlace | None) -> None:
         """Whether what is below `above` is nobody's mechanism. Raises SpecError."""
@@ -407,6 +405,10 @@ class Draft:
                     if both is not self.root and place.comes_back_with(both):
                         found.add((place, port))
         return found
+
+    def places(self) -> Iterator[DraftPlace]:
+        """All places that are in the draft at this point, parents first."""
+        return self.root.walk()
 
     def staying(self) -> Iterator[DraftPlace]:
         """All that is there when all is done, parents first."""

@@ -28,7 +28,7 @@ from .arrangement import planned_spec
 from .draft import START_TIMEOUT, DraftPlace, is_elsewhere
 from .lasting import recipe_specs
 from .operation import wrong
-from .relocation import MOVED_WITHIN, Gated
+from .relocation import MOVED_WITHIN, Gated, seen
 from .structure import CANDIDATES
 
 if TYPE_CHECKING:
@@ -39,11 +39,12 @@ if TYPE_CHECKING:
 
 def is_far(supervisor: DraftPlace) -> bool:
     """Whether a supervisor lives, or will live, in another process."""
-    if supervisor.cell is not None:
-        return is_elsewhere(supervisor.cell)
-    return any(
-        one.is_planned and one.spec is not None and one.spec.isolation == "process" for one in supervisor.upwards()
-    )
+    for one in supervisor.upwards():
+        if not one.is_planned:
+            return one.cell is not None and is_elsewhere(one.cell)
+        if one.spec is not None and one.spec.isolation == "process":
+            return True
+    return False
 
 
 def check_handing(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> None:
@@ -52,24 +53,36 @@ def check_handing(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> None:
     Raises:
         SpecError: why not.
     """
-    cell, spec = place.cell, place.spec
-    if cell is None or place.is_stopped or spec is None:
-        raise wrong(place.path, "it does not run, and a supervisor lives in another process: start it first")
-    if place.is_supervisor:
-        raise wrong(place.path, "it is a supervisor: its children live where it does")
-    if is_far(old) and recipe_spec(cell) is None:
-        raise wrong(
-            place.path, "no recipe at the root has its spec: its supervisor alone, in another process, knows it"
-        )
+    check_handed(place, old, new)
     if is_far(new):
         for one in (recipe_specs(new.cell) or ()) if new.cell is not None else ():
-            if port := next(
-                (port for port in one.bindings.keys() - one.late if cell.node.find(one.bindings[port]) is cell), ""
-            ):
+            early = one.bindings.keys() - one.late
+            if port := next((port for port in early if is_at(place, one.bindings[port])), ""):
                 why = f"it is started before the one to which its spec binds {port!r}"
                 raise wrong(f"{new.path}/{one.id}", f"{why}: a restart of its supervisor would fail")
         if place.name in new.was.children:
             raise wrong(new.path, f"it has a child {place.name!r} until this transaction is in force: use the next one")
+
+
+def is_at(place: DraftPlace, path: str) -> bool:
+    """Whether the actor of a place is found at an address now."""
+    return place.cell is not None and place.cell.node.find(path) is place.cell
+
+
+def check_handed(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> None:
+    """Whether an actor can be given away, with its life, where its supervisor lives in another process, or will.
+
+    Raises:
+        SpecError: why not.
+    """
+    cell, spec = place.cell, place.spec
+    if cell is None or place.is_stopped:
+        raise wrong(place.path, "it does not run, and a supervisor lives in another process: start it first")
+    if spec is None or (is_far(old) and recipe_spec(cell) is None):
+        raise wrong(
+            place.path, "no recipe at the root has its spec: its supervisor alone, in another process, knows it"
+        )
+    if is_far(new):
         check_subtree(new.path, (spec,))
         Boxed(spec).packed()
 
@@ -128,6 +141,7 @@ class Handing:
             spec = dataclasses.replace(spec, isolation="process")
         asked = supervisor.ask(StartChild(spec, candidate=self._candidate), START_TIMEOUT)
         self._start = system.node.loop.create_task(_reply(asked), name=f"room for {place.path}")
+        self._start.add_done_callback(seen)
 
     def _has_failed(self) -> bool:
         """Whether the supervisor has ended before it had answered. Raises what it has answered: a refusal."""

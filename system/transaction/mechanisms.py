@@ -9,12 +9,17 @@ from ...actors.errors import SpecError
 from ...supervision.arbiter import Hand, arbiter_of
 from ...supervision.respec import NO_RECIPE, recipe_spec
 from ...supervision.spec import Isolation
+from ...supervision.supervisor_changes import check_subtree
 from .draft import Draft, DraftPlace, Target, is_elsewhere, rules
+from .handing import is_far
 from .living import OnSharedWork
 from .operation import wrong
 from .relocation import Relocation, described
+from .reparenting import Regrouping, successors
+from .succession import Beside
 
 if TYPE_CHECKING:
+    from ...actors.process.resource_limits import Limits
     from ...ftm.group.probation import Probation
     from ..system import ActorSystem
 
@@ -44,9 +49,10 @@ class Isolate(OnPlace):
     verb: ClassVar[str] = "isolate"
     unsupervised: ClassVar[str] = "nobody supervises it: it has no isolation to change"
 
-    def __init__(self, target: Target, isolation: Isolation) -> None:
+    def __init__(self, target: Target, isolation: Isolation, limits: Limits | None = None) -> None:
         super().__init__(target)
         self._to: Isolation = isolation
+        self._limits = limits  # of a supervisor's process; None: those of its spec
 
     @property
     def text(self) -> str:
@@ -58,7 +64,28 @@ class Isolate(OnPlace):
         assert place.spec is not None
         if self._to not in ("task", "process"):
             raise SpecError(self.target, f"isolation must be one of task, process, not {self._to!r}")
-        place.spec = dataclasses.replace(place.spec, isolation=self._to)
+        if place.is_supervisor and not place.is_planned and place.spec.isolation != self._to:
+            await self._begin_anew(draft, place)
+        else:
+            place.spec = dataclasses.replace(place.spec, isolation=self._to)
+
+    async def _begin_anew(self, draft: Draft, place: DraftPlace) -> None:
+        """Another supervisor takes the place of this one, where it is to live, and gets all below it."""
+        above = place.parent
+        assert above is not None
+        assert place.spec is not None
+        place.relocation = self._work = None
+        if is_far(above):
+            raise wrong(self.target, "its supervisor lives in another process: it lives there, as a task")
+        limits = self._limits or place.spec.limits
+        spec = dataclasses.replace(place.spec, isolation=self._to, limits=limits if self._to == "process" else None)
+        anew = await successors(draft, place, above, is_given=True)
+        if self._to == "process":
+            check_subtree(place.path, [one.spec for one in place.children.values() if one.spec is not None])
+        place.spec = spec
+        work = self._work = Regrouping(place, draft)
+        work.begin_anew(anew, Beside(place), self)
+        draft.arrangement.touch(above, self)
 
 
 class OnProtection(OnPlace):

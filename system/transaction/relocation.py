@@ -53,7 +53,7 @@ class Gated:
             name=self._text,
             context=system.node.base_context.copy(),
         )
-        self.task.add_done_callback(_seen)
+        self.task.add_done_callback(seen)
 
     async def reach(self, system: ActorSystem, work: Callable[[Gate], Coroutine[Any, Any, object]]) -> None:
         """Have it begun, if it is not, and wait until it is ready."""
@@ -255,7 +255,8 @@ class Relocation(StagedWork):
             arbiter_of(system.node).release(grant)
 
 
-def _seen(done: asyncio.Future[Any]) -> None:
+def seen(done: asyncio.Future[Any]) -> None:
+    """Whoever wanted it may not wait any more: its error is no news then."""
     if not done.cancelled():
         done.exception()
 

@@ -1,4 +1,9 @@
-"""Moving a child to another supervisor: its life goes on, only its address changes."""
+"""Moving a child to another supervisor: its life goes on, only its address changes.
+
+So does that of a supervisor, with all below it, if all its supervisors live in the root's process, and stay there. Else
+another one takes its place (`succession.py`). Actors come to rest where a turn could be repeated under another address;
+supervisors that begin anew stand down when all else is ready.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +21,12 @@ from ...supervision.children import STOPPED, UP
 from ...supervision.respec import recipe_spec
 from .arrangement import busy, child_of
 from .draft import Draft, DraftPlace, Target, is_elsewhere
-from .handing import Handing, check_handing, is_far
-from .operation import Operation, text_of, wrong
+from .handing import Handing, check_handed, check_handing, is_far
+from .living import OnSharedWork
+from .operation import Operation, StagedWork, text_of, wrong
 from .relocation import MOVED_WITHIN, Gated
 from .structure import check_child, check_not_uniform
+from .succession import Elsewhere, NewSupervisor, Succession, check_succession
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
@@ -27,7 +34,7 @@ if TYPE_CHECKING:
     from ..system import ActorSystem
 
 
-class Reparent(Operation):
+class Reparent(OnSharedWork):
     """Put a child under another supervisor."""
 
     verb: ClassVar[str] = "move"
@@ -36,11 +43,6 @@ class Reparent(Operation):
         super().__init__(target)
         self._to = supervisor
         self._above: DraftPlace | None = None  # the new supervisor, at this point
-        self._root: DraftPlace | None = None
-        self._asked: dict[Switch, int] = {}  # who was asked for a snapshot, behind which turn
-        self._rests: dict[DraftPlace, Gated] = {}
-        self._certificates: dict[DraftPlace, MovedCertificates] = {}
-        self._handing: Handing | None = None  # by the first step that moves this actor, to where the last one wants it
 
     @property
     def text(self) -> str:
@@ -57,6 +59,8 @@ class Reparent(Operation):
         if new in place.walk():
             raise wrong(place.path, f"it cannot be moved below itself, to {new.path}")
         check_not_uniform(old)
+        if any(one.place is place for one in draft.arrangement.successions):
+            raise wrong(place.path, "it begins anew there by this very transaction: move it once")
         if is_far(old) or is_far(new):
             await draft.supervisor(old.path)  # It tells whom it has before it has one less in the draft.
             check_handing(place, old, new)
@@ -67,24 +71,72 @@ class Reparent(Operation):
                 )
         if new.is_dynamic and place.is_stopped:
             raise wrong(place.path, f"it is stopped, and {new.path} is dynamic: it keeps nobody who does not run")
+        anew: list[DraftPlace] = []
+        if begins_anew(place, old, new):
+            if place.name in new.was.children:
+                why = f"it has a child {place.name!r} until this transaction is in force: use the next one"
+                raise wrong(new.path, why)
+            anew = await successors(draft, place, new, is_given=is_far(old) or is_far(new))
         for one in addressed(place):
             check_movable(one)
         check_child(new, place.spec)
         del old.children[place.name]
         new.children[place.name], place.parent = place, new
-        self._found, self._above, self._root = place, new, draft.root
-        if not (place.is_moved or place.is_planned):  # Who is added is started where it is to be.
-            self._handing = draft.arrangement.handings[place] = Handing(place, draft.timeout)
+        self._found, self._above = place, new
+        if anew:
+            work = self._work = Regrouping(place, draft)
+            work.begin_anew(anew, Elsewhere(place), self)
+        elif not (place.is_moved or place.is_planned):  # Who is added is started where it is to be.
+            work = self._work = Regrouping(place, draft)
+            work.hand(place)  # By the first step that moves it, to where the last one wants it.
         place.is_moved = True
         self.between_turns_of = (old, new)
         for holder in (old, new):
             draft.arrangement.touch(holder, self)
 
+
+class Regrouping(StagedWork):
+    """An actor, with all below it, that gets another supervisor, or whose own supervisors begin anew."""
+
+    def __init__(self, top: DraftPlace, draft: Draft) -> None:
+        self._top, self._draft = top, draft
+        self._asked: dict[Switch, int] = {}  # who was asked for a snapshot, behind which turn
+        self._rests: dict[DraftPlace, Gated] = {}
+        self._certificates: dict[DraftPlace, MovedCertificates] = {}
+        self._handings: list[tuple[DraftPlace, Handing]] = []
+        self._successions: list[Succession] = []  # from above
+        self._candidate: NewSupervisor | None = None  # the uppermost supervisor that begins anew
+
+    def hand(self, place: DraftPlace) -> None:
+        """Have this actor be given to the supervisor that it has in the draft in the end."""
+        handing = self._draft.arrangement.handings[place] = Handing(place, self._draft.timeout)
+        self._handings.append((place, handing))
+
+    def begin_anew(self, places: Iterable[DraftPlace], candidate: NewSupervisor, step: Operation) -> None:
+        """Have these supervisors begin anew, the uppermost as this candidate, and get all that are below them."""
+        self._candidate = candidate
+        for place in places:
+            succession = Succession(place, self._draft)
+            self._successions.append(succession)
+            arrangement = self._draft.arrangement
+            arrangement.successions.append(succession)
+            for holder in (succession.left, place):
+                arrangement.touch(holder, step)
+            for child in place.children.values():
+                if not (child.is_supervisor or child.is_moved):
+                    self.hand(child)
+                    child.is_moved = True
+
     async def prepare(self, system: ActorSystem) -> None:
         """Have recorded and protected actors rest: no turn of theirs is to be repeated under another address."""
-        if self._found is None or self._handing is None or not self._place.has_moved:
+        if not (self._candidate or self._moved):
             return
-        await self._handing.prepare(system)
+        if self._why_not_moved(system):
+            await self._let_go(system)  # Whoever has stood down restarts nobody.
+        if self._candidate is not None:
+            await self._candidate.prepare(system)
+        for _, handing in self._moved:
+            await handing.prepare(system)
         await self._certify(system)
         waits = bool(self._others_settle(system)) or bool(self._unsteady(system))
         for one, rest in self._resting(system):
@@ -92,12 +144,39 @@ class Reparent(Operation):
                 await rest.give_up()
             else:
                 await rest.reach(system, functools.partial(system._moves.pause, one.living(system.node), MOVED_WITHIN))
+        if waits or self._why_not_moved(system):
+            await self._let_go(system)
+            return
+        for succession in self._successions:
+            await succession.hold(system)
+
+    async def _let_go(self, system: ActorSystem) -> None:
+        """Supervisors that have stood down go on."""
+        for succession in self._successions:
+            await succession.let_go(system)
+
+    @property
+    def _moved(self) -> list[tuple[DraftPlace, Handing]]:
+        """Those of its actors that have another supervisor in the end, and how each is given to that."""
+        return [(place, handing) for place, handing in self._handings if place.has_moved]
+
+    def _why_not_moved(self, system: ActorSystem) -> str:
+        """Why somebody cannot be given away at this instant; "" if everybody can."""
+        if self._candidate is not None and (why := self._candidate.ready(system)):
+            return why
+        for place, handing in self._moved:
+            assert place.was.below is not None
+            old = place.was.below.living(system.node)
+            if why := handing.ready(system) or ("" if is_elsewhere(old) else self._is_busy(old, place)):
+                return why
+        return ""
 
     async def _certify(self, system: ActorSystem) -> None:
         """Have those whose links are secured be certified where they go; requests flow meanwhile."""
-        for one in addressed(self._place):
+        own = {self._top, *(place for place, _ in self._handings)}
+        for one in addressed(self._top):
             cell = one.now(system.node) if one.is_protected and not one.is_planned else None
-            if cell is None or (one is not self._place and one.has_moved):  # That is another step's.
+            if cell is None or cell.path == one.path or (one not in own and one.has_moved):  # That is another step's.
                 continue
             if one not in self._certificates:
                 from ...ftm.migration.protection import moved_certificates
@@ -122,11 +201,11 @@ class Reparent(Operation):
                 failed.append(f"{one.path}: {error}")
         if failed:
             why = "certificates under the addresses where its replicas are not could not be revoked"
-            raise ControlFailed(self.target, self.verb, f"{why}: {'; '.join(failed)}")
+            raise ControlFailed(self._top.path, "move", f"{why}: {'; '.join(failed)}")
 
     def _resting(self, system: ActorSystem) -> list[tuple[DraftPlace, Gated]]:
         """Those that run turns again, of the actor and all below it, and how each comes to rest."""
-        for one in addressed(self._place):
+        for one in addressed(self._top):
             # Who is reworked rests for that, and is saved; replicas are only told.
             rests = not one.is_planned and (one.rework is None or one.is_protected)
             cell = one.now(system.node) if rests else None
@@ -144,8 +223,8 @@ class Reparent(Operation):
 
     def _others_settle(self, system: ActorSystem) -> str:
         """Why the others are not so far that addresses can change; they are asked for what is missing."""
-        assert self._root is not None
-        reworked = [place for place in self._root.walk() if place.rework is not None]  # They are saved at the commit.
+        # Those that are reworked are saved at the commit.
+        reworked = [place for place in self._draft.places() if place.rework is not None]
         own = [place.now(system.node) for place in (*reworked, *(one for one, _ in self._resting(system)))]
         settled = {switch_of(cell) for cell in own if cell is not None}
         others = [switch for switch in system.homes if switch not in settled]
@@ -154,16 +233,14 @@ class Reparent(Operation):
 
     @property
     def waits_for(self) -> str:
-        lodging = "" if self._handing is None else self._handing.waits_for
-        return lodging or next((rest.waits_for for rest in self._rests.values() if rest.waits_for), "")
+        lodgings, rests = (handing for _, handing in self._handings), self._rests.values()
+        said = (*(one.waits_for for one in lodgings), *(one.waits_for for one in rests))
+        return next(filter(None, said), "")
 
     def ready(self, system: ActorSystem) -> str:
-        place = self._place
-        if self._handing is None or not place.has_moved:
+        if not (self._candidate or self._moved):
             return ""
-        assert place.was.below is not None
-        old = place.was.below.living(system.node)
-        if why := self._handing.ready(system) or (self._is_busy(old, place.name) if not is_elsewhere(old) else ""):
+        if why := self._why_not_moved(system):
             return why
         if why := self._others_settle(system) or self._unsteady(system):
             return why
@@ -173,17 +250,17 @@ class Reparent(Operation):
                 return f"{resting.path} is not at rest"
             if switch is not None and switch.method.replays and not is_saved(switch):
                 return f"the last snapshot of {resting.path} is not in the store yet"
-        return ""
+        return next((why for one in self._successions if (why := one.ready(system))), "")
 
-    def _is_busy(self, old: Cell, name: str) -> str:
+    def _is_busy(self, old: Cell, place: DraftPlace) -> str:
         """Why a supervisor of this process cannot let its child go at this instant; "" if it can."""
         if why := busy(old):
             return why
-        one = child_of(old, name)
+        one = child_of(old, place.name)
         if one is None:
-            raise wrong(old.path, f"it has no child {name!r} any more")
+            raise wrong(old.path, f"it has no child {place.name!r} any more")
         if one.state not in (UP, STOPPED) or one.row is not None or one.up is not None:
-            return f"{self.target} is being restarted"
+            return f"{old.path}/{place.name} is being restarted"
         return ""
 
     def commit(self, system: ActorSystem) -> None:
@@ -192,8 +269,8 @@ class Reparent(Operation):
 
     async def finish(self, system: ActorSystem) -> None:
         try:
-            if self._handing is not None:
-                await self._handing.finish(system)
+            for _, handing in self._handings:
+                await handing.finish(system)
             for rest in self._rests.values():
                 if rest.task is not None:
                     with contextlib.suppress(HoldfastError):  # Its life has ended: the next one begins where it is now.
@@ -203,10 +280,13 @@ class Reparent(Operation):
 
     async def release(self, system: ActorSystem) -> None:
         try:
+            await self._let_go(system)
             for rest in self._rests.values():
                 await rest.give_up()
-            if self._handing is not None:
-                await self._handing.release(system)
+            for _, handing in self._handings:
+                await handing.release(system)
+            if self._candidate is not None:
+                await self._candidate.release(system)
         finally:
             await self._settle_certificates(is_moved=False)
 
@@ -225,15 +305,48 @@ def check_movable(place: DraftPlace) -> None:
     Raises:
         SpecError: something that cannot be told knows it by its address.
     """
-    cell, spec = place.cell, place.spec
-    if place.is_supervisor and (
-        (spec is not None and spec.isolation == "process") or (cell is not None and is_elsewhere(cell))
-    ):
-        raise wrong(place.path, "its process knows all below it by their addresses")
-    method = spec.recovery if spec is not None else None
+    method = place.spec.recovery if place.spec is not None else None
     if method is not None and method.replays and not method.snapshots:
         why = "it takes no snapshots, so all its turns would be repeated under another address"
         raise wrong(place.path, f"{why}: use hybrid(...)")
+
+
+def begins_anew(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> bool:
+    """Whether another supervisor takes the place of this one, for some of it is in another process, or will be."""
+    if not place.is_supervisor or place.is_planned:
+        return False
+    return is_far(old) or is_far(new) or any(one.is_supervisor and has_process(one) for one in addressed(place))
+
+
+def has_process(place: DraftPlace) -> bool:
+    """Whether a supervisor has a process of its own, or is below one that has."""
+    cell, spec = place.cell, place.spec
+    return (spec is not None and spec.isolation == "process") or (cell is not None and is_elsewhere(cell))
+
+
+async def successors(draft: Draft, place: DraftPlace, new: DraftPlace, *, is_given: bool) -> list[DraftPlace]:
+    """The supervisors at and below a place that begin anew, from above.
+
+    Args:
+        draft: as it is at this point.
+        place: the uppermost.
+        new: the supervisor below which all of it will be.
+        is_given: whether any of them leaves a process, or comes to one.
+
+    Raises:
+        SpecError: they cannot, or somebody below them cannot be given to another supervisor.
+    """
+    await draft.supervisor(place.path)  # It tells whom it has.
+    check_succession(place, new)
+    found = [place]
+    for child in list(place.children.values()):
+        if child.spec is None and child.cell is not None:
+            child.spec = recipe_spec(child.cell)
+        if is_given or is_far(place):
+            check_handed(child, place, new)
+        if child.is_supervisor:
+            found += await successors(draft, child, new, is_given=is_given)
+    return found
 
 
 WAITING = "recorded actors may have to repeat what they sent to it: their snapshots are waited for"

@@ -71,7 +71,7 @@ class Newcomer:
         if ref is None:
             self._is_over = True  # It did not want to be started.
             return
-        _fill(place, ref._cell)
+        fill(place, ref._cell)
         if is_elsewhere(cell):
             _grant(place)
 
@@ -100,7 +100,7 @@ class Newcomer:
             raise StartFailed(place.path, f"it has ended: {reason}")
         if cell is None or not cell.host.is_up(cell):
             return f"{place.path} is being started"
-        _fill(place, cell)
+        fill(place, cell)
         return ""
 
     async def finish(self, system: ActorSystem) -> None:
@@ -113,14 +113,14 @@ class Newcomer:
         except (AlreadyPresent, AlreadyStarted):
             pass  # Its supervisor was restarted, and knows it from its recipe.
 
-    async def release(self) -> None:
-        """Nothing is left of it."""
+    async def release(self, *, erase: bool = True) -> None:
+        """Nothing is left of it, nor, with `erase`, of what was recorded at its address and below it."""
         if self._asked is None or self._asked.is_dead:
             return  # What was started has ended with it.
         supervisor: ActorRef[Supervisor] = ActorRef(self._asked)
         try:
             await supervisor.ask(
-                RemoveChild(self.place.name, erase=True, candidate=self.place.candidate), START_TIMEOUT
+                RemoveChild(self.place.name, erase=erase, candidate=self.place.candidate), START_TIMEOUT
             )
         except ActorStopped:
             pass  # The same.
@@ -202,12 +202,12 @@ def _planned(draft: Draft, above: DraftPlace, spec: ChildSpec) -> DraftPlace:
     return place
 
 
-def _fill(place: DraftPlace, cell: Cell) -> None:
-    """The place is lived in now: later steps find who does."""
+def fill(place: DraftPlace, cell: Cell) -> None:
+    """A place is lived in now: later steps find who does."""
     place.cell = cell
     for name, below in (cell.children or {}).items():
         if name in place.children:
-            _fill(place.children[name], below)
+            fill(place.children[name], below)
 
 
 def _grant(place: DraftPlace) -> None:
@@ -324,6 +324,7 @@ def named_spec(supervisor: Target, spec: ChildSpec | Start[Any], taken: set[str]
     made = child(None, spec) if isinstance(spec, Start) else spec
     if not isinstance(made, ChildSpec):
         raise wrong("add", f"takes child(...), start(...) or supervisor(...), not {spec!r}")
+    made = dataclasses.replace(made, comes_back=True, made_up=False)  # As it was told of another child, perhaps.
     if made.id != NAMELESS:
         return made
     path = text_of(supervisor)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-import itertools
 import os
 import random
 import signal
@@ -22,33 +21,14 @@ import pytest
 import holdfast as hf
 from holdfast.actors.kernel.message import message_name
 from holdfast.actors.process.wire import frames
-from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.supervision.admin import RemoveChild
 from tests.actors.process.waiting import next_event
-from tests.migration.travellers import KINDS, TOLD, Add, Luggage, Seen, Stream, Traveller
+from tests.migration.far_places import IN_TIME, PLACES, Pump, pid_of, processes, traveller
+from tests.migration.travellers import KINDS, Add, Luggage, Seen, Stream, Traveller
 from tests.system.test_transaction_commit import Die
 from tests.system.trees import Stumble
 
-IN_TIME = 60.0
 WAYS = {"far to near": ("far", "near"), "near to far": ("near", "far"), "far to far": ("far", "other")}
-
-
-PLACES = ["task", "process", "replicas"]
-
-
-def traveller(kind: str, place: str) -> hf.ChildSpec:
-    more: dict[str, Any] = {} if KINDS[kind] is None else {"recovery": KINDS[kind]}
-    more |= {"mechanism": hf.PBR()} if place == "replicas" else {"isolation": place}
-    return hf.child("one", hf.start(Traveller), mailbox=hf.bounded(100_000), **more)
-
-
-def processes(system: hf.ActorSystem, ref: Any) -> list[int]:
-    """Those in which it lives."""
-    place = ref._cell.host.place
-    if not isinstance(place, GroupPlace) or place.group is None:
-        return [system.pid_of(ref)]
-    names = place.group.membership.names
-    return [system.pid_of(system.ref(f"{ref.path}/ftm/{name}", hf.Actor)) for name in names]
 
 
 def supervisors(kind: str, at: str, isolation: Any) -> list[hf.ChildSpec]:
@@ -67,10 +47,6 @@ async def move(system: hf.ActorSystem, ref: Any, to: str, *then: hf.Operation) -
         change.move(ref, f"/app/{to}")
         for step in then:
             change.step(step)
-
-
-def pid_of(system: hf.ActorSystem, supervisor: str) -> int:
-    return system.pid_of(system.ref(f"/app/{supervisor}", hf.Supervisor))
 
 
 @pytest.fixture
@@ -102,32 +78,6 @@ async def test_it_goes_with_all_it_has(system: hf.ActorSystem, isolation: str, k
     for name in ("near", "far", "other"):
         below = await system.ref(f"/app/{name}", hf.Supervisor).ask(hf.WhichChildren(), IN_TIME)
         assert [(one.id, one.state) for one in below] == ([("one", "running")] if name == new else [])
-
-
-class Pump:
-    """Tells, and asks one after another. Each answer must be the sum of what stands before it."""
-
-    def __init__(self, ref: Any) -> None:
-        self._ref, self._is_over = ref, False
-        self.answers: list[int] = []
-        self._task = asyncio.create_task(self._send())
-
-    async def _send(self) -> None:
-        while not self._is_over:
-            self._ref.tell(Add(TOLD + len(self.answers)))
-            self.answers.append(await self._ref.ask(Add(1 + len(self.answers)), IN_TIME))
-
-    async def reached(self, more: int) -> None:
-        wanted = len(self.answers) + more
-        while len(self.answers) < wanted and not self._task.done():
-            await asyncio.sleep(0)
-
-    async def judge(self) -> None:
-        self._is_over = True
-        await self._task
-        added, count = (await self._ref.ask(Seen(), IN_TIME))["added"], len(self.answers)
-        assert added == [n for number in range(count) for n in (TOLD + number, 1 + number)]
-        assert self.answers == list(itertools.accumulate(added))[1::2]
 
 
 async def is_at_one_place(system: hf.ActorSystem, ref: Any) -> None:
@@ -439,7 +389,6 @@ async def test_a_move_that_is_given_up_leaves_it_where_it_was(system: hf.ActorSy
 async def test_what_cannot_be_is_refused_before_anything_is_done(system: hf.ActorSystem) -> None:
     far = [
         traveller("plain", "task"),
-        hf.supervisor("team"),
         hf.dynamic("pool"),
         hf.child("stopped", hf.start(Traveller), autostart=False),
     ]
@@ -449,7 +398,6 @@ async def test_what_cannot_be_is_refused_before_anything_is_done(system: hf.Acto
         hf.StartChild(hf.child("pooled", hf.start(Traveller))), IN_TIME
     )
     refusals: dict[str, Any] = {
-        "its children live where it does": lambda change: change.move("/app/far/team", "/app/near"),
         "no supervisor looks after it": lambda change: change.move(pooled.path, "/app/near"),
         "it does not run": lambda change: change.move("/app/near/two", "/app/far"),
     }

@@ -15,7 +15,8 @@ import holdfast as hf
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.migration.subtree_moves import FromSubtree
 from tests.actors.process.waiting import next_event
-from tests.migration.test_far_moves import IN_TIME, Reluctant, pid_of
+from tests.migration.far_places import IN_TIME, pid_of
+from tests.migration.test_far_moves import Reluctant
 from tests.migration.travellers import KINDS, Add, Seen, Traveller
 from tests.system.trees import Stumble
 

@@ -28,6 +28,8 @@ from holdfast.testing.hanging import what_waits
 IN_TIME = 40.0
 """Seconds in which whatever is asked is answered, and every change is over."""
 SUPERVISORS = {"near": "task", "far": "process", "other": "process"}
+TEAM = "team"
+"""A supervisor below one of these, which is moved too, and given a process of its own."""
 KINDS = ("plain", "slow", "kept")
 PAUSES = (0.0, 0.0, 0.005, 0.03, 0.1, 0.3)
 STRIKES = ((), ("crash",), ("crash", "kill"), ("crash", "crash", "kill", "kill_supervisor"))
@@ -36,6 +38,8 @@ CHANGES = (
     ("isolate", "protect", "detach"),
     ("isolate", "isolate", "move", "protect", "detach"),
     ("isolate", "isolate", "move", "protect", "detach", "give_up", "cancel", "suspend"),
+    ("move", "move_team", "isolate_team"),
+    ("isolate", "move", "move_team", "isolate_team", "protect", "detach", "give_up", "cancel", "suspend"),
 )
 
 Entry = tuple[str, int]
@@ -157,10 +161,22 @@ class Storm:
                 )
                 for kind in KINDS
             ]
-            await self._system.start(hf.supervisor(name, children=specs, isolation=isolation, intensity=100_000))
+            team = [] if name != "near" else [self._team()]
+            children = [*specs, *team]
+            await self._system.start(hf.supervisor(name, children=children, isolation=isolation, intensity=100_000))
             for spec in specs:
                 ref = self._system.ref(f"/app/{name}/{spec.id}", Book)
                 self.books.append(Known(spec.id, ref, spec.recovery is not None))
+        self.team = self._system.ref(f"/app/near/{TEAM}", hf.Supervisor)
+        for path, is_recorded in (("member", False), ("deep/kept_member", True)):
+            ref = self._system.ref(f"{self.team.path}/{path}", Book)
+            self.books.append(Known(path, ref, is_recorded))
+
+    @staticmethod
+    def _team() -> hf.ChildSpec:
+        kept = hf.child("kept_member", hf.start(Book, "team"), recovery=hf.hybrid(interval=0.1))
+        deep = hf.supervisor("deep", children=[kept], intensity=100_000)
+        return hf.supervisor(TEAM, children=[hf.child("member", hf.start(Book)), deep], intensity=100_000)
 
     async def _ask(self, book: Known, client: str) -> None:
         number = 0
@@ -220,8 +236,16 @@ class Storm:
         await self._system.set_isolation(book.ref, to, timeout=self._seconds)
 
     async def move(self, book: Known) -> None:
+        to = self.chance.choice([*(f"/app/{name}" for name in SUPERVISORS), self.team.path])
+        await self._change(lambda change: change.move(book.ref, to), self._seconds)
+
+    async def move_team(self, book: Known) -> None:
         to = self.chance.choice([*SUPERVISORS])
-        await self._change(lambda change: change.move(book.ref, f"/app/{to}"), self._seconds)
+        await self._change(lambda change: change.move(self.team, f"/app/{to}"), self._seconds)
+
+    async def isolate_team(self, book: Known) -> None:
+        to: Any = self.chance.choice(("task", "process"))
+        await self._system.set_isolation(self.team, to, timeout=self._seconds)
 
     async def protect(self, book: Known) -> None:
         mechanism = self.chance.choice((PBR, LFR))()
@@ -237,6 +261,7 @@ class Storm:
         collect: Callable[[hf.Change], None] = self.chance.choice(
             (
                 lambda change: change.move(book.ref, f"/app/{to}"),
+                lambda change: change.move(self.team, f"/app/{to}"),
                 lambda change: change.protect(book.ref, PBR()),
                 lambda change: change.isolation(book.ref, isolation),
             )
@@ -244,7 +269,7 @@ class Storm:
         await self._change(collect, self.chance.choice((0.01, 0.05, 0.2, 0.5)))
 
     async def cancel(self, book: Known) -> None:
-        work = self.chance.choice((self.isolate, self.move, self.protect, self.detach))
+        work = self.chance.choice((self.isolate, self.move, self.move_team, self.protect, self.detach))
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(work(book), self.chance.choice((0.001, 0.01, 0.1, 0.5)))
 
@@ -269,9 +294,10 @@ class Storm:
             self._strike(pid)
 
     async def kill_supervisor(self, book: Known) -> None:
-        self._strike(
-            self._system.pid_of(self._system.ref(f"/app/{self.chance.choice(('far', 'other'))}", hf.Supervisor))
-        )
+        path = self.chance.choice(("/app/far", "/app/other", self.team.path))
+        pid = self._system.pid_of(self._system.ref(path, hf.Supervisor))
+        if pid != os.getpid():
+            self._strike(pid)
 
     def _strike(self, pid: int) -> None:
         for book in self.books:

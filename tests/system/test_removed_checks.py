@@ -18,6 +18,7 @@ BOUNDED = "tests/migration/test_bounded_moves.py"
 AWAITED = "tests/supervision/test_awaited.py"
 CERTIFIED = "tests/system/test_moved_certificates.py"
 AT_ODDS = "tests/migration/test_moves_at_odds.py"
+SUPERVISORS = "tests/migration/test_moved_supervisors.py"
 
 CHECKS = {
     "the states are in the store together": Check(
@@ -644,6 +645,118 @@ CHECKS = {
         "False:\n",
         COMMIT,
         "test_a_name_that_somebody_else_took",
+    ),
+    "a supervisor that has stood down goes on if the transaction is given up": Check(
+        "system/transaction/succession.py",
+        "        if is_asked and cell is not None:",
+        "        if False:",
+        SUPERVISORS,
+        "test_a_move_that_is_given_up_leaves_all and far",
+    ),
+    "nobody is lost who was started beside a move of its supervisor": Check(
+        "system/transaction/succession.py",
+        "        if come := [name for name in self._account.children if name not in known]:",
+        "        if come := list[str]():",
+        SUPERVISORS,
+        "test_who_has_come_meanwhile",
+    ),
+    "an address that was left leads to who has left it when a candidate has gone from there": Check(
+        "system/transaction/succession.py",
+        "        system.homes.addresses.put_back(self._forwarded or {})\n",
+        "        pass\n",
+        SUPERVISORS,
+        "test_who_has_left_the_address",
+    ),
+    "restarts count on where another supervisor takes the place": Check(
+        "supervision/handover.py",
+        "    supervisor._restarts = tuple(sorted((*supervisor._restarts, *(now - ago for ago in account.restarts))))\n",
+        "    assert now\n",
+        SUPERVISORS,
+        "test_restarts_before_the_move",
+    ),
+    "children keep their order below another supervisor": Check(
+        "supervision/handover.py",
+        "{**first, **known}",
+        "{**known, **first}",
+        SUPERVISORS,
+        "test_its_flags_and_the_order",
+    ),
+    "ties within the process to which a supervisor comes are kept there alone": Check(
+        "system/transaction/succession.py",
+        '        new.host.told(new, "replaces", {"was": name})\n',
+        "        pass\n",
+        SUPERVISORS,
+        "test_who_is_tied_to_it and (new or old)",
+    ),
+    "a process that nobody finds yet speaks of its own actor": Check(
+        "actors/process/process_host.py",
+        "    own = worker.cell if path == worker.home else None",
+        "    own = None",
+        SUPERVISORS,
+        "test_all_below_it and to and process",
+    ),
+    "the name of an actor below another one in a process is free when it ends": Check(
+        "actors/process/stand_ins.py",
+        "            self._node.unregister(name)\n",
+        "            pass\n",
+        SUPERVISORS,
+        "test_who_is_tied_to_it",
+    ),
+    "a link through a ref from before is one with who is there now": Check(
+        "actors/kernel/context.py",
+        "links.link(self.cell, other._cell.living)",
+        "links.link(self.cell, other._cell)",
+        SUPERVISORS,
+        "test_a_ref_from_before",
+    ),
+    "a journal says who has gone": Check(
+        "supervision/dynamic.py",
+        "keeper.note(child_key(self.ctx.path, name), None))",
+        "keeper.notes(name))",
+        SUPERVISORS,
+        "test_a_journal_says_who",
+    ),
+    "a journal says who has come": Check(
+        "supervision/dynamic.py",
+        "        self._try_to_note(one, lambda: self._note(one))\n",
+        "        pass\n",
+        SUPERVISORS,
+        "test_a_journal_says_who",
+    ),
+    "whoever has stood down goes on while somebody has to be restarted": Check(
+        "system/transaction/reparenting.py",
+        "            await self._let_go(system)  # Whoever has stood down restarts nobody.\n",
+        "            pass\n",
+        SUPERVISORS,
+        "test_who_falls_when_its_supervisor",
+    ),
+    "a life that ended with a process gives way to who is started there, however deep": Check(
+        "checkpoint/places/subtree_place.py",
+        "        return None if parent is None else parent.cell\n",
+        "        return None\n",
+        SUPERVISORS,
+        "test_who_has_come_to_a_process_that_dies",
+    ),
+    "a process answers what others still wait for from there": Check(
+        "actors/process/worker_pool.py",
+        "        if answers and any(map(_is_awaited, self.pending.values())):",
+        "        if False:",
+        SUPERVISORS,
+        "test_a_promised_reply",
+    ),
+    "who had left an address below one that moves is known by the new one too": Check(
+        "checkpoint/addresses.py",
+        "                self._put(again, renamed(names, now))\n",
+        "                pass\n",
+        SUPERVISORS,
+        "test_a_ref_to_who_had_left",
+    ),
+    "the lives of a supervisor that takes another one's place are counted anew": Check(
+        "system/transaction/succession.py",
+        "one.cell, one.ignored_life = new, 0",
+        "one.cell = new",
+        SUPERVISORS,
+        "test_the_new_one_is_restarted and to",
     ),
 }
 

@@ -102,7 +102,10 @@ async def test_its_process_comes_back_in_the_new_shape(system: hf.ActorSystem) -
 async def test_what_cannot_be_done_there_is_refused_before_anything_is(system: hf.ActorSystem) -> None:
     before = await shape(system)
     refusals = {
-        "its children live where it does": lambda change: change.move("/app/near", "/app/far"),
+        "it is changed by this very transaction": lambda change: (
+            change.stop("/app/near/own"),
+            change.move("/app/near", "/app/far"),
+        ),
         "cannot hold another supervisor": lambda change: change.add(
             "/app/far", hf.supervisor("p", children=[], isolation="process")
         ),

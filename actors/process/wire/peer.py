@@ -514,6 +514,8 @@ def obey(node: Node, cell: Cell, name: str, frame: frames.Command, *, by_root: b
             links.demonitor(named(node, frame, "watcher"), cell, for_good=bool(data.get("for_good")))
         case "link":
             links.link(named(node, frame, "peer"), cell, name)
+        case "replaces" if by_root:
+            links.hand_over(named(node, frame, "was"), cell)
         case "unlink":
             links.sever(named(node, frame, "peer"), cell)
         case verb:
