@@ -303,7 +303,8 @@ class Server(lifecycle.HerePlace):
         life = self._begin_at_point(point)
         has_state = point is not None and not is_blank(point)
         is_lost = point is None and life.turn >= 0  # It begins as without recovery, and is live at once.
-        greets = type(life.cell.actor).on_start is not Actor.on_start and (has_state or is_lost)
+        actor: Any = life.cell.actor
+        greets = type(actor).on_start is not Actor.on_start and (has_state or is_lost)
         first: list[Item] = [BeginAgain(life, "on_start")] if is_lost and greets else []
         last: list[Item] = []
         if is_lost or (point is not None and point.live):
