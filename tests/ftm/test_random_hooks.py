@@ -183,7 +183,7 @@ class Program:
             await self.ref.ask(message, IN_TIME)
 
 
-def mechanisms() -> dict[str, hf.Mechanism | None]:
+def mechanisms() -> dict[str, hf.Mechanism | tuple[hf.Mechanism, ...] | None]:
     return {
         "none": None,
         "pbr": hf.PBR(),
