@@ -20,7 +20,7 @@ Listed = Callable[[Cell], Mapping[str, Child] | None]
 """The children of a supervisor that lives in this process; None if there is none at a cell."""
 
 
-class Wait(NamedTuple):
+class AwaitedStart(NamedTuple):
     """A child that waits, and the address that it waits for."""
 
     who: str
@@ -49,7 +49,7 @@ class Prospects:
             if port in one.spec.late or node.find(path) is not None:
                 continue
             one.awaited = path
-            circle = self._circle(Wait(who, path))
+            circle = self._circle(AwaitedStart(who, path))
             if circle is None or len(circle) == 1:
                 raise StartFailed(who, f"binding {port!r}: {NoSuchActor(path)}")
             if circle:
@@ -58,11 +58,11 @@ class Prospects:
             return path
         return ""
 
-    def _circle(self, first: Wait) -> list[Wait] | None:
+    def _circle(self, first: AwaitedStart) -> list[AwaitedStart] | None:
         """Those who keep each other, and at last `first`, waiting; none if that is nobody. None: nobody will come."""
         if self._in_front(first.target) is None:
             return None
-        trails, seen = [[first]], set[Wait]()
+        trails, seen = [[first]], set[AwaitedStart]()
         while trails:
             trail = trails.pop()
             if trail[-1] in seen:
@@ -74,7 +74,7 @@ class Prospects:
                 trails.append([*trail, wait])
         return []
 
-    def _in_front(self, path: str) -> list[Wait] | None:
+    def _in_front(self, path: str) -> list[AwaitedStart] | None:
         """Who waits, and has to be up before somebody comes to live at an address. None: nobody will come."""
         at = self._node.root
         if at is None or not path.startswith(f"{at.path}/"):
@@ -91,17 +91,17 @@ class Prospects:
                 current = one.row.current
                 return [] if current is None else list(self._waiting(f"{at.path}/{current.spec.id}", current))
             if one.awaited:
-                return [Wait(f"{at.path}/{one.spec.id}", one.awaited)]
+                return [AwaitedStart(f"{at.path}/{one.spec.id}", one.awaited)]
             if one.cell is None or one.cell.state is GONE:
                 return []
             at = one.cell
             del names[0]
         return []
 
-    def _waiting(self, path: str, one: Child) -> Iterator[Wait]:
+    def _waiting(self, path: str, one: Child) -> Iterator[AwaitedStart]:
         """A child that waits, or those below it that do."""
         if one.awaited:
-            yield Wait(path, one.awaited)
+            yield AwaitedStart(path, one.awaited)
         elif one.cell is not None:
             for name, below in (self._listed(one.cell) or {}).items():
                 yield from self._waiting(f"{path}/{name}", below)
