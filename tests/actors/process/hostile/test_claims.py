@@ -113,7 +113,7 @@ async def test_a_claim_that_moves_with_its_actor_is_still_one(town: Town, recove
     assert [cell.path for cell in evil._cell.extra().bindings.values()] == [SUP]
     await town.refused(evil, Kill(VICTIM))
     await until(lambda: not isinstance(evil._cell.host.place, GroupPlace))  # It was on probation.
-    assert [cell.path for cell in evil._cell.extra().bindings.values()] == [SUP]
+    await until(lambda: [cell.path for cell in evil._cell.extra().bindings.values()] == [SUP])  # Its new life says so.
     await town.refused(evil, Kill(VICTIM))
 
 
