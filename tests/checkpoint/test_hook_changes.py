@@ -104,6 +104,18 @@ class Falling(Loose):
         self.ctx.create_task(self._fall())
 
 
+class Begin(hf.Message[None]):
+    """Have background work begin that does not end."""
+
+
+class Busy(Hall):
+    """Has background work out."""
+
+    @hf.on(Begin)
+    def begin(self, message: Begin) -> None:
+        self.ctx.pipe_to_self(asyncio.Event().wait(), lambda _: Entered())
+
+
 class Calm(Hall):
     """Has nothing to do when it comes back."""
 
@@ -307,3 +319,18 @@ async def test_a_recovery_that_fails_says_that_the_replay_went_elsewhere(
                     break
         note.unlink()
     assert await ref.ask(Enter(2), IN_TIME) == 2
+
+
+async def test_what_a_hook_changes_while_background_work_is_out_is_not_saved(system: hf.ActorSystem) -> None:
+    """A limit: the replay has begun the work again, so its turn must stay in the journal; nothing leads to the change."""
+    ref = await started(system, "task", Busy)
+    await ref.ask(Begin(), IN_TIME)
+    ref.kill()
+    assert await ref.ask(Enter(1), IN_TIME) == 1
+    with system.events() as events:
+        ref.kill()
+        async with asyncio.timeout(IN_TIME):
+            async for one in events:
+                if isinstance(one, hf.RecoveryFailed):
+                    assert "diverged" in one.reason
+                    break
