@@ -322,7 +322,7 @@ async def test_a_recovery_that_fails_says_that_the_replay_went_elsewhere(
 
 
 async def test_what_a_hook_changes_while_background_work_is_out_is_not_saved(system: hf.ActorSystem) -> None:
-    """A limit: the replay has begun the work again, so its turn must stay in the journal; nothing leads to the change."""
+    """A limit: a replay has begun the work again, so its turn must stay in the journal; nothing leads to the change."""
     ref = await started(system, "task", Busy)
     await ref.ask(Begin(), IN_TIME)
     ref.kill()
