@@ -51,11 +51,10 @@ from .children import (
 )
 from .decisions import affected, decide, is_reported
 from .errands import Errand, answered
-from .handover import TakeOver, account_of, take_over, why_occupied
 from .inquiries import Inquiries
 from .intensity import admit_restart, recent_restarts
 from .spec import ChildSpec, Flags, Plan, check_spec
-from .supervisor_changes import check_place, new_plan, succession
+from .supervisor_changes import TakeOver, account_of, check_place, new_plan, succession, take_over, why_occupied
 
 DISMISSED = 1000
 """Of the children that were stopped by order and whose specs are gone, so many are remembered, the newest."""

@@ -1,15 +1,18 @@
-"""What a supervisor is made of, at its start and when it is changed while it works."""
+"""What a supervisor is made of: at its start, when it is changed while it works, and when another takes its place."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from ..actors.errors import HoldfastError, Ignore, SpecError, StartIgnored, remote_crash, type_name
 from ..actors.kernel.cell import GONE
+from ..actors.kernel.message import RuntimeOrder
 from ..actors.kernel.node import Node
 from .admin import ChangeSupervisor, opened
-from .children import Child, complete
+from .children import STOPPED, UP, Child, complete
 from .spec import ChildSpec, Flags, Plan, check_spec
 
 if TYPE_CHECKING:
@@ -119,3 +122,40 @@ def everything(specs: Iterable[ChildSpec]) -> Iterator[ChildSpec]:
         yield spec
         if spec.is_supervisor:
             yield from everything(spec.below())
+
+
+class Account(msgspec.Struct, frozen=True):
+    """What a supervisor leaves to the one that takes its place."""
+
+    children: tuple[str, ...]
+    """The ids of its children, in start order."""
+    restarts: tuple[float, ...]
+    """How many seconds ago each restart was that may still count, the oldest first."""
+
+
+class TakeOver(RuntimeOrder[None]):
+    """Go on in the place of another supervisor, whose children are yours by now."""
+
+    account: Account
+
+
+def why_occupied(supervisor: Supervisor) -> str:
+    """What keeps a supervisor from giving its children away between two turns; "" if nothing does."""
+    if any(not errand.is_over for errand in supervisor._errands):
+        return "it is starting or stopping children"
+    busy = next((one for one in supervisor._listed().values() if one.state not in (UP, STOPPED)), None)
+    return "" if busy is None else f"its child {busy.spec.id!r} is {busy.state}"
+
+
+def account_of(supervisor: Supervisor) -> Account:
+    """What a supervisor leaves to the one that takes its place."""
+    now = supervisor.ctx.cell.node.loop.time()
+    return Account(tuple(supervisor._listed()), tuple(now - at for at in supervisor._restarts))
+
+
+def take_over(supervisor: Supervisor, account: Account) -> None:
+    """Have a supervisor go on with the children that it has got, in the order of the one that had them."""
+    now, known = supervisor.ctx.cell.node.loop.time(), supervisor._children
+    supervisor._restarts = tuple(sorted((*supervisor._restarts, *(now - ago for ago in account.restarts))))
+    first = {name: known[name] for name in account.children if name in known}
+    supervisor._children = {**first, **known}

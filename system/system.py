@@ -182,7 +182,8 @@ class ActorSystem(Recorded, Controls):
         )
         self._body = asyncio.current_task()
         root = self._root = node.root = node.cell_below(None, f"/{self.name}")
-        up = lifecycle.begin(root, Start(Supervisor, (options.flags, ())))
+        flags = self.specifications.root_in_force(root.path, options.flags)
+        up = lifecycle.begin(root, Start(Supervisor, (flags, ())))
         if up is not None:
             await up
         root.ended().add_done_callback(self._root_ended)

@@ -26,9 +26,9 @@ from ...actors.process.process_host import WorkerPlace
 from ...actors.process.wire.peer import OutsideHost
 from ...actors.process.worker_pool import Worker
 from ...supervision.children import complete
-from ...supervision.handover import Account, TakeOver, account_of, take_over, why_occupied
 from ...supervision.spec import Flags
 from ...supervision.supervisor import Supervisor
+from ...supervision.supervisor_changes import Account, TakeOver, account_of, take_over, why_occupied
 from .arrangement import busy, child_of, planned_spec
 from .draft import DraftPlace, check_awake, is_elsewhere
 from .operation import wrong

@@ -86,7 +86,7 @@ CHECKS = {
     ),
     "a life that was left by an ended process makes room": Check(
         "actors/process/stand_ins.py",
-        "            self._free(parent, name)\n",
+        "            self._free(home, path)\n",
         "",
         AT_ODDS,
         "test_the_process_of_its_new_supervisor and plain",
@@ -668,14 +668,14 @@ CHECKS = {
         "test_who_has_left_the_address",
     ),
     "restarts count on where another supervisor takes the place": Check(
-        "supervision/handover.py",
+        "supervision/supervisor_changes.py",
         "    supervisor._restarts = tuple(sorted((*supervisor._restarts, *(now - ago for ago in account.restarts))))\n",
         "    assert now\n",
         SUPERVISORS,
         "test_restarts_before_the_move",
     ),
     "children keep their order below another supervisor": Check(
-        "supervision/handover.py",
+        "supervision/supervisor_changes.py",
         "{**first, **known}",
         "{**known, **first}",
         SUPERVISORS,
