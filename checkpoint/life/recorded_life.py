@@ -395,9 +395,7 @@ class Life:
         self.port.to_home(Live(self.restored.seconds))
         if self.saving.is_due:
             self.want_snapshot()
-        elif (
-            stage.has_replayed and self.method.snapshots
-        ):  # A crash loop must not have to replay the same turns for ever.
+        elif stage.has_replayed and self.method.snapshots:  # A crash loop must not replay the same turns for ever.
             self.port.when_told(self._snapshot_of_replay)  # The actor is released meanwhile.
         postponed, stage.postponed = stage.postponed, []
         for call in postponed:

@@ -37,7 +37,7 @@ class ReplicaState:
     is_again: bool = False  # a part is run once more: nothing leaves
     is_as_given: bool = False  # a life begins that stands as another one does, whatever its hooks do
     is_work_lost: bool = False  # background work has ended with the last life
-    wants_life: bool = False  # the last one has ended between two turns, and nobody waits for the next
+    wants_life: bool = False  # one is to begin whose hooks count, though no request waits for it
     start_turn: int = -1  # that a life without a point goes on from
     handed: int = 0  # parts that were handed over
     confirmed: int = 0  # parts that are known to be at home

@@ -97,6 +97,14 @@ class Loose(Hall):
         raise RuntimeError("fell")
 
 
+class Slow(Loose):
+    """Takes its time when it comes back."""
+
+    async def on_recovered(self) -> None:  # type: ignore[override]  # either is called
+        await asyncio.sleep(0.1)
+        super().on_recovered()
+
+
 class Falling(Loose):
     """Falls soon after it begins, whatever is done."""
 
@@ -229,18 +237,18 @@ async def test_who_dies_of_the_first_message_behind_the_change_comes_back_with_i
     assert await ref.ask(Entered(), IN_TIME) == [1, 2, 3, 4]
 
 
-@pytest.mark.parametrize("how", ["it falls", "its turn fails", "its leader dies"])
+@pytest.mark.parametrize("how", ["it falls", "it falls, and is slow", "its turn fails", "its leader dies"])
 async def test_replicas_that_die_before_they_say_more_than_the_first_end_come_back_with_the_change(
     system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     """The next life of the leader begins, and its hook changes the state before anything else is handled."""
-    ref = await started(system, "pbr", Loose)
+    ref = await started(system, "pbr", Slow if "slow" in how else Loose)
     group, take_done = group_of(ref), Group.take_done
     asked: list[Any] = [asyncio.ensure_future(ref.ask(Enter(1), IN_TIME))]
     assert await ref.ask(Entered(), IN_TIME) == []
     await system.checkpoint(ref)
     last = 2 if how == "its leader dies" else 3
-    if how == "it falls":
+    if how.startswith("it falls"):
         ref.tell(Trip())
     elif how == "its turn fails":
         ref.tell(Stumble())
