@@ -181,14 +181,14 @@ async def protect(system: hf.ActorSystem) -> Walk:
     ref = await system.start(hf.child("guarded", hf.start(Recorded), recovery=hf.hybrid()))
     await ref.ask(Fill())
 
-    def protected(mechanism: hf.PBR | None) -> Step:
+    def protected(mechanism: hf.ftm.PBR | None) -> Step:
         async def change() -> None:
             async with system.transaction(timeout=60.0) as changes:
                 changes.protect(ref, mechanism)
 
         return change
 
-    return Walk(protected(hf.PBR()), protected(None))
+    return Walk(protected(hf.ftm.PBR()), protected(None))
 
 
 WALKS: dict[str, Callable[[hf.ActorSystem], Awaitable[Walk]]] = {

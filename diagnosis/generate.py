@@ -70,7 +70,7 @@ async def generate(
     """Look at a running system for a while and write down what it is made of.
 
     Args:
-        node: `system.node`.
+        node: `system._node`.
         seconds: how long to listen for publishers; one that publishes more rarely is not found.
         topics: to listen to besides those that have subscribers.
         leave_out: addresses; they and all below them are no part of the model. Diagnosis itself never is.

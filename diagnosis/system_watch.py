@@ -30,7 +30,7 @@ class WatchedSystem(Protocol):
     """The system that is watched: an `ActorSystem`."""
 
     @property
-    def node(self) -> Node:
+    def _node(self) -> Node:
         """The node of the process in which diagnosis itself lives."""
         ...
 
@@ -114,7 +114,7 @@ async def watch(
     Raises:
         ModelError: something is wrong with the model. StartFailed, AlreadyStarted: see `ActorSystem.start`.
     """
-    generated = await generate(system.node, seconds=seconds) if model is None else None
+    generated = await generate(system._node, seconds=seconds) if model is None else None
     watchers = [*observers]
     if generated is not None:
         declaration = generated.declaration
@@ -131,9 +131,9 @@ async def watch(
     mend = None
     if repair is not False:
         policy = None if repair is True else repair
-        mend = repairer(declaration, _actions(system.node, where, actions), policy, addresses=where)
+        mend = repairer(declaration, _actions(system._node, where, actions), policy, addresses=where)
     started = await system.start(tree(History(declaration), watchers, name=name, repairer=mend, **options))
-    return Watch(started, system.node, where, generated)
+    return Watch(started, system._node, where, generated)
 
 
 def expecting(declaration: Declaration, limits: LimitsOf) -> Declaration:

@@ -61,7 +61,7 @@ class Controls:
     _moves: Moves
 
     @property
-    def node(self) -> Node:
+    def _node(self) -> Node:
         """The node that hosts this process's actors."""
         raise NotImplementedError
 

@@ -93,7 +93,7 @@ async def idle(system: ActorSystem, *, timeout: float = TIMEOUT) -> None:
         NotIdle: it went on all that time, or without end at one moment of virtual time; one task at a time may wait
             for this.
     """
-    node = system.node
+    node = system._node
     try:
         async with patience(timeout, node):
             while True:
@@ -166,11 +166,11 @@ async def _hear(system: ActorSystem) -> bool:
     """One round trip through each actor process. Returns whether anything moved, or may have."""
     pool = system._workers
     if isinstance(pool, SimulatedWorkers):  # Their turns are in this loop, and what is on its way is known.
-        return await pool.arrived() or bool(_busy(system.node))
+        return await pool.arrived() or bool(_busy(system._node))
     moved = bool(_waiting(system))
     for worker in list(system._workers.by_cell.values()):
         moved |= await _ping(worker)
-    return moved or bool(_busy(system.node))
+    return moved or bool(_busy(system._node))
 
 
 async def _ping(worker: Worker) -> bool:

@@ -79,8 +79,8 @@ class GuardedSystem(ActorSystem):
 
     async def __aenter__(self) -> GuardedSystem:
         await super().__aenter__()
-        self.node.events.add_sink(self._note)
-        self._checks = SendChecks(self.node)
+        self._node.events.add_sink(self._note)
+        self._checks = SendChecks(self._node)
         return self
 
     def _make_pool(self, node: Node) -> Workers:
@@ -88,7 +88,7 @@ class GuardedSystem(ActorSystem):
         return SimulatedWorkers(node, loop) if isinstance(loop, ControlledLoop) else super()._make_pool(node)
 
     def _host_for(self, spec: ChildSpec) -> AddressHost:
-        loop = self.node.loop
+        loop = self._node.loop
         if spec.isolation == "process" and isinstance(loop, VirtualClockLoop) and not isinstance(loop, ControlledLoop):
             raise RealTimeNeeded(f"{spec.id!r} with isolation='process'")
         return super()._host_for(spec)

@@ -145,7 +145,7 @@ class Probe:
         self._deadline = math.inf
         self._pilot: Pilot | None = None
         self._taps: list[Tap] = []
-        self._events = system.node.events.listen()
+        self._events = system._node.events.listen()
         self.ref: ActorRef[Any] = system.spawn(Start(ProbeActor, (self._hear,)), name)
 
     def _hear(self, heard: Heard) -> None:
@@ -255,7 +255,7 @@ class Probe:
         name = f"the event {_name(wanted) if isinstance(wanted, type) else 'that was described'}"
         seconds, others = self._seconds(timeout), list[Event]()
         try:
-            async with patience(seconds, self._system.node):
+            async with patience(seconds, self._system._node):
                 async for event in self._events:
                     if isinstance(event, wanted) if isinstance(wanted, type) else wanted(event):
                         return event
@@ -320,7 +320,7 @@ class Probe:
         elif not self._inbox:
             self._wake.clear()
             try:
-                async with patience(within, self._system.node):
+                async with patience(within, self._system._node):
                     await self._wake.wait()
             except NotIdle:
                 raise
@@ -365,7 +365,7 @@ class Probe:
             )
         self._expects = asyncio.current_task()
         try:
-            async with patience(max(seconds, 0.0), self._system.node):
+            async with patience(max(seconds, 0.0), self._system._node):
                 while not self._inbox:
                     self._alive()
                     self._wake.clear()
@@ -502,7 +502,7 @@ class Probe:
         ctx = self.ref._cell.ctx
         if ctx is None:
             raise HoldfastError(f"{self.path} has stopped")
-        context = self._system.node.base_context.copy()
+        context = self._system._node.base_context.copy()
         context.run(current.set, ctx)
         return context
 
@@ -520,7 +520,7 @@ class Probe:
 
     def subscribe(self, topic: str) -> None:
         """Receive what is published there."""
-        self._system.node.topics.subscribe(topic, self.ref._cell)
+        self._system._node.topics.subscribe(topic, self.ref._cell)
 
     async def stop(self) -> None:
         """End the probe's life, and its taps."""

@@ -171,7 +171,7 @@ class Simulation:
             raise
         finally:
             inside.reset(mark)
-        root.node, root.is_up = root.system.node, True
+        root.node, root.is_up = root.system._node, True
         root.system._body = self._test
         self._swaps.put(root.node.clock, "wall", lambda: EPOCH + root.node.loop.time())
         pool = root.system._workers
@@ -291,7 +291,7 @@ class RealRun(Simulation):
             options["store"] = f"sqlite:{Path(folder, 'app.db')}"
         system = await self._life.enter_async_context(GuardedSystem(**options))
         self._roots.append(Root(system))
-        self._ends.append(watch_turns(system.node, Tracer(self.trace)))
+        self._ends.append(watch_turns(system._node, Tracer(self.trace)))
         return system
 
     async def moment(self, turns: int = 100) -> None:
@@ -331,7 +331,7 @@ def _kill(root: Root) -> None:
         waiter = waiter_of(task)
         if waiter is not None and not waiter.done() and _is_called_by(task, system, node):
             waiter.set_exception(AskFailed(f"/{node.name}", "the root was killed"))
-    system._node = system._root = None  # It is not running.
+    system._running = system._root = None  # It is not running.
 
 
 def _is_called_by(task: asyncio.Task[Any], system: GuardedSystem, node: Node) -> bool:

@@ -14,14 +14,14 @@ from ... import (
     ActorSystem,
     ChildSpec,
     HoldfastError,
-    NoSuchActor,
-    Recovered,
     child,
     fresh,
     hybrid,
     start,
     supervisor,
 )
+from ...actors.errors import NoSuchActor
+from ...actors.events import Recovered
 from .actors import FindPath, GetMap, LogRead, Mapper, MapperState, NoWay, Planner, Reader, ReadLog, as_grid
 from .grid import USABLE_RANGE, Geometry
 from .killer import Killer, schedule

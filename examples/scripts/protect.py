@@ -5,7 +5,7 @@ import holdfast as hf
 
 async def reconfigure(system) -> None:
     async with system.transaction(timeout=60.0) as change:
-        change.attach("/app/bank/alice", hf.PBR())
-        change.compose("/app/bank/alice", hf.TR())  # inside; a file "my_mechanism.py" would do, too
-        change.transition("/app/bank/alice", hf.LFR())
+        change.attach("/app/bank/alice", hf.ftm.PBR())
+        change.compose("/app/bank/alice", hf.ftm.TR())  # inside; a file "my_mechanism.py" would do, too
+        change.transition("/app/bank/alice", hf.ftm.LFR())
         change.detach("/app/bank/alice", "tr")

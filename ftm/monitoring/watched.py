@@ -63,7 +63,7 @@ def watch_of(
     made.update((layer.name, layer) for layer in present)
 
     async def change(adapt: ChangeStack) -> None:
-        there = system.node.find(adapt.address)
+        there = system._node.find(adapt.address)
         protected = there is not None and there.spec.mechanism is not None
         layers = tuple(made[name] for name in adapt.target)
         async with system.transaction(timeout=CHANGED_WITHIN) as step:

@@ -16,6 +16,7 @@ from ...actors.events import StoreRefused
 from ...actors.exit_reasons import SHUTDOWN
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Actor, Start, on, start
+from ...actors.kernel.context import ActorContext
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.mailbox import Bounded
 from ...actors.kernel.message import Message, RuntimeOrder
@@ -264,21 +265,21 @@ class HasNode(Protocol):
     """What has a node: an actor system."""
 
     @property
-    def node(self) -> Node: ...
+    def _node(self) -> Node: ...
 
 
-def pool_of(system: HasNode, path: str, kind: type[A]) -> ActorRef[A]:
+def pool_of(system: HasNode | ActorContext, path: str, kind: type[A]) -> ActorRef[A]:
     """A ref to a pool, typed as one to a worker: what is sent there goes to one of them.
 
     Args:
-        system: the actor system; in an actor, `self.ctx.cell`.
+        system: the actor system; in an actor, `self.ctx`.
         path: the pool's address.
         kind: the class of the workers.
 
     Raises:
         NoSuchActor: nobody lives there. WrongActor: it is no pool, or one of other workers.
     """
-    node = system.node
+    node = system.cell.node if isinstance(system, ActorContext) else system._node
     node.find_ref(path, PoolSupervisor)
     cell = node.find_ref(f"{path}/{ROUTER}", Router)._cell
     made = cell.more.start if cell.more is not None else None

@@ -78,7 +78,7 @@ class Arrangement:
         """
         for place in self._places:
             self.step = self._steps[place].text
-            cell = place.living(system.node)
+            cell = place.living(system._node)
             if is_elsewhere(cell) or place not in self._rearranged:
                 continue
             if why := busy(cell):
@@ -87,7 +87,7 @@ class Arrangement:
                 is_taken = child_of(cell, name) is not None or name in (cell.children or {})
                 if child.has_moved and is_taken and name not in place.was.children:
                     raise wrong(place.path, f"it has a child {name!r} already")
-        return self._names_ready(system.node)
+        return self._names_ready(system._node)
 
     def _names_ready(self, node: Node) -> str:
         for name, (step, before, after) in self._names.items():
@@ -103,7 +103,7 @@ class Arrangement:
     def commit(self, system: ActorSystem) -> None:
         """Have the tree and the names be as the steps say, at once."""
         self._arrange(system)
-        node, after = system.node, {name: place for name, (_, _, place) in self._names.items()}
+        node, after = system._node, {name: place for name, (_, _, place) in self._names.items()}
         for name, place in after.items():
             if place is None or node.names.get(name) is not place.living(node):
                 node.unregister(name)
@@ -112,7 +112,7 @@ class Arrangement:
                 node.register(name, place.living(node))
 
     def _arrange(self, system: ActorSystem) -> None:
-        cells = {place: place.living(system.node) for place in self._places}
+        cells = {place: place.living(system._node) for place in self._places}
         here = {
             place: cell.actor
             for place, cell in cells.items()
@@ -122,7 +122,7 @@ class Arrangement:
         moved = [child for place in changed for child in place.children.values() if child.has_moved]
         was = {child: f"{cells[_left(child)].path}/{child.name}" for child in moved}
         if moved or self.successions:
-            settle_bindings(system.node.root)
+            settle_bindings(system._node.root)
         taken = {child: _taken(child, self.handings[child], here, cells) for child in moved}
         for place, supervisor in here.items():
             _arrange(place, supervisor, taken)
@@ -131,15 +131,15 @@ class Arrangement:
         now |= dict(one.leave_tree(system) for one in reversed(self.successions))
         now = {old: new for old, new in now.items() if old != new}
         left = {one.left for one in self.successions}
-        if now and system.node.root is not None:  # First: what comes now is called by addresses as they are now.
-            Renamed(now).keep(system.node.root)
+        if now and system._node.root is not None:  # First: what comes now is called by addresses as they are now.
+            Renamed(now).keep(system._node.root)
         for place, supervisor in here.items():
             _respecify(place, supervisor)
         for place, cell in [(place, cell) for place, cell in cells.items() if place not in left]:
             keep(cell, lambda flags, specs, place=place: _edited(place, flags, specs, taken))  # type: ignore[misc]
         if now:
-            system.homes.move(now)
-            system.mechanism_notes.moved(now)
+            system._homes.move(now)
+            system._mechanism_notes.moved(now)
         for child in moved:  # Before anything else is said to their processes.
             for cell in every_cell(taken[child].cell) if was[child] in now else ():
                 cell.host.place.readdress(cell, was[child], now[was[child]])
@@ -154,12 +154,12 @@ class Arrangement:
             if start is not None:
                 cell.host.told(cell, "recipe", {"start": pack_recipe(start, cell.path)})
         if now:
-            tell_bindings(system.node.root, {new: old for old, new in now.items()})
+            tell_bindings(system._node.root, {new: old for old, new in now.items()})
 
     async def finish(self, system: ActorSystem) -> None:
         """Tell those that live in other processes."""
         for place in self._told:
-            cell = place.living(system.node) if not place.is_planned else None
+            cell = place.living(system._node) if not place.is_planned else None
             if cell is not None and is_elsewhere(cell):
                 flags, specs = recipe_flags(cell), recipe_specs(cell)
                 ref: ActorRef[Supervisor] = ActorRef(cell)

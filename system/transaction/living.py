@@ -25,11 +25,11 @@ class OnLiving(Operation):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = self._found = draft.find(self._at, parts=self.on_parts)
         self.target, self.between_turns_of = place.path, (place,)
-        place.check_lived_in(system.node)
+        place.check_lived_in(system._node)
 
     def cell(self, system: ActorSystem) -> Cell:
         """Who lives there now. Raises NoSuchActor."""
-        return self._place.living(system.node)
+        return self._place.living(system._node)
 
 
 class OnSharedWork(OnLiving):

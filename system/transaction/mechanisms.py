@@ -109,7 +109,7 @@ class OnProtection(OnPlace):
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
-        if (busy := arbiter_of(system.node).in_the_way(self.target, Hand.ADAPTATION)) is not None:
+        if (busy := arbiter_of(system._node).in_the_way(self.target, Hand.ADAPTATION)) is not None:
             raise busy
         place = self._place
         assert place.spec is not None

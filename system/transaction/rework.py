@@ -81,7 +81,7 @@ class Rework(StagedWork):
         if self._is_ordered:
             return
         while True:
-            cell = self._place.living(system.node)
+            cell = self._place.living(system._node)
             await self._claim(system, cell)
             life, self._held = cell.life, None
             try:
@@ -117,7 +117,7 @@ class Rework(StagedWork):
     def ready(self, system: ActorSystem) -> str:
         """Whether the life that was prepared is the one."""
         place = self._place
-        cell = place.living(system.node)
+        cell = place.living(system._node)
         if self._is_ordered:
             return busy(cell) if lives_here(cell) else ""
         if lives_here(cell):
@@ -129,7 +129,7 @@ class Rework(StagedWork):
 
     def commit(self, system: ActorSystem) -> None:
         """It goes on with what it has prepared: here at once; elsewhere as soon as it hears so, before all else."""
-        cell = self._place.living(system.node)
+        cell = self._place.living(system._node)
         if self._is_ordered:
             if self.suspended is not None:
                 self._tell(cell, Suspend() if self.suspended else Resume())
@@ -185,7 +185,7 @@ class Rework(StagedWork):
         """Wait until an actor in another process has heard it."""
         if self._concluded is None:
             return
-        cell = self._place.living(system.node)
+        cell = self._place.living(system._node)
         switch = switch_of(cell)
         before = 0 if switch is None else len(switch.arrival.unsaved)
         try:
@@ -202,7 +202,7 @@ class Rework(StagedWork):
         """It goes on as before."""
         if self._is_ordered:
             return
-        cell = self._place.now(system.node)
+        cell = self._place.now(system._node)
         try:
             if cell is not None and self._lock is not None:
                 await order(cell, Conclude(self._attempt, False, None), CONCLUDED_WITHIN)

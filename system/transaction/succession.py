@@ -97,7 +97,7 @@ class Elsewhere(NewSupervisor):
 
     async def prepare(self, system: ActorSystem) -> None:
         if self._forwarded is None:
-            self._forwarded = system.homes.addresses.left(self._place.path)
+            self._forwarded = system._homes.addresses.left(self._place.path)
         await self._newcomer.prepare(system)
 
     def ready(self, system: ActorSystem) -> str:
@@ -105,7 +105,7 @@ class Elsewhere(NewSupervisor):
 
     async def release(self, system: ActorSystem) -> None:
         await self._newcomer.release(erase=False)
-        system.homes.addresses.put_back(self._forwarded or {})
+        system._homes.addresses.put_back(self._forwarded or {})
 
 
 class Beside(NewSupervisor):
@@ -120,7 +120,7 @@ class Beside(NewSupervisor):
             return
         await self.release(system)
         assert self._place.parent is not None
-        above, node = self._place.parent.living(system.node), system.node
+        above, node = self._place.parent.living(system._node), system._node
         spec = complete(above, planned_spec(self._place, in_force=False))
         cell = self._cell = Cell(node, above, spec.id, node.ports.host_for(spec))
         cell.spec, cell.extra().start = spec, spec.start
@@ -178,7 +178,7 @@ class Succession:
 
     async def hold(self, system: ActorSystem) -> None:
         """Have it give orders no more, if it lives in another process."""
-        cell = self.left.living(system.node)
+        cell = self.left.living(system._node)
         if not is_elsewhere(cell) or self._held == (cell, cell.life):
             return
         life, self._is_asked = cell.life, True
@@ -190,7 +190,7 @@ class Succession:
     async def let_go(self, system: ActorSystem) -> None:
         """It goes on."""
         is_asked, self._is_asked, self._held = self._is_asked, False, None
-        cell = self.left.now(system.node)
+        cell = self.left.now(system._node)
         if is_asked and cell is not None:  # Also if its answer was not waited for.
             with contextlib.suppress(AskFailed, ActorStopped):  # It is another life by now.
                 await order(cell, Conclude(self._attempt, False, None), CONCLUDED_WITHIN)
@@ -201,7 +201,7 @@ class Succession:
         Raises:
             HoldfastError: it cannot be done any more.
         """
-        cell = self.left.living(system.node)
+        cell = self.left.living(system._node)
         if not is_elsewhere(cell):
             why = busy(cell)
             supervisor = cell.actor
@@ -222,7 +222,7 @@ class Succession:
 
     def leave_tree(self, system: ActorSystem) -> tuple[str, str]:
         """The old one is below nobody any more; returns its address, and that of the new one."""
-        old, new = self.left.living(system.node), self.place.living(system.node)
+        old, new = self.left.living(system._node), self.place.living(system._node)
         self._ends, self._was, above = old, old.path, old.parent
         assert above is not None
         one = child_of(above, old.name)
@@ -239,7 +239,7 @@ class Succession:
 
     def commit(self, system: ActorSystem) -> None:
         """From here on the new one is the one; its children are below it already."""
-        old, new, account = self._ends, self.place.living(system.node), self._account
+        old, new, account = self._ends, self.place.living(system._node), self._account
         assert account is not None
         _hand_over(old, new)
         waiting = _end(old, new, self._was)

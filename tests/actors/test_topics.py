@@ -71,7 +71,7 @@ async def test_subscriptions_at_run_time(system: hf.ActorSystem) -> None:
     await reader.ask(Do(lambda actor: actor.ctx.unsubscribe("/never")))
     await system.publish("/news", News(2))
     assert await reader.ask(Seen()) == [1]
-    assert system.node.topics.names() == []
+    assert system._node.topics.names() == []
 
 
 async def test_an_actor_publishes_with_itself_as_sender(actor_system: GuardedSystem, probe: Probe) -> None:
@@ -88,7 +88,7 @@ async def test_a_restarted_actor_is_subscribed_as_its_class_says_and_no_more(sys
     with pytest.raises(hf.RemoteCrash):
         await reader.ask(Do(lambda _: 1 / 0))
     await reader.ask(Seen())
-    assert system.node.topics.names() == ["/more", "/news"]
+    assert system._node.topics.names() == ["/more", "/news"]
 
 
 async def test_a_stopped_subscriber_is_forgotten(actor_system: GuardedSystem, probe: Probe) -> None:
@@ -96,7 +96,7 @@ async def test_a_stopped_subscriber_is_forgotten(actor_system: GuardedSystem, pr
     probe.subscribe("/news")
     await probe.stop()
     await actor_system.publish("/news", News(1))
-    assert actor_system.node.topics.names() == []
+    assert actor_system._node.topics.names() == []
 
 
 @pytest.mark.parametrize("inside", [False, True])
@@ -146,7 +146,7 @@ async def test_a_slow_subscriber_holds_the_publisher_back(system: hf.ActorSystem
     assert not waiting.done()
     gate.set()
     await waiting
-    await system.node.settled()
+    await system._node.settled()
     assert await slow.ask(Seen()) == [0, 1]
 
 

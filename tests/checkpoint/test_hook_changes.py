@@ -133,10 +133,10 @@ class Calm(Hall):
 PLACES: dict[str, dict[str, Any]] = {
     "task": {},
     "process": {"isolation": "process"},
-    "pbr": {"mechanism": hf.PBR()},
-    "lfr": {"mechanism": hf.LFR()},
-    "tr": {"mechanism": hf.TR()},
-    "tmr": {"mechanism": hf.TMR()},
+    "pbr": {"mechanism": hf.ftm.PBR()},
+    "lfr": {"mechanism": hf.ftm.LFR()},
+    "tr": {"mechanism": hf.ftm.TR()},
+    "tmr": {"mechanism": hf.ftm.TMR()},
 }
 
 
@@ -184,7 +184,7 @@ async def test_who_falls_again_and_again_between_two_turns_is_given_up(place: st
             await system.start(above)
         async with asyncio.timeout(IN_TIME):
             async for event in events:
-                if isinstance(event, hf.SupervisorGaveUp):
+                if isinstance(event, hf.events.SupervisorGaveUp):
                     return
 
 
@@ -291,7 +291,7 @@ async def test_a_state_that_the_hook_leaves_as_it_was_is_not_saved_again(
             async with asyncio.timeout(IN_TIME):
                 while not await is_up(system, ref, life):
                     await asyncio.sleep(0.005)
-        assert not [one for one in events.take() if isinstance(one, hf.SnapshotTaken)]
+        assert not [one for one in events.take() if isinstance(one, hf.events.SnapshotTaken)]
 
 
 class Moody(Hall):
@@ -320,8 +320,8 @@ async def test_a_recovery_that_fails_says_that_the_replay_went_elsewhere(
         is_told = False
         async with asyncio.timeout(IN_TIME):
             async for one in events:
-                is_told |= isinstance(one, hf.RecoveryFailed) and "diverged" in one.reason
-                if isinstance(one, hf.ChildStartFailed):
+                is_told |= isinstance(one, hf.events.RecoveryFailed) and "diverged" in one.reason
+                if isinstance(one, hf.events.ChildStartFailed):
                     assert is_told
                     assert "diverged" in one.reason
                     break
@@ -339,6 +339,6 @@ async def test_what_a_hook_changes_while_background_work_is_out_is_not_saved(sys
         ref.kill()
         async with asyncio.timeout(IN_TIME):
             async for one in events:
-                if isinstance(one, hf.RecoveryFailed):
+                if isinstance(one, hf.events.RecoveryFailed):
                     assert "diverged" in one.reason
                     break

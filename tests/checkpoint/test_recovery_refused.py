@@ -29,8 +29,8 @@ async def test_replay_of_an_actor_that_is_not_deterministic_diverges(system: hf.
     await ref.ask(Do([], notes))
     with system.events() as stream:
         ref.kill()
-        assert "diverged at turn 1, output 1" in (await event(stream, hf.RecoveryFailed)).reason
-        await event(stream, hf.SupervisorGaveUp)
+        assert "diverged at turn 1, output 1" in (await event(stream, hf.events.RecoveryFailed)).reason
+        await event(stream, hf.events.SupervisorGaveUp)
     noted = await notes.ask(Notes())
     assert len(noted) == 1
 
@@ -51,7 +51,7 @@ async def test_a_message_that_kills_its_process_again_and_again_is_quarantined(
         after = ref.ask(Do(["tell 1", "ask good", "tell 2"], notes), timeout=30.0)
         with pytest.raises(hf.Quarantined):
             await bad
-        assert (await event(stream, hf.MessageQuarantined)).deliveries == 3
+        assert (await event(stream, hf.events.MessageQuarantined)).deliveries == 3
     await after
     await struck(system, ref)
     assert (tmp_path / "deaths").read_text() == "xxx"
@@ -67,7 +67,7 @@ async def test_deaths_that_the_runtime_ordered_do_not_quarantine(system: hf.Acto
         gate.unlink()
         with system.events() as stream:
             ref.kill()
-            await event(stream, hf.Recovered)
+            await event(stream, hf.events.Recovered)
     let_through(gate)
     assert await asked == "0"
 
@@ -141,9 +141,9 @@ async def test_a_replay_is_followed_by_a_snapshot_so_that_the_next_need_not_repe
     await ref.ask(Note("one"))
     with system.events() as stream:
         strike(system, ref)
-        assert (await event(stream, hf.SnapshotTaken)).turn == 1
+        assert (await event(stream, hf.events.SnapshotTaken)).turn == 1
         strike(system, ref)
-        back = await event(stream, hf.Recovered)
+        back = await event(stream, hf.events.Recovered)
         if back.life == 2:  # In one process the snapshot is told of before the recovery that led to it.
-            back = await event(stream, hf.Recovered)
+            back = await event(stream, hf.events.Recovered)
     assert (back.life, back.replayed) == (3, 0)

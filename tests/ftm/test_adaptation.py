@@ -151,7 +151,7 @@ async def test_compose_and_detach_a_layer(system: hf.ActorSystem) -> None:
     await load.reached(20)
     async with system.transaction(timeout=30) as change:
         change.transition(ref, PBR())  # In the place of the one of its sort.
-    settled = [event for event in events.take() if isinstance(event, hf.MechanismSettled)]
+    settled = [event for event in events.take() if isinstance(event, hf.events.MechanismSettled)]
     assert stack(ref) == ("pbr", "tr"), settled
     events.close()
     await load.reached(20)

@@ -169,7 +169,7 @@ async def come_and_go(system: hf.ActorSystem, ref: hf.ActorRef[Any], load: Load,
 
 async def test_the_engine_dies_with_three_replicas_and_its_next_life_goes_on(system: hf.ActorSystem) -> None:
     """T38-T41: at each step, while a replica comes in, and while it goes again."""
-    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.PBR()))
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.ftm.PBR()))
     load = Load(ref, clients=2)
     for step, wanted in itertools.product(STEPS, (("tmr",), ("pbr",))):
         await load.reached(3)
@@ -183,7 +183,7 @@ async def test_the_engine_dies_with_three_replicas_and_its_next_life_goes_on(sys
 
 async def test_a_change_with_three_replicas_that_is_given_up_is_undone(system: hf.ActorSystem) -> None:
     """At each step before there is no way back; the engine dies as well, in the middle of undoing it."""
-    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.TMR()))
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.ftm.TMR()))
     load = Load(ref, clients=2)
     for step in STEPS[: STEPS.index("commit")]:
         await load.reached(3)

@@ -150,7 +150,7 @@ async def test_detached_while_whoever_leads_is_deposed_when_nothing_is_inside(
     epoch, quiet = group.membership.epoch, group.quiet
 
     def suspected(done: asyncio.Future[None]) -> None:
-        primary, manager = group.membership.primary, system.node.cell_at(f"{ref.path}/ftm/failover").actor
+        primary, manager = group.membership.primary, system._node.cell_at(f"{ref.path}/ftm/failover").actor
         assert primary is not None
         assert isinstance(manager, FailoverManager)
         group.replicas.suspect(primary, group.membership.members[primary], "a test wants it")
@@ -552,7 +552,7 @@ async def test_a_change_that_the_end_of_the_system_overtakes_fails(mechanism: An
         changing = asyncio.create_task(change())
         with system.events() as events:
             async for event in events:
-                if isinstance(event, hf.TransactionBegan):
+                if isinstance(event, hf.events.TransactionBegan):
                     break
     with pytest.raises(hf.TransactionFailed, match="the system ends"):
         async with asyncio.timeout(20):

@@ -223,7 +223,7 @@ async def test_links_that_nobody_certifies_are_refused(system: hf.ActorSystem, a
     await load.reached(10)
     with pytest.raises(hf.TransactionFailed, match=r"no authority lives|has no handler") as failed:
         async with system.transaction(timeout=60) as change:
-            change.compose(ref, hf.SEC(address), outside=True)
+            change.compose(ref, hf.ftm.SEC(address), outside=True)
     assert not failed.value.kept
     await load.reached(10)
     await load.stop()
@@ -246,7 +246,7 @@ async def test_a_replica_that_waits_for_the_life_that_it_begins_can_be_stopped(s
     await two_again(ref)
     left = next(name for name in group.membership.names if name != group.membership.primary)
     os.kill(pid_of(system, ref, group.membership.primary or ""), signal.SIGKILL)
-    server = system.node.cell_at(f"{ref.path}/ftm/{left}").ref
+    server = system._node.cell_at(f"{ref.path}/ftm/{left}").ref
     async with asyncio.timeout(60):
         while group.membership.leading is None:
             await asyncio.sleep(0.001)
@@ -323,7 +323,7 @@ async def test_bricks_that_hang_in_a_replica_that_does_not_lead_are_found_withou
         assert await ref.ask(Add(1), timeout=60) == 1
         async with asyncio.timeout(20):
             async for event in events:
-                if isinstance(event, hf.ReplicaLost) and "let nothing pass" in event.why:
+                if isinstance(event, hf.events.ReplicaLost) and "let nothing pass" in event.why:
                     assert event.replica == "r2"
                     break
         assert await ref.ask(Add(2), timeout=60) == 2

@@ -68,7 +68,7 @@ class Repair:
         problem = repair_problem(self._domain, nodes=["alice"], bad=["alice"], running=["alice"], facts=facts)
         executor = Executor(
             self,
-            arbiter_of(self._system.node),
+            arbiter_of(self._system._node),
             address=lambda step: ALICE,
             actions=lambda name: self._one,
             is_dangerous=lambda one: False,
@@ -129,7 +129,7 @@ def kill(
 
 
 def holder(system: hf.ActorSystem) -> Hand | None:
-    grant = arbiter_of(system.node).holder(ALICE)
+    grant = arbiter_of(system._node).holder(ALICE)
     return None if grant is None else grant.hand
 
 
@@ -329,7 +329,7 @@ async def test_monitoring_waits_while_somebody_else_has_the_actor(system: hf.Act
         resources=Resources(units=2),
     )
     watch = MechanismWatch(ALICE, judge, lambda order: decided.set(), probe=None)
-    grant = arbiter_of(system.node).claim(ALICE, Hand.REPAIR, "it is slow")
+    grant = arbiter_of(system._node).claim(ALICE, Hand.REPAIR, "it is slow")
     with system.events() as events:
         engine = await system.start(hf.child("monitoring", hf.start(MonitoringEngine, watch)))
         engine.tell(Observe("mismatch", 3))
@@ -342,7 +342,7 @@ async def test_monitoring_waits_while_somebody_else_has_the_actor(system: hf.Act
             f"{ALICE} is in the hands of repair: it is slow"
         ]
         assert not decided.is_set()
-        arbiter_of(system.node).release(grant)
+        arbiter_of(system._node).release(grant)
         async with asyncio.timeout(SECONDS):
             await decided.wait()
         seen += events.take()
@@ -360,7 +360,7 @@ async def test_a_supervisor_restart_in_the_middle_of_a_failover_comes_behind_it(
     ]
     await system.start(hf.supervisor("s", children=children, strategy="one_for_all", intensity=100))
     alice, bob = system.ref("/app/s/alice", Counter), system.ref("/app/s/bob", Counter)
-    load, steps, judge = Load(alice), list[str](), arbiter_of(system.node)
+    load, steps, judge = Load(alice), list[str](), arbiter_of(system._node)
     await load.reached(10)
     host: Any = alice._cell.host.place
 
@@ -424,7 +424,7 @@ async def test_what_the_new_primary_knows_and_its_home_does_not_is_not_done_twic
 async def test_a_life_that_ends_in_the_middle_of_a_failover_is_its_supervisors(system: hf.ActorSystem) -> None:
     """The last replica dies too: repair has to wait until the supervisor is done, and may act then."""
     ref = await protected(system, recovery=hf.hybrid(), backoff=hf.Backoff(initial=0.3, maximum=0.3, jitter=0.0))
-    load, judge = Load(ref), arbiter_of(system.node)
+    load, judge = Load(ref), arbiter_of(system._node)
     await load.reached(10)
     backup = other(group_of(ref))
     at_step(ref, "lead", lambda: kill(system, ref, backup))

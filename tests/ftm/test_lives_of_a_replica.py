@@ -41,7 +41,7 @@ def request(node: Any, number: int, message: hf.Message[Any]) -> Request:
 async def server(system: hf.ActorSystem) -> Any:
     """A server as a replica has it, in this process, with a state to begin from."""
     GATE[:] = [asyncio.Event()]
-    node = system.node
+    node = system._node
     standing = Standing(node.nowhere("/app/x/ftm/r1"), 1, (LFR(),))
     made = standing.server = Server(standing, hf.hybrid())
     cell = node.cell_below(node.root, "x", AddressHost(FED, made, NEAR))

@@ -173,7 +173,7 @@ async def test_a_request_that_is_dropped_is_served_by_the_stack_before(
     assert stack(ref) == (below[0].name,)
 
 
-class Waits(hf.Operation):
+class Waits(hf.system.Operation):
     """A step whose end waits until it is known what comes of the change that another one makes."""
 
     verb = "wait"
@@ -201,7 +201,7 @@ async def test_how_a_change_went_is_told_however_late_one_asks(
         if isinstance(event, MechanismSettled) and not settled.done():
             settled.set_result(None)
 
-    system.node.events.add_sink(seen)
+    system._node.events.add_sink(seen)
     async with system.transaction(timeout=60) as change:
         change.step(Waits(settled))
         if below:

@@ -23,7 +23,7 @@ from tests.ftm.test_failover import pid_of, two_again
 pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
 
 
-async def whole(system: hf.ActorSystem, ref: hf.ActorRef[Counter], wanted: bool) -> hf.ProtectionStatus:
+async def whole(system: hf.ActorSystem, ref: hf.ActorRef[Counter], wanted: bool) -> hf.ftm.ProtectionStatus:
     """How it is protected when it is whole, or is not."""
     async with asyncio.timeout(30):
         while (found := await system.protection(ref)).is_whole is not wanted:

@@ -93,7 +93,7 @@ async def test_a_suspected_value_fault_leads_to_time_redundancy_while_requests_f
 ) -> None:
     """A24, T63: the observer sees wrong values, repair composes TR into the group, and they are masked from then on."""
     noise = tmp_path / "noise"
-    ref = await system.start(hf.child("alice", hf.start(Gauge, str(noise)), mechanism=hf.PBR()))
+    ref = await system.start(hf.child("alice", hf.start(Gauge, str(noise)), mechanism=hf.ftm.PBR()))
     heard = probe(system)
     heard.subscribe(REPAIR)
     load = Load(ref, clients=2)
@@ -123,8 +123,8 @@ async def test_mechanisms_by_name_in_the_repertoire(system: hf.ActorSystem) -> N
     names: list[Any] = [
         attach_mechanism(system.transaction, "pbr", ALICE),
         transition_mechanism(system.transaction, "lfr", ALICE, cost=3),
-        compose_mechanism(system.transaction, hf.TR(), ALICE, outside=True, name="repeat"),
-        attach_mechanism(system.transaction, (hf.PBR(), "tr"), ALICE),
+        compose_mechanism(system.transaction, hf.ftm.TR(), ALICE, outside=True, name="repeat"),
+        attach_mechanism(system.transaction, (hf.ftm.PBR(), "tr"), ALICE),
     ]
     assert [one.name for one in names] == ["attach_pbr", "transition_lfr", "repeat", "attach_pbr_tr"]
     assert "total-cost) 3" in names[1].pddl

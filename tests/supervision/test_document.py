@@ -191,8 +191,8 @@ async def test_whom_on_stop_is_called_for(how: str, _column: str, expected: str)
                 peer.kill()
             else:
                 ref.tell(Leave() if "ctx" in how else Boom())
-        await system.node.settled()
-        await system.node.settled()
+        await system._node.settled()
+        await system._node.settled()
         assert "/app/a" not in system.tree()
         assert bool(told) is (expected == "called")
 

@@ -80,7 +80,7 @@ async def test_each_crash_has_one_record_and_it_counts_the_restarts(records: lis
         fragile = system.ref("/app/top/x", Fragile)
         for _ in range(2):
             fragile.tell(Boom())
-            await system.node.settled()
+            await system._node.settled()
     crashes = of(records, "actor crashed")
     assert [(crash["restarts"], crash["allowed"]) for crash in crashes] == [(0, 1), (1, 1)]
     assert ["exception" in record for record in records] == [True, True, False]
@@ -90,7 +90,7 @@ async def test_each_crash_has_one_record_and_it_counts_the_restarts(records: lis
 async def test_a_crash_that_no_supervisor_sees_is_logged_all_the_same(records: list[Record]) -> None:
     async with hf.ActorSystem() as system:
         system.spawn(hf.start(Fragile), "alone").tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
         await asyncio.sleep(2.0)  # of the virtual clock
         (crash,) = records
     assert (crash["event"], crash["address"]) == ("actor crashed", "/app/alone")
@@ -160,7 +160,7 @@ async def test_standard_logging_decides_which_levels_are_seen(standard: FromStan
     try:
         async with hf.ActorSystem() as system:
             system.spawn(hf.start(Fragile), "fragile").tell(Boom())
-            await system.node.settled()
+            await system._node.settled()
     finally:
         logging.getLogger("holdfast").setLevel(logging.NOTSET)
     assert standard.records == []
@@ -171,7 +171,7 @@ async def test_a_supervisor_that_gives_up_is_logged_as_an_error(records: list[Re
         top = hf.supervisor("top", intensity=0, restart="temporary", children=[hf.child("x", hf.start(Fragile))])
         await system.start(top)
         system.ref("/app/top/x", Fragile).tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
     (gave_up,) = of(records, "supervisor gave up")
     assert (gave_up["log_level"], gave_up["address"], gave_up["child"]) == ("error", "/app/top", "x")
 
@@ -212,12 +212,12 @@ async def test_a_flood_of_one_kind_hides_no_other(records: list[Record]) -> None
         for _ in range(100):
             gone.tell(Boom())
         system.spawn(hf.start(Fragile), "late").tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
     assert [crash["address"] for crash in of(records, "actor crashed")] == ["/app/late"]
 
 
 async def test_log_false_is_silent(records: list[Record]) -> None:
     async with hf.ActorSystem(log=False) as system:
         system.spawn(hf.start(Fragile)).tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
     assert records == []

@@ -23,14 +23,14 @@ SUPERVISORS = "tests/migration/test_moved_supervisors.py"
 CHECKS = {
     "the states are in the store together": Check(
         "system/transaction/transaction.py",
-        "            with self._system.homes.journal.together():\n",
+        "            with self._system._homes.journal.together():\n",
         "            if True:\n",
         COMMIT,
         "test_a_root_that_is_killed and commit and task",
     ),
     "the specification is in the store with the states": Check(
         "system/transaction/transaction.py",
-        "        system.specifications.changed(*self._draft.below_root(), mechanisms)\n",
+        "        system._specifications.changed(*self._draft.below_root(), mechanisms)\n",
         "        pass\n",
         KEPT,
         "test_a_root_that_is_killed and finish",
@@ -310,7 +310,7 @@ CHECKS = {
     ),
     "a binding follows the actor and not its address": Check(
         "system/transaction/arrangement.py",
-        "            settle_bindings(system.node.root)\n",
+        "            settle_bindings(system._node.root)\n",
         "            pass\n",
         COMMIT,
         "test_who_was_bound_to_a_life_that_is_over",
@@ -345,7 +345,7 @@ CHECKS = {
     ),
     "processes are told where those are that they are bound to": Check(
         "system/transaction/arrangement.py",
-        "            tell_bindings(system.node.root, {new: old for old, new in now.items()})\n",
+        "            tell_bindings(system._node.root, {new: old for old, new in now.items()})\n",
         "            pass\n",
         TIES,
         "test_who_is_bound_to_it",
@@ -359,7 +359,7 @@ CHECKS = {
     ),
     "the mechanism of an actor is noted where it is now": Check(
         "system/transaction/arrangement.py",
-        "            system.mechanism_notes.moved(now)\n",
+        "            system._mechanism_notes.moved(now)\n",
         "",
         REPLICAS,
         "test_a_root_that_is_killed and trial and finish",
@@ -662,7 +662,7 @@ CHECKS = {
     ),
     "an address that was left leads to who has left it when a candidate has gone from there": Check(
         "system/transaction/succession.py",
-        "        system.homes.addresses.put_back(self._forwarded or {})\n",
+        "        system._homes.addresses.put_back(self._forwarded or {})\n",
         "        pass\n",
         SUPERVISORS,
         "test_who_has_left_the_address",

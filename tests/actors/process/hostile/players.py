@@ -144,7 +144,7 @@ class House(hf.Supervisor):
         lives: dict[str, dict[str, Any]] = {
             "plain": {},
             "recorded": {"recovery": hf.hybrid()},
-            "protected": {"mechanism": hf.PBR()},
+            "protected": {"mechanism": hf.ftm.PBR()},
         }
         options = lives[self.kind]
         evil = hf.child("evil", hf.start(Evil), bindings={"port": self.target}, **options)

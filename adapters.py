@@ -16,10 +16,10 @@ from typing import Any, ClassVar, cast
 
 import msgspec
 
-from .errors import HoldfastError, type_name
-from .kernel.actor import Actor, on, subscribe
-from .kernel.message import Message
-from .kernel.ref import ActorRef
+from .actors.errors import HoldfastError, type_name
+from .actors.kernel.actor import Actor, on, subscribe
+from .actors.kernel.message import Message
+from .actors.kernel.ref import ActorRef
 
 Parameter = inspect.Parameter
 
