@@ -317,7 +317,7 @@ async def _transitions(first: Sequence[Any], second: Sequence[Any], count: int) 
 
             async def change(target: Sequence[Any] = target) -> None:
                 async with system.transaction(timeout=30) as steps:
-                    steps.transition(ref, tuple(target))
+                    steps.protect(ref, tuple(target))
 
             gaps.append(await _windows(clients, change))
         await clients.stop()

@@ -57,13 +57,11 @@ async def main() -> None:
                 break
 
         async with system.transaction() as change:
-            change.transition(bank, hf.ftm.LFR())  # two compute instead of one
+            change.protect(bank, hf.ftm.LFR())  # two compute instead of one
         async with system.transaction() as change:
-            change.transition(
-                bank, hf.ftm.compose(hf.ftm.PBR(), hf.ftm.TR())
-            )  # each request twice, against transient faults
+            change.protect(bank, (hf.ftm.PBR(), hf.ftm.TR()))  # each request twice, against transient faults
         async with system.transaction() as change:
-            change.detach(bank)  # a plain task again; it never stopped
+            change.protect(bank, None)  # a plain task again; it never stopped
 
         closing.set()
         asked = sum(await asyncio.gather(*customers))

@@ -30,7 +30,7 @@ def tree_from(mapping: Mapping[str, Any], where: str = "tree") -> ChildSpec:
     A table is a child (`id`, `start = "package.module:Class"`, `args`, `kwargs`, and the options of `child`), or a
     supervisor (`name`, `children` and the options of `supervisor`; with `kind = "dynamic"` or `"partitions"` those of
     `dynamic` and `partitions`, whose `template` and `copy` are tables too). `recovery` is a table with `use`, the name
-    of a method such as `"holdfast:hybrid"`, and its options; `mechanism` is one with `use` = `"holdfast:PBR"`, or a
+    of a method such as `"holdfast:hybrid"`, and its options; `mechanism` is one with `use` = `"holdfast.ftm:PBR"`, or a
     list of such, outermost first.
 
     Args:

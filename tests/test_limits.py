@@ -154,7 +154,7 @@ async def test_the_spec_of_a_child_comes_packed_from_another_process() -> None:
 
 async def attach(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
     async with system.transaction(timeout=60.0) as change:
-        change.attach(ref, PBR())
+        change.protect(ref, PBR())
 
 
 @pytest.mark.parametrize("isolation", ["task", "process"])
@@ -203,7 +203,7 @@ async def test_state_and_code_of_a_protected_actor_are_not_replaced() -> None:
                 await refused
         await system.resume(ref, timeout=60.0)
         async with system.transaction(timeout=60.0) as change:
-            change.detach(ref)
+            change.protect(ref, None)
         await system.replace_state(ref, with_more, timeout=60.0)
         await attach(system, ref)
         assert await ref.ask(Do("goes on"), timeout=60.0) == 2

@@ -12,7 +12,7 @@ from ...actors.kernel.actor import Actor, Start
 from ...supervision.spec import ChildSpec, Isolation, Strategy
 from . import living
 from .draft import Target
-from .mechanisms import Attach, Compose, Detach, DetachLayer, Isolate, OnProtection, Protect, Transition, Update
+from .mechanisms import Isolate, OnProtection, Protect, Update
 from .operation import Operation, Step, text_of
 from .reparenting import Reparent
 from .running import StartAgain, StopChild
@@ -115,35 +115,18 @@ class Change:
 
     # -- fault tolerance ----------------------------------------------------------------------------------------------
 
-    def protect(self, target: Target, mechanism: Any) -> None:
-        """Have an actor protected by just this mechanism, or by just these, outermost first, whatever it has now.
+    def protect(self, target: Target, stack: Any) -> None:
+        """Have an actor protected by just this stack of mechanisms, whatever it has now; its life goes on.
 
-        None: by none. Its life goes on, and only the bricks that differ are touched.
+        Only the bricks that differ from those that it has are touched.
+
+        Args:
+            target: the actor.
+            stack: one mechanism or several, outermost first; None or an empty sequence: none. Each is one such as
+                `PBR()`, the name of one, or a file or module that defines one. The name of one that the actor has
+                means that one, with its settings: `("pbr", TR())` adds one inside.
         """
-        self.step(Protect(target, mechanism))
-
-    def attach(self, target: Target, mechanism: Any) -> None:
-        """Protect an actor by a mechanism, or by several, outermost first; its life goes on.
-
-        A mechanism is one such as `PBR()`, its name, or a file or module that defines one.
-        """
-        self.step(Attach(target, mechanism))
-
-    def detach(self, target: Target, mechanism: str = "") -> None:
-        """Have it live as its spec says without a mechanism; its life goes on. With a name: without that one alone."""
-        self.step(DetachLayer(target, mechanism) if mechanism else Detach(target))
-
-    def compose(self, target: Target, mechanism: Any, *, outside: bool = False) -> None:
-        """Nest one more mechanism inside of those that it has, or outside."""
-        self.step(Compose(target, mechanism, outside=outside))
-
-    def transition(self, target: Target, mechanism: Any, *, whole: bool = False) -> None:
-        """Put a mechanism in the place of the one of its sort, or several in the place of all, outermost first.
-
-        A tuple of one is that one. With `whole=True` what is given is the whole stack, also if it is only one. Only the
-        bricks that differ are touched.
-        """
-        self.step(Transition(target, mechanism, whole=whole))
+        self.step(Protect(target, stack))
 
     def update(self, target: Target, brick: str, new: Any, *, mechanism: str = "", role: str = "") -> None:
         """Give one brick new code.

@@ -123,7 +123,7 @@ async def test_the_mechanism_of_the_example_runs_from_its_file(system: hf.ActorS
     file = tmp_path / "audit.log"
     ref = await system.start(hf.child("c", hf.start(Counter)))
     async with system.transaction() as change:
-        change.attach(ref, (kind(str(file)), hf.ftm.PBR()))
+        change.protect(ref, (kind(str(file)), hf.ftm.PBR()))
     clients = Load(ref)
     await clients.reached(50)
     os.kill(system.pid_of(system.ref("/app/c/ftm/r1", hf.Actor)), signal.SIGKILL)
@@ -188,16 +188,15 @@ def test_each_reason_of_a_rejection_is_explained() -> None:
 
 
 REFUSED: dict[str, Callable[[Any], None]] = {
-    "detach that first": lambda change: change.attach("/app/c", hf.ftm.LFR()),
-    "it has no mechanism yet: attach one": lambda change: change.compose("/app/plain", hf.ftm.TR()),
-    "not inside": lambda change: change.transition("/app/c", (hf.ftm.TR(), hf.ftm.PBR())),
-    "keeps replicas already": lambda change: change.compose("/app/c", hf.ftm.LFR()),
-    "it stands in the composition twice": lambda change: change.transition(
+    "it has no mechanism yet: protect it first": lambda change: change.update("/app/plain", "after", hf.ftm.After),
+    "not inside": lambda change: change.protect("/app/c", (hf.ftm.TR(), hf.ftm.PBR())),
+    "keeps replicas already": lambda change: change.protect("/app/c", ("pbr", hf.ftm.LFR())),
+    "it stands in the composition twice": lambda change: change.protect(
         "/app/c", (hf.ftm.PBR(), hf.ftm.TR(), hf.ftm.TR())
     ),
-    "a supervisor cannot be protected": lambda change: change.attach("/app/family", hf.ftm.PBR()),
-    "there is no mechanism of that name": lambda change: change.transition("/app/c", "none"),
-    "`state_access = False`": lambda change: change.attach("/app/closed", hf.ftm.PBR()),
+    "a supervisor cannot be protected": lambda change: change.protect("/app/family", hf.ftm.PBR()),
+    "there is no mechanism of that name": lambda change: change.protect("/app/c", "none"),
+    "`state_access = False`": lambda change: change.protect("/app/closed", hf.ftm.PBR()),
 }
 
 

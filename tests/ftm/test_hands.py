@@ -22,7 +22,7 @@ from holdfast.diagnosis.repair import (
     RepairAction,
     Repertoire,
     action,
-    compose_mechanism,
+    protect_by,
     restart_child,
 )
 from holdfast.diagnosis.repair.executor import Executor, Result
@@ -293,7 +293,7 @@ async def test_what_repair_has_in_hand_is_not_adapted_by_others(system: hf.Actor
 async def test_repair_has_a_mechanism_changed_for_it(system: hf.ActorSystem) -> None:
     """The actor is in its hands, so what is done to it in this step is done by its leave."""
     ref = await protected(system)
-    load, repair = Load(ref), Repair(system, compose_mechanism(system.transaction, "tr", {"alice": ALICE}))
+    load, repair = Load(ref), Repair(system, protect_by(system.transaction, ("pbr", "tr"), {"alice": ALICE}))
     await load.reached(10)
     result = await repair.carry_out()
     assert (result.outcome, result.why) == (DONE, "")
@@ -311,8 +311,7 @@ async def test_a_change_that_failed_gives_the_actor_back(system: hf.ActorSystem)
     ref = await protected(system)
     with pytest.raises(hf.TransactionFailed):  # noqa: PT012
         async with system.transaction(timeout=30) as change:
-            change.transition(ref, LFR())
-            change.compose(ref, "tr")
+            change.protect(ref, (LFR(), "tr"))
             change.add("/app", hf.child("bad", hf.start(Failing)))
     assert stack(ref) == ("pbr",)
     assert holder(system) is None
@@ -403,7 +402,7 @@ async def test_what_the_new_primary_knows_and_its_home_does_not_is_not_done_twic
             await above.ask(hf.RestartChild("alice"), SECONDS)
         else:
             async with system.transaction(timeout=SECONDS) as change:
-                change.detach(ref)
+                change.protect(ref, None)
 
     made = at_step(ref, "lead", lambda: asyncio.create_task(leave(), context=contextvars.Context()))
     monkeypatch.setattr(group, "take_done", take_done)

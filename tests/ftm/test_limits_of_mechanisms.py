@@ -86,7 +86,7 @@ async def test_the_root_keeps_no_large_state_for_a_stack_on_probation(
     ref = await system.start(hf.child("alice", hf.start(Large, size)))
     assert await ref.ask(Add(1), timeout=60) == 1
     async with system.transaction(timeout=60) as change:
-        change.attach(ref, hf.ftm.PBR())
+        change.protect(ref, hf.ftm.PBR())
     await two_again(ref)
     assert await ref.ask(Add(2), timeout=60) == 2
     with system.events() as events:

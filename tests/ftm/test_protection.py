@@ -68,7 +68,7 @@ async def test_a_kill_of_a_life_that_is_ending_already_is_no_reason_to_end_it_ne
 async def test_a_new_stack_is_on_probation(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=PBR()))
     async with system.transaction(timeout=60) as change:
-        change.transition(ref, LFR())
+        change.protect(ref, LFR())
     found = await system.protection(ref)
     assert (found.stack, found.config, found.is_on_probation) == (("lfr",), 2, True)
 
@@ -77,10 +77,7 @@ async def test_a_new_stack_is_on_probation(system: hf.ActorSystem) -> None:
 async def test_a_tuple_of_one_means_that_one(system: hf.ActorSystem, mechanism: object) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=(PBR(), TR())))
     async with system.transaction(timeout=60) as change:
-        change.transition(ref, mechanism)
-    assert (await system.protection(ref)).stack == ("lfr", "tr")
-    async with system.transaction(timeout=60) as change:
-        change.transition(ref, mechanism, whole=True)
+        change.protect(ref, mechanism)
     assert (await system.protection(ref)).stack == ("lfr",)
 
 

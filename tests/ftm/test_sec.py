@@ -496,24 +496,24 @@ async def test_attached_composed_and_detached_while_requests_flow(secured: hf.Ac
     load = Load(ref)
     await load.reached(20)
     async with secured.transaction(timeout=30) as change:
-        change.attach(ref, hf.ftm.PBR())
+        change.protect(ref, hf.ftm.PBR())
     await load.reached(20)
     async with secured.transaction(timeout=30) as change:
-        change.compose(ref, SEC(CA), outside=True)
+        change.protect(ref, (SEC(CA), "pbr"))
     assert group_of(ref).replicas.link is not None
     await load.reached(20)
     await kill_primary(secured, ref)
     await load.reached(20)
     await joined(ref)
     async with secured.transaction(timeout=30) as change:
-        change.detach(ref, "sec")
+        change.protect(ref, "pbr")
     assert group_of(ref).replicas.link is None
     await load.reached(20)
     async with secured.transaction(timeout=30) as change:
-        change.transition(ref, hf.ftm.compose(SEC(CA), hf.ftm.PBR()))
+        change.protect(ref, hf.ftm.compose(SEC(CA), hf.ftm.PBR()))
     await load.reached(20)
     async with secured.transaction(timeout=30) as change:
-        change.detach(ref)
+        change.protect(ref, None)
     await load.reached(20)
     await load.stop()
     load.check(await ref.ask(Tags()))

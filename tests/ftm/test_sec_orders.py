@@ -51,7 +51,7 @@ async def test_a_change_is_made_though_its_orders_are_held_back_altered_and_repl
     tap.seen.clear()
     tap.strike = strike
     async with secured.transaction(timeout=60) as change:
-        change.transition(ref, hf.ftm.compose(hf.ftm.SEC(CA), LFR(), hf.ftm.TR()))
+        change.protect(ref, hf.ftm.compose(hf.ftm.SEC(CA), LFR(), hf.ftm.TR()))
     tap.strike = lambda path, frame: frame
     assert names(ref) == ["sec", "lfr", "tr"]
     assert {path for path, _ in held} == {"/app/c/ftm/r1/protocol", "/app/c/ftm/r2/protocol"}
@@ -75,7 +75,7 @@ async def test_the_order_that_ends_a_link_is_answered_over_it(
     ref = await begun(secured)
     tap.seen.clear()
     async with secured.transaction(timeout=60) as change:
-        change.detach(ref, "sec")
+        change.protect(ref, "pbr")
     assert not [one for _, one in tap.seen if isinstance(one, Commit)]  # Nobody has to ask in plain words.
     assert names(ref) == ["pbr"]
     assert await ref.ask(Add(1)) == 2
@@ -85,7 +85,7 @@ async def test_an_engine_that_dies_before_it_knows_that_the_links_have_ended_lea
     ref = await begun(secured)
     seen = struck(ref, "switch", fails)
     async with secured.transaction(timeout=60) as change:
-        change.detach(ref, "sec")
+        change.protect(ref, "pbr")
     assert seen.count("switch") == 2
     assert names(ref) == ["pbr"]
     assert await ref.ask(Add(1)) == 2

@@ -50,7 +50,7 @@ async def test_replicas_that_run_are_watched_as_a_change_of_mechanism_says(
     with system.events() as events:
         ref = await begun(system, hf.ftm.PBR())
         async with system.transaction(timeout=30) as change:
-            change.transition(ref, hf.ftm.PBR(detection=WATCHED))
+            change.protect(ref, hf.ftm.PBR(detection=WATCHED))
         assert await ref.ask(Hang(str(tmp_path / "first")), timeout=60) == "went on"
         assert [one.address for one in events.take() if isinstance(one, hf.events.TurnHung)] == [ref.path]
 

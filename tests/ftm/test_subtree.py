@@ -278,7 +278,7 @@ async def test_a_child_of_a_dynamic_supervisor(system: hf.ActorSystem) -> None:
     assert await asyncio.gather(*(one.ask(Add(tag)) for tag in range(6))) == [1, 2, 3, 4, 5, 6]
     with pytest.raises(hf.TransactionRefused, match="no recipe here has its spec"):
         async with system.transaction() as change:
-            change.transition(one, "lfr")
+            change.protect(one, "lfr")
 
 
 class Never(Counter):

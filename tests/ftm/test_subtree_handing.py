@@ -527,8 +527,8 @@ async def test_undone_with_its_transaction_it_lives_as_before(system: hf.ActorSy
         await load.reached(10)
     with pytest.raises(hf.TransactionFailed):
         async with system.transaction(timeout=30) as change:
-            change.attach(alice, LFR())
-            change.detach(bob)
+            change.protect(alice, LFR())
+            change.protect(bob, None)
             change.add("/app/bank", hf.child("bad", hf.start(Bad)))
     assert isinstance(alice._cell.host, OutsideHost)
     assert names_of(bob) == ["pbr"]
@@ -551,9 +551,9 @@ async def test_a_turn_that_does_not_end_rolls_it_back(system: hf.ActorSystem, tm
         async with system.transaction(timeout=seconds) as collected:
             match verb:
                 case "attach":
-                    collected.attach(alice, PBR())
+                    collected.protect(alice, PBR())
                 case "detach":
-                    collected.detach(alice)
+                    collected.protect(alice, None)
                 case _:
                     collected.isolation(alice, "process" if verb == "apart" else "task")
 

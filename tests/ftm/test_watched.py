@@ -54,7 +54,7 @@ async def test_what_is_decided_is_done_to_what_the_spec_says(system: hf.ActorSys
         assert (await done(events)).current == ("pbr", "tr")
     assert stack(ref) == (PBR(window=3), hf.ftm.TR())  # What it had keeps its settings.
     async with system.transaction(timeout=30) as change:
-        change.transition(ref, (LFR(), hf.ftm.TR()))
+        change.protect(ref, (LFR(), hf.ftm.TR()))
     async with asyncio.timeout(30):
         while (await monitor.ask(Report())).current != ("lfr", "tr"):
             await asyncio.sleep(0.01)
@@ -90,7 +90,7 @@ async def test_what_is_moved_to_another_supervisor_is_watched_there(system: hf.A
                 await asyncio.sleep(0.01)
         async with system.transaction(timeout=30) as change:
             change.add("/app/here", hf.child("alice", hf.start(Counter)))
-            change.transition(ref, LFR())
+            change.protect(ref, LFR())
         async with asyncio.timeout(30):
             while (await monitor.ask(Report())).current != ("lfr",):
                 await asyncio.sleep(0.01)

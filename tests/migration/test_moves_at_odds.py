@@ -253,12 +253,12 @@ async def test_a_mechanism_that_gives_way_while_somebody_detaches_it_is_gone_onc
     ref = await supervised(system, child(hf.start(Traveller), kind), old)
     assert await ref.ask(Add(1), IN_TIME) == 1
     async with system.transaction(timeout=IN_TIME) as change:
-        change.attach(ref, PBR())
+        change.protect(ref, PBR())
     gives_way = system._moves.unprotect(ref._cell, IN_TIME)
 
     async def detach() -> None:
         async with system.transaction(timeout=IN_TIME) as change:
-            change.detach(ref)
+            change.protect(ref, None)
 
     await asyncio.gather(detach(), gives_way)
     assert await ref.ask(Add(1), IN_TIME) == 2

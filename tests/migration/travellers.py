@@ -168,7 +168,7 @@ async def take(system: hf.ActorSystem, ref: hf.ActorRef[Any], step: str) -> None
                 change.protect(ref, hf.ftm.PBR())
         case "unprotect":
             async with system.transaction(timeout=60.0) as change:
-                change.detach(ref)
+                change.protect(ref, None)
         case "move":
             async with system.transaction(timeout=60.0) as change:
                 change.move(ref, "/app/here" if ref.path.startswith("/app/there/") else "/app/there")

@@ -140,7 +140,7 @@ GOOD: dict[str, Any] = {
         (("children", 0, "recovery"), {"interval": 1.0}, r"tree\.children\[0\]\.recovery\.use: must be a name"),
         (("children", 0, "mechanism"), {"window": 3}, r"tree\.children\[0\]\.mechanism\.use: must be a name"),
         (("children", 0, "mechanism"), [{"use": "holdfast:hybrid"}], r"tree\.children\[0\]: .*mechanism must be one"),
-        (("children", 0, "mechanism"), [{"use": "holdfast:PBR", "windw": 3}], r"mechanism\[0\]: .*'windw'"),
+        (("children", 0, "mechanism"), [{"use": "holdfast.ftm:PBR", "windw": 3}], r"mechanism\[0\]: .*'windw'"),
         (("children", 0, "mechanism"), "pbr", r"tree\.children\[0\]\.mechanism: must be a list"),
         (("children", 0, "significant"), True, r"tree\.children\[0\]: child 'a': a permanent child cannot be"),
         (("children", 1, "name"), None, r"tree\.children\[1\]: "),
@@ -160,8 +160,8 @@ def test_errors_say_where(place: tuple[Any, ...], value: Any, error: str) -> Non
 
 
 def test_mechanisms_are_tables_too() -> None:
-    one = {"id": "one", "start": COUNTER, "mechanism": {"use": "holdfast:PBR", "window": 3}}
-    two = {"id": "two", "start": COUNTER, "mechanism": [{"use": "holdfast:LFR"}, {"use": "holdfast:TR"}]}
+    one = {"id": "one", "start": COUNTER, "mechanism": {"use": "holdfast.ftm:PBR", "window": 3}}
+    two = {"id": "two", "start": COUNTER, "mechanism": [{"use": "holdfast.ftm:LFR"}, {"use": "holdfast.ftm:TR"}]}
     children = [
         hf.child("one", hf.start(Counter), mechanism=hf.ftm.PBR(window=3)),
         hf.child("two", hf.start(Counter), mechanism=(hf.ftm.LFR(), hf.ftm.TR())),

@@ -252,7 +252,7 @@ class Storm:
         await self._change(lambda change: change.protect(book.ref, mechanism), self._seconds)
 
     async def detach(self, book: Known) -> None:
-        await self._change(lambda change: change.detach(book.ref), self._seconds)
+        await self._change(lambda change: change.protect(book.ref, None), self._seconds)
 
     async def give_up(self, book: Known) -> None:
         """A transaction that has hardly any time."""

@@ -312,7 +312,7 @@ async def test_it_is_taken_out_of_its_replicas_behind_the_move_and_protected_aga
         assert await one.ask(Add(), IN_TIME) == 1
         await moved(system)
         async with system.transaction(timeout=IN_TIME) as change:
-            change.detach(one)
+            change.protect(one, None)
         assert await one.ask(Add(), IN_TIME) == 2
         await system.set_isolation(one, "process", timeout=IN_TIME)
         async with system.transaction(timeout=IN_TIME) as change:

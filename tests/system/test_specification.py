@@ -276,11 +276,11 @@ async def test_who_is_bound_to_the_program_comes_back_behind_it(tmp_path: Path) 
 async def test_mechanisms_and_specifications_are_kept_side_by_side(tmp_path: Path) -> None:
     async with program(tmp_path / "store") as system:
         async with system.transaction(timeout=60) as change:
-            change.attach("/app/left/r", PBR())
+            change.protect("/app/left/r", PBR())
             change.add("/app/left", counter("x", recovery=RECORDED, mechanism=TR()))
         async with system.transaction(timeout=60) as change:
             change.reorder("/app/left", ["x", "r"])
-            change.detach("/app/left/x")
+            change.protect("/app/left/x", None)
         for event in await change.settled():
             assert event.is_kept
         assert await ref(system, "/app/left/r").ask(Add(5)) == 5
@@ -359,7 +359,7 @@ async def on_trial(store: str) -> None:
     """The root is killed before it is known whether a mechanism stays."""
     async with program(Path(store)) as system:
         async with system.transaction(timeout=60) as change:
-            change.attach("/app/left/r", PBR())
+            change.protect("/app/left/r", PBR())
             change.add("/app/left", counter("x"))
         os.kill(os.getpid(), signal.SIGKILL)
 

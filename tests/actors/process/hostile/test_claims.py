@@ -108,7 +108,7 @@ async def test_a_claim_that_moves_with_its_actor_is_still_one(town: Town, recove
     assert await evil.ask(Write(claimed), timeout=60) == 1
     assert await evil.ask(Ping(), timeout=60) == 1
     async with town.system.transaction() as change:
-        change.attach(evil, hf.ftm.PBR())
+        change.protect(evil, hf.ftm.PBR())
     assert evil.path + "/ftm" in town.system.tree()
     assert [cell.path for cell in evil._cell.extra().bindings.values()] == [SUP]
     await town.refused(evil, Kill(VICTIM))
