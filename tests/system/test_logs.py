@@ -157,7 +157,7 @@ async def test_standard_logging_gets_the_record_where_structlog_is_not_set_up(st
     assert vars(record)["holdfast"]["restarts"] == 0
 
 
-def test_a_program_that_has_set_up_nothing_gets_its_log_on_stderr() -> None:
+async def test_a_program_that_has_set_up_nothing_gets_its_log_on_stderr() -> None:
     program = """
 import asyncio, holdfast as hf
 
@@ -178,7 +178,8 @@ async def main():
 
 asyncio.run(main())
 """
-    done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True, timeout=60)
+    argv = [sys.executable, "-c", program]
+    done = subprocess.run(argv, check=False, capture_output=True, text=True, timeout=60)  # noqa: ASYNC221
     assert (done.returncode, done.stdout) == (0, "done\n")
     assert "actor crashed" in done.stderr
 
