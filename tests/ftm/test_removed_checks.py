@@ -12,6 +12,7 @@ JOINING = "tests/ftm/test_pbr_joining.py"
 PBR, LFR, SEC = "tests/ftm/test_pbr.py", "tests/ftm/test_lfr.py", "tests/ftm/test_sec.py"
 SUBTREE, STATE = "tests/ftm/test_subtree.py", "tests/ftm/test_group_state.py"
 PUT_BACK, UNAWAITED = "tests/ftm/test_put_back.py", "tests/ftm/test_unawaited_asks.py"
+SPOILED = "tests/ftm/test_spoiled_states.py"
 RANDOM_HOOKS = "tests/ftm/test_random_hooks.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 CHECKS = {
@@ -731,6 +732,34 @@ CHECKS = {
         "                pass\n            if is_last",
         PUT_BACK,
         "an_alternate_has_put_back",
+    ),
+    "hooks that leave what nobody can save do not end the replica": Check(
+        "ftm/replica/protected_actor.py",
+        "        life.spoiled = error\n        self._stay(life)\n",
+        "        pass\n",
+        SPOILED,
+        "a_state_that_a_hook_leaves and pbr and all",
+    ),
+    "what was not run is not compared": Check(
+        "ftm/bricks/runs.py",
+        "        if life is not None and life.spoiled is not None:\n",
+        "        if False:\n",
+        SPOILED,
+        "a_state_that_a_hook_leaves and tr and all",
+    ),
+    "no turn fails of what `on_start` has left": Check(
+        "ftm/replica/protected_actor.py",
+        "                if self.points.point is None or not has_run:\n",
+        "                if self.points.point is None or not begun:\n",
+        SPOILED,
+        "a_recovery_that_begins and pbr",
+    ),
+    "whoever is asked for a state that nobody can save goes on alone": Check(
+        "ftm/bricks/state_transfer.py",
+        "        except Exception as error:  # What the user's own values and methods raise is no reason",
+        "        except ZeroDivisionError as error:  # What the user's own values and methods raise is no reason",
+        SPOILED,
+        "lfr and Silent",
     ),
     "a message that kills is found out": Check(
         "ftm/group/delivery.py",
