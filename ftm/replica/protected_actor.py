@@ -615,8 +615,6 @@ class Server(lifecycle.HerePlace):
         begin, state, attempts = time.perf_counter(), self.state, self.attempts
         part = self.part = BatchPart(pending)
         while pending and not state.is_over:
-            if self.life is None and part.begun and not self._goes_on([], self._rest.missed or ENDED):
-                break  # It has ended between two turns, and with it what the first ones have left.
             is_new = self.life is None
             if self.only_computes:  # Hooks have counted in the first run, if they have.
                 await self.ensure_as_given()
@@ -644,6 +642,8 @@ class Server(lifecycle.HerePlace):
                 attempts.size = size_after(attempts.size, len(chunk), now - at)
                 if (now - begin > PART and not state.is_again) or part.is_cut:
                     break
+                if pending and self.life is None and not self._goes_on([], self._rest.missed or ENDED):
+                    break  # It has ended between two turns, and with it what the first ones have left.
             elif why is UNDONE:
                 self._take_back()
             elif not self._goes_on(chunk, why):

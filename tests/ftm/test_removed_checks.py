@@ -121,6 +121,20 @@ CHECKS = {
         "tests/checkpoint/test_hook_changes.py",
         "test_replicas_that_die_before",
     ),
+    "what the hooks of a life that has begun alone have left is at home before what stands on it": Check(
+        "ftm/bricks/bricks.py",
+        "            await self._hand_more()  # A snapshot of what its hooks",
+        "            pass  # A snapshot of what its hooks",
+        "tests/checkpoint/test_hook_changes.py",
+        "test_replicas_that_die_before and slow",
+    ),
+    "what hooks have left, and was not saved, is no snapshot": Check(
+        "ftm/replica/actor_state.py",
+        "    is_known = stands and not life.is_touched  #",
+        "    is_known = stands  #",
+        SPOILED,
+        "a_state_that_a_hook_leaves and pbr and all",
+    ),
     "no difference leads to what hooks have left": Check(
         "ftm/replica/rewind_points.py",
         "    if turn <= points.untraced:\n",
@@ -746,6 +760,13 @@ CHECKS = {
         "        if False:\n",
         SPOILED,
         "a_state_that_a_hook_leaves and tr and all",
+    ),
+    "what the first chunks of a part have left goes with their life, and is run again": Check(
+        "ftm/replica/protected_actor.py",
+        "                if pending and self.life is None and not self._goes_on([], self._rest.missed or ENDED):\n",
+        "                if False:\n",
+        "tests/ftm/test_lives_of_a_replica.py",
+        "between_two_chunks",
     ),
     "no turn fails of what `on_start` has left": Check(
         "ftm/replica/protected_actor.py",

@@ -110,6 +110,9 @@ async def test_a_state_that_a_hook_leaves_and_nobody_can_save(
                     with pytest.raises((UnsavableValue, hf.RemoteCrash), match="lock"):
                         await ref.ask(Count(), timeout=IN_TIME)
             await told(events)
+            if recovery is not None:
+                with pytest.raises(hf.CheckpointFailed, match="lock"):
+                    await system.checkpoint(ref)
             assert not [one for one in events.take() if isinstance(one, (hf.Masked, hf.Diverged, hf.RecoveryFailed))]
         if name != "lfr":
             note.unlink()
