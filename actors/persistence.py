@@ -1,4 +1,4 @@
-"""What is kept of addresses beyond the lives there: how supervisors speak of it, knowing no recovery method."""
+"""How supervisors speak of state that outlives their children's lives, without knowing any recovery method."""
 
 from __future__ import annotations
 

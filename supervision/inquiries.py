@@ -1,4 +1,4 @@
-"""What a supervisor says of its children without doing anything to them."""
+"""What a supervisor reports of its children without changing anything."""
 
 from __future__ import annotations
 

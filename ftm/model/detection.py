@@ -1,4 +1,4 @@
-"""How the replicas of a protected actor are watched, as a word of its mechanism."""
+"""How a mechanism has its replicas watched: the settings of failure detection."""
 
 from __future__ import annotations
 
