@@ -1,4 +1,4 @@
-"""How supervisors speak of state that outlives their children's lives, without knowing any recovery method."""
+"""The interface by which supervisors speak of state that outlives lives, without knowing any recovery method."""
 
 from __future__ import annotations
 

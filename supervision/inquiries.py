@@ -1,4 +1,4 @@
-"""What a supervisor reports of its children without changing anything."""
+"""Answers to questions about a supervisor's children, which change nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which replicas of a group are up, suspected, members and primary, and failover's next step. Decisions only.
+"""The members of a group of replicas, their primary and their suspects, and failover's next step: data and decisions.
 
 Nothing here waits, tells, or reads a clock. `replicas.py` has what else belongs to a change of the membership, and
 `failover.py` carries the steps out. They are told which life each replica lives now: a name to a number, 0 for none.

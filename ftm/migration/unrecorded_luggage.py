@@ -1,4 +1,4 @@
-"""What a life without recovery takes along between a subtree's process and the root.
+"""The luggage of a life without recovery, between a subtree's process and the root.
 
 Whoever waits for a reply is answered over the connection, wherever the asked actor lives then.
 """

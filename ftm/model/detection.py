@@ -1,4 +1,4 @@
-"""How a mechanism has its replicas watched: the settings of failure detection."""
+"""Settings of failure detection, by which a mechanism has its replicas watched."""
 
 from __future__ import annotations
 
