@@ -1,4 +1,4 @@
-"""What happens in a system, as typed values on one stream. Unformatted: text is made when somebody looks."""
+"""Events: what happens in a system, as typed values on one stream; text is made only when somebody reads it."""
 
 from __future__ import annotations
 

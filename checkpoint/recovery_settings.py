@@ -1,4 +1,4 @@
-"""What a recovery method may say of safe state, of messages that come meanwhile, and of hooks: checked data."""
+"""Validated settings of recovery methods: safe state, held messages and hooks."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What a person sees of holdfast: the command line and the demo. The library itself never imports this folder."""
+"""The command line and the demo. The library itself never imports this folder."""

@@ -1,4 +1,4 @@
-"""Administration: the messages that a supervisor answers, and how it says no."""
+"""Administration: the messages that a supervisor answers, and its refusals."""
 
 from __future__ import annotations
 

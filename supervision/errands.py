@@ -1,4 +1,4 @@
-"""Errands: what a supervisor does that has to wait for others. No wait is in a turn of its own.
+"""Errands: the waiting work of a supervisor, as coroutines stepped in its turns; no turn ever waits.
 
 An errand is written as a coroutine. It is stepped in turns of the actor; where it waits, that turn ends, and when what
 it waits for has come, the rest is another item in the actor's mailbox. So the actor answers, and can be stopped, while

@@ -1,4 +1,4 @@
-"""What a supervisor says of its children without doing anything to them."""
+"""Answers to questions about a supervisor's children, which change nothing."""
 
 from __future__ import annotations
 

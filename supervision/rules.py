@@ -1,4 +1,4 @@
-"""Restart rules: what follows from an end when its reason says more than the restart type."""
+"""Restart rules: what follows from an end when its reason decides instead of the restart type."""
 
 from __future__ import annotations
 

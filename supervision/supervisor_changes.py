@@ -1,4 +1,4 @@
-"""What a supervisor is made of: at its start, when it is changed while it works, and when another takes its place."""
+"""The plan of a supervisor (its flags and children): at its start, in a live change, in a succession."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Moving live actors between tasks and OS processes: which moves there are, one at a time for each actor."""
+"""Moves live actors between tasks and OS processes: finds the sides, one move at a time for each actor."""
 
 from __future__ import annotations
 

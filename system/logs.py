@@ -1,4 +1,4 @@
-"""Events as log records: one for each crash, however many events tell of it, and a limit on floods."""
+"""Writes events as log records: one for each crash, with a limit on floods."""
 
 from __future__ import annotations
 

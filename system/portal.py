@@ -1,4 +1,4 @@
-"""Calls from other threads: `system.from_thread()` makes the handle through which they reach the system's actors."""
+"""Calls from other threads: the handle that `system.from_thread()` returns."""
 
 from __future__ import annotations
 

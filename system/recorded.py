@@ -1,4 +1,4 @@
-"""What a system lets its user do to recorded actors: quarantine, and snapshots of several actors as one."""
+"""A system's methods for recorded actors: quarantine, and group snapshots."""
 
 from __future__ import annotations
 

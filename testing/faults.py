@@ -1,4 +1,4 @@
-"""Faults at named points, from a seed: what crashes, hangs, comes late, twice, out of order, damaged, or never.
+"""Faults injected at named points from a seed: crash, hang, delay, duplicate, reorder, damage or loss.
 
 A fault is installed on one actor (or one system) by exchanging the function that stands at that point, for as long as
 the context is open. Production code has no hooks for it and pays nothing.

@@ -1,4 +1,4 @@
-"""A system under guard: at its end the test hears of everything that went wrong and that it did not expect."""
+"""A system under guard: at its end the test hears of everything unexpected that went wrong."""
 
 from __future__ import annotations
 

@@ -151,6 +151,17 @@ def test_the_map_is_up_to_date() -> None:
     assert (ROOT / "docs" / "map.md").read_text("utf-8") == house_map.text()
 
 
+def test_each_module_stands_on_the_map_once() -> None:
+    folder, found = "", Counter[str]()
+    for line in house_map.text().splitlines():
+        if line.startswith("## "):
+            folder = line.removeprefix("## ").removeprefix("holdfast")
+            found[str(Path(folder, "__init__.py"))] += 1
+        elif line.startswith("| `"):
+            found[str(Path(folder, line.split("`")[1]))] += 1
+    assert found == Counter(map(str, SOURCES))
+
+
 def test_no_folder_is_crowded_and_no_room_has_a_name_twice() -> None:
     names = Counter((path.parts[0], path.name) for path in SOURCES if path.name != "__init__.py")
     assert [name for name, count in names.items() if count > 1] == []

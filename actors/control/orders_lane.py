@@ -1,4 +1,4 @@
-"""Asks on the system lane: an order goes to an actor ahead of all messages, wherever it lives, and is answered."""
+"""The system lane: orders reach an actor ahead of its messages, wherever it lives, and are answered."""
 
 from __future__ import annotations
 

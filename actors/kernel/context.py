@@ -1,4 +1,4 @@
-"""`self.ctx`: what an actor may do besides handling messages. One per life."""
+"""The context, `self.ctx`: what an actor may do besides handling messages. Each life has its own."""
 
 from __future__ import annotations
 

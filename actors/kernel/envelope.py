@@ -1,4 +1,4 @@
-"""What stands in a mailbox: bare messages, envelopes, asks, and the runtime's own items.
+"""The items that stand in a mailbox: bare messages, envelopes, asks, and the runtime's own.
 
 The run loop knows nothing of these kinds. It looks up `table[type(item)]` and calls what it finds: a user's handler
 for a message, `run` for everything else.

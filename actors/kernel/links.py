@@ -1,4 +1,4 @@
-"""Links and monitors: who hears of an end, and what it does to them. Erlang's rules.
+"""Links and monitors by Erlang's rules: who is told of an end, and what it does to them.
 
 A link is two-sided: an abnormal end ends the other side with the same reason, unless that one traps exits. A monitor is
 one-sided and only informs: of one life (`monitor`), or of the address (`watch`: once, when it is gone for good).

@@ -1,4 +1,4 @@
-"""How a message gets into a mailbox: one `admit` function per situation, swapped when the situation changes.
+"""Mailboxes: one `admit` function per situation of an address, swapped when the situation changes.
 
 `cell.admit(cell, item)` is called for every message; which function stands there says what happens to it. No flag is
 tested per message.

@@ -1,4 +1,4 @@
-"""What an actor takes along when it is moved between a task and an OS process: packed here, unpacked there.
+"""Packs and unpacks what an actor takes along when it moves between a task and an OS process.
 
 Handles that only mean something at one place (timers, rights to reply, refs, watches) may be in the state: they are
 packed by what they stand for, and the actor finds handles of the same meaning in their place.

@@ -1,4 +1,4 @@
-"""Moving a life: how the old one is brought to rest between two turns, and the new one held until it is the one.
+"""Brings a moving life to rest between two turns, and holds the new life until it becomes the one.
 
 What both sides of a process border need is here; who decides is `system/live_moves.py`.
 """

@@ -1,4 +1,4 @@
-"""The message handler as an actor: it has written what the homes submit, once for all that a tick has brought.
+"""The message handler as an actor: it has each tick's submissions of all homes written at once.
 
 What waits to be written stands in `homes.journal`, not here: a handler that is killed loses nothing, its next life goes
 on with what it finds. If it does not come in time, the journal does its work itself.

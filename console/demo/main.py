@@ -1,4 +1,4 @@
-"""From a plan to a verdict on the screen: what the `demo` command calls."""
+"""Runs the `demo` command, from its plan to its verdict on the screen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What two runs measured, and the verdict: is the disturbed map the undisturbed one, bit by bit."""
+"""The report of the demo: what two runs measured, and whether their maps are equal bit by bit."""
 
 from __future__ import annotations
 

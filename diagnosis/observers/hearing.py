@@ -1,4 +1,4 @@
-"""How observers hear topics: an ear for each, so that it is known which topic a message came on."""
+"""Ears of observers: one for each topic, so that it is known which topic a message came on."""
 
 from __future__ import annotations
 

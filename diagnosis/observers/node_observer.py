@@ -1,4 +1,4 @@
-"""Is it running? `running(n)` for actors (D20)."""
+"""An observer of whether actors run: `running(n)` (D20)."""
 
 from __future__ import annotations
 

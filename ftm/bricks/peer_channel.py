@@ -1,4 +1,4 @@
-"""Post between bricks of different replicas: each letter is handled once, in the order in which they were sent.
+"""The channel between bricks of different replicas: each letter is handled once, in the order sent.
 
 A letter that has no answer after a while may have been lost on its way, or its answer; or it is still being handled.
 So the other brick is asked (`Recall`): it answers what it has, or says that it never came. Then it is sent again;

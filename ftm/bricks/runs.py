@@ -1,4 +1,4 @@
-"""Runs: what a batch comes to when it is computed once more, from the same state, by another version or replica.
+"""Runs: a batch computed once more from the same state, by another version or another replica.
 
 A shadow is a second life of the protected actor in a replica: what it computes is compared, and leaves only if the
 replica that leads takes it over.

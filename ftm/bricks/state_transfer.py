@@ -1,4 +1,4 @@
-"""State transfer: another replica is brought to the state of the one that leads, between two batches (T8c).
+"""State transfer: brings another replica to the leader's state between two batches (T8c).
 
 The two RequestProtocols do it: the leader's captures and sends, the follower's takes, and may ask for it again. The
 leader's gives it out, too, when the actor is to live without a mechanism.

@@ -1,4 +1,4 @@
-"""Whether an actor is protected now, by what, who leads, and whether a replica could die."""
+"""The protection status of an actor: its mechanisms, who leads, and whether a replica may die."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The proxy: what the home feeds goes out in one batch at a time, and each outcome comes home once (A44, A54)."""
+"""The proxy: sends requests of the home in one batch at a time, and brings each outcome home once (A44, A54)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the root reaches the replicas of a group and their processes, and what it hears of them.
+"""The root's access to the replicas of a group: their processes, what is sent to them, what is heard.
 
 Who of them counts stands in the membership, which is data; here is what a change of it does besides. If the outermost
 mechanism wants that, all that replicas are told, and say, is sealed.

@@ -1,4 +1,4 @@
-"""What reaches a protected actor besides messages: orders go to whoever leads, bindings to every replica."""
+"""Steers a protected actor besides its messages: orders go to the leader, bindings to every replica."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What goes along when a life that is not recorded is handed over between a subtree's process and the root.
+"""The luggage of a life without recovery, between a subtree's process and the root.
 
 Whoever waits for a reply is answered over the connection, wherever the asked actor lives then.
 """

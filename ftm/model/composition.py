@@ -1,4 +1,4 @@
-"""What must hold of a stack of mechanisms before it is made to run, and how one stack becomes another (T39, T42)."""
+"""Checks a stack of mechanisms before it is run, and the way from one stack to another (T39, T42)."""
 
 from __future__ import annotations
 

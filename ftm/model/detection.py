@@ -1,4 +1,4 @@
-"""How the replicas of a protected actor are watched, as a word of its mechanism."""
+"""Settings of failure detection, by which a mechanism has its replicas watched."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a fault-tolerance mechanism is: roles, what each brick does in them, and what it assumes. One file each.
+"""The base of fault-tolerance mechanisms: roles, their bricks, and assumptions. Each has its own file.
 
 A mechanism is a frozen dataclass: its fields are its settings. It is found by name (`find`), by an entry point of the
 group `holdfast.mechanisms`, or loaded from a file or module that the system has never seen (`load`).

@@ -1,4 +1,4 @@
-"""The monitoring engine: sees to it that a mechanism suits what there is, and has it changed when it does not (A6).
+"""The monitoring engine: watches whether the mechanism in force still suits, and has it changed if not (A6).
 
 It looks at events of the protected address (crashes, mismatches, refused frames, mechanisms that somebody else has
 changed) and at the class of what lives there, measures resources, and lets `Judge` decide. What it decides is an event

@@ -1,4 +1,4 @@
-"""A watch over a protected actor as it is: the mechanism of its spec, what its class says, changes by transactions."""
+"""A watch over one protected actor: its mechanism, its class, and changes by transactions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The heart of a replica: it beats as long as the bricks run."""
+"""The heart of a replica: it beats for as long as the bricks run."""
 
 from __future__ import annotations
 

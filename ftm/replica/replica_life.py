@@ -1,4 +1,4 @@
-"""A life of the protected actor inside a replica, and what stands in its mailbox besides its inputs."""
+"""A life of the protected actor inside a replica, and the items of its mailbox besides inputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rewind points: states as bytes at which the protected actor's life begins, and to which it can be taken back.
+"""Rewind points: states as bytes from which the protected actor's life begins, or to which it returns.
 
 A replica has a point behind each part that it has handed over, and knows what was handed over since. All here is data
 and decisions about it; the server (`protected_actor.py`) carries them out.

@@ -1,4 +1,4 @@
-"""Jobs that somebody waits for: the handle, and the task that follows a job to its end in its caller's name."""
+"""Awaited jobs: the handle, and the task that follows a job to its end on behalf of its caller."""
 
 from __future__ import annotations
 

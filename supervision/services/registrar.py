@@ -1,4 +1,4 @@
-"""The actor behind a registry: who holds which key, who waits for which lock. Users reach it through `Registry`.
+"""The actor behind a registry: it knows the holders of keys and the waiters for locks.
 
 It runs no code of its users: what they decide with functions is decided in the caller (`registry.py`). A key comes as
 its bytes, so that 1, 1.0 and True are three keys, the same from every process.

@@ -1,4 +1,4 @@
-"""What a transaction makes of the tree: who has which children, in which order, by which flags, and which names.
+"""The tree that a transaction leads to: children of each supervisor, their order, flags and names.
 
 The steps say so in the draft. At the commit all supervisors that they are about follow it at once, and their recipes
 with them, so that a restart of a supervisor keeps it.

@@ -1,4 +1,4 @@
-"""What is written in the body of a transaction: operations are collected, and carried out when it ends."""
+"""The object that the body of a transaction calls: it collects operations, carried out when the body ends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A child whose old or new supervisor lives in another process: its life goes on, and the root exchanges who decides.
+"""Hands a child to or from a supervisor in another process; the root exchanges who decides about it.
 
 The new supervisor, in its process, has the child started as a candidate; the root does not begin the life that is so
 wanted, for it has one. At the commit that life is the one, and the old supervisor is told that it has lost the child.

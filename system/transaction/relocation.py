@@ -1,4 +1,4 @@
-"""Where a transaction has a live actor go on: as a task, in a process of its own, as replicas behind mechanisms.
+"""Takes a live actor elsewhere in a transaction: to a task, a process, or replicas behind mechanisms.
 
 The new place is made ready and the actor comes to rest beside what runs; it waits at a gate that the commit opens. What
 its spec says from then on is in force, and what runs follows it: if the life ends on the way, the next one is moved.

@@ -1,4 +1,4 @@
-"""Moving a child to another supervisor: its life goes on, only its address changes.
+"""Moves a child to another supervisor: its life goes on, and only its address changes.
 
 So does that of a supervisor, with all below it, if all its supervisors live in the root's process, and stay there. Else
 another one takes its place (`succession.py`). Actors come to rest where a turn could be repeated under another address;

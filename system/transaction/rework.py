@@ -1,4 +1,4 @@
-"""What a transaction changes in one live actor: its state, its code, whether it is suspended.
+"""Holds one live actor while a transaction changes its state, its code, or whether it is suspended.
 
 The actor is held between two of its turns and tries what is wanted of it. At the commit it goes on with what it has
 tried, or, if the transaction is given up, as before: it has handled nothing in between.

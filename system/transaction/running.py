@@ -1,4 +1,4 @@
-"""Operations on whether a child runs: stop one whose spec stays, start it again."""
+"""Operations that stop a child and keep its spec, or start it again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A supervisor that another one takes the place of, where the root cannot just give it another address.
+"""Replaces a supervisor by a new one, where it cannot just be given another address.
 
 The new one is started beside it, at the new address and without children. All its children are moved there, each as if
 it were moved alone; at the commit, when it has none any more, all that others have tied to the old one is tied to the

@@ -1,4 +1,4 @@
-"""Whether a history is linearizable: whether its operations could have taken effect one after the other.
+"""Checks whether a history is linearizable: whether its operations could have taken effect one after the other.
 
 There must be an order of them that the model allows, in which no operation stands before one whose outcome was there
 before it was invoked. An operation whose outcome nobody knows may stand anywhere after its invocation, or nowhere.
