@@ -10,7 +10,7 @@ BESIDE := $(patsubst %/,%,$(sort $(dir $(wildcard tests/*.py benchmarks/*.py exa
 .PHONY: demo test campaign soak loaded alarms lint check bench build clean
 
 demo: $(VENV)/.demo
-	$(BIN)/holdfast demo
+	$(BIN)/python examples/programs/demo.py
 
 # The tests of one file stay in one process.
 test: $(VENV)/.dev

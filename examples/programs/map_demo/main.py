@@ -1,4 +1,4 @@
-"""From a plan to a verdict on the screen: what the `demo` command calls."""
+"""From a plan to a verdict on the screen: what the command line calls."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from ... import run
+from holdfast import run
+
 from .demo_runs import DemoPlan, compare
 from .picture import draw, save
 from .report import DemoReport

@@ -9,7 +9,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Literal
 
-from ... import (
+from holdfast import (
     ActorRef,
     ActorSystem,
     ChildSpec,
@@ -20,8 +20,9 @@ from ... import (
     start,
     supervisor,
 )
-from ...actors.errors import NoSuchActor
-from ...actors.events import Recovered
+from holdfast.errors import NoSuchActor
+from holdfast.events import Recovered
+
 from .actors import FindPath, GetMap, LogRead, Mapper, MapperState, NoWay, Planner, Reader, ReadLog, as_grid
 from .grid import USABLE_RANGE, Geometry
 from .killer import Killer, schedule
