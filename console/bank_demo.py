@@ -38,7 +38,7 @@ from .. import (
 )
 from ..errors import NoSuchActor
 
-Method = Literal["hybrid", "fresh"]
+MethodName = Literal["hybrid", "fresh"]
 
 OWNERS = ("alice", "bob", "carol")
 CUSTOMERS = 6  # of each account; each asks its next question when the one before is answered
@@ -73,7 +73,7 @@ class BankAccount(Actor):
         return self.payments
 
 
-def bank(method: Method) -> ChildSpec:
+def bank(method: MethodName) -> ChildSpec:
     """Describe the bank: each account in a process of its own, brought back by the given method."""
     recovery = hybrid(interval=1.0) if method == "hybrid" else fresh()
     accounts = [child(owner, start(BankAccount), isolation="process", recovery=recovery) for owner in OWNERS]
@@ -138,7 +138,7 @@ def longest_silences(killed_at: Sequence[float], answered_at: Sequence[float]) -
     return found
 
 
-async def show_bank(console: Console, *, seconds: float, method: Method, seed: int) -> BankReport:
+async def show_bank(console: Console, *, seconds: float, method: MethodName, seed: int) -> BankReport:
     """Run the bank for so many seconds under kills, and print each kill and a summary.
 
     Raises:

@@ -6,7 +6,7 @@ import asyncio
 import dataclasses
 import inspect
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Generic, Literal, TypeGuard, get_args
+from typing import Any, Generic, Literal, Protocol, TypeGuard, get_args
 
 from typing_extensions import TypeVar
 
@@ -34,6 +34,21 @@ AutoShutdown = Literal["never", "any_significant", "all_significant"]
 Isolation = Literal["task", "process"]
 Shutdown = float | Literal["brutal_kill", "infinity"]
 StartTimeout = float | Literal["infinity"]
+
+
+class Recovers(Protocol):
+    """What a child spec asks of a recovery method, such as `hybrid()`."""
+
+    def check(self, where: str, kind: type[Actor]) -> None:
+        """Refuse a class that cannot be recovered so."""
+
+
+class Protects(Protocol):
+    """What a child spec asks of a fault-tolerance mechanism, such as `PBR()`."""
+
+    def check(self, kind: type[Actor], where: str) -> None:
+        """Refuse a class that cannot be protected so."""
+
 
 NAMELESS = "*"
 """The id of a spec without one: a dynamic supervisor makes one up at each start."""
@@ -219,14 +234,14 @@ def child(
     restart: Restart = "permanent",
     shutdown: Shutdown | None = None,
     isolation: Isolation = "task",
-    recovery: Any = None,
+    recovery: Recovers | None = None,
     mailbox: Bounded | None = None,
     backoff: Backoff | None = None,
     limits: Limits | None = None,
     bindings: Mapping[str, str] | None = None,
     significant: bool = False,
     rules: Iterable[Rule] = (),
-    mechanism: Any = None,
+    mechanism: Protects | tuple[Protects, ...] | None = None,
     start_timeout: StartTimeout | None = None,
     autostart: bool = True,
 ) -> ChildSpec[A]:

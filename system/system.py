@@ -7,7 +7,7 @@ import contextlib
 import os
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar, cast, overload
 
 from ..actors.control.drain import drain as drain_queue
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, TreeFailed
@@ -412,8 +412,12 @@ class ActorSystem(Recorded, Controls):
         elif not cell.is_dead:
             await lifecycle.stop_in_time(cell, reason)
 
-    def ref(self, path: str, kind: type[A]) -> ActorRef[A]:
-        """A ref to the actor at an address.
+    @overload
+    def ref(self, path: str) -> ActorRef[Any]: ...
+    @overload
+    def ref(self, path: str, kind: type[A]) -> ActorRef[A]: ...
+    def ref(self, path: str, kind: type[Actor] = Actor) -> ActorRef[Any]:
+        """Return a ref to the actor at an address; `kind` is its class, or a base of it, if you want the ref typed.
 
         Raises:
             NoSuchActor: nobody lives there. WrongActor: another class does.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ...actors.control.orders import Change as StateChange
@@ -21,6 +21,7 @@ from .wiring import Bind, RegisterName, Unbind, UnregisterName
 
 if TYPE_CHECKING:
     from ...ftm.events import MechanismSettled
+    from ...ftm.model.composition import Layer
     from ..system import ActorSystem
 
 
@@ -115,7 +116,7 @@ class Change:
 
     # -- fault tolerance ----------------------------------------------------------------------------------------------
 
-    def protect(self, target: Target, stack: Any) -> None:
+    def protect(self, target: Target, stack: Layer | Sequence[Layer] | None) -> None:
         """Have an actor protected by just this stack of mechanisms, whatever it has now; its life goes on.
 
         Only the bricks that differ from those that it has are touched.
