@@ -7,7 +7,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 BESIDE := $(patsubst %/,%,$(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py))))
 
 .DEFAULT_GOAL := check
-.PHONY: demo test campaign soak loaded alarms lint check bench build clean
+.PHONY: demo test campaign soak loaded alarms lint check bench build docs clean
 
 demo: $(VENV)/.demo
 	$(BIN)/python examples/programs/demo.py
@@ -75,8 +75,12 @@ build: $(VENV)/.dev
 	rm -rf build dist *.egg-info
 	$(BIN)/python -m build --no-isolation --outdir dist .
 
+# The book, as pages that open without a server: site/index.html.
+docs: $(VENV)/.dev .link/holdfast
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+
 clean:
-	rm -rf $(VENV) .venv-* .link build dist *.egg-info .coverage .coverage.* htmlcov
+	rm -rf $(VENV) .venv-* .link build dist site *.egg-info .coverage .coverage.* htmlcov
 	rm -rf .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 

@@ -28,7 +28,7 @@ def new_plan(supervisor: Supervisor, message: ChangeSupervisor | None = None) ->
     Raises:
         SpecError: something in it is not valid. StartIgnored, RemoteCrash: when `init` is asked anew, and raises.
     """
-    node, where = supervisor.ctx.cell.node, supervisor.ctx.path
+    node, where = supervisor.ctx._cell.node, supervisor.ctx.path
     if message is None:
         plan = _asked(supervisor)
     elif message.flags is None and message.children is None:
@@ -76,7 +76,7 @@ def succession(supervisor: Supervisor, known: dict[str, Child], plan: Plan) -> d
     Raises:
         SpecError: a spec changes what belongs to the address of a child that has one.
     """
-    specs = [complete(supervisor.ctx.cell, spec) for spec in plan.children]
+    specs = [complete(supervisor.ctx._cell, spec) for spec in plan.children]
     for spec in specs:
         one = known.get(spec.id)
         if one is None or one.cell is None or one.cell.state is GONE:
@@ -149,13 +149,13 @@ def why_occupied(supervisor: Supervisor) -> str:
 
 def account_of(supervisor: Supervisor) -> Account:
     """What a supervisor leaves to the one that takes its place."""
-    now = supervisor.ctx.cell.node.loop.time()
+    now = supervisor.ctx._cell.node.loop.time()
     return Account(tuple(supervisor._listed()), tuple(now - at for at in supervisor._restarts))
 
 
 def take_over(supervisor: Supervisor, account: Account) -> None:
     """Have a supervisor go on with the children that it has got, in the order of the one that had them."""
-    now, known = supervisor.ctx.cell.node.loop.time(), supervisor._children
+    now, known = supervisor.ctx._cell.node.loop.time(), supervisor._children
     supervisor._restarts = tuple(sorted((*supervisor._restarts, *(now - ago for ago in account.restarts))))
     first = {name: known[name] for name in account.children if name in known}
     supervisor._children = {**first, **known}

@@ -387,7 +387,7 @@ class ActorSystem(Recorded, Controls):
         cell = ref._cell.living
         check_no_part(cell)
         caller = current.get(None)
-        if caller is None or not is_below(caller.cell, cell):
+        if caller is None or not is_below(caller._cell, cell):
             await self._stop(cell, reason, deadline if drain else None)
             return
         node = self._node  # In nobody's name: it has to go on when the caller's life is over.

@@ -105,7 +105,7 @@ class Anything(Table):
 
 def _take(actor: Any, message: Any) -> object:
     ctx = actor.ctx
-    asked = isinstance(ctx.item, Ask)
+    asked = isinstance(ctx._item, Ask)
     handle = ctx.reply_handle() if asked else None
     actor.hear(Received(message, ctx.sender, handle))
     return handle

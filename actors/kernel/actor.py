@@ -202,7 +202,7 @@ class Actor:
     @on(SafeStateChange)
     def _on_safe_state(self, message: SafeStateChange) -> Any:
         """An ordinary message, in its place, and journaled if we are recorded."""
-        watch(self.ctx.cell, message)
+        watch(self.ctx._cell, message)
         return self.on_safe_state(message.entered)
 
     def on_recovered(self) -> Any:
@@ -229,7 +229,7 @@ class Actor:
 
     async def _stop_children(self) -> None:
         """The life ends: its children go first, newest first."""
-        for child in reversed(list((self.ctx.cell.children or {}).values())):
+        for child in reversed(list((self.ctx._cell.children or {}).values())):
             await child.node.stop_child(child)
 
 

@@ -149,7 +149,7 @@ def chain_of(item: Any) -> Chain:
 def unhandled(actor: Any, message: Any) -> object:
     """Stands in the table for types without a handler."""
     ctx: ActorContext = actor.ctx
-    ctx.cell.node.dead_letter(ctx.cell, message, f"{type(actor).__name__} has no handler for it")
+    ctx._cell.node.dead_letter(ctx._cell, message, f"{type(actor).__name__} has no handler for it")
     return None
 
 
@@ -189,7 +189,7 @@ class Ask(Item, msgspec.Struct, eq=False):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        cell: Cell = actor.ctx.cell
+        cell: Cell = actor.ctx._cell
         if item.deadline <= cell.node.now:  # Nobody waits any more: not run (unless the wait was only cancelled).
             item.expire()
             return None

@@ -236,7 +236,7 @@ class Exit(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        cell: Cell = actor.ctx.cell
+        cell: Cell = actor.ctx._cell
         if not item.active:
             return None
         if cell.more is not None and cell.more.trap_exits:

@@ -261,7 +261,7 @@ class Hold(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        cell: Cell = actor.ctx.cell
+        cell: Cell = actor.ctx._cell
         queue_of(cell).appendleft(item)
         cell.scheduled = False
         return LEAVE

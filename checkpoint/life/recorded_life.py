@@ -162,7 +162,7 @@ class Life:
         """The actor was constructed, and cannot begin."""
         cell = self.cell
         assert cell.ctx is not None
-        cell.ctx.close()
+        cell.ctx._close()
         cell.actor = cell.ctx = None
         raise StartFailed(cell.path, why) from error
 

@@ -23,7 +23,7 @@ class MessageHandler(RecoveryPart):
 
     def on_start(self, restored: bool) -> None:
         """Take up what waits, and be woken from now on."""
-        cell = self.ctx.cell
+        cell = self.ctx._cell
         # Not `ref.tell`: that would speak in the name of whoever has submitted something.
         self._homes.journal.wake_handler = lambda: cell.admit(cell, FLUSH)
         self._homes.journal.come()

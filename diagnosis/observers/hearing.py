@@ -75,7 +75,7 @@ def listen(actor: Actor, topic: str) -> None:
     Publishers never wait for an ear.
     """
     ctx = actor.ctx
-    ear = ctx.cell.node.spawn(
-        Start(Ear, (topic, ctx.ref)), parent=ctx.cell, mailbox=bounded(HEARD, overflow="drop_oldest")
+    ear = ctx._cell.node.spawn(
+        Start(Ear, (topic, ctx.ref)), parent=ctx._cell, mailbox=bounded(HEARD, overflow="drop_oldest")
     )
     ctx.link(ear.ref)

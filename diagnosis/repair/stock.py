@@ -159,7 +159,7 @@ async def _restart(act: Act, node: str, *, addresses: Mapping[str, str], timeout
 
 async def _bind(act: Act, node: str, *, bindings: Mapping[str, tuple[str, str, str]]) -> None:
     address, port, target = bindings[node]
-    here = act.ctx.cell.node
+    here = act.ctx._cell.node
     here.bind(here.find_ref(address, Actor)._cell, port, here.find_ref(target, Actor)._cell)
 
 

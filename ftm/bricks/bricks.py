@@ -257,9 +257,9 @@ class Proceed(Brick):
 
     def go_on(self) -> None:
         """See to it that what waits is handled. Called from our turns, and from the protected actor's."""
-        if self._task is not None or self.ctx.closed:
+        if self._task is not None or self.ctx._closed:
             return
-        cell = self.ctx.cell
+        cell = self.ctx._cell
         context = cell.context or lifecycle.open_context(cell)
         if current.get(None) is self.ctx:
             self._task = self.ctx.create_task(self._run())
@@ -398,4 +398,4 @@ class Proceed(Brick):
         standing = self._standing
         if standing.leads and not standing.is_fenced:
             # Called in the protected actor's turn: a plain `tell` would be taken for one of its own.
-            self.ctx.tell(self.out._cell, Outward(standing.epoch, [record]))
+            self.ctx._tell(self.out._cell, Outward(standing.epoch, [record]))

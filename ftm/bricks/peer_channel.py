@@ -285,7 +285,7 @@ class Posting(Letters):
         outbox = standing.other.brick(self.slot)
         if outbox is None:
             outbox = await self._find(path, self.slot, self.slot)
-            standing.node.bind(self.ctx.cell, "peer", outbox.ref._cell)
+            standing.node.bind(self.ctx._cell, "peer", outbox.ref._cell)
         return outbox
 
     async def _find(self, path: str, slot: str, key: str) -> Outbox:

@@ -106,7 +106,7 @@ class Proxy(GroupPart):
 
     async def _take(self, call: Call) -> Back:
         for part in call.parts:
-            self._hear(self.ctx.cell.node.codec.decode(SAID[part.name], part.body))
+            self._hear(self.ctx._cell.node.codec.decode(SAID[part.name], part.body))
         self._send()
         return Back("", "", b"")
 

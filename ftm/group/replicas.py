@@ -428,7 +428,7 @@ class GroupPart(Actor):
         """Do something then, instead of what was to be done before."""
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = self.ctx.cell.node.loop.call_later(seconds, call)
+        self._timer = self.ctx._cell.node.loop.call_later(seconds, call)
 
 
 def finish(waiting: Iterable[asyncio.Future[None]]) -> None:

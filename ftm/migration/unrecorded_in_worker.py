@@ -101,7 +101,7 @@ class PlainChild:
 
     def _at_rest(self, actor: Actor, state: bytes, owed: list[list[Any]] | None = None) -> None:
         """The same; `owed` is told when it leaves."""
-        guest, cell = self._guest, actor.ctx.cell
+        guest, cell = self._guest, actor.ctx._cell
         check_sendable(cell)
         bound = cell.extra().bound
         rest, stash = pack_rest(actor), pack(guest, cell, cell.extra().stash or ())

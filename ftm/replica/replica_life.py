@@ -94,7 +94,7 @@ class ServerContext(RecordedContext):
 
     @property
     def ref(self) -> ActorRef[Any]:
-        return self.cell.node.cell_at(self.path).ref
+        return self._cell.node.cell_at(self.path).ref
 
     def create_task(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
         if self._server.only_computes:  # The run that counts has begun it too: the actor does not end of this one.

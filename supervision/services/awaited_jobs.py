@@ -135,7 +135,7 @@ async def follow(job: Job[Any], started: asyncio.Future[ActorRef[Any]], linked: 
             await cell.ended()
             raise AskFailed(job.path, "it was ended before it began")
         if linked is not None:
-            link(linked.cell, cell)
+            link(linked._cell, cell)
         value = await _result(cell)
         if job.kind is not None:
             value = _decoded(cell, job.kind, value)

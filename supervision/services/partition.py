@@ -115,7 +115,7 @@ class PartitionSupervisor(UniformSupervisor):
             number = partition_of(message.key, self._now)
         except HoldfastError as error:
             return self._fail(error)
-        return self.ctx.cell.node.cell_at(f"{self.ctx.path}/{number}").ref
+        return self.ctx._cell.node.cell_at(f"{self.ctx.path}/{number}").ref
 
     @on(CountPartitions, readonly=True)
     def _count_partitions(self, message: CountPartitions) -> int:

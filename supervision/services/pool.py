@@ -89,13 +89,13 @@ class PoolSupervisor(UniformSupervisor):
     def _added(self) -> list[str]:
         """The recorded workers that an earlier life of ours has added, the lowest number first."""
         above = child_key(self.ctx.path, "")
-        names = (key.removeprefix(above) for key in self.ctx.cell.node.ports.keeper.notes(above))
+        names = (key.removeprefix(above) for key in self.ctx._cell.node.ports.keeper.notes(above))
         return sorted((name for name in names if name.isdecimal()), key=int)
 
     def _note(self, name: str, value: bytes | None) -> None:
         """Keep in mind that there is a recorded worker more than at the start. Raises HoldfastError."""
         if self._template.has_home:
-            self.ctx.cell.node.ports.keeper.note(child_key(self.ctx.path, name), value)
+            self.ctx._cell.node.ports.keeper.note(child_key(self.ctx.path, name), value)
 
     def _check(self, plan: Plan) -> None:
         *workers, router = (spec.id for spec in plan.children) if plan.children else ("",)
@@ -119,7 +119,7 @@ class PoolSupervisor(UniformSupervisor):
         try:
             self._note(one.spec.id, None)
         except HoldfastError as error:  # It is over all the same, but will come back with us.
-            self.ctx.cell.node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
+            self.ctx._cell.node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
         if one in self._crew:  # A temporary one that has ended is none any more.
             self._crew.remove(one)
 
@@ -148,7 +148,7 @@ class PoolSupervisor(UniformSupervisor):
             while len(self._crew) < message.size:
                 await self._grow()
         self._leaving.update(one.spec.id for one in going)
-        gone = [self.ctx.cell.node.loop.create_future() for _ in going]
+        gone = [self.ctx._cell.node.loop.create_future() for _ in going]
         for one, future in zip(going, gone, strict=True):
             self._errand(self._let_go(one, message.deadline, future))
         for future in gone:
@@ -279,7 +279,7 @@ def pool_of(system: HasNode | ActorContext, path: str, kind: type[A]) -> ActorRe
     Raises:
         NoSuchActor: nobody lives there. WrongActor: it is no pool, or one of other workers.
     """
-    node = system.cell.node if isinstance(system, ActorContext) else system._node
+    node = system._cell.node if isinstance(system, ActorContext) else system._node
     node.find_ref(path, PoolSupervisor)
     cell = node.find_ref(f"{path}/{ROUTER}", Router)._cell
     made = cell.more.start if cell.more is not None else None

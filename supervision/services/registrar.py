@@ -204,7 +204,7 @@ class RegistryActor(Actor):
 
     def on_start(self, restored: bool) -> None:
         """Go on with the book that earlier lives at this address have kept, without those who are dead by now."""
-        cell = self.ctx.cell
+        cell = self.ctx._cell
         book = cell.node.kept.get(cell)
         if not isinstance(book, Book):
             book = cell.node.kept[cell] = Book(dict(self._first_meta))
@@ -294,7 +294,7 @@ class RegistryActor(Actor):
     @on(Lock)
     def _lock(self, message: Lock) -> ReplyHandle[Any] | None:
         """Queue for the lock of a key; whoever has asked first gets it."""
-        item = self.ctx.item
+        item = self.ctx._item
         handle = self.ctx.reply_handle()
         sender = item.sender if isinstance(item, Ask) else None
         if sender is not None and not is_living(sender, message.life):
@@ -388,7 +388,7 @@ class RegistryActor(Actor):
             holdings.monitor.cancel()
 
     def _tell_listeners(self, message: Message[Any]) -> None:
-        node = self.ctx.cell.node
+        node = self.ctx._cell.node
         for name in self._listeners:
             cell = node.find(name) if name.startswith("/") else node.names.get(name)
             if cell is None:

@@ -300,7 +300,7 @@ def _check_key(key: object) -> None:
 def _life() -> int:
     """The calling actor's life, that of a recorded one not told: its replay has to send the same."""
     ctx = current.get(None)
-    return ctx.life if ctx is not None and ctx.may_fail_fast else 0
+    return ctx.life if ctx is not None and ctx._may_fail_fast else 0
 
 
 def _own_ref() -> ActorRef[Any]:

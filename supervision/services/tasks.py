@@ -293,7 +293,7 @@ class Tasks:
         started.add_done_callback(seen)
         work = follow(job, started, ctx if linked else None)
         task = node.loop.create_task(work, name=f"job of {self.ref.path}", context=node.base_context.copy())
-        keep = (self.ref._cell if ctx is None else ctx.cell).extra().belongings.tasks
+        keep = (self.ref._cell if ctx is None else ctx._cell).extra().belongings.tasks
         keep.add(task)
         task.add_done_callback(keep.discard)
         task.add_done_callback(functools.partial(followed, job, started))

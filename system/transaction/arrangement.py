@@ -293,7 +293,7 @@ def _readdress(
         above.children = {**(above.children or {}), child.name: cell}
         cell.parent = above
     for supervisor in here.values():
-        cell = supervisor.ctx.cell
+        cell = supervisor.ctx._cell
         below = cell.children or {}
         first = {name: below[name] for name in supervisor._children if name in below}
         cell.children = {**first, **below}
@@ -313,7 +313,7 @@ def _respecify(place: DraftPlace, supervisor: Supervisor) -> None:
             continue
         if child.comes_last:
             try:
-                child.cell = one.cell = new_cell(supervisor.ctx.cell, one)
+                child.cell = one.cell = new_cell(supervisor.ctx._cell, one)
             except HoldfastError:
                 pass  # Its start will say so.
         elif one.cell is not None:

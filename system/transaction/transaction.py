@@ -241,7 +241,7 @@ class Transaction:
     def _removes_caller(self) -> bool:
         """Whether the turn that called us belongs to an actor that goes: its end waits for that turn."""
         caller = current.get(None)
-        place = self._draft.by_cell.get(caller.cell) if caller is not None and self._draft is not None else None
+        place = self._draft.by_cell.get(caller._cell) if caller is not None and self._draft is not None else None
         while place is not None:
             if place.is_leaving or place.is_stopped:
                 return True
@@ -269,7 +269,7 @@ def refuse_self(operation: Operation) -> None:
         TransactionRefused: it would.
     """
     caller = current.get(None)
-    if caller is not None and any(place.cell is caller.cell for place in operation.between_turns_of):
+    if caller is not None and any(place.cell is caller._cell for place in operation.between_turns_of):
         raise TransactionRefused(
             operation.text, f"{caller.path} cannot change itself within its own turn: spawn a task"
         )

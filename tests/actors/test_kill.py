@@ -169,7 +169,7 @@ async def test_a_stop_that_comes_when_a_turn_has_just_failed_finds_the_asker_ans
 
     async def work(actor: Doer) -> None:
         await asyncio.sleep(0)
-        loop.call_soon(actor.ctx.cell.request_stop)  # Comes behind this turn and ahead of the actor's next slice.
+        loop.call_soon(actor.ctx._cell.request_stop)  # Comes behind this turn and ahead of the actor's next slice.
         raise RuntimeError("boom")
 
     ref = system.spawn(hf.start(Doer))

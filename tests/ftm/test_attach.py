@@ -364,19 +364,20 @@ async def test_what_a_mechanism_needs_is_checked_before_anything_is_done(system:
         hf.child("bob", hf.start(Counter), mechanism="pbr")  # type: ignore[arg-type]
     with pytest.raises(hf.SpecError, match="supervisor"):
         hf.child("bob", hf.start(hf.Supervisor), mechanism=PBR())
-    with pytest.raises(hf.TransactionRefused, match="no mechanism"):
-        await detach(system, ref)
+    await detach(system, ref)  # It has none.
+    assert not isinstance(ref._cell.host.place, GroupPlace)
 
 
-async def test_attached_twice_is_refused_and_a_dry_run_changes_nothing(system: hf.ActorSystem) -> None:
+async def test_protected_twice_is_protected_once_and_a_dry_run_changes_nothing(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter)))
     async with system.transaction(dry_run=True) as change:
         change.protect(ref, PBR())
-    assert "attach PBR to /app/alice" in change.describe()
+    assert "protect /app/alice by PBR" in change.describe()
     assert not isinstance(ref._cell.host.place, GroupPlace)
     await attach(system, ref)
-    with pytest.raises(hf.TransactionRefused, match="already"):
-        await attach(system, ref)
+    config = (await system.protection(ref)).config
+    await attach(system, ref)
+    assert (await system.protection(ref)).config == config
     assert await ref.ask(Total()) == 0
 
 

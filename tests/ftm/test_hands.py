@@ -238,7 +238,7 @@ async def test_a_repair_step_that_comes_in_the_middle_of_an_adaptation_is_left_o
     await transition(system, ref, LFR())
     result = await made[0]
     assert result.outcome == SKIPPED
-    assert f"{ALICE} is in the hands of adaptation: transition of {ALICE} to LFR" in result.why
+    assert f"{ALICE} is in the hands of adaptation: protect {ALICE} by LFR" in result.why
     assert (stack(ref), ref._cell.life) == (("lfr",), 1)
     assert holder(system) is None
     await load.stop()

@@ -106,7 +106,7 @@ class Gated(Total):
 
     @hf.on(Fetch)
     async def fetch(self, message: Fetch) -> Any:
-        reached = self.gates.pop(self.ctx.cell.path.split("/")[4], None)
+        reached = self.gates.pop(self.ctx._cell.path.split("/")[4], None)
         if reached is not None:
             reached.set_result(None)
             await asyncio.Event().wait()

@@ -130,7 +130,7 @@ class Curious(Total):
 
     @hf.on(Fetch)
     async def fetch(self, message: Fetch) -> Any:
-        if "/r3/" in self.ctx.cell.path:
+        if "/r3/" in self.ctx._cell.path:
             await self.other.ask(Add(0))
         return await super().fetch(message)
 

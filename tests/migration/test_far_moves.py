@@ -493,13 +493,13 @@ class Forge(hf.Message[bool]):
 class Speaker(hf.Actor):
     @hf.on(Speak)
     def speak(self, message: Speak) -> int:
-        names = self.ctx.cell.node.ports.uplink.connection.names
+        names = self.ctx._cell.node.ports.uplink.connection.names
         self.ctx.find(message.to, Traveller).tell(Add(1))
         return int(names.to_wire(self.ctx.path))
 
     @hf.on(Forge)
     def forge(self, message: Forge) -> bool:
-        connection = self.ctx.cell.node.ports.uplink.connection
+        connection = self.ctx._cell.node.ports.uplink.connection
         name, to = connection.names.to_wire(message_name(Add)), connection.names.to_wire(message.to)
         connection.send(frames.Tell(to, name, msgspec.Raw(msgspec.msgpack.encode([1])), 0, message.sender))
         return True

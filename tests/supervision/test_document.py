@@ -98,7 +98,7 @@ async def answer(supervisor: hf.ActorRef[Any], call: hf.Message[Any]) -> str:
 
 
 def call_of(name: str, plan: Plan) -> hf.Message[Any]:
-    kind: Any = getattr(hf, name)
+    kind: Any = getattr(hf, name, None) or getattr(hf.supervision, name)
     return hf.StartChild(kid(plan, "a")) if kind is hf.StartChild else cast("hf.Message[Any]", kind("a"))
 
 

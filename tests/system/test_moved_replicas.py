@@ -119,7 +119,7 @@ class Resident(hf.Actor):
             file.with_suffix(".begun").touch()
             while file.exists():
                 time.sleep(0.001)
-            self.ctx.cell.node.emit(ProtectionCostly(self.ctx.path, "", 1.0, 1))
+            self.ctx._cell.node.emit(ProtectionCostly(self.ctx.path, "", 1.0, 1))
 
         look()
         return True

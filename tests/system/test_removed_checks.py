@@ -240,14 +240,14 @@ CHECKS = {
     ),
     "a supervisor that has lost a child says so": Check(
         "supervision/supervisor.py",
-        "        return one.cell is not None and one.cell.parent is not self.ctx.cell\n",
+        "        return one.cell is not None and one.cell.parent is not self.ctx._cell\n",
         "        return False\n",
         FAR,
         "test_what_its_old_supervisor_says",
     ),
     "a supervisor does not stop who was given to another": Check(
         "supervision/supervisor.py",
-        "            if child.parent is self.ctx.cell:  # Else",
+        "            if child.parent is self.ctx._cell:  # Else",
         "            if True:  # Else",
         FAR,
         "test_a_supervisor_that_stops",
@@ -704,8 +704,8 @@ CHECKS = {
     ),
     "a link through a ref from before is one with who is there now": Check(
         "actors/kernel/context.py",
-        "links.link(self.cell, other._cell.living)",
-        "links.link(self.cell, other._cell)",
+        "links.link(self._cell, other._cell.living)",
+        "links.link(self._cell, other._cell)",
         SUPERVISORS,
         "test_a_ref_from_before",
     ),

@@ -250,7 +250,7 @@ class Peer:
             finally:
                 if frame.sender is not None:
                     ask.sender = self._sender(frame.sender)
-            if ask.chain and (ctx := cell.ctx) is not None and ctx.turn_in(ask.chain):
+            if ask.chain and (ctx := cell.ctx) is not None and ctx._turn_in(ask.chain):
                 raise AskDeadlock(cell.path, tuple(path for path, _ in ask.chain))
             cell.admit(cell, ask)
         except HoldfastError as error:

@@ -62,7 +62,7 @@ class Worker(hf.Actor):
     @hf.on(Names)
     def names(self, message: Names) -> int:
         gc.collect()
-        return len(self.ctx.cell.node.ports.uplink._outside)
+        return len(self.ctx._cell.node.ports.uplink._outside)
 
 
 class Job(hf.Actor):
