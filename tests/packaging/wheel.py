@@ -8,7 +8,9 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def sources() -> list[str]:
-    """The files of the repository as they are now, also new ones, by their paths in it."""
+    """The files of the repository as they are now, also new ones, by their paths in it; or of a source archive."""
+    if not (ROOT / ".git").exists():
+        return sorted((ROOT / "holdfast.egg-info/SOURCES.txt").read_text("utf-8").split("\n"))
     listing = ["git", "-c", "safe.directory=*", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     done = subprocess.run(listing, cwd=ROOT, check=True, capture_output=True, text=True, timeout=60)
     return sorted(path for path in set(done.stdout.split("\0")) if path and (ROOT / path).is_file())
@@ -16,7 +18,7 @@ def sources() -> list[str]:
 
 def copy_sources(target: Path) -> Path:
     """Copy the files of the repository, with their modes and without their times."""
-    for path in sources():
+    for path in filter(None, sources()):
         copy = target / path
         copy.parent.mkdir(parents=True, exist_ok=True)
         copy.write_bytes((ROOT / path).read_bytes())
