@@ -294,7 +294,7 @@ class SnapshotFailed(Event, frozen=True, eq=False):
 
 
 class StoreRefused(Event, frozen=True, eq=False):
-    """What a supervisor in another process wanted kept or erased could not be."""
+    """The store did not keep or erase something for a supervisor in another process."""
 
     reason: str
 

@@ -48,7 +48,7 @@ class Wired(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Generated(msgspec.Struct, frozen=True):
-    """What was found: a declaration to begin with, and how it came about.
+    """A declaration of a model to begin with, made from a running system, and how it came about.
 
     Attributes:
         declaration: each actor is a component. A topic depends on the publisher's subscriptions and, through replies

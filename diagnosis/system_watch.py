@@ -56,7 +56,7 @@ class Watch:
 
     @property
     def diagnoser(self) -> ActorRef[DiagnoserActor]:
-        """Who diagnoses. Raises NoSuchActor if it does not run."""
+        """Return a ref to the actor that diagnoses. Raises NoSuchActor if it does not run."""
         return self._node.find_ref(f"{self.tree.path}/{DIAGNOSER}", DiagnoserActor)
 
     async def diagnosis(self) -> Diagnosis:
@@ -64,11 +64,11 @@ class Watch:
         return await self.diagnoser.ask(GetDiagnosis())
 
     async def why(self) -> Explained:
-        """Why, and what to look at next."""
+        """Ask why the diagnosis is what it is, and what to look at next."""
         return await self.diagnoser.ask(GetExplanation())
 
     async def observed(self) -> Observed:
-        """What is observed of the system at the moment."""
+        """Ask for all that is observed of the system at the moment."""
         return await self.diagnoser.ask(GetObserved())
 
 

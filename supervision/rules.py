@@ -27,7 +27,7 @@ class Rule:
     action: Action
 
     def fits(self, reason: ExitReason) -> bool:
-        """Whether the rule is about this end."""
+        """Say whether the rule is about this end."""
         if isinstance(self.reason, ExitReason):
             return self.reason == reason
         return any(self.reason in (name, name.rpartition(".")[2]) for name in names_of(reason))

@@ -172,7 +172,7 @@ class ChildSpec(Generic[A_co]):
 
     @property
     def has_home(self) -> bool:
-        """Whether what is sent to it waits outside of its lives, so that its starts may take their time."""
+        """Say whether what is sent to the child waits outside of its lives, so that its starts may take their time."""
         return self.recovery is not None or self.mechanism is not None
 
     def below(self) -> Iterator[ChildSpec]:
@@ -180,7 +180,7 @@ class ChildSpec(Generic[A_co]):
         return _specs_in((*self.start.args, *self.start.kwargs.values()))
 
     def restarts(self, reason: ExitReason) -> bool:
-        """Whether an end by itself for this reason is followed by another life."""
+        """Say whether an end by itself for this reason is followed by another life."""
         return decide(self.restart, self.rules, reason) == "restart"
 
     async def stop(self, cell: Cell, reason: ExitReason = SHUTDOWN) -> ExitReason:
@@ -245,7 +245,7 @@ def child(
     start_timeout: StartTimeout | None = None,
     autostart: bool = True,
 ) -> ChildSpec[A]:
-    """A child spec.
+    """Describe one child of a supervisor: how it starts, lives, comes back, and is stopped.
 
     Args:
         id: the last part of the address, unique among siblings; None lets a dynamic supervisor make one up.
@@ -299,7 +299,7 @@ def child(
 
 @dataclasses.dataclass(frozen=True, slots=True, init=False)
 class Plan:
-    """What a supervisor's `init` returns: its children in start order, and its flags. Checked when it is made.
+    """The children of a supervisor in start order, and its flags: its `init` returns them. Checked when it is made.
 
     Raises:
         SpecError: naming the option, or the child, and what it may be.

@@ -143,7 +143,7 @@ class Strikes:
         self._undo: list[Callable[[], None]] = []
 
     def next(self, what: object) -> Kind | None:
-        """One chance: the fault that strikes now, if any. `what` passes the point."""
+        """Take one chance, and return the fault that strikes now, if any. `what` passes the point."""
         if self.is_over:  # Other faults, which strike longer, still lead here.
             return None
         self.chances += 1
@@ -166,7 +166,7 @@ class Strikes:
         return strike.kind
 
     def delay(self) -> float:
-        """How long the delay that strikes now is, in seconds."""
+        """Return how long the delay that strikes now is, in seconds."""
         if self.least == self.longest:
             return self.least
         level = self.draw.randrange(LEVELS)
@@ -261,7 +261,7 @@ class Faults:
         return strikes
 
     def end(self) -> None:
-        """End all of them."""
+        """End the injection: all faults are taken back, and none strikes any more."""
         for strikes in reversed(self.installed):
             strikes.end()
 

@@ -156,12 +156,12 @@ class Probe:
 
     @property
     def path(self) -> str:
-        """Its address."""
+        """The address at which the probe receives."""
         return self.ref.path
 
     @property
     def sender(self) -> ActorRef[Any] | None:
-        """Who sent the message that was expected last; None if it was no actor."""
+        """Return a ref to the sender of the message that was expected last; None if it was no actor."""
         return self._last.sender if self._last is not None else None
 
     @property

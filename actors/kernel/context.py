@@ -82,7 +82,7 @@ class ActorContext:
 
     @property
     def sender(self) -> ActorRef[Any] | None:
-        """Who sent the message in hand; None if it was no actor."""
+        """Return a ref to the actor that sent the message in hand; None if no actor did."""
         item = self._item
         sender: Cell | None = item.sender if isinstance(item, Item) else None
         return None if sender is None else sender.ref
@@ -360,7 +360,7 @@ class ActorContext:
 
     @property
     def trap_exits(self) -> bool:
-        """Whether EXIT signals come to `on_exit` instead of ending this actor."""
+        """Say whether EXIT signals come to `on_exit` instead of ending this actor."""
         more = self._cell.more
         return more is not None and more.trap_exits
 

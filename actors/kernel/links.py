@@ -36,7 +36,7 @@ class Monitor:
             target.host.told(target, "demonitor", {"watcher": self.watcher.path, "for_good": self.for_good})
 
     def forget(self) -> None:
-        """It is over: its DOWN has been told, or is not wanted."""
+        """Forget the monitor: its DOWN has been told, or is not wanted any more."""
         if self.watcher.more is not None:
             self.watcher.more.ties.watching.pop(self, None)
 

@@ -47,7 +47,7 @@ class ActorRef(Generic[A_co]):
         return self._cell.path
 
     def tell(self, message: Message[Any]) -> None:
-        """Send without waiting.
+        """Send a message without waiting until it is accepted, and without a reply.
 
         Raises:
             UnknownMessage: the actor's class is known and has no handler for it.

@@ -33,7 +33,7 @@ class Timer:
 
     @property
     def is_active(self) -> bool:
-        """Whether the message may still come."""
+        """Say whether the message of the timer may still come."""
         return self._handle is not None or self._queued
 
     def cancel(self) -> None:
@@ -46,7 +46,7 @@ class Timer:
             self._cell.more.belongings.timers.discard(self)
 
     def pause(self) -> None:
-        """Its actor is being moved: nothing comes until `resume`."""
+        """Hold the timer while its actor is moved: nothing comes until `resume`."""
         if self._handle is not None:
             self._handle.cancel()  # Kept: what has a handle is armed again.
 
@@ -81,7 +81,7 @@ class Timer:
         self._cell, self._handle, self._queued, self._interval, self._due = cell, None, False, None, 0.0
 
     def belongs_to(self, cell: Cell) -> None:
-        """Its actor lives at this cell from now on."""
+        """Bind the timer to another cell: its actor lives there from now on."""
         self._cell = cell
 
     def _arm(self) -> None:
@@ -99,7 +99,7 @@ class Timer:
             self._arm()
 
     def taken(self) -> bool:
-        """Its turn has come: whether it still counts."""
+        """Note that the turn of the timer's message has come; returns whether the message still counts."""
         counts, self._queued = self._queued, False
         if self._interval is None and self._cell.more is not None:
             self._cell.more.belongings.timers.discard(self)

@@ -24,13 +24,13 @@ from ..tree import supervisor
 
 
 class Route(Message[ActorRef[Any]]):
-    """Which partition is this key's; the reply is its ref."""
+    """Ask which partition a key belongs to; the reply is a ref to that partition."""
 
     key: Any
 
 
 class CountPartitions(Message[int]):
-    """How many partitions there are now."""
+    """Ask how many partitions there are now."""
 
 
 class ResizePartitions(RuntimeOrder[int]):

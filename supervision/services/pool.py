@@ -40,7 +40,7 @@ DRAIN_SECONDS = 5.0
 
 
 class PoolStatus(msgspec.Struct, frozen=True):
-    """How a pool is: its workers, how many of them are up, how many are on their way out, what waits at the router."""
+    """The state of a pool: its workers, how many are up, how many on their way out, what waits at the router."""
 
     size: int
     up: int

@@ -40,7 +40,7 @@ SLACK = 5.0
 
 
 class ProgramStatus(msgspec.Struct, frozen=True):
-    """How a program is: its pid, seconds since its start, and its last lines of output, oldest first."""
+    """The state of a program: its pid, seconds since its start, and its last lines of output, oldest first."""
 
     pid: int
     uptime: float

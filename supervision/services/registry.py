@@ -191,11 +191,11 @@ class Registry(Generic[K, V]):
         return [entry for entry in self._entries(await self._ask(Find())) if test(entry)]
 
     async def count(self) -> int:
-        """How many entries there are."""
+        """Count the entries that there are."""
         return await self._ask(Count())
 
     async def count_match(self, key: K, test: Callable[[V], bool]) -> int:
-        """How many entries for a key pass the test."""
+        """Count the entries for a key that pass the test."""
         return len(await self.match(key, test))
 
     async def dispatch(

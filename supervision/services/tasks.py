@@ -256,7 +256,7 @@ class Tasks:
         *,
         on_timeout: Literal["leave", "kill_task"] = "leave",
     ) -> list[Ok[None, R] | Failed[None] | None]:
-        """How several jobs ended, in their order; None for those that are not over after `timeout` seconds."""
+        """Wait for the ends of several jobs, in their order; None for those not over after `timeout` seconds."""
         every = list(jobs)
         if every:
             await asyncio.wait([job._future for job in every], timeout=timeout)

@@ -93,7 +93,7 @@ class Change:
         self.step(RegisterName(name, target))
 
     def unregister(self, name: str) -> None:
-        """Free a name."""
+        """Free a name that an actor has beside its address."""
         self.step(UnregisterName(name))
 
     # -- live actors --------------------------------------------------------------------------------------------------
@@ -144,17 +144,17 @@ class Change:
     # -- all of it ----------------------------------------------------------------------------------------------------
 
     def step(self, operation: Operation) -> None:
-        """One more operation, of whatever kind."""
+        """Collect one more operation, of whatever kind."""
         self._operations.append(operation)
 
     @property
     def operations(self) -> tuple[Operation, ...]:
-        """What was collected so far."""
+        """Return the operations that were collected so far."""
         return tuple(self._operations)
 
     @property
     def steps(self) -> tuple[Step, ...]:
-        """The steps, in order."""
+        """Return the steps of the transaction, in the order in which they are taken."""
         return tuple(Step(n, one.verb, one.target, one.text) for n, one in enumerate(self._operations, 1))
 
     async def settled(self) -> tuple[MechanismSettled, ...]:
@@ -168,7 +168,7 @@ class Change:
 
     @property
     def difference(self) -> tuple[str, ...]:
-        """How the tree changes: lines with `-` go, lines with `+` come. Known after the checks."""
+        """List how the tree changes: lines with `-` go, lines with `+` come. Known after the checks."""
         return tuple(self._difference or ())
 
     def describe(self) -> str:
