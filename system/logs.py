@@ -23,6 +23,7 @@ from ..actors.events import (
     JournalStopped,
     LifeAbandoned,
     LogLine,
+    LoopLagged,
     MessageQuarantined,
     Moved,
     ProcessDied,
@@ -37,15 +38,40 @@ from ..actors.events import (
     SafeStateMissed,
     SafeStateOverdue,
     ShutdownError,
+    SnapshotDamaged,
     SnapshotFailed,
     StopOverdue,
     StoreRefused,
     SupervisorGaveUp,
     TrustBreached,
+    TurnsLost,
+    TurnSlow,
 )
 from ..actors.exit_reasons import Crash
 from ..actors.kernel.envelope import Item, item_name
 from ..actors.kernel.message import Message, MessageText, message_of
+from ..ftm.alarms import (
+    Diverged,
+    Masked,
+    NondeterminismFound,
+    Objected,
+    Outvoted,
+    ProtectionCostly,
+    ProtectionLost,
+    RequestsDropped,
+    StatesDiffer,
+)
+from ..ftm.events import (
+    BackgroundWorkLost,
+    FailedOver,
+    MechanismSettled,
+    ReplicaFaulty,
+    ReplicaJoined,
+    ReplicaLost,
+    TurnHung,
+)
+from .mechanism_notes import AdaptationUndone
+from .specification import SpecificationNotKept
 from .transaction.events import ScriptLoaded, TransactionCommitted, TransactionRolledBack
 
 BURST = 10
@@ -177,8 +203,10 @@ WRITTEN: dict[type, tuple[int, str]] = {
     SafeStateOverdue: (logging.ERROR, "safe state overdue"),
     HeldMessages: (logging.WARNING, "messages held"),
     RolledBack: (logging.ERROR, "rolled back"),
+    TurnsLost: (logging.ERROR, "turns lost"),
     MessageQuarantined: (logging.ERROR, "message quarantined"),
     SnapshotFailed: (logging.ERROR, "snapshot failed"),
+    SnapshotDamaged: (logging.ERROR, "snapshot damaged"),
     JournalFull: (logging.WARNING, "journal full"),
     JournalBlocked: (logging.ERROR, "journal blocked"),
     JournalGoesOn: (logging.INFO, "journal goes on"),
@@ -189,6 +217,26 @@ WRITTEN: dict[type, tuple[int, str]] = {
     ScriptLoaded: (logging.INFO, "code loaded"),
     TransactionCommitted: (logging.INFO, "transaction committed"),
     TransactionRolledBack: (logging.WARNING, "transaction rolled back"),
+    SpecificationNotKept: (logging.ERROR, "specification not kept"),
+    LoopLagged: (logging.WARNING, "loop lagged"),
+    TurnSlow: (logging.WARNING, "turn slow"),
+    AdaptationUndone: (logging.WARNING, "adaptation undone"),
+    BackgroundWorkLost: (logging.ERROR, "background work lost"),
+    Diverged: (logging.ERROR, "replica diverged"),
+    FailedOver: (logging.WARNING, "failed over"),
+    Masked: (logging.WARNING, "fault masked"),
+    MechanismSettled: (logging.INFO, "mechanism settled"),
+    NondeterminismFound: (logging.ERROR, "nondeterminism found"),
+    Objected: (logging.WARNING, "outcome objected to"),
+    Outvoted: (logging.WARNING, "replica outvoted"),
+    ProtectionCostly: (logging.WARNING, "protection costly"),
+    ProtectionLost: (logging.ERROR, "protection lost"),
+    ReplicaFaulty: (logging.ERROR, "replica faulty"),
+    ReplicaJoined: (logging.INFO, "replica joined"),
+    ReplicaLost: (logging.WARNING, "replica lost"),
+    RequestsDropped: (logging.ERROR, "requests dropped"),
+    StatesDiffer: (logging.ERROR, "states differ"),
+    TurnHung: (logging.ERROR, "turn hung"),
 }
 """Level and name of the record that an event becomes; others are not written."""
 
