@@ -418,7 +418,7 @@ class EventStream:
         return self._events.popleft()
 
     def take(self) -> list[Event]:
-        """All events that wait, without waiting for more."""
+        """Return all events that wait, without waiting for more."""
         events = list(self._events)
         self._events.clear()
         return events

@@ -128,7 +128,7 @@ class Method:
 
     @classmethod
     def of(cls, data: dict[str, Any]) -> Method:
-        """The method again, as far as a life has to know it."""
+        """Make the method again from its data, as far as a life has to know it."""
         return msgspec.convert(data, cls)
 
     def check(self, where: str, kind: type[Actor]) -> None:
@@ -153,7 +153,7 @@ class Method:
 
 
 def fresh() -> Method:
-    """A new life starts from nothing, as a restarted ROS node does; queued messages are kept."""
+    """Start a new life from nothing, as a restarted ROS node does; queued messages are kept."""
     return Method("fresh")
 
 

@@ -125,12 +125,12 @@ class RecoveryFile:
         return [known[name] for name in names]
 
     def take_unmet(self) -> list[tuple[str, str]]:
-        """The tables that nobody has been started for up to now, and where they stand; each is given out once."""
+        """Return the tables that nobody has been started for so far, and where they stand; each is given out once."""
         unmet, self._unmet = self._unmet, {}
         return list(unmet.items())
 
     def complete(self, spec: Any, address: str) -> Any:
-        """A child spec with the recovery that this file has for it. Raises SpecError: it does not go with the class."""
+        """Add the recovery that this file has for a child spec. Raises SpecError: it does not go with the class."""
         if spec.is_supervisor:
             return spec
         recovery = self.method_for(address, spec.start.kind, spec.recovery)

@@ -153,7 +153,7 @@ class RecoveryHooks:
         self.timeout = timeout
 
     def of(self, when: str, phase: str) -> Hook | None:
-        """The hook of one point."""
+        """Return the hook of one point of a recovery."""
         return self._hooks.get((when, phase))
 
     def __repr__(self) -> str:

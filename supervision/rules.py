@@ -34,7 +34,7 @@ class Rule:
 
 
 def rule(reason: ExitReason | type[ExitReason] | type[BaseException] | str, action: Action) -> Rule:
-    """A restart rule for a child spec; of several the first that fits decides, then the restart type.
+    """Make a restart rule for a child spec; of several the first that fits decides, then the restart type.
 
     Args:
         reason: an exit reason (`hf.Signal(9)`), a class of them (`hf.Signal`), an exception class (it stands for the

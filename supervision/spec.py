@@ -176,7 +176,7 @@ class ChildSpec(Generic[A_co]):
         return self.recovery is not None or self.mechanism is not None
 
     def below(self) -> Iterator[ChildSpec]:
-        """The children that the spec of a supervisor names, its template among them."""
+        """Yield the children that the spec of a supervisor names, its template among them."""
         return _specs_in((*self.start.args, *self.start.kwargs.values()))
 
     def restarts(self, reason: ExitReason) -> bool:
@@ -325,7 +325,7 @@ class Plan:
 
     @classmethod
     def of(cls, flags: Flags, children: Iterable[ChildSpec]) -> Plan:
-        """A plan from flags that are there already."""
+        """Make a plan from flags that are there already."""
         return cls(children, **{field.name: getattr(flags, field.name) for field in dataclasses.fields(flags)})
 
 

@@ -223,7 +223,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return 0
 
     def at_rest(self) -> bool:
-        """Nothing can happen any more without more time. Returns whether something can now."""
+        """Hear that nothing can happen any more without more time. Returns whether something can now."""
         return False
 
     @contextlib.contextmanager
@@ -247,7 +247,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             expire(why)
 
     def restless(self, why: str) -> NotIdle:
-        """The NotIdle that names what is to run now and what the next timers are."""
+        """Make the NotIdle that names what is to run now and what the next timers are."""
         from .barrier import NotIdle, movers
 
         return NotIdle(why, tuple(movers([*self._ready, *sorted(self._scheduled)])))
@@ -300,7 +300,7 @@ def _is_pidfd(fd: int) -> bool:
 
 
 def virtual() -> VirtualClockLoop:
-    """A new loop whose clock begins at 0: for `asyncio.Runner(loop_factory=...)` and pytest-asyncio's factories."""
+    """Make a loop whose clock begins at 0: for `asyncio.Runner(loop_factory=...)` and pytest-asyncio's factories."""
     return VirtualClockLoop()
 
 

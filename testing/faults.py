@@ -175,7 +175,7 @@ class Strikes:
         return self.least + (self.longest - self.least) * level / (LEVELS - 1)
 
     def crash(self) -> InjectedCrash:
-        """The exception of a crash that strikes now."""
+        """Return the exception of a crash that strikes now."""
         return InjectedCrash(self.at, self.chances, self.seed)
 
     def at_end(self, undo: Callable[[], None]) -> None:
@@ -183,7 +183,7 @@ class Strikes:
         self._undo.append(undo)
 
     def end(self) -> None:
-        """No more faults: what was exchanged is put back, what was held goes on. A second call changes nothing."""
+        """Inject no more faults; what was exchanged is put back, what was held goes on. Twice is no error."""
         self.is_over = True
         while self._undo:
             self._undo.pop()()

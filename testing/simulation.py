@@ -261,7 +261,7 @@ class Simulation:
         worker.forked.kill()
 
     def stop_recording(self) -> None:
-        """The test is over: how its actors end belongs to no chart."""
+        """Record no more for the chart: the test is over, and how its actors end is none of it."""
         while self._ends:
             self._ends.pop()()
 

@@ -1,4 +1,4 @@
-"""A docstring of a public name can be read alone and says more than the name does, by the rules of `tests.public_docs`."""
+"""Docstrings of public names can be read alone and say more than the names do, by the rules of `public_docs.py`."""
 
 import doctest
 

@@ -27,7 +27,7 @@ class Monitor:
         self.life = watcher.life  # a watch ends with the life that set it
 
     def cancel(self) -> None:
-        """No DOWN arrives after this, not even one that is queued already."""
+        """Cancel the monitor: no DOWN arrives after this, not even one that is queued already."""
         self.active = False
         target = self.target
         self.forget()

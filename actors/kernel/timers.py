@@ -37,7 +37,7 @@ class Timer:
         return self._handle is not None or self._queued
 
     def cancel(self) -> None:
-        """The message does not come any more, not even if it is queued already."""
+        """Cancel the timer: its message does not come any more, not even if it is queued already."""
         if self._handle is not None:
             self._handle.cancel()
         self._handle = None
@@ -51,7 +51,7 @@ class Timer:
             self._handle.cancel()  # Kept: what has a handle is armed again.
 
     def resume(self) -> None:
-        """The actor stays after all."""
+        """Let a timer go on that was paused: its actor stays after all."""
         if self._handle is not None:
             self._arm()
 
@@ -64,7 +64,7 @@ class Timer:
     def unpacked(
         cls, cell: Cell, message: Message[Any], left: float | None, interval: float | None, queued: bool
     ) -> Timer:
-        """The timer of an actor that has been moved here."""
+        """Make the timer of an actor that has been moved here again, from its data."""
         timer = cls(cell, message, left or 0.0, interval)
         timer.pause()
         if left is None:

@@ -122,7 +122,7 @@ class Before(Brick):
         return work
 
     def message_of(self, request: Request) -> Any:
-        """The message that a request brings to the protected actor; None if it is something else, such as a timer."""
+        """Return the message that a request brings to the protected actor; None if it is a timer or the like."""
         feed, cell = request.feed, self._standing.server.cell
         if feed.kind != MESSAGE or cell is None:
             return None
@@ -164,7 +164,7 @@ class After(Brick):
         return done
 
     def taken(self) -> None:
-        """The state behind these outcomes has been captured, or is not needed: the next turns may run."""
+        """Go on, for the state behind these outcomes has been captured, or is not needed: the next turns may run."""
         if self._handle is not None:
             self._handle.reply(Taken())
 
@@ -210,7 +210,7 @@ class Proceed(Brick):
         self._standing.server.report_to(self)
 
     async def heard(self, outcome: Outcome) -> None:
-        """An ask of the protected actor has an outcome; called before it gets it."""
+        """Hear that an ask of the protected actor has an outcome; called before the actor gets it."""
 
     # -- batches ----------------------------------------------------------------------------------------------------
 

@@ -136,7 +136,7 @@ class Mechanism(MechanismDeclaration, Described):
         return dataclasses.replace(role, **other) if other else role
 
     def role_name(self, *, leads: bool) -> str:
-        """The name of the role of a replica that leads, or does not."""
+        """Return the name of the role of a replica that leads, or does not."""
         names = list(self.roles) or ["single"]
         return names[0] if leads else names[-1]
 
@@ -157,11 +157,11 @@ class Mechanism(MechanismDeclaration, Described):
         return None
 
     def for_replicas(self) -> Self:
-        """The same, with what only this process can add before replicas in others begin with it."""
+        """Return the mechanism with what only this process can add before replicas in others begin with it."""
         return self
 
     def with_brick(self, role: str, part: str, kind: type[Brick]) -> Self:
-        """The same mechanism, with another brick as `before`, `proceed` or `after` of one role."""
+        """Return the same mechanism, with another brick as `before`, `proceed` or `after` of one role."""
         new = copy.copy(self)
         object.__setattr__(new, "exchanged", {**self.exchanged, (role, part): kind})
         return new

@@ -172,6 +172,6 @@ class Change:
         return tuple(self._difference or ())
 
     def describe(self) -> str:
-        """The steps, and how the tree changes (known after the checks), in words."""
+        """Say in words which steps there are, and how the tree changes (known after the checks)."""
         lines = [f"{step.number}. {step.text}" for step in self.steps] or ["nothing to do"]
         return "\n".join([*lines, *(self._difference or ())])

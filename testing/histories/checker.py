@@ -75,7 +75,7 @@ class Linearization:
         return True
 
     def verify(self) -> None:
-        """Nothing: it is as it should be."""
+        """Do nothing, for the history is as it should be."""
 
 
 @dataclass(frozen=True)

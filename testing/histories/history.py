@@ -108,7 +108,7 @@ class History:
         return list(self._all.values())
 
     def begin(self, client: str, message: object, *, to: str = "", at: float = 0.0) -> int:
-        """An operation is invoked. Returns its number, for `end` and `forget`."""
+        """Note that an operation is invoked. Returns its number, for `end` and `forget`."""
         number = next(self._numbers)
         self._all[number] = Operation(client, message, next(self._clock), to=to, at=at)
         return number
