@@ -163,7 +163,10 @@ class LogSink:
         if structlog is None:
             _write_standard(level, name, fields)
         else:
-            structlog.get_logger(LOGGER).log(level, name, **fields)
+            logger = structlog.get_logger(LOGGER)
+            if not structlog.is_configured():  # Its own default would mix with what the program prints.
+                logger = structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
+            logger.log(level, name, **fields)
 
     def _describe(self, event: Event) -> Fields:
         return describe(event, payloads=self._log_payloads)
@@ -259,7 +262,9 @@ def describe(event: Event, *, payloads: bool = False) -> Fields:
             fields[name] = str(value)
             if isinstance(event, CRASHES):
                 fields["exception"] = value.traceback
-        elif isinstance(value, (int, float, dict)):
+        elif isinstance(value, dict):
+            fields[name] = {key: round(one, 6) if isinstance(one, float) else one for key, one in value.items()}
+        elif isinstance(value, (int, float)):
             fields[name] = value
         else:
             fields[name] = str(value)
@@ -267,7 +272,7 @@ def describe(event: Event, *, payloads: bool = False) -> Fields:
 
 
 def _structlog() -> Any:
-    """structlog, if the program has set it up, or has set up no logging at all: then it writes to the terminal."""
+    """structlog, if the program has set it up, or has set up no logging at all: then it writes to stderr."""
     if "structlog" not in sys.modules and logging.getLogger(LOGGER).hasHandlers():
         return None
     import structlog  # only now: it is a third of the time that importing holdfast would take
