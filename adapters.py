@@ -95,7 +95,7 @@ class BusTick(Message):
 
 
 class Bus:
-    """What a wrapped program is given to register its callbacks with, and to publish through."""
+    """The connection of a wrapped program: it registers its callbacks there, and publishes through it."""
 
     def __init__(self, actor: Wrapped) -> None:
         self._actor = actor
@@ -131,7 +131,7 @@ class Bus:
         self.sent.append((to, message))
 
     def now(self) -> float:
-        """The Unix time, the same again under replay."""
+        """Return the Unix time in seconds, the same again under replay."""
         return self._actor.ctx.now()
 
     @property
@@ -202,7 +202,7 @@ def wrap(
     key_variables: Iterable[str] | None = None,
     deterministic: bool = True,
 ) -> type[Wrapped]:
-    """An actor class around a plain Python class or program, whose code does not change.
+    """Make an actor class around a plain Python class or program, whose code does not change.
 
     To live in a process of its own it must be found by name, as a namedtuple must: assign it to that name in the
     module (`RobotActor = wrap(Robot, "RobotActor")`).

@@ -25,7 +25,7 @@ START = ("start", "args", "kwargs")
 
 
 def tree_from(mapping: Mapping[str, Any], where: str = "tree") -> ChildSpec:
-    """A supervisor spec from plain data, such as parsed TOML, JSON or YAML.
+    """Make a supervisor spec from plain data, such as parsed TOML, JSON or YAML.
 
     A table is a child (`id`, `start = "package.module:Class"`, `args`, `kwargs`, and the options of `child`), or a
     supervisor (`name`, `children` and the options of `supervisor`; with `kind = "dynamic"` or `"partitions"` those of
@@ -53,7 +53,7 @@ def tree_from(mapping: Mapping[str, Any], where: str = "tree") -> ChildSpec:
 
 
 def load_tree(path: str | Path) -> ChildSpec:
-    """A supervisor spec from a TOML file; see `tree_from`.
+    """Read a supervisor spec from a TOML file; see `tree_from`.
 
     Raises:
         SpecError: naming file and place, and what is wrong there. OSError: the file cannot be read.

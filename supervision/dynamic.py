@@ -327,7 +327,7 @@ def dynamic(
     significant: bool = False,
     rules: tuple[Rule, ...] = (),
 ) -> ChildSpec:
-    """A supervisor that starts empty and takes children by `StartChild`, as a spec.
+    """Describe a supervisor that starts empty and takes children by `StartChild`, as a spec.
 
     Args:
         name: the last part of its address.

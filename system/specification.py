@@ -44,7 +44,7 @@ class SpecificationSuperseded(Event, frozen=True, eq=False):
 
 
 class SpecificationNotKept(Event, frozen=True, eq=False):
-    """What transactions have made of a spec cannot be stored, or not be had any more: the next root goes without it."""
+    """A spec that transactions have made cannot be stored, or not be had any more: the next root goes without it."""
 
     why: str
 

@@ -7,7 +7,7 @@ import contextlib
 import os
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar, cast, overload
 
 from ..actors.control.drain import drain as drain_queue
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, TreeFailed
@@ -333,7 +333,7 @@ class ActorSystem(Recorded, Controls):
         return self._running
 
     def from_thread(self) -> ThreadPortal:
-        """A handle for other threads, such as those in which a web framework runs its plain `def` endpoints."""
+        """Return a handle for other threads, such as those in which a web framework runs its plain `def` endpoints."""
         return ThreadPortal(self._node)
 
     async def start(self, spec: ChildSpec[A], *, fresh: bool = False) -> ActorRef[A]:
@@ -412,8 +412,12 @@ class ActorSystem(Recorded, Controls):
         elif not cell.is_dead:
             await lifecycle.stop_in_time(cell, reason)
 
-    def ref(self, path: str, kind: type[A]) -> ActorRef[A]:
-        """A ref to the actor at an address.
+    @overload
+    def ref(self, path: str) -> ActorRef[Any]: ...
+    @overload
+    def ref(self, path: str, kind: type[A]) -> ActorRef[A]: ...
+    def ref(self, path: str, kind: type[Actor] = Actor) -> ActorRef[Any]:
+        """Return a ref to the actor at an address; `kind` is its class, or a base of it, if you want the ref typed.
 
         Raises:
             NoSuchActor: nobody lives there. WrongActor: another class does.
@@ -439,7 +443,7 @@ class ActorSystem(Recorded, Controls):
         self._homes.roll_back(path, "it was asked for")
 
     def transaction(self, *, dry_run: bool = False, timeout: float = 10.0) -> Transaction:
-        """Several changes of the running tree as one: `async with system.transaction() as change: change.add(...)`.
+        """Make several changes of the tree as one: `async with system.transaction() as change: change.add(...)`.
 
         The body collects; when it ends, all is checked, then done. If the body raises, nothing is done.
 
@@ -472,7 +476,7 @@ class ActorSystem(Recorded, Controls):
         self._node.unregister(name)
 
     def whereis(self, name: str) -> ActorRef[Any]:
-        """The actor with this name. Raises NoSuchActor."""
+        """Return a ref to the actor with this name. Raises NoSuchActor."""
         cell = self._node.names.get(name)
         if cell is None:
             raise NoSuchActor(name)
@@ -492,7 +496,7 @@ class ActorSystem(Recorded, Controls):
     # -- looking at it ----------------------------------------------------------------------------------------------
 
     def events(self) -> EventStream:
-        """A new stream of events from here on: `async for event in stream`; close it when done."""
+        """Return a new stream of events from here on: `async for event in stream`; close it when done."""
         return self._node.events.listen()
 
     @property
@@ -501,7 +505,7 @@ class ActorSystem(Recorded, Controls):
         return self._node.numbers.dead_letters
 
     def pid_of(self, ref: ActorRef[Any]) -> int:
-        """The OS process an actor lives in now: its own, or this one.
+        """Return the pid of the OS process that an actor lives in now: its own, or this one.
 
         Raises:
             NoSuchActor: it lives nowhere at the moment.
@@ -525,7 +529,7 @@ class ActorSystem(Recorded, Controls):
         return self._node.numbers.late_replies
 
     def tree(self) -> list[str]:
-        """The addresses that live now, parents before children."""
+        """List the addresses that live now, parents before children."""
         found: list[str] = []
         waiting = [self._root] if self._root is not None else []
         while waiting:

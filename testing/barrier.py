@@ -42,7 +42,7 @@ PING = "holdfast.testing:Ping"
 
 
 class NotIdle(HoldfastError, TimeoutError):
-    """What was waited for did not come to rest: `after` so much of something; `busy` says what still moved."""
+    """The system did not come to rest: `after` so much of something; `busy` says what still moved."""
 
     after: str
     busy: tuple[str, ...]

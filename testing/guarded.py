@@ -162,7 +162,7 @@ class GuardedSystem(ActorSystem):
 
     @property
     def asks(self) -> Mapping[asyncio.Future[Any], tuple[str, object]]:
-        """What was asked, and of whom, by the futures that somebody still holds."""
+        """List what was asked, and of whom, by the futures that somebody still holds."""
         return {} if self._checks is None else self._checks.asks
 
     def read_along(self, reads: Reads) -> None:
@@ -182,7 +182,7 @@ class GuardedSystem(ActorSystem):
             self.letters.append(event)
 
     def problems(self) -> list[str]:
-        """What happened and was not expected, as texts."""
+        """List what happened and was not expected, as texts."""
         found = [
             self._expected_crashes.problem("crashes", self.crashes),
             self._expected_letters.problem("dead letters", self.letters),

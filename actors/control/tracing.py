@@ -27,7 +27,7 @@ Coroutine_ = types.CoroutineType
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Statistics:
-    """What an actor has done since its statistics were switched on."""
+    """The counts of an actor's messages and turns since its statistics were switched on."""
 
     since: float
     """Unix time at which they were."""

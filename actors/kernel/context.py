@@ -82,7 +82,7 @@ class ActorContext:
 
     @property
     def sender(self) -> ActorRef[Any] | None:
-        """Who sent the message in hand; None if it was no actor."""
+        """Return a ref to the actor that sent the message in hand; None if no actor did."""
         item = self._item
         sender: Cell | None = item.sender if isinstance(item, Item) else None
         return None if sender is None else sender.ref
@@ -99,7 +99,7 @@ class ActorContext:
         return self._random
 
     def uuid(self) -> uuid.UUID:
-        """A new random UUID, drawn from `random`."""
+        """Return a new random UUID, drawn from `random`."""
         return uuid.UUID(int=self.random.getrandbits(128), version=4)
 
     # -- sending (called by ActorRef for sends inside a turn) -------------------------------------------------------
@@ -188,7 +188,7 @@ class ActorContext:
             to._cell.admit(to._cell, message_in(item))  # The item of a timer or a pipe is of this life.
 
     def reply_handle(self) -> ReplyHandle[Any]:
-        """The right to answer the ask in hand later: `return self.ctx.reply_handle()`, keep it, call `reply`."""
+        """Return the right to answer the ask in hand later: `return self.ctx.reply_handle()`, keep it, call `reply`."""
         item = self._item
         return self._promise(item) if isinstance(item, Ask) else ReplyHandle(None)
 
@@ -247,12 +247,12 @@ class ActorContext:
     # -- later ------------------------------------------------------------------------------------------------------
 
     def tell_after(self, delay: float, message: Message[Any]) -> Timer:
-        """The message comes to this actor itself after `delay` seconds; the timer ends with this life."""
+        """Have a message come to this actor itself after `delay` seconds; the timer ends with this life."""
         self._alive()
         return Timer(self._cell, message, delay, None)
 
     def every(self, interval: float, message: Message[Any]) -> Timer:
-        """The message comes every `interval` seconds; ticks that fall due while one waits are left out."""
+        """Have a message come every `interval` seconds; ticks that fall due while one waits are left out."""
         self._alive()
         return Timer(self._cell, message, interval, interval)
 
@@ -348,7 +348,7 @@ class ActorContext:
         return cast("ActorRef[A]", self._cell.node.spawn(start, name, parent=self._cell).ref)
 
     def find(self, path: str, kind: type[A]) -> ActorRef[A]:
-        """A ref to the actor at `path`.
+        """Return a ref to the actor at `path`.
 
         In a turn of a recorded actor it is one to the address, whether somebody lives there or not: a replay must go
         the same way again, when perhaps nobody does.
@@ -360,7 +360,7 @@ class ActorContext:
 
     @property
     def trap_exits(self) -> bool:
-        """Whether EXIT signals come to `on_exit` instead of ending this actor."""
+        """Say whether EXIT signals come to `on_exit` instead of ending this actor."""
         more = self._cell.more
         return more is not None and more.trap_exits
 
@@ -450,7 +450,7 @@ class ActorContext:
         self._closed = True
 
     def create_task(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
-        """A background task that ends with this life; an exception in it crashes the actor."""
+        """Start a background task that ends with this life; an exception in it crashes the actor."""
         self._alive()
         task = self._beside(work, "task")
         task.add_done_callback(self._task_done)

@@ -261,7 +261,7 @@ class ReplyHandle(Generic[R]):
 
     @property
     def ask(self) -> Ask | None:
-        """What is to be answered; None if nobody waits."""
+        """Return the ask that is to be answered; None if nobody waits."""
         return self._ask
 
     def reply(self, value: R) -> None:

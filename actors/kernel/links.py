@@ -27,7 +27,7 @@ class Monitor:
         self.life = watcher.life  # a watch ends with the life that set it
 
     def cancel(self) -> None:
-        """No DOWN arrives after this, not even one that is queued already."""
+        """Cancel the monitor: no DOWN arrives after this, not even one that is queued already."""
         self.active = False
         target = self.target
         self.forget()
@@ -36,7 +36,7 @@ class Monitor:
             target.host.told(target, "demonitor", {"watcher": self.watcher.path, "for_good": self.for_good})
 
     def forget(self) -> None:
-        """It is over: its DOWN has been told, or is not wanted."""
+        """Forget the monitor: its DOWN has been told, or is not wanted any more."""
         if self.watcher.more is not None:
             self.watcher.more.ties.watching.pop(self, None)
 

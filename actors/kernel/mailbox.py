@@ -330,7 +330,7 @@ class Bounded:
 
 
 def bounded(capacity: int, *, overflow: Overflow = "block") -> Bounded:
-    """A mailbox for at most `capacity` messages.
+    """Describe a mailbox for at most `capacity` messages.
 
     Args:
         capacity: messages, >= 1.

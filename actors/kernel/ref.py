@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal
+
+from typing_extensions import TypeVar
 
 from ..errors import ActorRestarting, SpecError
 from .envelope import Ask
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
     from .cell import Cell
     from .context import ActorContext
 
-A_co = TypeVar("A_co", bound="Actor", covariant=True)
+A_co = TypeVar("A_co", bound="Actor", default=Any, covariant=True)
 R = TypeVar("R")
 
 Restarting = Literal["wait", "fail"]
@@ -45,7 +47,7 @@ class ActorRef(Generic[A_co]):
         return self._cell.path
 
     def tell(self, message: Message[Any]) -> None:
-        """Send without waiting.
+        """Send a message without waiting until it is accepted, and without a reply.
 
         Raises:
             UnknownMessage: the actor's class is known and has no handler for it.

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 ORDER = ("link", "assertion", "replication", "repetition")
 """Layers, outermost first: what is outside sees plain data, what is inside runs once for each replica."""
 PARTS: tuple[Part, ...] = get_args(Part)
+Layer = Mechanism | type[Mechanism] | str | os.PathLike[str]
+"""A mechanism as a change takes it: an instance, a class without settings, a name, or a file."""
 
 
 def layers_of(wanted: Any, there: Any = None) -> tuple[Mechanism, ...]:

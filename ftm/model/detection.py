@@ -10,7 +10,7 @@ from ...actors.errors import SpecError
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Detection:
-    """How replicas are watched.
+    """Settings by which replicas are watched.
 
     Args:
         interval: seconds between two heartbeats.

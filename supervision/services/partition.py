@@ -24,13 +24,13 @@ from ..tree import supervisor
 
 
 class Route(Message[ActorRef[Any]]):
-    """Which partition is this key's; the reply is its ref."""
+    """Ask which partition a key belongs to; the reply is a ref to that partition."""
 
     key: Any
 
 
 class CountPartitions(Message[int]):
-    """How many partitions there are now."""
+    """Ask how many partitions there are now."""
 
 
 class ResizePartitions(RuntimeOrder[int]):
@@ -40,7 +40,7 @@ class ResizePartitions(RuntimeOrder[int]):
 
 
 def partition_of(key: object, count: int) -> int:
-    """The partition of a key: `abs(key) % count` for an int, a stable hash of its type and value for anything else.
+    """Return the partition of a key: `abs(key) % count` for an int, else by a stable hash of its type and value.
 
     The same in every process and at every time, so that a key can be stored with the partition that it belongs to.
 
@@ -169,7 +169,7 @@ def partitions(
     isolation: Isolation = "task",
     limits: Limits | None = None,
 ) -> ChildSpec:
-    """Several copies of one child under a supervisor, as a spec. `Route(key)` asks it for the copy of a key.
+    """Describe several copies of one child under a supervisor. `Route(key)` asks it for the copy of a key.
 
     Args:
         name: the last part of the supervisor's address; the copies are `name/0`, `name/1`, ...

@@ -40,7 +40,7 @@ DRAIN_SECONDS = 5.0
 
 
 class PoolStatus(msgspec.Struct, frozen=True):
-    """How a pool is: its workers, how many of them are up, how many are on their way out, what waits at the router."""
+    """The state of a pool: its workers, how many are up, how many on their way out, what waits at the router."""
 
     size: int
     up: int
@@ -202,7 +202,7 @@ def pool(
     shutdown: Shutdown = "infinity",
     rules: Iterable[Rule] = (),
 ) -> ChildSpec:
-    """Several workers of one class and a router in front of them, as a spec. `pool_of` gives a ref to it.
+    """Describe several workers of one class and a router in front of them. `pool_of` gives a ref to it.
 
     The router takes what the workers' class handles, tells, sends and asks, and forwards it: sender, deadline and chain
     stay. While no worker can take a message (none is up, or all are full: a bounded mailbox with the policy "block"),
@@ -269,7 +269,7 @@ class HasNode(Protocol):
 
 
 def pool_of(system: HasNode | ActorContext, path: str, kind: type[A]) -> ActorRef[A]:
-    """A ref to a pool, typed as one to a worker: what is sent there goes to one of them.
+    """Return a ref to a pool, typed as one to a worker: what is sent there goes to one of them.
 
     Args:
         system: the actor system; in an actor, `self.ctx`.

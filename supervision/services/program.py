@@ -40,7 +40,7 @@ SLACK = 5.0
 
 
 class ProgramStatus(msgspec.Struct, frozen=True):
-    """How a program is: its pid, seconds since its start, and its last lines of output, oldest first."""
+    """The state of a program: its pid, seconds since its start, and its last lines of output, oldest first."""
 
     pid: int
     uptime: float
@@ -330,7 +330,7 @@ def program(
     significant: bool = False,
     rules: Iterable[Rule] = (),
 ) -> ChildSpec:
-    """An external program as a child.
+    """Describe an external program as a child: any command, started and stopped like an actor.
 
     It ends with its actor, and with the process that hosts that, however it ends; its descendants end with it. Its
     output is logged. Exit code 0 is a normal end, any other `Exited(code)`, a signal `Signal(number)`. `ProgramInfo`

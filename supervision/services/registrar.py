@@ -349,7 +349,7 @@ class RegistryActor(Actor):
     # -- ends -------------------------------------------------------------------------------------------------------
 
     def on_down(self, source: ActorRef[Any], reason: ExitReason, recovering: bool) -> None:
-        """A holder's life is over, unless it is brought back with its state: then it holds what it held."""
+        """Let go what a holder held whose life is over, unless it is brought back with its state."""
         if not recovering:
             self._drop_dead(source._cell, told=True)
 

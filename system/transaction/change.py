@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ...actors.control.orders import Change as StateChange
@@ -21,6 +21,7 @@ from .wiring import Bind, RegisterName, Unbind, UnregisterName
 
 if TYPE_CHECKING:
     from ...ftm.events import MechanismSettled
+    from ...ftm.model.composition import Layer
     from ..system import ActorSystem
 
 
@@ -92,7 +93,7 @@ class Change:
         self.step(RegisterName(name, target))
 
     def unregister(self, name: str) -> None:
-        """Free a name."""
+        """Free a name that an actor has beside its address."""
         self.step(UnregisterName(name))
 
     # -- live actors --------------------------------------------------------------------------------------------------
@@ -115,7 +116,7 @@ class Change:
 
     # -- fault tolerance ----------------------------------------------------------------------------------------------
 
-    def protect(self, target: Target, stack: Any) -> None:
+    def protect(self, target: Target, stack: Layer | Sequence[Layer] | None) -> None:
         """Have an actor protected by just this stack of mechanisms, whatever it has now; its life goes on.
 
         Only the bricks that differ from those that it has are touched.
@@ -143,17 +144,17 @@ class Change:
     # -- all of it ----------------------------------------------------------------------------------------------------
 
     def step(self, operation: Operation) -> None:
-        """One more operation, of whatever kind."""
+        """Collect one more operation, of whatever kind."""
         self._operations.append(operation)
 
     @property
     def operations(self) -> tuple[Operation, ...]:
-        """What was collected so far."""
+        """Return the operations that were collected so far."""
         return tuple(self._operations)
 
     @property
     def steps(self) -> tuple[Step, ...]:
-        """The steps, in order."""
+        """Return the steps of the transaction, in the order in which they are taken."""
         return tuple(Step(n, one.verb, one.target, one.text) for n, one in enumerate(self._operations, 1))
 
     async def settled(self) -> tuple[MechanismSettled, ...]:
@@ -167,10 +168,10 @@ class Change:
 
     @property
     def difference(self) -> tuple[str, ...]:
-        """How the tree changes: lines with `-` go, lines with `+` come. Known after the checks."""
+        """List how the tree changes: lines with `-` go, lines with `+` come. Known after the checks."""
         return tuple(self._difference or ())
 
     def describe(self) -> str:
-        """The steps, and how the tree changes (known after the checks), in words."""
+        """Say in words which steps there are, and how the tree changes (known after the checks)."""
         lines = [f"{step.number}. {step.text}" for step in self.steps] or ["nothing to do"]
         return "\n".join([*lines, *(self._difference or ())])

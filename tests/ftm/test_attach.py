@@ -361,7 +361,7 @@ async def test_what_a_mechanism_needs_is_checked_before_anything_is_done(system:
     with pytest.raises(hf.TransactionRefused, match=r"cannot go along.*in its spec"):
         await attach(system, ref, LFR())
     with pytest.raises(hf.SpecError, match=r"mechanism must be .*find\(name\)"):
-        hf.child("bob", hf.start(Counter), mechanism="pbr")
+        hf.child("bob", hf.start(Counter), mechanism="pbr")  # type: ignore[arg-type]
     with pytest.raises(hf.SpecError, match="supervisor"):
         hf.child("bob", hf.start(hf.Supervisor), mechanism=PBR())
     await detach(system, ref)  # It has none.

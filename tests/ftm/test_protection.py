@@ -74,7 +74,7 @@ async def test_a_new_stack_is_on_probation(system: hf.ActorSystem) -> None:
 
 
 @pytest.mark.parametrize("mechanism", [LFR(), (LFR(),)], ids=["alone", "tuple of one"])
-async def test_a_tuple_of_one_means_that_one(system: hf.ActorSystem, mechanism: object) -> None:
+async def test_a_tuple_of_one_means_that_one(system: hf.ActorSystem, mechanism: LFR | tuple[LFR]) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=(PBR(), TR())))
     async with system.transaction(timeout=60) as change:
         change.protect(ref, mechanism)

@@ -286,6 +286,7 @@ async def test_a_ref_says_who_lives_there_or_that_nobody_does() -> None:
             with pytest.raises(hf.errors.NoSuchActor) as nobody:
                 system.ref(path, Kid)
             assert nobody.value.actor == path
+        assert system.ref("/app/top/kid") == system.ref("/app/top/kid", hf.Actor)
         with pytest.raises(hf.errors.WrongActor, match=r"/app/top/kid is a .*Kid, not a .*Listener"):
             system.ref("/app/top/kid", Listener)
 

@@ -6,7 +6,8 @@ import asyncio
 import random
 from collections.abc import Awaitable, Callable
 
-from ... import ActorRef, HoldfastError
+from holdfast import ActorRef, HoldfastError
+
 from .actors import IsWayFree, LookAt, Mapper, Planner, Seen, WayAnswer
 from .log import Survey
 

@@ -4,9 +4,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-
-from holdfast.console.demo.grid import Geometry, OccupancyGrid
-from holdfast.console.demo.planner import find_path, free_space, is_way_free, length
+from map_demo.grid import Geometry, OccupancyGrid
+from map_demo.planner import find_path, free_space, is_way_free, length
 
 FREE, WALL = -8, 17
 

@@ -9,19 +9,21 @@ from pathlib import Path
 from time import monotonic
 from typing import Literal
 
-from ... import (
+from holdfast import (
     ActorRef,
     ActorSystem,
     ChildSpec,
     HoldfastError,
+    Method,
     child,
     fresh,
     hybrid,
     start,
     supervisor,
 )
-from ...actors.errors import NoSuchActor
-from ...actors.events import Recovered
+from holdfast.errors import NoSuchActor
+from holdfast.events import Recovered
+
 from .actors import FindPath, GetMap, LogRead, Mapper, MapperState, NoWay, Planner, Reader, ReadLog, as_grid
 from .grid import USABLE_RANGE, Geometry
 from .killer import Killer, schedule
@@ -31,7 +33,7 @@ from .questions import PATIENCE, Questions
 from .report import DemoReport, MapperKill, MapperRecovery, RunOutcome, judge_asks
 from .show import Progress, Watcher
 
-Method = Literal["hybrid", "fresh"]
+MethodName = Literal["hybrid", "fresh"]
 
 MAPPER, PLANNER, READER = "/demo/robot/mapper", "/demo/robot/planner", "/demo/robot/reader"
 LONGEST_READING = 3600.0  # seconds
@@ -45,12 +47,12 @@ class DemoPlan:
     log: Path
     kills: int
     seed: int
-    method: Method
+    method: MethodName
     interval: float
     speed: float
 
 
-def tree(geometry: Geometry, recovery: object, kills: int) -> ChildSpec:
+def tree(geometry: Geometry, recovery: Method, kills: int) -> ChildSpec:
     """The supervision tree. Only the mapper's child spec knows that it has a process, and how it comes back."""
     mapper = child("mapper", start(Mapper, geometry), isolation="process", recovery=recovery)
     planner = child("planner", start(Planner), bindings={"mapper": MAPPER})
@@ -60,7 +62,7 @@ def tree(geometry: Geometry, recovery: object, kills: int) -> ChildSpec:
     )
 
 
-def recovery_of(plan: DemoPlan) -> object:
+def recovery_of(plan: DemoPlan) -> Method:
     """The recovery method that the plan names."""
     match plan.method:
         case "hybrid":

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from holdfast.console.demo.grid import (
+from map_demo.grid import (
     HIT,
     LIMIT,
     MISS,

@@ -4,10 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from map_demo.grid import Geometry, OccupancyGrid
+from map_demo.picture import BORDER, DIFFERENT, FREE, OCCUPIED, TITLE, UNKNOWN, draw, save
 from PIL import Image
-
-from holdfast.console.demo.grid import Geometry, OccupancyGrid
-from holdfast.console.demo.picture import BORDER, DIFFERENT, FREE, OCCUPIED, TITLE, UNKNOWN, draw, save
 
 PLACE = Geometry(1.0, 0.0, 0.0, 4, 3)
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ... import Actor, Binding, Message, Refusal, on, subscribe
+from holdfast import Actor, Binding, Message, Refusal, on, subscribe
+
 from .grid import Geometry, OccupancyGrid
 from .log import LaserScan, LogCutOff, LogError, read_scans
 from .planner import find_path, is_way_free

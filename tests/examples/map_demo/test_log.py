@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from holdfast.console.demo.log import LogCutOff, LogError, killian_court, read_scans, survey
+from map_demo.log import LogCutOff, LogError, killian_court, read_scans, survey
 
 AFTER_REMISSIONS = "{x} 2.0 0.5 {x} 2.0 0.5 0 0 0 0 0 {time} host 12.5"
 

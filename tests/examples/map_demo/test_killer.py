@@ -5,9 +5,8 @@ import signal
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from holdfast.console.demo.killer import LONGEST_DELAY, Killer, Moment, schedule
-from holdfast.console.demo.report import MapperKill
+from map_demo.killer import LONGEST_DELAY, Killer, Moment, schedule
+from map_demo.report import MapperKill
 
 
 @given(st.integers(0, 50), st.integers(1, 5000), st.integers())

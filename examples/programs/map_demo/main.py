@@ -7,7 +7,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from ... import run
+from holdfast import run
+
 from .demo_runs import DemoPlan, compare
 from .picture import draw, save
 from .report import DemoReport

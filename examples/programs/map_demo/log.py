@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...actors.errors import HoldfastError
+from holdfast import HoldfastError
 
 SCAN = "ROBOTLASER1"
 FIELDS_BEFORE_RANGES = 9  # tag type start fov step max_range accuracy remission_mode n

@@ -4,9 +4,8 @@ import json
 from dataclasses import replace
 
 import numpy as np
-
-from holdfast.console.demo.grid import Geometry, OccupancyGrid
-from holdfast.console.demo.report import (
+from map_demo.grid import Geometry, OccupancyGrid
+from map_demo.report import (
     Asks,
     DemoReport,
     MapperKill,
