@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Collection, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 from ..actors.errors import HoldfastError
 from ..actors.events import ActorCrashed, DeadLetter, Event, HookFailed, LifeAbandoned, ProcessDied
@@ -18,8 +18,9 @@ from ..system.system import ActorSystem
 from .clock import RealTimeNeeded, VirtualClockLoop
 from .guard.leaks import Leaks
 from .guard.sends import Reads, SendChecks
-from .schedules.control import ControlledLoop
-from .schedules.processes import SimulatedWorkers
+
+if TYPE_CHECKING:
+    from .schedules.control import ControlledLoop
 
 CRASHES = (ActorCrashed, HookFailed, LifeAbandoned)
 DEATHS = (Signal, Exited, OutOfMemory, Hung)
@@ -59,6 +60,15 @@ class UnexpectedEnd(HoldfastError, AssertionError, text="{problems:\n}"):
     problems: tuple[str, ...]
 
 
+def _is_controlled(loop: asyncio.AbstractEventLoop) -> TypeGuard[ControlledLoop]:
+    """Whether a run is simulated in this loop."""
+    if not isinstance(loop, VirtualClockLoop):
+        return False
+    from .schedules.control import ControlledLoop  # It takes long to import, and few tests simulate.
+
+    return isinstance(loop, ControlledLoop)
+
+
 class GuardedSystem(ActorSystem):
     """An ActorSystem for tests. It notes crashes and dead letters, and checks what is sent.
 
@@ -85,11 +95,15 @@ class GuardedSystem(ActorSystem):
 
     def _make_pool(self, node: Node) -> Workers:
         loop = asyncio.get_running_loop()
-        return SimulatedWorkers(node, loop) if isinstance(loop, ControlledLoop) else super()._make_pool(node)
+        if _is_controlled(loop):
+            from .schedules.processes import SimulatedWorkers
+
+            return SimulatedWorkers(node, loop)
+        return super()._make_pool(node)
 
     def _host_for(self, spec: ChildSpec) -> AddressHost:
         loop = self._node.loop
-        if spec.isolation == "process" and isinstance(loop, VirtualClockLoop) and not isinstance(loop, ControlledLoop):
+        if spec.isolation == "process" and isinstance(loop, VirtualClockLoop) and not _is_controlled(loop):
             raise RealTimeNeeded(f"{spec.id!r} with isolation='process'")
         return super()._host_for(spec)
 

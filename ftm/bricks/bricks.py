@@ -293,11 +293,9 @@ class Proceed(Brick):
         brings = bool(pending) or go is not None  # Else home may not have what was handled before.
         if pending and not state.is_over:
             await server.ensure()
+            await self._hand_more()  # A snapshot of what its hooks have left, before anything that stands on it.
             pending = server.returned_first(pending)
         while True:
-            if pending and not state.is_over:
-                await server.ensure()
-                await self._hand_more()  # A snapshot of what its hooks have left, before anything that stands on it.
             ends = await server.run_part(pending)
             live = None
             # What was handled before is decided as it was: `on_recovered` and what follows from it are no part of that.

@@ -320,6 +320,8 @@ class Deciding(After):
         life = server.life
         if not done.ends or server.state.is_over or (life is None and server.points.previous is None):
             return done
+        if life is not None and life.spoiled is not None:
+            return done  # It has run nothing.
         if life is not None and life.feed is not None:  # A follower's turn waits in the middle: nothing is decided.
             if any(end.id in server.traces.objections for end in done.ends):
                 raise HoldfastError(f"{self._standing.path}: an assertion has failed while a turn waits")

@@ -124,6 +124,7 @@ class ServerLife(Life):
         self.let_out: list[Out] = []  # of the turn in hand, beside `outs`: it has left, or is held back
         self.begun_names: set[str] = set()  # the variables of the actor when `__init__` had run
         self.is_touched = False  # by its hooks, since the point at which it has begun
+        self.spoiled: Exception | None = None  # its hooks have left what is no state: why
         self.has_begun_tasks = False  # in turns since the last point
         self.saving.is_needed = server.state.has_access
 

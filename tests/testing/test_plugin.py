@@ -133,7 +133,7 @@ async def test_does_not_wait(actor_system):
     ],
 )
 def test_a_leak_fails_the_test(suite, leak: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("holdfast.testing.guard.leaks.SHORT_GRACE", 0.1)
+    monkeypatch.setattr("holdfast.testing.guard.process_leaks.SHORT_GRACE", 0.1)
     result = suite(f"""
 kept = []
 
@@ -203,7 +203,7 @@ async def test_told_to_end(actor_system, kept):
     kept[-1].terminate()
 
 async def test_own(actor_system, kept, monkeypatch):
-    monkeypatch.setattr("holdfast.testing.guard.leaks.SHORT_GRACE", 0.0)
+    monkeypatch.setattr("holdfast.testing.guard.process_leaks.SHORT_GRACE", 0.0)
     program = "import sys; sys.stdin.read()"
     kept.append(subprocess.Popen([sys.executable, "-c", program, boot.__file__], stdin=subprocess.PIPE))
     asyncio.get_running_loop().call_later(0.0, kept[-1].stdin.close)

@@ -126,14 +126,14 @@ class Relay(hf.Actor):
 @pytest.mark.parametrize("what", ["wrong_reply", "huge_reply"])
 async def test_a_reply_that_cannot_be_sent_fails_the_ask(system: hf.ActorSystem, what: str) -> None:
     one = await start(system)
-    with pytest.raises(hf.errors.BadMessage, match="reply"):
+    with pytest.raises(hf.errors.BadReply, match="reply"):
         await one.ask(Run(what, MAX_BYTES + 100_000), timeout=20)
     assert await one.ask(Add(1)) == 1
 
 
 async def test_a_reply_of_the_wrong_type_fails_the_ask(system: hf.ActorSystem) -> None:
     one = await start(system, Liar)
-    with pytest.raises(hf.errors.BadMessage, match="Expected `int`, got `str`"):
+    with pytest.raises(hf.errors.BadReply, match="Expected `int`, got `str`"):
         await one.ask(Total())
 
 
