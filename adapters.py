@@ -21,6 +21,8 @@ from .actors.kernel.actor import Actor, on, subscribe
 from .actors.kernel.message import Message
 from .actors.kernel.ref import ActorRef
 
+__all__ = ["Bus", "Calls", "Wrapped", "calls", "wrap"]
+
 Parameter = inspect.Parameter
 
 

@@ -54,8 +54,8 @@ LONGEST = 3600.0
 """Seconds that one request may take."""
 _TREE = {"add", "remove", "move", "reorder", "strategy", "intensity", "isolation", "stop", "start"}
 _LIVING = {"bind", "unbind", "register", "unregister", "suspend", "resume", "replace_state", "replace_code"}
-OPERATIONS = frozenset(_TREE | _LIVING | {"protect", "attach", "detach", "compose", "transition", "update"})
-NAMED = {"compose": ("outside",), "transition": ("whole",), "update": ("mechanism", "role")}
+OPERATIONS = frozenset(_TREE | _LIVING | {"protect", "update"})
+NAMED = {"update": ("mechanism", "role")}
 """What comes last is named."""
 
 

@@ -32,7 +32,7 @@ UNDER_WAY = "adapting "
 
 def part_of(address: str) -> str:
     """Why something is not done to what the mechanism of this address has below it."""
-    how = "attach, detach, compose, transition or update"
+    how = "protect or update"
     return f"it is a part of the mechanism of {address}, whose replicas must stay alike: change that by {how}"
 
 

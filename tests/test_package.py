@@ -84,10 +84,10 @@ def test_the_rooms_are_bound_and_only_they() -> None:
     assert re.findall(r"^from holdfast import (\w+) as \1$", text, re.MULTILINE) == ROOMS
 
 
-@pytest.mark.parametrize("name", sorted(set(ROOMS) - {"adapters"}))
+@pytest.mark.parametrize("name", ROOMS)
 def test_a_room_exports_what_it_lists(name: str) -> None:
     room = importlib.import_module(f"holdfast.{name}")
-    assert set(public_names(room)) <= set(room.__all__)
+    assert {one for one in public_names(room) if name != "adapters"} <= set(room.__all__)
     assert list(room.__all__) == sorted(set(room.__all__) & set(vars(room)))
 
 
@@ -98,7 +98,7 @@ def test_errors_and_events_have_one_place(name: str) -> None:
     here = set(importlib.import_module(f"holdfast.{name}").__all__)
     for other in set(ROOMS) - {name}:
         room = importlib.import_module(f"holdfast.{other}")
-        kinds = [one for one in getattr(room, "__all__", []) if isinstance(getattr(room, one), type)]
+        kinds = [one for one in room.__all__ if isinstance(getattr(room, one), type)]
         assert not [one for one in kinds if issubclass(getattr(room, one), base)]
     kinds = [one for one in holdfast.__all__ if isinstance(getattr(holdfast, one), type)]
     assert not {one for one in kinds if issubclass(getattr(holdfast, one), base)} - here

@@ -64,7 +64,7 @@ def admit_gone(cell: Cell, item: Any) -> None:
     if successor is not None:
         successor.admit(successor, item)
     elif isinstance(item, Item):
-        item.undelivered(cell, "it has stopped")
+        item.undelivered(cell, "for good")
     else:
         cell.node.dead_letter(cell, item, "the actor has stopped")
 

@@ -140,7 +140,7 @@ class ReplaceActorCode(OnRework):
 def check_unprotected(place: DraftPlace) -> None:
     """Refuse what would change one replica of a protected actor, and not the others. Raises SpecError."""
     if place.spec is not None and place.spec.mechanism is not None:
-        raise wrong(place.path, "it is protected by a mechanism: detach that, and attach it again after")
+        raise wrong(place.path, "it is protected by a mechanism: `protect` it by None, and again after")
 
 
 def _is_actor(kind: object) -> bool:

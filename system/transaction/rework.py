@@ -66,7 +66,7 @@ class Rework(StagedWork):
         if place.is_supervisor:
             raise wrong(place.path, "a supervisor is changed by its own operations: add, remove, strategy ...")
         if place.is_protected:
-            raise wrong(place.path, "it is protected by a mechanism: detach that, and attach it again after")
+            raise wrong(place.path, "it is protected by a mechanism: `protect` it by None, and again after")
         if place.cell is not None and not lives_here(place.cell) and not place.cell.is_dead:
             wanted.pack(place.path)
         self._wanted.append(wanted)

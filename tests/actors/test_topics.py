@@ -16,6 +16,9 @@ class News(hf.Message[None]):
 class Seen(hf.Message[list[int]]): ...
 
 
+class Other(hf.Message): ...
+
+
 class Do(hf.Message[Any]):
     work: Any
 
@@ -133,6 +136,20 @@ async def test_a_subscriber_that_cannot_take_it_does_not_keep_it_from_the_others
     assert await last.ask(Seen()) == [1]
     assert await slow.ask(Seen()) == [0, 1]
     assert await full.ask(Seen()) in ([0], [0, 1])
+
+
+@pytest.mark.parametrize("inside", [False, True])
+async def test_a_subscriber_gets_only_what_it_has_a_handler_for(system: hf.ActorSystem, inside: bool) -> None:
+    """The rest is for others, and no dead letter."""
+    reader = system.spawn(hf.start(Subscriber))
+    editor = system.spawn(hf.start(Reader))
+    for message in (News(1), Seen(), News(2), Other()):
+        if inside:
+            await editor.ask(Do(lambda actor, message=message: actor.ctx.publish("/news", message)))
+        else:
+            await system.publish("/news", message)
+    assert await reader.ask(Seen()) == [1, 2]
+    assert system.dead_letters == 0
 
 
 async def test_a_slow_subscriber_holds_the_publisher_back(system: hf.ActorSystem) -> None:

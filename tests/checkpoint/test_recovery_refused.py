@@ -29,8 +29,11 @@ async def test_replay_of_an_actor_that_is_not_deterministic_diverges(system: hf.
     await ref.ask(Do([], notes))
     with system.events() as stream:
         ref.kill()
+        waiting = ref.ask(Do([], notes), timeout=30.0)
         assert "diverged at turn 1, output 1" in (await event(stream, hf.events.RecoveryFailed)).reason
         await event(stream, hf.events.SupervisorGaveUp)
+    with pytest.raises(hf.ActorStopped, match="diverged at turn 1"):
+        await waiting
     noted = await notes.ask(Notes())
     assert len(noted) == 1
 

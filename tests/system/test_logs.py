@@ -2,6 +2,8 @@
 
 import asyncio
 import logging
+import subprocess
+import sys
 from collections.abc import Iterator, MutableMapping
 from typing import Any
 
@@ -153,6 +155,33 @@ async def test_standard_logging_gets_the_record_where_structlog_is_not_set_up(st
     assert shown.count("Traceback (most recent call last):") == 1
     assert shown.endswith("ValueError: 100 % gone")
     assert vars(record)["holdfast"]["restarts"] == 0
+
+
+async def test_a_program_that_has_set_up_nothing_gets_its_log_on_stderr() -> None:
+    program = """
+import asyncio, holdfast as hf
+
+class Boom(hf.Message): ...
+
+class Fragile(hf.Actor):
+    @hf.on(Boom)
+    def boom(self, message): raise ValueError("boom")
+
+async def main():
+    async with hf.ActorSystem("app") as system:
+        ref = await system.start(hf.child("one", hf.start(Fragile)))
+        with system.events() as events:
+            ref.tell(Boom())
+            async for event in events:
+                if isinstance(event, hf.events.ChildRestarted): break
+    print("done")
+
+asyncio.run(main())
+"""
+    argv = [sys.executable, "-c", program]
+    done = subprocess.run(argv, check=False, capture_output=True, text=True, timeout=60)  # noqa: ASYNC221
+    assert (done.returncode, done.stdout) == (0, "done\n")
+    assert "actor crashed" in done.stderr
 
 
 async def test_standard_logging_decides_which_levels_are_seen(standard: FromStandard) -> None:
