@@ -38,7 +38,7 @@ class Method:
 
     name: str
     interval: float = 0.0
-    max_deliveries: int = 5
+    max_deliveries: int = 3
     journal_limit: int = JOURNAL_LIMIT
     keep: int = 2
     on_escalate: OnEscalate | None = None
@@ -160,7 +160,7 @@ def fresh() -> Method:
 def checkpoint_only(
     interval: float = 2.0,
     *,
-    max_deliveries: int = 5,
+    max_deliveries: int = 3,
     journal_limit: int = JOURNAL_LIMIT,
     keep: int = 2,
     on_escalate: OnEscalate | None = None,
@@ -200,7 +200,7 @@ def checkpoint_only(
 def replay_only(
     *,
     pacing: Pacing = "fast",
-    max_deliveries: int = 5,
+    max_deliveries: int = 3,
     journal_limit: int = JOURNAL_LIMIT,
     on_escalate: OnEscalate | None = None,
     skip: bool = True,
@@ -240,7 +240,7 @@ def hybrid(
     interval: float = 2.0,
     *,
     pacing: Pacing = "fast",
-    max_deliveries: int = 5,
+    max_deliveries: int = 3,
     journal_limit: int = JOURNAL_LIMIT,
     keep: int = 2,
     on_escalate: OnEscalate | None = None,

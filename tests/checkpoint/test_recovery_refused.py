@@ -43,6 +43,32 @@ def test_a_class_that_says_it_is_not_deterministic_is_refused() -> None:
         hf.child("honest", hf.start(Honest), recovery=hf.hybrid())
 
 
+@pytest.mark.parametrize("deep", [0, 1, 2])
+async def test_a_message_is_quarantined_before_anybody_else_falls(
+    system: hf.ActorSystem, deep: int, tmp_path: Path
+) -> None:
+    """With the defaults: the root allows three restarts in five seconds, other supervisors one, and they escalate."""
+    spec: hf.ChildSpec = hf.child("doer", hf.start(Doer), isolation="process", recovery=hf.hybrid())
+    path = "/app"
+    for number in range(deep):
+        spec = hf.supervisor(f"s{number}", children=[spec])
+    await system.start(spec)
+    path += "".join(f"/s{number}" for number in reversed(range(deep))) + "/doer"
+    ref, notes = system.ref(path, Doer), await sink(system)
+    await ref.ask(Note("before"))
+    bad = Do([f"die {tmp_path}/deaths"], notes)
+    with system.events() as events:
+        if deep:
+            ref.tell(bad)  # An ask ends with the supervisor that gives up.
+        else:
+            with pytest.raises(hf.Quarantined):
+                await ref.ask(bad, timeout=30.0)
+        assert (await event(events, hf.events.MessageQuarantined)).deliveries == 3
+    assert (tmp_path / "deaths").read_text() == "xxx"
+    assert len(system.quarantined()) == 1
+    assert await system.ref(path, Doer).ask(Seen(), timeout=30.0)
+
+
 async def test_a_message_that_kills_its_process_again_and_again_is_quarantined(
     system: hf.ActorSystem, tmp_path: Path
 ) -> None:

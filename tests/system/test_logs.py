@@ -179,7 +179,7 @@ async def main():
 asyncio.run(main())
 """
     argv = [sys.executable, "-c", program]
-    done = subprocess.run(argv, check=False, capture_output=True, text=True, timeout=60)  # noqa: ASYNC221
+    done = subprocess.run(argv, check=False, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout) == (0, "done\n")
     assert "actor crashed" in done.stderr
 
