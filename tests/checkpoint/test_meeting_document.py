@@ -1,4 +1,4 @@
-"""The tables of docs/supervision.md on recovery and restarts: each cell is a test."""
+"""The tables of docs/supervision-recovery.md: each cell is a test."""
 
 from __future__ import annotations
 

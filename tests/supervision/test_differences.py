@@ -1,4 +1,4 @@
-"""The list "What differs from OTP" in docs/supervision.md: every entry has a test, and every test an entry."""
+"""The tables of docs/differs-from-otp.md: every entry has a reason and a test, and every test an entry."""
 
 import asyncio
 import re
@@ -11,31 +11,30 @@ import pytest
 import holdfast as hf
 from tests.supervision.family import Boom, Family, Life, Plan, kid, refused
 
-TEXT = (Path(__file__).parents[2] / "docs" / "supervision.md").read_text("utf-8")
+TEXT = (Path(__file__).parents[2] / "docs" / "differs-from-otp.md").read_text("utf-8")
 SLOW = hf.Backoff(initial=60.0, maximum=60.0, jitter=0.0)
 
 Test = Callable[[hf.ActorSystem], Awaitable[None]]
 TESTS: dict[str, Test] = {}
+ENTRIES: dict[str, str] = {}
+"""What differs, and the name of the test that shows it."""
 
 
 def entry(what: str) -> Callable[[Test], Test]:
     def note(test: Test) -> Test:
-        TESTS[what] = test
+        ENTRIES[what] = test.__name__
+        TESTS[test.__name__] = test
         return test
 
     return note
 
 
-def entries() -> list[str]:
-    found = re.search(r"^\| what \| in OTP \|.*\n\|[-|]+\|\n((?:\|.*\n)+)", TEXT, re.M)
-    assert found
-    return [line.split(" | ")[0].removeprefix("| ") for line in found[1].splitlines()]
-
-
 def test_every_entry_has_a_test_and_a_reason() -> None:
-    assert entries() == list(TESTS)
-    rows = re.findall(r"^\|.*\|$", TEXT[TEXT.index("| what | in OTP |") :], re.M)
-    assert all(len([cell for cell in row.strip("|").split("|") if cell.strip()]) == 4 for row in rows)
+    """The cells of a row: what differs, what OTP does, what holdfast does, why, and the test."""
+    rows = [[cell.strip() for cell in row.split(" | ")] for row in re.findall(r"^\| (.+) \|$", TEXT, re.M)]
+    entries = [row for row in rows if row[0] != "what"]
+    assert all(len(row) == 5 and all(row) for row in entries)
+    assert {row[0]: row[4].strip("`") for row in entries} == ENTRIES
 
 
 class Hangs(hf.Actor):
@@ -69,14 +68,14 @@ class Notes(hf.Actor):
 
 
 @entry("order of `WhichChildren`")
-async def _(system: hf.ActorSystem) -> None:
+async def children_in_start_order(system: hf.ActorSystem) -> None:
     plan = Plan()
     family = await Family.start(system, plan, kid(plan, "a"), kid(plan, "b"))
     assert list(await family.states()) == ["a", "b"]
 
 
 @entry("calls while a child starts or stops")
-async def _(system: hf.ActorSystem) -> None:
+async def calls_are_answered(system: hf.ActorSystem) -> None:
     top = await system.start(hf.supervisor("top", children=[hf.child("lingers", hf.start(Lingers))]))
     top.tell(hf.StartChild(hf.child("hangs", hf.start(Hangs))))
     top.tell(hf.TerminateChild("lingers"))
@@ -85,7 +84,7 @@ async def _(system: hf.ActorSystem) -> None:
 
 
 @entry("calls about a child that is stopping")
-async def _(system: hf.ActorSystem) -> None:
+async def a_stopping_child_is_busy(system: hf.ActorSystem) -> None:
     top = await system.start(hf.supervisor("top", children=[hf.child("a", hf.start(Lingers))]))
     first = top.ask(hf.TerminateChild("a"))
     assert isinstance(await refused(top.ask(hf.RestartChild("a"))), hf.errors.ChildBusy)
@@ -96,13 +95,13 @@ async def _(system: hf.ActorSystem) -> None:
 
 
 @entry("a start that never ends")
-async def _(system: hf.ActorSystem) -> None:
+async def a_start_is_limited(system: hf.ActorSystem) -> None:
     with pytest.raises(hf.StartFailed, match="within 60 s"):
         await system.start(hf.child("a", hf.start(Hangs)))
 
 
 @entry('`shutdown="infinity"` of a supervisor')
-async def _(system: hf.ActorSystem) -> None:
+async def infinity_of_a_supervisor_is_limited(system: hf.ActorSystem) -> None:
     children = [hf.child("a", hf.start(Lingers, 1000.0), shutdown=10.0)]
     top = await system.start(hf.supervisor("top", children=children))
     await system.stop(top)  # More of it, also what hangs: test_never_waits.py
@@ -110,7 +109,7 @@ async def _(system: hf.ActorSystem) -> None:
 
 
 @entry("a supervisor that is killed")
-async def _(system: hf.ActorSystem) -> None:
+async def children_are_killed_with_it(system: hf.ActorSystem) -> None:
     told: list[str] = []
     top = await system.start(hf.supervisor("top", restart="temporary", children=[hf.child("a", hf.start(Notes, told))]))
     top.kill()
@@ -119,14 +118,14 @@ async def _(system: hf.ActorSystem) -> None:
 
 
 @entry("a child that does not trap exits is told to stop")
-async def _(system: hf.ActorSystem) -> None:
+async def on_stop_is_called_without_traps(system: hf.ActorSystem) -> None:
     told: list[str] = []
     await system.stop(await system.start(hf.child("a", hf.start(Notes, told))))
     assert told == ["shutdown"]
 
 
 @entry("`on_stop` raises after a crash")
-async def _(system: hf.ActorSystem) -> None:
+async def the_first_crash_is_the_reason(system: hf.ActorSystem) -> None:
     with system.events() as events:
         ref = await system.start(hf.child("a", hf.start(Fails)))
         ref.tell(Boom())
@@ -136,7 +135,7 @@ async def _(system: hf.ActorSystem) -> None:
 
 
 @entry("restart window")
-async def _(system: hf.ActorSystem) -> None:
+async def the_window_is_exact(system: hf.ActorSystem) -> None:
     plan = Plan()
     family = await Family.start(system, plan, kid(plan, "a"), intensity=1, period=1.0)
     for _ in range(3):
@@ -146,7 +145,7 @@ async def _(system: hf.ActorSystem) -> None:
 
 
 @entry("the default intensity of a dynamic supervisor")
-async def _(system: hf.ActorSystem) -> None:
+async def one_default_intensity(system: hf.ActorSystem) -> None:
     plan = Plan()
     top = await system.start(hf.dynamic("top", restart="temporary"))
     ref = await top.ask(hf.StartChild(kid(plan, "a")))
@@ -157,7 +156,7 @@ async def _(system: hf.ActorSystem) -> None:
 
 
 @entry("a reference")
-async def _(system: hf.ActorSystem) -> None:
+async def a_ref_is_an_address(system: hf.ActorSystem) -> None:
     plan = Plan()
     family = await Family.start(system, plan, kid(plan, "a"))
     ref = family.ref("a")
@@ -190,7 +189,7 @@ class Watches(hf.Actor):
 
 
 @entry("monitors of one actor by another")
-async def _(system: hf.ActorSystem) -> None:
+async def monitors_have_the_source(system: hf.ActorSystem) -> None:
     target = system.spawn(hf.start(hf.Actor), "target")
     watcher = system.spawn(hf.start(Watches, target.path))
     await watcher.ask(Watch())
@@ -200,7 +199,7 @@ async def _(system: hf.ActorSystem) -> None:
 
 
 @entry("what is wrong with a spec")
-async def _(system: hf.ActorSystem) -> None:
+async def spec_errors_in_words(system: hf.ActorSystem) -> None:
     with pytest.raises(hf.SpecError, match="child 'a': restart must be one of permanent, transient, temporary"):
         hf.child("a", hf.start(hf.Actor), restart=cast_any("always"))
 
@@ -210,7 +209,7 @@ def cast_any(value: Any) -> Any:
 
 
 @entry("`GetChildSpec` of a supervisor in another process")
-async def _(system: hf.ActorSystem) -> None:
+async def specs_from_processes_stay_packed(system: hf.ActorSystem) -> None:
     top = await system.start(
         hf.supervisor("top", isolation="process", children=[hf.child("a", hf.start(Lingers, 0.0))])
     )
@@ -218,7 +217,7 @@ async def _(system: hf.ActorSystem) -> None:
 
 
 @entry("siblings while a `rest_for_one` retry waits for its back-off")
-async def _(system: hf.ActorSystem) -> None:
+async def siblings_wait_for_the_back_off(system: hf.ActorSystem) -> None:
     plan = Plan()
     children = [kid(plan, name, backoff=SLOW if name == "b" else None) for name in "abc"]
     family = await Family.start(system, plan, *children, strategy="rest_for_one")
@@ -228,7 +227,7 @@ async def _(system: hf.ActorSystem) -> None:
 
 
 @entry("statistics")
-async def _(system: hf.ActorSystem) -> None:
+async def statistics_of_an_address(system: hf.ActorSystem) -> None:
     plan = Plan()
     family = await Family.start(system, plan, kid(plan, "a"))
     ref = family.ref("a")
@@ -241,17 +240,18 @@ async def _(system: hf.ActorSystem) -> None:
     assert (found.messages_in, found.restarts) == (3, 1)
 
 
-VIRTUAL = [what for what in TESTS if "another process" not in what]
+REAL = ["specs_from_processes_stay_packed"]
+"""Those that start a process, and so cannot live in virtual time."""
 
 
 @pytest.mark.asyncio(loop_factories=["virtual"])
-@pytest.mark.parametrize("what", VIRTUAL)
-async def test_it_is_so(what: str) -> None:
+@pytest.mark.parametrize("name", [name for name in TESTS if name not in REAL])
+async def test_it_is_so(name: str) -> None:
     async with hf.ActorSystem(log=False) as system:
-        await TESTS[what](system)
+        await TESTS[name](system)
 
 
-@pytest.mark.parametrize("what", [what for what in TESTS if what not in VIRTUAL])
-async def test_it_is_so_in_another_process(what: str) -> None:
+@pytest.mark.parametrize("name", REAL)
+async def test_it_is_so_in_another_process(name: str) -> None:
     async with hf.ActorSystem(log=False) as system:
-        await TESTS[what](system)
+        await TESTS[name](system)

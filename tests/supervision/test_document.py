@@ -1,4 +1,4 @@
-"""The tables of docs/supervision.md against real runs: each cell is a test."""
+"""The tables of the pages on supervision against real runs: each cell is a test."""
 
 import asyncio
 import re
@@ -13,7 +13,9 @@ from tests.supervision.family import Boom, Family, Kid, Leave, Life, Plan, kid
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 
-TEXT = (Path(__file__).parents[2] / "docs" / "supervision.md").read_text("utf-8")
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = ("supervision.md", "supervision-calls.md", "supervision-recovery.md")
+TEXT = "\n".join((DOCS / page).read_text("utf-8") for page in PAGES)
 SLOW = hf.Backoff(initial=60.0, maximum=60.0, jitter=0.0)
 
 
