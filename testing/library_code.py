@@ -12,10 +12,15 @@ from typing import Final
 
 ROOMS: Final = ("actors", "checkpoint", "console", "diagnosis", "ftm", "supervision", "system", "testing")
 """The folders of the package. What else is below its root (tests, examples, environments) is not the library's."""
+MODULES: Final = ("adapters", "errors", "events")
+"""The modules beside them."""
 PREFIX: Final = __name__.partition(".")[0] + "."
 ROOT: Final = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 """Not resolved: the code of a package that is imported through a link has the link's path, as this file has."""
-FOLDERS: Final = tuple(os.path.join(ROOT, room, "") for room in ROOMS)
+PLACES: Final = (
+    *(os.path.join(ROOT, room, "") for room in ROOMS),
+    *(os.path.join(ROOT, f"{module}.py") for module in MODULES),
+)
 
 
 def is_file_of_library(file: str) -> bool:
@@ -24,7 +29,7 @@ def is_file_of_library(file: str) -> bool:
     >>> is_file_of_library(__file__), is_file_of_library(f"{ROOT}/tests/testing/test_bank.py")
     (True, False)
     """
-    return file.startswith(FOLDERS)
+    return file.startswith(PLACES)
 
 
 def is_module_of_library(name: str) -> bool:

@@ -10,7 +10,7 @@ import pytest
 
 import holdfast
 from holdfast.testing import simulate
-from holdfast.testing.library_code import ROOMS
+from holdfast.testing.library_code import MODULES, ROOMS
 from tests.testing.suites import HEAD, run_suite
 
 CHECKOUT = Path(holdfast.__file__).parent
@@ -92,4 +92,6 @@ async def test_holder(actor_system):
 def test_every_folder_of_the_package_is_the_librarys() -> None:
     loaded = {name.split(".")[1] for name in sys.modules if name.startswith("holdfast.")}
     with_modules = {file.parent.name for file in CHECKOUT.glob("*/__init__.py")}
-    assert loaded <= with_modules == set(ROOMS)
+    beside = {file.stem for file in CHECKOUT.glob("[a-z]*.py")}
+    assert (with_modules, beside) == (set(ROOMS), set(MODULES))
+    assert loaded <= with_modules | beside

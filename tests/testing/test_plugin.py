@@ -415,7 +415,7 @@ async def test_first(actor_system, probe):
 @pytest.mark.asyncio(loop_scope="{scope}")
 async def test_in_the_same_loop(actor_system, probe, actor_systems):
     await reached(actor_system, probe)
-    assert (await actor_systems("other")).node.loop is asyncio.get_running_loop()
+    assert (await actor_systems("other"))._node.loop is asyncio.get_running_loop()
 
 async def test_in_a_loop_of_its_own(actor_system, probe):
     await reached(actor_system, probe)
