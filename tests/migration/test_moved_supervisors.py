@@ -93,8 +93,7 @@ async def is_whole(system: hf.ActorSystem, at: str, homes: tuple[str, ...]) -> N
     """All of it is there and nothing of it elsewhere, in the end."""
     async with asyncio.timeout(IN_TIME):
         while True:
-            # In a process an address has no class between two lives: the last of these is said there then.
-            with contextlib.suppress(hf.NoSuchActor, hf.ActorStopped, hf.AskFailed, hf.UnknownMessage):
+            with contextlib.suppress(hf.NoSuchActor, hf.ActorStopped, hf.AskFailed):
                 told = {name: await below(system, f"/app/{name}") for name in homes}
                 if told == {name: [("team", "running")] if name == at else [] for name in homes}:
                     inner = await below(system, f"/app/{at}/team/inner")
