@@ -7,10 +7,10 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 BESIDE := $(patsubst %/,%,$(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py))))
 
 .DEFAULT_GOAL := check
-.PHONY: demo test campaign soak loaded alarms lint check bench build clean
+.PHONY: demo test campaign soak loaded alarms lint check bench build docs clean
 
 demo: $(VENV)/.demo
-	$(BIN)/holdfast demo
+	$(BIN)/python examples/programs/demo.py
 
 # The tests of one file stay in one process.
 test: $(VENV)/.dev
@@ -38,6 +38,7 @@ campaign: $(VENV)/.dev
 	    tests/faults tests/actors/process/hostile/test_fuzz.py
 	HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s tests/system/test_removed_checks.py \
 	    tests/actors/process/hostile/test_removed_claims.py
+	HOLDFAST_BUILDS=1 $(BIN)/python -m pytest -q -s tests/packaging
 	HOLDFAST_MUTANTS=100 $(BIN)/python -m pytest -q -s -o faulthandler_timeout=0 tests/test_mutants.py
 
 # Memory, descriptors, processes, threads and the store stay as they are under kills, for so many hours. See docs/testing.md.
@@ -70,13 +71,16 @@ check: lint
 bench: $(VENV)/.dev
 	@failed=0; for file in benchmarks/bench_*.py; do $(BIN)/python "$$file" || failed=1; done; exit $$failed
 
-# setuptools would ship deleted modules from a build/ left behind.
+# The same commit gives the same bytes, anywhere and at any time.
 build: $(VENV)/.dev
-	rm -rf build dist *.egg-info
-	$(BIN)/python -m build --no-isolation --outdir dist .
+	$(BIN)/python .ci/build.py dist
+
+# The book, as pages that open without a server: site/index.html.
+docs: $(VENV)/.dev .link/holdfast
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 clean:
-	rm -rf $(VENV) .venv-* .link build dist *.egg-info .coverage .coverage.* htmlcov
+	rm -rf $(VENV) .venv-* .link build dist site *.egg-info .coverage .coverage.* htmlcov
 	rm -rf .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 

@@ -1,4 +1,4 @@
-"""Who blocks the thread of an actor process: a thread that ends the process when a time limit cannot be kept.
+"""A thread that ends an actor's process when blocked code keeps its event loop from meeting a time limit.
 
 The limits of starts and stops are timers of the loop, and no timer comes while code such as `time.sleep` keeps the
 loop's thread. At the root there is nobody else who could go on; in an actor process the root starts it again.

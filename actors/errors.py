@@ -145,6 +145,13 @@ class BadMessage(SendError, text="{message} to {actor}: {problem}"):
     problem: str
 
 
+class BadReply(HoldfastError, text="a reply could not be sent, though its turn has run: {message}: {problem}"):
+    """The reply, or a field of a refusal, cannot be coded as its type says. The turn has run: do not just ask again."""
+
+    message: str
+    problem: str
+
+
 class AskDeadlock(SendError):
     """The receiver is itself waiting, directly or through others, for the asker."""
 

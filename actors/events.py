@@ -1,4 +1,4 @@
-"""What happens in a system, as typed values on one stream. Unformatted: text is made when somebody looks."""
+"""Events: what happens in a system, as typed values on one stream; text is made only when somebody reads it."""
 
 from __future__ import annotations
 
@@ -294,7 +294,7 @@ class SnapshotFailed(Event, frozen=True, eq=False):
 
 
 class StoreRefused(Event, frozen=True, eq=False):
-    """What a supervisor in another process wanted kept or erased could not be."""
+    """The store did not keep or erase something for a supervisor in another process."""
 
     reason: str
 
@@ -418,7 +418,7 @@ class EventStream:
         return self._events.popleft()
 
     def take(self) -> list[Event]:
-        """All events that wait, without waiting for more."""
+        """Return all events that wait, without waiting for more."""
         events = list(self._events)
         self._events.clear()
         return events

@@ -79,7 +79,7 @@ class Crash(ExitReason, frozen=True, eq=False):
         return f"{self.type_name}: {self.text}" if self.text else self.type_name
 
     def portable(self) -> Crash:
-        """The same reason without the exception object: what crosses a process border."""
+        """Return the same reason without the exception object: what crosses a process border."""
         return self if self.error is None else Crash(self.type_name, self.text, self.traceback)
 
 

@@ -1,4 +1,4 @@
-"""The event loop that holdfast runs on by itself: uvloop's, or asyncio's own where there is no uvloop (as on Windows).
+"""The default event loop of holdfast: uvloop where there is one, else asyncio's own (as on Windows).
 
 This module imports uvloop, which takes time and is not everywhere: import it where a loop is made, not before.
 """

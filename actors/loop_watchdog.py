@@ -1,4 +1,4 @@
-"""Who occupies the event loop: a thread that looks, now and then, at what the loop's thread is doing.
+"""A thread that looks now and then at what blocks the event loop.
 
 Nothing is measured per message: a turn that is seen twice, in the very same call, without the loop having come to
 anything else in between, has been going on all the while.

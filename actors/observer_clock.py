@@ -1,4 +1,4 @@
-"""A clock for whoever waits for others to say something: it stands still while the observer is late itself (T3)."""
+"""A clock for observers that wait for others: it stands still while the observer itself is late (T3)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What becomes of a message that comes when a mailbox is full: one rule for every mailbox, wherever it is kept."""
+"""The overflow policy of a full mailbox: one rule for every mailbox, wherever it is kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is kept of addresses beyond the lives there: how supervisors speak of it, knowing no recovery method."""
+"""The interface by which supervisors speak of state that outlives lives, without knowing any recovery method."""
 
 from __future__ import annotations
 

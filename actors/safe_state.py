@@ -1,4 +1,4 @@
-"""Safe state at its receiver: what an actor is told, and the dead man's switch of the process it lives in."""
+"""The receiving side of safe state: what an actor is told, and the dead man's switch of its process."""
 
 from __future__ import annotations
 

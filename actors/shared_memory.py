@@ -1,4 +1,4 @@
-"""Memory without a name that two processes share, and that neither can take away from the other.
+"""Anonymous memory that two processes share, and that neither can take away from the other.
 
 A mapping that reaches behind the end of its file kills whoever reads it (SIGBUS). So a file that is shared is sealed
 before it is mapped: from then on nobody can make it shorter, not even a process that still holds it and means harm.

@@ -1,4 +1,4 @@
-"""The hooks by which a user's class may say itself what its state is; without them its attributes are saved."""
+"""The hooks by which an actor class defines its own state; without them its attributes are saved."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Connections that the event loop can surely watch: each is tried before the loop has it.
+"""Makes sure that the event loop can watch a connection before the loop is given it.
 
 There may be no memory for one more, or `fs.epoll.max_user_watches` be reached. asyncio tells that to nobody who waits
 for the connection, and uvloop ends the whole program.

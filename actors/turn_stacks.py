@@ -1,4 +1,4 @@
-"""What turns wait for, as text: the stack of each one that is suspended, and of what actors do outside their turns."""
+"""Stacks of suspended turns and of background work, as text: what each of them waits for."""
 
 from __future__ import annotations
 

@@ -13,10 +13,12 @@ import resource
 import statistics
 import subprocess
 import sys
+from pathlib import Path
 
 from harness import Run, main
 
-DEMO = [sys.executable, "-c", "from holdfast.console.cli import app; app()", "demo", "--json", "--kills", "0"]
+SCRIPT = Path(__file__).resolve().parents[1] / "examples/programs/demo.py"
+DEMO = [sys.executable, str(SCRIPT), "--json", "--kills", "0"]
 
 
 def cpu_seconds(method: str) -> float:

@@ -47,7 +47,7 @@ async def os_level(run: Run) -> None:
                     echo.tell(DATA)
                     if not i % BURST:
                         await asyncio.sleep(0)
-                await system.homes.settled()
+                await system._homes.settled()
                 spent.append((time.perf_counter() - began) / count * 1e6)
                 await system.resume(echo)
                 await echo.ask(Told(), timeout=600.0)
@@ -101,7 +101,7 @@ async def os_turns(run: Run) -> None:
                     if not i % BURST:
                         await asyncio.sleep(0)
                 await echo.ask(Told(), timeout=600.0)
-                await system.homes.settled()
+                await system._homes.settled()
                 spent.append((time.perf_counter() - began) / count * 1e6)
             run.bound("a whole turn that outlives the root, pipelined", min(spent), unit="us", target=25.0)
 

@@ -42,16 +42,16 @@ from ftm_workload import Bump, Change, Count, Parts, Second, Third, Whole, is_co
 from tests.ftm import campaign as engine  # pyright: ignore[reportMissingImports]  # found by the line above
 
 STACKS: dict[str, tuple[Any, ...]] = {
-    "PBR": (hf.PBR(),),
-    "LFR": (hf.LFR(),),
-    "TR": (hf.TR(),),
-    "PBR+TR": (hf.PBR(), hf.TR()),
-    "LFR+TR": (hf.LFR(), hf.TR()),
-    "TMR": (hf.TMR(),),
-    "AD+PBR": (hf.AD(assertions=(is_counted,)), hf.PBR()),
-    "RB": (hf.RB(alternates=(Second,), test=is_counted),),
-    "NVP": (hf.NVP(versions=(Second, Third)),),
-    "SEC+PBR": (hf.SEC("/bench/ca"), hf.PBR()),
+    "PBR": (hf.ftm.PBR(),),
+    "LFR": (hf.ftm.LFR(),),
+    "TR": (hf.ftm.TR(),),
+    "PBR+TR": (hf.ftm.PBR(), hf.ftm.TR()),
+    "LFR+TR": (hf.ftm.LFR(), hf.ftm.TR()),
+    "TMR": (hf.ftm.TMR(),),
+    "AD+PBR": (hf.ftm.AD(assertions=(is_counted,)), hf.ftm.PBR()),
+    "RB": (hf.ftm.RB(alternates=(Second,), test=is_counted),),
+    "NVP": (hf.ftm.NVP(versions=(Second, Third)),),
+    "SEC+PBR": (hf.ftm.SEC("/bench/ca"), hf.ftm.PBR()),
 }
 CHANGES: dict[str, tuple[tuple[Any, ...], tuple[Any, ...]]] = {
     "PBR to LFR and back": (STACKS["PBR"], STACKS["LFR"]),
@@ -317,7 +317,7 @@ async def _transitions(first: Sequence[Any], second: Sequence[Any], count: int) 
 
             async def change(target: Sequence[Any] = target) -> None:
                 async with system.transaction(timeout=30) as steps:
-                    steps.transition(ref, tuple(target))
+                    steps.protect(ref, tuple(target))
 
             gaps.append(await _windows(clients, change))
         await clients.stop()

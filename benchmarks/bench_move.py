@@ -104,7 +104,7 @@ async def _moves(run: Run, name: str, recovery: Any) -> None:
         with system.events() as stream:
             for number in range(count):
                 await system.set_isolation(ref, "task" if number % 2 else "process", timeout=30.0)
-                pauses += [event.pause_seconds for event in stream.take() if isinstance(event, hf.Moved)]
+                pauses += [event.pause_seconds for event in stream.take() if isinstance(event, hf.events.Moved)]
         await senders.over()
         sums = await ref.ask(Sums(), 30.0)
     lost = doubled = reordered = 0

@@ -73,7 +73,7 @@ async def message_growth(run: Run) -> None:
             refs = [system.spawn(hf.start(Counter, gate, 1 + count // size)) for _ in range(size)]
             for ref in refs:  # The first message makes the queue, the first turn the context.
                 ref.tell(TICK)
-            await system.node.settled()
+            await system._node.settled()
             around, length = itertools.cycle(refs), min(size, BURST)
             bursts = [list(itertools.islice(around, length)) for _ in range(count // length)]
             began = time.perf_counter()

@@ -75,7 +75,7 @@ async def tell(system: GuardedSystem, count: int) -> float:
     for number in range(4):
         refs[2 * number].tell(Hop(count // 4, refs[2 * number + 1]))
     begin = thread_time()
-    await system.node.settled()
+    await system._node.settled()
     return count / (thread_time() - begin)
 
 

@@ -90,7 +90,7 @@ async def _measure(run: Run, isolation: Any, share: float, target: float) -> Non
                 plain.append(await _window(system, ref, cells, is_saved=False))
                 await ref.ask(Rewrite(cells), timeout=60.0)
                 saved.append(await _window(system, ref, cells, is_saved=True))
-            taken = [one for one in stream.take() if isinstance(one, hf.SnapshotTaken)]
+            taken = [one for one in stream.take() if isinstance(one, hf.events.SnapshotTaken)]
     what = f"{size // 1_000_000} MB in a {isolation}, {share:.0%} rewritten"
     run.bound(f"{what}: longest added delay", max(saved) - statistics.median(plain), unit="ms", target=target)
     run.bound(f"{what}: longest pause", max(one.pause for one in taken) * 1e3, unit="ms", target=target)

@@ -68,7 +68,7 @@ async def start_crowd(run: Run) -> None:
             began = time.perf_counter()
             for i in range(count):
                 system.spawn(hf.start(Idle), f"child{i}")
-            await system.node.settled()
+            await system._node.settled()
             return (time.perf_counter() - began) * 1e3
 
     await run.compare(f"start of {count:,} children, beside spawning them", ours, limit, unit="ms", target=1 / 3)

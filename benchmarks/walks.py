@@ -181,14 +181,64 @@ async def protect(system: hf.ActorSystem) -> Walk:
     ref = await system.start(hf.child("guarded", hf.start(Recorded), recovery=hf.hybrid()))
     await ref.ask(Fill())
 
-    def protected(mechanism: hf.PBR | None) -> Step:
+    def protected(mechanism: hf.ftm.PBR | None) -> Step:
         async def change() -> None:
             async with system.transaction(timeout=60.0) as changes:
                 changes.protect(ref, mechanism)
 
         return change
 
-    return Walk(protected(hf.PBR()), protected(None))
+    return Walk(protected(hf.ftm.PBR()), protected(None))
+
+
+async def migrate(system: hf.ActorSystem) -> Walk:
+    """A recorded actor goes from a task into a process of its own."""
+    ref = await system.start(hf.child("moved", hf.start(Recorded), recovery=hf.hybrid()))
+    await ref.ask(Fill())
+    return Walk(lambda: system.set_isolation(ref, "process"), lambda: system.set_isolation(ref, "task"))
+
+
+async def protected_ask(system: hf.ActorSystem) -> Walk:
+    """An ask to an actor behind PBR, until its reply is here."""
+    ref = await system.start(hf.child("doubled", hf.start(Recorded), mechanism=hf.ftm.PBR()))
+    return Walk(lambda: ref.ask(Fill()))
+
+
+async def failover(system: hf.ActorSystem) -> Walk:
+    """SIGKILL to the process of a primary, until the other replica has answered."""
+    ref = await system.start(hf.child("doubled", hf.start(Recorded), mechanism=hf.ftm.PBR()))
+
+    async def kill() -> None:
+        os.kill(pids[-1], signal.SIGKILL)
+        await ref.ask(Fill(), timeout=60.0)
+
+    async def rest() -> None:
+        """Let the new replica catch up, and find the one that leads now."""
+        await asyncio.sleep(2.0)
+        pids.append(await primary())
+
+    async def primary() -> int:
+        leader = (await system.protection(ref)).leader
+        return system.pid_of(system.ref(f"{ref.path}/ftm/{leader}", hf.Actor))
+
+    pids = [await primary()]
+    return Walk(kill, rest)
+
+
+async def transaction(system: hf.ActorSystem) -> Walk:
+    """A child is added and a binding made in one step."""
+    ref = await system.start(hf.supervisor("desk", children=[hf.child("kept", hf.start(Recorded))]))
+    spec = hf.child("added", hf.start(Recorded))
+
+    async def add() -> None:
+        async with system.transaction() as change:
+            change.add(ref, spec)
+
+    async def remove() -> None:
+        async with system.transaction() as change:
+            change.remove(system.ref(f"{ref.path}/added", Recorded))
+
+    return Walk(add, remove)
 
 
 WALKS: dict[str, Callable[[hf.ActorSystem], Awaitable[Walk]]] = {
@@ -196,6 +246,10 @@ WALKS: dict[str, Callable[[hf.ActorSystem], Awaitable[Walk]]] = {
     "ask to a process": ask_to_a_process,
     "recorded message to its reply": recorded_message,
     "SIGKILL to released": kill_to_released,
+    "move from a task to a process": migrate,
+    "ask behind PBR": protected_ask,
+    "SIGKILL of a primary to the next reply": failover,
+    "transaction": transaction,
     "protect": protect,
 }
 

@@ -1,1 +1,17 @@
 """Crash recovery: snapshots, journals, stores and replay."""
+
+from .home.quarantine import QuarantinedMessage
+from .recovery_file import RecoveryFile
+from .recovery_settings import Held, RecoveryHooks, RecoveryStep, SafeState, held, recovery_hooks, safe_state
+
+__all__ = [
+    "Held",
+    "QuarantinedMessage",
+    "RecoveryFile",
+    "RecoveryHooks",
+    "RecoveryStep",
+    "SafeState",
+    "held",
+    "recovery_hooks",
+    "safe_state",
+]

@@ -1,4 +1,4 @@
-"""Addresses that actors have left: where they are found now, and under which key the store has what is theirs.
+"""Addresses that actors have left: where each actor is now, and under which key the store keeps its data.
 
 What is recorded of an actor stays under the key that it was first kept under, whatever its address becomes: a move to
 another supervisor writes one note instead of a journal. Both tables are in the store, so the next root has them too:

@@ -1,4 +1,4 @@
-"""Which submission waits for what: two lanes, each in order, as data and decisions."""
+"""The two lanes of commits, each in order: which submission waits for which. Data and decisions."""
 
 from __future__ import annotations
 

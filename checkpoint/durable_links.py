@@ -1,4 +1,4 @@
-"""What a recorded actor watches and is linked to: known to its home, so that the next root has it too.
+"""The monitors and links of a recorded actor, kept by its home so that the next root ties them again.
 
 Within one root, monitors and links stand at the cells. When the root was restarted they are tied anew, each as soon as
 somebody lives at the other address again.

@@ -1,4 +1,4 @@
-"""The one place where an engine is called: whatever it raises becomes an error that the journal's callers know."""
+"""The only caller of store engines: turns whatever an engine raises into errors that callers know."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Group commit: what homes submit becomes one append per tick, and takes effect when it is as safe as it has to be.
+"""Group commit: one append per tick for all homes; each submission takes effect once it is safe enough.
 
 Two lanes, each in order. What is only to outlive this process (`durability="os"`) takes effect when it is written; what
 is to outlive the machine (`"fsync"`) when it is synced too, which a thread does for all that has gathered meanwhile.

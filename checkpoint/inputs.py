@@ -1,4 +1,4 @@
-"""What a home keeps of one actor: its inputs, its ended turns, its timers, and the batch that becomes one append."""
+"""The records a home keeps of one actor: inputs, ended turns, timers, and the batch of one append."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ class StaleEpoch(
 
 
 class DamagedStore(StoreError):
-    """What was stored cannot be trusted: `address` and `position` say where, when that is known."""
+    """The store holds something that cannot be trusted: `address` and `position` say where, when that is known."""
 
     path: str
     address: str | None

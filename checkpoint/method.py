@@ -31,14 +31,14 @@ OF_LIVES = ("name", "interval", "check_readonly", "key_variables", "origin", "st
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Method:
-    """How an actor is recovered; made by `fresh`, `checkpoint_only`, `replay_only` or `hybrid`, or by a recovery file.
+    """A recovery method; made by `fresh`, `checkpoint_only`, `replay_only` or `hybrid`, or by a recovery file.
 
     `key_variables` are those that a recovery file names, and `origin` is where it does; else the class says.
     """
 
     name: str
     interval: float = 0.0
-    max_deliveries: int = 5
+    max_deliveries: int = 3
     journal_limit: int = JOURNAL_LIMIT
     keep: int = 2
     on_escalate: OnEscalate | None = None
@@ -91,7 +91,7 @@ class Method:
         return min(self.journal_limit, self.journal_bytes or self.journal_limit)
 
     def after_escalation(self, times: int) -> OnEscalate:
-        """How an actor comes back whose supervisor has ended because of it for the `times`-th time in the window.
+        """Choose how an actor comes back that has ended its supervisor for the `times`-th time in the window.
 
         >>> [hybrid().after_escalation(times) for times in (1, 2, 3)]
         ['restore', 'older_snapshot', 'restore']
@@ -102,33 +102,33 @@ class Method:
 
     @property
     def records(self) -> bool:
-        """Whether inputs are journaled, and something comes back."""
+        """Say whether inputs are journaled, and something comes back."""
         return self.name != "fresh"
 
     @property
     def snapshots(self) -> bool:
-        """Whether the state is saved now and then."""
+        """Say whether the state is saved now and then."""
         return self.name in ("hybrid", "checkpoint_only")
 
     @property
     def replays(self) -> bool:
-        """Whether what was handled since the last snapshot is handled again."""
+        """Say whether what was handled since the last snapshot is handled again."""
         return self.name in ("hybrid", "replay_only")
 
     @property
     def speed(self) -> float:
-        """How many times faster than they came replayed inputs are fed; 0: without waiting at all."""
+        """Return how many times faster than they came replayed inputs are fed; 0: without waiting at all."""
         if self.pacing == "fast":
             return 0.0
         return 1.0 if self.pacing == "original" else float(self.pacing)
 
     def data(self) -> dict[str, Any]:
-        """What a life in another process has to know of it."""
+        """Return as plain data what a life in another process has to know of the method."""
         return {name: msgspec.to_builtins(getattr(self, name)) for name in OF_LIVES}
 
     @classmethod
     def of(cls, data: dict[str, Any]) -> Method:
-        """The method again, as far as a life has to know it."""
+        """Make the method again from its data, as far as a life has to know it."""
         return msgspec.convert(data, cls)
 
     def check(self, where: str, kind: type[Actor]) -> None:
@@ -153,14 +153,14 @@ class Method:
 
 
 def fresh() -> Method:
-    """A new life starts from nothing, as a restarted ROS node does; queued messages are kept."""
+    """Start a new life from nothing, as a restarted ROS node does; queued messages are kept."""
     return Method("fresh")
 
 
 def checkpoint_only(
     interval: float = 2.0,
     *,
-    max_deliveries: int = 5,
+    max_deliveries: int = 3,
     journal_limit: int = JOURNAL_LIMIT,
     keep: int = 2,
     on_escalate: OnEscalate | None = None,
@@ -200,7 +200,7 @@ def checkpoint_only(
 def replay_only(
     *,
     pacing: Pacing = "fast",
-    max_deliveries: int = 5,
+    max_deliveries: int = 3,
     journal_limit: int = JOURNAL_LIMIT,
     on_escalate: OnEscalate | None = None,
     skip: bool = True,
@@ -240,7 +240,7 @@ def hybrid(
     interval: float = 2.0,
     *,
     pacing: Pacing = "fast",
-    max_deliveries: int = 5,
+    max_deliveries: int = 3,
     journal_limit: int = JOURNAL_LIMIT,
     keep: int = 2,
     on_escalate: OnEscalate | None = None,

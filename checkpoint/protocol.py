@@ -1,4 +1,4 @@
-"""What a home and a recorded life say to each other, in one process or across the border of one.
+"""The records that a home and a recorded life exchange, in one process or across the border of one.
 
 The home (`home/switch.py`) numbers and journals inputs and feeds them; the life (`life/recorded_life.py`) runs one turn
 per input and reports each turn's outputs and outcome. Payloads stay encoded in between.

@@ -51,7 +51,7 @@ class RecoveryTable:
 
 
 class RecoveryFile:
-    """What a recovery file says; made by `load_recovery`."""
+    """The recovery methods that a file gives to actors; made by `load_recovery`."""
 
     def __init__(self, text: str, path: str) -> None:
         """Raises SpecError: naming file, line, table and what is wrong there."""
@@ -99,7 +99,7 @@ class RecoveryFile:
                 raise self._error(name, f"{type_name(kind)} is no actor class")
 
     def method_for(self, address: str, kind: type[Actor], given: Method | None = None) -> Method | None:
-        """How the actor at an address is recovered: as its child spec says (`given`), else as this file does.
+        """Choose how the actor at an address is recovered: as its child spec says (`given`), else as this file does.
 
         Of the tables for addresses the one that names it counts, else the first that fits; then that for the class,
         which may also add the key variables to what another place says of the method.
@@ -115,7 +115,7 @@ class RecoveryFile:
         return dataclasses.replace(method, key_variables=named.key_variables, origin=named.origin)
 
     def meet(self, address: str, kind: str) -> list[RecoveryTable]:
-        """Somebody is started: the tables that are for it, the most telling first."""
+        """Note that an actor is started; returns the tables that are for it, the most telling first."""
         names = [name for name, _ in self._addresses if name == address]
         names += [name for name, _ in self._addresses if fnmatch.fnmatchcase(address, name)]
         names += [kind] if kind in self._classes else []
@@ -125,19 +125,19 @@ class RecoveryFile:
         return [known[name] for name in names]
 
     def take_unmet(self) -> list[tuple[str, str]]:
-        """The tables that nobody has been started for up to now, and where they stand; each is given out once."""
+        """Return the tables that nobody has been started for so far, and where they stand; each is given out once."""
         unmet, self._unmet = self._unmet, {}
         return list(unmet.items())
 
     def complete(self, spec: Any, address: str) -> Any:
-        """A child spec with the recovery that this file has for it. Raises SpecError: it does not go with the class."""
+        """Add the recovery that this file has for a child spec. Raises SpecError: it does not go with the class."""
         if spec.is_supervisor:
             return spec
         recovery = self.method_for(address, spec.start.kind, spec.recovery)
         return spec if recovery == spec.recovery else dataclasses.replace(spec, recovery=recovery)
 
     def data(self) -> dict[str, str]:
-        """As another process gets it."""
+        """Return the file as plain data, for another process."""
         return {"text": self.text, "path": self.path}
 
     # -- reading it ---------------------------------------------------------------------------------------------------

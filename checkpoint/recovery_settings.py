@@ -1,4 +1,4 @@
-"""What a recovery method may say of safe state, of messages that come meanwhile, and of hooks: checked data."""
+"""Validated settings of recovery methods: safe state, held messages and hooks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HOOK_TIMEOUT = 2.0
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SafeState:
-    """Who is to be safe while an actor is recovered, and how they are told; made by `safe_state`.
+    """The actors that are to be safe while another is recovered, and how they are told; made by `safe_state`.
 
     Attributes:
         to: addresses ("/app/wheels"), and names of bindings of the recovered actor ("wheels").
@@ -37,7 +37,7 @@ class SafeState:
 
 
 def safe_state(*to: str, enter: Message[Any] | None = None, leave: Message[Any] | None = None) -> SafeState:
-    """Who is to be safe while an actor is recovered.
+    """Name the actors that are to be safe while another actor is recovered.
 
     Args:
         to: addresses such as "/app/wheels", or names of bindings of the recovered actor's class.
@@ -82,7 +82,7 @@ def as_safe_state(where: str, given: str | Sequence[str] | SafeState | None) -> 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Held:
-    """How many messages are held while an actor is recovered, and what becomes of more; made by `held`."""
+    """A limit for messages that are held while an actor is recovered, and what becomes of more; made by `held`."""
 
     capacity: int
     overflow: Overflow = "block"
@@ -119,7 +119,7 @@ def as_held(where: str, given: Held | Mapping[str, Held] | None) -> tuple[Held |
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class RecoveryStep:
-    """What a hook is told: before or after which phase of whose recovery.
+    """One step of a recovery, as a hook is told of it: before or after a phase, and whose recovery it is.
 
     Attributes:
         address: the actor that is recovered.
@@ -140,7 +140,10 @@ Hook = Callable[[RecoveryStep], Any]
 
 
 class RecoveryHooks:
-    """What is called before and after phases of recoveries; made by `recovery_hooks`. (No data: it stays here.)"""
+    """Functions that are called before and after phases of recoveries; made by `recovery_hooks`.
+
+    Functions are no data, so they stay in this process.
+    """
 
     def __init__(self, before: Mapping[Phase, Hook], after: Mapping[Phase, Hook], timeout: float) -> None:
         self._hooks: dict[tuple[str, str], Hook] = {
@@ -150,7 +153,7 @@ class RecoveryHooks:
         self.timeout = timeout
 
     def of(self, when: str, phase: str) -> Hook | None:
-        """The hook of one point."""
+        """Return the hook of one point of a recovery."""
         return self._hooks.get((when, phase))
 
     def __repr__(self) -> str:

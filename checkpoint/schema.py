@@ -1,4 +1,4 @@
-"""Which code has written what is recorded: the class of the actor, and the fields of messages, replies and refusals.
+"""The schema of recorded data: the actor's class and the fields of its messages, replies and refusals.
 
 Messages are coded by position. What the journal holds of a type can be read by a class that has the same fields in the
 same order, and perhaps more behind them, with defaults; any other class would take one field for another. So the fields

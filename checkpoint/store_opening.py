@@ -1,4 +1,4 @@
-"""Stores by name: where journals and snapshots go."""
+"""Opens the store that a name such as `sqlite:app.db` stands for."""
 
 from __future__ import annotations
 

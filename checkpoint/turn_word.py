@@ -1,4 +1,4 @@
-"""The word of a recorded life in memory that outlives its process: the input in hand, and whether its turn is at work.
+"""The word in shared memory that says which input a recorded life has in hand, and whether it is at work.
 
 A process has one thread for its turns, so that of all turns in hand at most one is at work, and the others wait for
 something. If the process dies while one is, it is that one which has ended it, as far as anybody can know. A turn is

@@ -1,1 +1,1 @@
-"""What a person sees of holdfast: the command line and the demo. The library itself never imports this folder."""
+"""What a person sees of holdfast: the command line and its demo. The library itself never imports this folder."""

@@ -1,11 +1,11 @@
-"""The `holdfast` command. What it needs beside the library comes with the extra `cli`, its demo with `demo`."""
+"""The `holdfast` command. What it needs beside the library comes with the extra `cli`."""
 
 from __future__ import annotations
 
 import sys
 
-EXTRAS = {"rich": "cli", "typer": "cli", "PIL": "demo", "numpy": "demo"}
-"""The packages of other people that the command imports, and the extra that each comes with."""
+EXTRA = {"rich", "typer"}
+"""The packages of other people that the command imports: those of the extra `cli`."""
 
 
 def app() -> None:
@@ -19,15 +19,15 @@ def app() -> None:
 
 
 def missing_extra(missing: ModuleNotFoundError) -> str:
-    """What to tell a user who lacks a package of an extra.
+    """What to tell a user who lacks a package of the extra.
 
     Raises:
-        ModuleNotFoundError: the package is of no extra; that is a fault of the installation, not a choice.
+        ModuleNotFoundError: the package is not of the extra; that is a fault of the installation, not a choice.
     """
     package = (missing.name or "").partition(".")[0]
-    if package not in EXTRAS:
+    if package not in EXTRA:
         raise missing
-    install = f"pip install 'holdfast[{EXTRAS[package]}]'"  # in quotes, for shells to which brackets mean something
+    install = "pip install 'holdfast[cli]'"  # in quotes, for shells to which brackets mean something
     return f"holdfast: this command needs the package {package!r}, which is not installed: {install}"
 
 

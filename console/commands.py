@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
-from .. import HoldfastError
+from .. import HoldfastError, run
 from . import operate
 
 commands = typer.Typer(
@@ -22,11 +21,10 @@ commands = typer.Typer(
 )
 
 DIFFERS = 1
-UNUSABLE = 2
 
 
 class RecoveryChoice(StrEnum):
-    """How a killed mapper comes back."""
+    """How a killed account comes back."""
 
     HYBRID = "hybrid"
     FRESH = "fresh"
@@ -53,36 +51,21 @@ def holdfast(
 
 @commands.command()
 def demo(
-    log: Annotated[
-        Path | None,
-        typer.Option("--log", help="A laser log: g2o text, or .zip or .gz of it. [default: MIT Killian Court]"),
-    ] = None,
-    kills: Annotated[int, typer.Option(min=0, max=1000, help="How often the mapper's process is killed.")] = 5,
-    seed: Annotated[int, typer.Option(help="Draws the moments of the kills, and the questions.")] = 7,
-    method: Annotated[RecoveryChoice, typer.Option(help="How the mapper comes back.")] = RecoveryChoice.HYBRID,
-    interval: Annotated[float, typer.Option(min=0.05, help="Seconds between two snapshots.")] = 2.0,
-    speed: Annotated[
-        float, typer.Option(min=0.0, help="Times the pace of the recording; 0: as fast as it goes.")
-    ] = 600.0,
-    picture: Annotated[Path, typer.Option(help="Where both maps are drawn.")] = Path("holdfast-demo.png"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
+    seconds: Annotated[float, typer.Option(min=0.1, max=3600.0, help="How long processes are killed.")] = 4.0,
+    method: Annotated[RecoveryChoice, typer.Option(help="How a killed account comes back.")] = RecoveryChoice.HYBRID,
+    seed: Annotated[int, typer.Option(help="Draws which process is killed, and when.")] = 7,
 ) -> None:
-    """Map a real building while the mapper's process is killed again and again; compare with an undisturbed run.
+    """Run a bank whose accounts are killed with SIGKILL again and again while their customers pay in.
 
-    Exit status 0: nothing lost, nothing doubled, the maps are equal bit by bit. 1: something differs. 2: there is
-    nothing to run on.
+    Exit status 0: every payment was answered and booked once. 1: a payment was lost or doubled.
     """
-    from .demo.demo_runs import DemoPlan
-    from .demo.log import LogError, killian_court
-    from .demo.main import run_demo
+    from .bank_demo import show_bank
 
     try:
-        plan = DemoPlan(log or killian_court(), kills, seed, method.value, interval, speed)
-        report = run_demo(plan, Console(), picture=picture, as_json=as_json)
-    except (LogError, OSError) as error:
-        raise _failed(error, UNUSABLE) from error
+        report = run(show_bank(Console(), seconds=seconds, method=method.value, seed=seed))
     except HoldfastError as error:
-        raise _failed(error, DIFFERS) from error
+        typer.echo(f"holdfast demo: {error}", err=True)
+        raise typer.Exit(DIFFERS) from error
     if not report.is_good:
         raise typer.Exit(DIFFERS)
 
@@ -90,8 +73,3 @@ def demo(
 commands.command()(operate.apply)
 commands.command()(operate.tree)
 commands.command()(operate.status)
-
-
-def _failed(error: Exception, status: int) -> typer.Exit:
-    typer.echo(f"holdfast demo: {error}", err=True)
-    return typer.Exit(status)

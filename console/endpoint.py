@@ -54,8 +54,8 @@ LONGEST = 3600.0
 """Seconds that one request may take."""
 _TREE = {"add", "remove", "move", "reorder", "strategy", "intensity", "isolation", "stop", "start"}
 _LIVING = {"bind", "unbind", "register", "unregister", "suspend", "resume", "replace_state", "replace_code"}
-OPERATIONS = frozenset(_TREE | _LIVING | {"protect", "attach", "detach", "compose", "transition", "update"})
-NAMED = {"compose": ("outside",), "transition": ("whole",), "update": ("mechanism", "role")}
+OPERATIONS = frozenset(_TREE | _LIVING | {"protect", "update"})
+NAMED = {"update": ("mechanism", "role")}
 """What comes last is named."""
 
 
@@ -313,7 +313,7 @@ class Endpoint:
     async def _control(self, request: ControlActor) -> Any:
         system, timeout = self._system, min(request.timeout, LONGEST)
         ref = system.ref(request.path, Actor)
-        with trusted_imports(system.node, Needed(request.script, request.args)):
+        with trusted_imports(system._node, Needed(request.script, request.args)):
             args = [open_arg(arg) for arg in request.args]
         value = await getattr(system, request.verb)(ref, *args, timeout=timeout)
         return str(value) if request.verb == "terminate" else value
@@ -321,7 +321,7 @@ class Endpoint:
     async def _transact(self, request: Transact) -> Any:
         timeout = min(request.timeout, LONGEST)
         everything = [arg for _, args in request.operations for arg in args]
-        with trusted_imports(self._system.node, Needed(request.script, everything)):
+        with trusted_imports(self._system._node, Needed(request.script, everything)):
             operations = [(verb, [open_arg(arg) for arg in args]) for verb, args in request.operations]
         async with self._system.transaction(dry_run=request.dry_run, timeout=timeout) as change:
             for verb, args in operations:

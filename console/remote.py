@@ -365,25 +365,9 @@ class RemoteChange:
         """Have a binding lead to nobody."""
         self._put("unbind", owner, port)
 
-    def protect(self, target: RemoteTarget, mechanism: Any) -> None:
-        """Have an actor protected by just these mechanisms, outermost first, whatever it has now; None: by none."""
-        self._put("protect", target, None if mechanism is None else in_full(mechanism))
-
-    def attach(self, target: RemoteTarget, mechanism: Any) -> None:
-        """Protect an actor by a mechanism, or by several, outermost first; a file is one of the running system's."""
-        self._put("attach", target, in_full(mechanism))
-
-    def detach(self, target: RemoteTarget, mechanism: str = "") -> None:
-        """Have it live without a mechanism."""
-        self._put("detach", target, mechanism)
-
-    def compose(self, target: RemoteTarget, mechanism: Any, *, outside: bool = False) -> None:
-        """Nest one more mechanism inside of those that it has, or outside."""
-        self._put("compose", target, in_full(mechanism), outside)
-
-    def transition(self, target: RemoteTarget, mechanism: Any, *, whole: bool = False) -> None:
-        """Put a mechanism in the place of the one of its sort, or several (or all, `whole`) in the place of all."""
-        self._put("transition", target, in_full(mechanism), whole)
+    def protect(self, target: RemoteTarget, stack: Any) -> None:
+        """Have an actor protected by just this stack; None: by none. A file is one of the running system's."""
+        self._put("protect", target, None if stack is None else in_full(stack))
 
     def update(self, target: RemoteTarget, brick: str, new: Any, *, mechanism: str = "", role: str = "") -> None:
         """Give one brick new code."""

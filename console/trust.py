@@ -1,4 +1,4 @@
-"""What a running system imports for a request: only from files that nobody else could have written, each one told."""
+"""Imports code for a request only from files that nobody else could have written, and reports each import."""
 
 from __future__ import annotations
 

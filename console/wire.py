@@ -1,4 +1,4 @@
-"""What an operator's command and a running system say to each other over the control endpoint.
+"""The protocol between an operator's command and a running system, over the control endpoint.
 
 A frame is a length, as between processes, and MessagePack. Requests are typed and bounded; what has to be rebuilt with
 its classes (child specs, functions, states) travels as packed bytes and is opened only when the request is carried out.

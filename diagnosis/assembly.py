@@ -24,7 +24,7 @@ PERIOD: Final = 60.0
 
 
 def observer(name: str, start: Start[Any]) -> ChildSpec:
-    """The spec of an observer: nobody who publishes ever waits for it, and a crash does not make it hurry.
+    """Describe an observer: nobody who publishes ever waits for it, and a crash does not make it hurry.
 
     Args:
         name: the last part of its address.
@@ -51,7 +51,7 @@ def tree(
     repairer: ChildSpec | None = None,
     others: Iterable[ChildSpec] = (),
 ) -> ChildSpec:
-    """A supervisor over the model server, the diagnoser, the observers, and whatever is to live with them.
+    """Describe a supervisor over the model server, the diagnoser, the observers, and whatever is to live with them.
 
     Args:
         model: checked here; it, and what it becomes, outlives restarts of its server.

@@ -179,7 +179,7 @@ class DiagnoserActor(Actor):
 
     @property
     def _now(self) -> float:
-        return self.ctx.cell.node.loop.time()
+        return self.ctx._cell.node.loop.time()
 
     def _due(self) -> None:
         self._changed = self._now

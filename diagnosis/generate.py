@@ -48,7 +48,7 @@ class Wired(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Generated(msgspec.Struct, frozen=True):
-    """What was found: a declaration to begin with, and how it came about.
+    """A declaration of a model to begin with, made from a running system, and how it came about.
 
     Attributes:
         declaration: each actor is a component. A topic depends on the publisher's subscriptions and, through replies
@@ -70,7 +70,7 @@ async def generate(
     """Look at a running system for a while and write down what it is made of.
 
     Args:
-        node: `system.node`.
+        node: `system._node`.
         seconds: how long to listen for publishers; one that publishes more rarely is not found.
         topics: to listen to besides those that have subscribers.
         leave_out: addresses; they and all below them are no part of the model. Diagnosis itself never is.
@@ -217,7 +217,7 @@ def _cut_circles(inputs: dict[str, list[str]], outputs: dict[str, list[str]]) ->
 def observers_for(
     generated: Generated, *, window: float = 2.0, hung_after: float | None = None, manner: Manner | None = None
 ) -> tuple[ChildSpec, ...]:
-    """An observer for all actors that were found, and one that learns its rate for each topic.
+    """Describe an observer for all actors that were found, and for each topic one that learns its rate.
 
     Args:
         generated: what was found.

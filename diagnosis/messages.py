@@ -82,7 +82,7 @@ class NextBest(Message):
 
 
 class Explained(Message):
-    """Why, in plain words, and what to look at next."""
+    """An explanation of a diagnosis in plain words, with what to look at next."""
 
     text: str
     conflicts: tuple[str, ...] = ()
@@ -103,7 +103,7 @@ class GetDiagnosis(Message[Diagnosis]):
 
 
 class GetExplanation(Message[Explained]):
-    """Why that is the diagnosis."""
+    """Ask why the diagnosis is what it is."""
 
 
 class GetObserved(Message[Observed]):

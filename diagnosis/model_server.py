@@ -63,7 +63,7 @@ class RollBackModel(Message[int]):
 
 
 class ValidateModel(Message[tuple[Finding, ...]]):
-    """What would the changes lead to? Nothing is changed.
+    """Ask what changes of the model would lead to; nothing is changed.
 
     Answered with what lint finds; refused with `ModelRefused`.
     """

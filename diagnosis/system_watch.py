@@ -30,7 +30,7 @@ class WatchedSystem(Protocol):
     """The system that is watched: an `ActorSystem`."""
 
     @property
-    def node(self) -> Node:
+    def _node(self) -> Node:
         """The node of the process in which diagnosis itself lives."""
         ...
 
@@ -56,19 +56,19 @@ class Watch:
 
     @property
     def diagnoser(self) -> ActorRef[DiagnoserActor]:
-        """Who diagnoses. Raises NoSuchActor if it does not run."""
+        """Return a ref to the actor that diagnoses. Raises NoSuchActor if it does not run."""
         return self._node.find_ref(f"{self.tree.path}/{DIAGNOSER}", DiagnoserActor)
 
     async def diagnosis(self) -> Diagnosis:
-        """The present diagnosis of the system."""
+        """Ask for the present diagnosis of the system."""
         return await self.diagnoser.ask(GetDiagnosis())
 
     async def why(self) -> Explained:
-        """Why, and what to look at next."""
+        """Ask why the diagnosis is what it is, and what to look at next."""
         return await self.diagnoser.ask(GetExplanation())
 
     async def observed(self) -> Observed:
-        """What is observed of the system at the moment."""
+        """Ask for all that is observed of the system at the moment."""
         return await self.diagnoser.ask(GetObserved())
 
 
@@ -114,7 +114,7 @@ async def watch(
     Raises:
         ModelError: something is wrong with the model. StartFailed, AlreadyStarted: see `ActorSystem.start`.
     """
-    generated = await generate(system.node, seconds=seconds) if model is None else None
+    generated = await generate(system._node, seconds=seconds) if model is None else None
     watchers = [*observers]
     if generated is not None:
         declaration = generated.declaration
@@ -131,13 +131,13 @@ async def watch(
     mend = None
     if repair is not False:
         policy = None if repair is True else repair
-        mend = repairer(declaration, _actions(system.node, where, actions), policy, addresses=where)
+        mend = repairer(declaration, _actions(system._node, where, actions), policy, addresses=where)
     started = await system.start(tree(History(declaration), watchers, name=name, repairer=mend, **options))
-    return Watch(started, system.node, where, generated)
+    return Watch(started, system._node, where, generated)
 
 
 def expecting(declaration: Declaration, limits: LimitsOf) -> Declaration:
-    """The declaration, where properties of components are expected to be within limits."""
+    """Return the declaration again, with limits that properties of components are expected to keep."""
     atoms = [(component, str(ok(_property(component, one)))) for component, some in limits.items() for one in some]
     more = tuple(Expectation(atom, (component,)) for component, atom in atoms)
     return msgspec.structs.replace(declaration, expectations=(*declaration.expectations, *more))
@@ -146,7 +146,7 @@ def expecting(declaration: Declaration, limits: LimitsOf) -> Declaration:
 def property_observers(
     limits: LimitsOf, addresses: Mapping[str, str], manner: Manner | None = None
 ) -> Iterable[ChildSpec]:
-    """An observer for each component with limits. Raises KeyError: a component without an address."""
+    """Describe an observer for each component with limits. Raises KeyError: a component without an address."""
     for component, some in limits.items():
         bounds = tuple(Bound(ok(_property(component, one)), one, good) for one, good in some.items())
         start = Start(PropertyObserver, (addresses[component], bounds), {"manner": manner})

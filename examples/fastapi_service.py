@@ -48,7 +48,7 @@ class State(TypedDict):
     """What each request finds in `request.state`."""
 
     office: hf.ActorRef[BoxOffice]
-    threads: hf.ThreadPortal
+    threads: hf.system.ThreadPortal
 
 
 @asynccontextmanager

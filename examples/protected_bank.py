@@ -45,23 +45,23 @@ async def customer(bank: hf.ActorRef[Bank], closing: asyncio.Event) -> int:
 async def main() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         events = system.events()
-        bank = await system.start(hf.child("bank", hf.start(Bank), mechanism=hf.PBR()))
+        bank = await system.start(hf.child("bank", hf.start(Bank), mechanism=hf.ftm.PBR()))
         closing = asyncio.Event()
         customers = [asyncio.create_task(customer(bank, closing)) for _ in range(4)]
 
         primary = system.ref("/app/bank/ftm/r1", hf.Actor)
         os.kill(system.pid_of(primary), signal.SIGKILL)
         async for event in events:
-            if isinstance(event, hf.FailedOver):
+            if isinstance(event, hf.events.FailedOver):
                 print(event.replica, event.epoch)  # r2 2
                 break
 
         async with system.transaction() as change:
-            change.transition(bank, hf.LFR())  # two compute instead of one
+            change.protect(bank, hf.ftm.LFR())  # two compute instead of one
         async with system.transaction() as change:
-            change.transition(bank, hf.compose(hf.PBR(), hf.TR()))  # each request twice, against transient faults
+            change.protect(bank, (hf.ftm.PBR(), hf.ftm.TR()))  # each request twice, against transient faults
         async with system.transaction() as change:
-            change.detach(bank)  # a plain task again; it never stopped
+            change.protect(bank, None)  # a plain task again; it never stopped
 
         closing.set()
         asked = sum(await asyncio.gather(*customers))

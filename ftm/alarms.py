@@ -1,4 +1,4 @@
-"""What replicas tell of their protection, as events; `address` is the protected actor's."""
+"""Events by which replicas report on their protection; `address` is the protected actor's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happens to protected addresses, as events; `address` is the protected actor's."""
+"""Events of protected addresses; `address` is the protected actor's."""
 
 from __future__ import annotations
 

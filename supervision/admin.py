@@ -1,4 +1,4 @@
-"""Administration: the messages that a supervisor answers, and how it says no."""
+"""Administration: the messages that a supervisor answers, and its refusals."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class MaxChildren(Refusal):
 
 
 class NotSupported(Refusal):
-    """This kind of supervisor does not do that; `why` says what to do instead."""
+    """A supervisor of this kind does not do that; `why` says what to do instead."""
 
     why: str
 
@@ -199,7 +199,7 @@ class WhichChildren(Message[list[ChildInfo]]):
 
 
 class ChildCounts(Message[None]):
-    """How many specs there are, how many of them run, and how many are supervisors and workers, running or not."""
+    """The number of specs, how many of them run, and how many are supervisors and workers, running or not."""
 
     specs: int
     active: int
@@ -208,7 +208,7 @@ class ChildCounts(Message[None]):
 
 
 class CountChildren(Message[ChildCounts]):
-    """How many children there are."""
+    """Ask a supervisor how many children it has."""
 
 
 class GetChildSpec(Message[Any]):

@@ -1,4 +1,4 @@
-"""The arbiter: an actor is in the hands of its supervisor, of failover, or of repair, never of two (T63).
+"""The arbiter: grants an actor to its supervisor, to failover or to repair, never to two of them (T63).
 
 Failover goes first, then the supervisor, then repair. Failover and repair ask for a *grant* before they touch an actor
 or a subtree, and give it back; a supervisor asks nobody: while it restarts a child, that child is its own. A grant has

@@ -1,4 +1,4 @@
-"""Children whose specs bind them to somebody who is being started: they wait, and find out whether that can ever be.
+"""Children that are bound to somebody who is still starting: they wait, and circles are found.
 
 Whoever waits keeps those waiting that are started behind it. If that leads back to itself, nobody in the circle can be
 up before another one is: it is told as an error, which names them all.

@@ -25,12 +25,12 @@ START = ("start", "args", "kwargs")
 
 
 def tree_from(mapping: Mapping[str, Any], where: str = "tree") -> ChildSpec:
-    """A supervisor spec from plain data, such as parsed TOML, JSON or YAML.
+    """Make a supervisor spec from plain data, such as parsed TOML, JSON or YAML.
 
     A table is a child (`id`, `start = "package.module:Class"`, `args`, `kwargs`, and the options of `child`), or a
     supervisor (`name`, `children` and the options of `supervisor`; with `kind = "dynamic"` or `"partitions"` those of
     `dynamic` and `partitions`, whose `template` and `copy` are tables too). `recovery` is a table with `use`, the name
-    of a method such as `"holdfast:hybrid"`, and its options; `mechanism` is one with `use` = `"holdfast:PBR"`, or a
+    of a method such as `"holdfast:hybrid"`, and its options; `mechanism` is one with `use` = `"holdfast.ftm:PBR"`, or a
     list of such, outermost first.
 
     Args:
@@ -53,7 +53,7 @@ def tree_from(mapping: Mapping[str, Any], where: str = "tree") -> ChildSpec:
 
 
 def load_tree(path: str | Path) -> ChildSpec:
-    """A supervisor spec from a TOML file; see `tree_from`.
+    """Read a supervisor spec from a TOML file; see `tree_from`.
 
     Raises:
         SpecError: naming file and place, and what is wrong there. OSError: the file cannot be read.

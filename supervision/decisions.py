@@ -1,4 +1,4 @@
-"""What a supervisor decides, as pure functions."""
+"""The decisions of a supervisor, as pure functions."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ class DynamicSupervisor(Supervisor):
 
     async def _start_all(self) -> None:
         """Start empty, or with the children that were there before, if there is a journal of them."""
-        node, where = self.ctx.cell.node, child_key(self.ctx.path, "")
+        node, where = self.ctx._cell.node, child_key(self.ctx.path, "")
         noted: list[Child] = []
         for key, data in node.ports.keeper.notes(where).items():
             name = key.removeprefix(where)
@@ -82,13 +82,13 @@ class DynamicSupervisor(Supervisor):
         path = f"{self.ctx.path}/{name}"
         try:
             await self._erase_below(path)
-            self.ctx.cell.node.ports.keeper.note(child_key(self.ctx.path, name), None)
+            self.ctx._cell.node.ports.keeper.note(child_key(self.ctx.path, name), None)
         except HoldfastError as error:  # It is tried again at our next start.
-            self.ctx.cell.node.emit(StoreRefused(path, str(error)))
+            self.ctx._cell.node.emit(StoreRefused(path, str(error)))
 
     async def _erase_below(self, path: str) -> None:
         """Forget what was recorded at an address and below it. Raises HoldfastError if the store refuses."""
-        erased = self.ctx.cell.node.ports.keeper.erase(path, below=True)
+        erased = self.ctx._cell.node.ports.keeper.erase(path, below=True)
         if erased is not None:
             await erased
 
@@ -111,7 +111,7 @@ class DynamicSupervisor(Supervisor):
 
     def _note(self, one: Child, spec: ChildSpec) -> None:
         """Note what becomes of a child when we are started again. Raises HoldfastError if that cannot be."""
-        key, keeper = child_key(self.ctx.path, one.spec.id), self.ctx.cell.node.ports.keeper
+        key, keeper = child_key(self.ctx.path, one.spec.id), self.ctx._cell.node.ports.keeper
         if self._flags.journal:
             given = spec if self._template is None else (*_added(self._template, spec), spec.made_up)
             keeper.note(key, pack_data(given, f"child {one.spec.id!r}"))
@@ -120,9 +120,9 @@ class DynamicSupervisor(Supervisor):
 
     def _give_away(self, name: str) -> Child:
         one = super()._give_away(name)
-        if has_stood_down(self.ctx.cell):
+        if has_stood_down(self.ctx._cell):
             return one  # Whoever takes our place comes to what is noted.
-        self._try_to_note(one, lambda: self.ctx.cell.node.ports.keeper.note(child_key(self.ctx.path, name), None))
+        self._try_to_note(one, lambda: self.ctx._cell.node.ports.keeper.note(child_key(self.ctx.path, name), None))
         return one
 
     def _welcome(self, one: Child) -> None:
@@ -139,18 +139,18 @@ class DynamicSupervisor(Supervisor):
         try:
             note()
         except HoldfastError as error:
-            self.ctx.cell.node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
+            self.ctx._cell.node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
 
     def _is_recorded(self, one: Child) -> bool:
         """Whether something may be recorded of a child, or below it."""
-        spec = complete(self.ctx.cell, one.spec)
+        spec = complete(self.ctx._cell, one.spec)
         return spec.has_home or spec.is_supervisor
 
     def _forget(self, one: Child) -> None:
         super()._forget(one)
         if not self._is_in_place:
             return
-        node, key = self.ctx.cell.node, child_key(self.ctx.path, one.spec.id)
+        node, key = self.ctx._cell.node, child_key(self.ctx.path, one.spec.id)
         is_lost = one.spec.made_up and self._is_recorded(one)  # Nobody starts an id again that was made up.
         if self._flags.journal:
             try:
@@ -182,7 +182,7 @@ class DynamicSupervisor(Supervisor):
     # -- starting ---------------------------------------------------------------------------------------------------
 
     def _spec_in(self, message: StartChild) -> ChildSpec:
-        own = self.ctx.cell
+        own = self.ctx._cell
         given = opened(message.spec, own.node)
         if message.candidate and isinstance(given, ChildSpec):  # It may be the child of another one that we shall have.
             spec = given
@@ -216,14 +216,14 @@ class DynamicSupervisor(Supervisor):
             self._count += 1
             name = f"{prefix}-{self._count}"
             # Whoever had it once may be recorded, and is not to come back as somebody else.
-            is_known = self.ctx.cell.node.ports.keeper.knows(f"{self.ctx.path}/{name}")
-            if not is_known and name not in self._children and name not in (self.ctx.cell.children or ()):
+            is_known = self.ctx._cell.node.ports.keeper.knows(f"{self.ctx.path}/{name}")
+            if not is_known and name not in self._children and name not in (self.ctx._cell.children or ()):
                 return name
 
     def _check_free(self, spec: ChildSpec) -> None:
         known = self._children.get(spec.id)
         if known is not None:
-            raise AlreadyStarted(spec.id, self.ctx.cell.node.cell_at(f"{self.ctx.path}/{spec.id}").ref)
+            raise AlreadyStarted(spec.id, self.ctx._cell.node.cell_at(f"{self.ctx.path}/{spec.id}").ref)
         most = self._flags.max_children
         if most is not None and len(self._children) >= most:
             raise MaxChildren(most)
@@ -238,7 +238,7 @@ class DynamicSupervisor(Supervisor):
         """We end: all children are told at once, and each has the time its spec gives it."""
         for one in list(self._listed().values()):
             self._has_ended(one)
-        await stop_together(list((self.ctx.cell.children or {}).values()))
+        await stop_together(list((self.ctx._cell.children or {}).values()))
 
     # -- what makes no sense here -----------------------------------------------------------------------------------
 
@@ -253,8 +253,8 @@ class DynamicSupervisor(Supervisor):
     @on(DeleteChild)
     def _delete_child(self, message: DeleteChild) -> Any:
         """A stopped child is forgotten here by itself; what was recorded of it is forgotten now."""
-        path, keeper = f"{self.ctx.path}/{message.id}", self.ctx.cell.node.ports.keeper
-        is_there = message.id in self._children or message.id in (self.ctx.cell.children or ())
+        path, keeper = f"{self.ctx.path}/{message.id}", self.ctx._cell.node.ports.keeper
+        is_there = message.id in self._children or message.id in (self.ctx._cell.children or ())
         if not is_there and "/" not in message.id and message.erase and keeper.knows(path):
             return self._answered(self._erase_below(path))  # If the store refuses, it can be deleted again.
         self._child(message.id)
@@ -348,7 +348,7 @@ def dynamic(
     significant: bool = False,
     rules: tuple[Rule, ...] = (),
 ) -> ChildSpec:
-    """A supervisor that starts empty and takes children by `StartChild`, as a spec.
+    """Describe a supervisor that starts empty and takes children by `StartChild`, as a spec.
 
     Args:
         name: the last part of its address.

@@ -1,4 +1,4 @@
-"""Errands: what a supervisor does that has to wait for others. No wait is in a turn of its own.
+"""Errands: the waiting work of a supervisor, as coroutines stepped in its turns; no turn ever waits.
 
 An errand is written as a coroutine. It is stepped in turns of the actor; where it waits, that turn ends, and when what
 it waits for has come, the rest is another item in the actor's mailbox. So the actor answers, and can be stopped, while
@@ -41,12 +41,12 @@ class Errand(Item):
             self.is_over = True
             raise
         awaited._asyncio_future_blocking = False  # As a task would: we do wait for it.
-        self._ctx.cell.node.errand_waits()
+        self._ctx._cell.node.errand_waits()
         awaited.add_done_callback(self._woken)
 
     def _woken(self, awaited: asyncio.Future[Any]) -> None:
-        cell = self._ctx.cell
-        if not self._ctx.closed:
+        cell = self._ctx._cell
+        if not self._ctx._closed:
             (cell.urge if self.is_urgent else cell.push)(self)
         cell.node.errand_goes_on()
 
@@ -57,21 +57,21 @@ class Errand(Item):
         except BaseException as error:
             if item._first is None:
                 raise
-            lifecycle.crash(item._ctx.cell, item._first, error)  # It is the start of this life that has failed.
+            lifecycle.crash(item._ctx._cell, item._first, error)  # It is the start of this life that has failed.
             return LEAVE
         if item.is_over and item._first is not None:
-            lifecycle.came_up(item._ctx.cell)
+            lifecycle.came_up(item._ctx._cell)
         return None
 
 
 async def answered(ctx: ActorContext, handle: ReplyHandle[Any], work: Coroutine[Any, Any, Any]) -> None:
     """Do what was asked for, and answer: an error is the caller's business, not our crash."""
-    item = ctx.item
+    item = ctx._item
     try:
         reply = await work
     except Refusal as no:
         if handle.ask is None:
-            ctx.cell.node.refused(ctx.cell, item, no)
+            ctx._cell.node.refused(ctx._cell, item, no)
         else:
             handle.ask.fail(no)
     except HoldfastError as error:

@@ -1,4 +1,4 @@
-"""What a supervisor says of its children without doing anything to them."""
+"""Answers to questions about a supervisor's children, which change nothing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Inquiries(Actor):
     def _get_child_spec(self, message: GetChildSpec) -> Any:
         """Find the spec of one child."""
         spec = self._child(message.id).spec
-        return spec if self.ctx.cell.node.ports.uplink is None else Boxed(spec)
+        return spec if self.ctx._cell.node.ports.uplink is None else Boxed(spec)
 
     def _child(self, name: str) -> Child:
         one = self._children.get(name)

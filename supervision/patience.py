@@ -1,4 +1,4 @@
-"""How long an end may take at most: of a child its own `shutdown`, of a supervisor all that its children may take."""
+"""Time limits of stops: a child's own `shutdown`; for a supervisor, what its children may take."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A child's recipe or place, replaced at run time: no restart, not even of its supervisors, brings the old one back."""
+"""Replaces a child's recipe or place at run time, so that no restart brings the old one back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Restart rules: what follows from an end when its reason says more than the restart type."""
+"""Restart rules: what follows from an end when its reason decides instead of the restart type."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class Rule:
     action: Action
 
     def fits(self, reason: ExitReason) -> bool:
-        """Whether the rule is about this end."""
+        """Say whether the rule is about this end."""
         if isinstance(self.reason, ExitReason):
             return self.reason == reason
         return any(self.reason in (name, name.rpartition(".")[2]) for name in names_of(reason))
 
 
 def rule(reason: ExitReason | type[ExitReason] | type[BaseException] | str, action: Action) -> Rule:
-    """A restart rule for a child spec; of several the first that fits decides, then the restart type.
+    """Make a restart rule for a child spec; of several the first that fits decides, then the restart type.
 
     Args:
         reason: an exit reason (`hf.Signal(9)`), a class of them (`hf.Signal`), an exception class (it stands for the

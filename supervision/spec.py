@@ -6,7 +6,7 @@ import asyncio
 import dataclasses
 import inspect
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Generic, Literal, TypeGuard, get_args
+from typing import Any, Generic, Literal, Protocol, TypeGuard, get_args
 
 from typing_extensions import TypeVar
 
@@ -34,6 +34,21 @@ AutoShutdown = Literal["never", "any_significant", "all_significant"]
 Isolation = Literal["task", "process"]
 Shutdown = float | Literal["brutal_kill", "infinity"]
 StartTimeout = float | Literal["infinity"]
+
+
+class Recovers(Protocol):
+    """What a child spec asks of a recovery method, such as `hybrid()`."""
+
+    def check(self, where: str, kind: type[Actor]) -> None:
+        """Refuse a class that cannot be recovered so."""
+
+
+class Protects(Protocol):
+    """What a child spec asks of a fault-tolerance mechanism, such as `PBR()`."""
+
+    def check(self, kind: type[Actor], where: str) -> None:
+        """Refuse a class that cannot be protected so."""
+
 
 NAMELESS = "*"
 """The id of a spec without one: a dynamic supervisor makes one up at each start."""
@@ -157,15 +172,15 @@ class ChildSpec(Generic[A_co]):
 
     @property
     def has_home(self) -> bool:
-        """Whether what is sent to it waits outside of its lives, so that its starts may take their time."""
+        """Say whether what is sent to the child waits outside of its lives, so that its starts may take their time."""
         return self.recovery is not None or self.mechanism is not None
 
     def below(self) -> Iterator[ChildSpec]:
-        """The children that the spec of a supervisor names, its template among them."""
+        """Yield the children that the spec of a supervisor names, its template among them."""
         return _specs_in((*self.start.args, *self.start.kwargs.values()))
 
     def restarts(self, reason: ExitReason) -> bool:
-        """Whether an end by itself for this reason is followed by another life."""
+        """Say whether an end by itself for this reason is followed by another life."""
         return decide(self.restart, self.rules, reason) == "restart"
 
     async def stop(self, cell: Cell, reason: ExitReason = SHUTDOWN) -> ExitReason:
@@ -219,18 +234,18 @@ def child(
     restart: Restart = "permanent",
     shutdown: Shutdown | None = None,
     isolation: Isolation = "task",
-    recovery: Any = None,
+    recovery: Recovers | None = None,
     mailbox: Bounded | None = None,
     backoff: Backoff | None = None,
     limits: Limits | None = None,
     bindings: Mapping[str, str] | None = None,
     significant: bool = False,
     rules: Iterable[Rule] = (),
-    mechanism: Any = None,
+    mechanism: Protects | tuple[Protects, ...] | None = None,
     start_timeout: StartTimeout | None = None,
     autostart: bool = True,
 ) -> ChildSpec[A]:
-    """A child spec.
+    """Describe one child of a supervisor: how it starts, lives, comes back, and is stopped.
 
     Args:
         id: the last part of the address, unique among siblings; None lets a dynamic supervisor make one up.
@@ -284,7 +299,7 @@ def child(
 
 @dataclasses.dataclass(frozen=True, slots=True, init=False)
 class Plan:
-    """What a supervisor's `init` returns: its children in start order, and its flags. Checked when it is made.
+    """The children of a supervisor in start order, and its flags: its `init` returns them. Checked when it is made.
 
     Raises:
         SpecError: naming the option, or the child, and what it may be.
@@ -310,7 +325,7 @@ class Plan:
 
     @classmethod
     def of(cls, flags: Flags, children: Iterable[ChildSpec]) -> Plan:
-        """A plan from flags that are there already."""
+        """Make a plan from flags that are there already."""
         return cls(children, **{field.name: getattr(flags, field.name) for field in dataclasses.fields(flags)})
 
 

@@ -130,7 +130,7 @@ class Supervisor(Inquiries):
         we answer meanwhile.
         """
         self.ctx.trap_exits = True  # Only our own parent can end us: the end of a stranger that is linked is no order.
-        start = self.ctx.cell.extra().start
+        start = self.ctx._cell.extra().start
         if start is None or start.begins_with is None:
             self._begin(new_plan(self))
             work = self._start_all()
@@ -140,7 +140,7 @@ class Supervisor(Inquiries):
             Supervisor._begin(self, Plan.of(flags, children))
             self._inherit({})
             work = self._start_listed()
-        self._first = self._errand(self._come_all_up(work), self.ctx.item)
+        self._first = self._errand(self._come_all_up(work), self.ctx._item)
 
     def _begin(self, plan: Plan) -> None:
         """Take up the plan of this start."""
@@ -158,7 +158,7 @@ class Supervisor(Inquiries):
         """The errand of our own start."""
         await work
         for early in self._early:
-            self.ctx.cell.push(early)
+            self.ctx._cell.push(early)
         self._early.clear()
 
     async def _start_all(self) -> None:
@@ -213,8 +213,9 @@ class Supervisor(Inquiries):
             return None
         self._is_up(one)
         cell = one.cell
-        if cell is not None and cell.state is DOWN:  # It ended before we heard that it was up: its end in our queue
-            self.ctx.cell.push(lifecycle.ChildExit(cell, cell.life, cell.extra().reason))  # may be passed over already.
+        if cell is not None and cell.state is DOWN:
+            # It ended before we heard that it was up: its end in our queue may be passed over already.
+            self.ctx._cell.push(lifecycle.ChildExit(cell, cell.life, cell.extra().reason))
         return True
 
     async def _await_bound(self, row: StartRow, one: Child) -> None:
@@ -225,8 +226,8 @@ class Supervisor(Inquiries):
         """
         if one.cell is not None and one.cell.state is not GONE:
             return  # It has been bound: the address is there since.
-        loop, who, seconds = self.ctx.cell.node.loop, self._path_of(one), one.spec.start_timeout or "infinity"
-        prospects, since = Prospects(self.ctx.cell.node, listed_at), loop.time()
+        loop, who, seconds = self.ctx._cell.node.loop, self._path_of(one), one.spec.start_timeout or "infinity"
+        prospects, since = Prospects(self.ctx._cell.node, listed_at), loop.time()
         try:
             while one.row is row and (missing := prospects.missing(who, one)):
                 if not isinstance(seconds, str) and loop.time() - since >= seconds:
@@ -247,7 +248,7 @@ class Supervisor(Inquiries):
         try:
             await up
         except asyncio.CancelledError as error:
-            turn = self.ctx.cell.extra().turn
+            turn = self.ctx._cell.extra().turn
             if turn is not None and turn.killed:
                 raise  # It is our own turn that is killed.
             why = limit.told if limit.is_over else "it was killed while it started"
@@ -273,7 +274,7 @@ class Supervisor(Inquiries):
         """
         cell = one.cell
         if cell is None or cell.state is GONE:
-            cell = one.cell = new_cell(self.ctx.cell, one)
+            cell = one.cell = new_cell(self.ctx._cell, one)
             one.ignored_life = 0  # A new address counts its lives anew.
         seconds = one.spec.start_timeout or "infinity"
         if isinstance(seconds, str):
@@ -289,13 +290,13 @@ class Supervisor(Inquiries):
         self._parked.discard(one.spec.id)
         self._dismissed.pop(one.spec.id, None)
         one.row = None
-        one.up_since = self.ctx.cell.node.loop.time()
+        one.up_since = self.ctx._cell.node.loop.time()
 
     def _start_failed(self, one: Child, error: HoldfastError) -> None:
         one.state, one.row = STOPPED, None
         if one.cell is not None:
             one.ignored_life = one.cell.life
-        node = self.ctx.cell.node
+        node = self.ctx._cell.node
         if node.events.has_listeners:
             reason = error.reason if isinstance(error, StartFailed) else str(error)
             node.emit(ChildStartFailed(self._path_of(one), reason))
@@ -312,7 +313,7 @@ class Supervisor(Inquiries):
     def child_exited(self, cell: Cell, life: int, reason: ExitReason) -> None:
         """Decide what follows from the end of a child's life (called by the loop, in a turn of ours)."""
         one = self._children.get(cell.name)
-        if cell.parent is not self.ctx.cell and cell.parent is not None:
+        if cell.parent is not self.ctx._cell and cell.parent is not None:
             cell.parent.push(lifecycle.ChildExit(cell, life, reason))  # It was moved since: another one decides.
             return
         if one is None or one.cell is not cell:
@@ -350,12 +351,12 @@ class Supervisor(Inquiries):
 
     def _has_lost(self, one: Child) -> bool:
         """Whether another supervisor has this child now, and its life goes on."""
-        return one.cell is not None and one.cell.parent is not self.ctx.cell
+        return one.cell is not None and one.cell.parent is not self.ctx._cell
 
     def _report_end(self, one: Child, life: int, reason: ExitReason) -> None:
         """Tell that a child has ended without having been told to."""
         one.ignored_life = life
-        node = self.ctx.cell.node
+        node = self.ctx._cell.node
         if node.events.has_listeners and is_reported(one.spec.restart, reason):
             allowed, period = self._flags.intensity, self._flags.period
             restarts = len(recent_restarts(self._restarts, node.loop.time(), period))
@@ -387,14 +388,14 @@ class Supervisor(Inquiries):
         left = (other.spec.significant and other.state != STOPPED for other in self._children.values())
         if flags.auto_shutdown == "all_significant" and any(left):
             return
-        self.ctx.cell.node.emit(AutoShutdown(self.ctx.path, one.spec.id, reason))
+        self.ctx._cell.node.emit(AutoShutdown(self.ctx.path, one.spec.id, reason))
         self.ctx.stop(SHUTDOWN)
 
     def _later(self, one: Child, reason: ExitReason) -> None:
         """Restart after the back-off; meanwhile everybody else is served."""
         backoff = one.spec.backoff
         assert backoff is not None
-        loop = self.ctx.cell.node.loop
+        loop = self.ctx._cell.node.loop
         if one.state == UP and loop.time() - one.up_since >= backoff.reset_after:
             one.attempts = 0
         delay = backoff.delay(one.attempts, self.ctx.random)
@@ -404,8 +405,8 @@ class Supervisor(Inquiries):
         loop.call_later(delay, self._post, Retry(one, one.retry, reason))
 
     def _post(self, item: Item) -> None:
-        if not self.ctx.closed:
-            self.ctx.cell.push(item)
+        if not self.ctx._closed:
+            self.ctx._cell.push(item)
 
     def _retry(self, one: Child, number: int, reason: ExitReason) -> None:
         """A restart is due, unless the child was stopped or started meanwhile."""
@@ -415,7 +416,7 @@ class Supervisor(Inquiries):
 
     def _restart(self, one: Child, reason: ExitReason) -> None:
         """One attempt by the strategy, counted; gives up when there were too many."""
-        node, flags = self.ctx.cell.node, self._flags
+        node, flags = self.ctx._cell.node, self._flags
         window = admit_restart(self._restarts, node.loop.time(), intensity=flags.intensity, period=flags.period)
         if window is None:
             self._give_up(one, reason, SHUTDOWN)
@@ -438,14 +439,14 @@ class Supervisor(Inquiries):
         """We end: too many restarts, or a rule says that this end is one for whoever is above us."""
         one.state = STOPPED
         self._blame(one)
-        node = self.ctx.cell.node
+        node = self.ctx._cell.node
         node.gave_up = SupervisorGaveUp(self.ctx.path, one.spec.id, reason)
         node.emit(node.gave_up)
         self.ctx.stop(told)
 
     def _blame(self, one: Child) -> None:
         """We end because of this child."""
-        self.ctx.cell.node.ports.keeper.blame(self._path_of(one))
+        self.ctx._cell.node.ports.keeper.blame(self._path_of(one))
 
     def _path_of(self, one: Child) -> str:
         return f"{self.ctx.path}/{one.spec.id}"
@@ -454,9 +455,9 @@ class Supervisor(Inquiries):
         """Forget what was recorded of a child that does not run. Raises HoldfastError if the store refuses."""
         if one.cell is not None:
             lifecycle.retire(one.cell, "it begins afresh")
-        one.spec = complete(self.ctx.cell, one.spec)
+        one.spec = complete(self.ctx._cell, one.spec)
         if one.spec.is_supervisor or one.spec.has_home:
-            keeper = self.ctx.cell.node.ports.keeper
+            keeper = self.ctx._cell.node.ports.keeper
             erased = keeper.erase(self._path_of(one), below=one.spec.is_supervisor)
             if erased is not None:
                 await erased
@@ -487,7 +488,7 @@ class Supervisor(Inquiries):
             self._later(one, reason)
             return
         one.retry += 1
-        self.ctx.cell.push(Retry(one, one.retry, reason))  # Through our own mailbox: we answer in between.
+        self.ctx._cell.push(Retry(one, one.retry, reason))  # Through our own mailbox: we answer in between.
 
     # -- stopping ---------------------------------------------------------------------------------------------------
 
@@ -516,7 +517,7 @@ class Supervisor(Inquiries):
 
     async def _stop_children(self) -> None:
         """We end: the children go in reverse start order, which need not be the order in which their addresses came."""
-        below = list((self.ctx.cell.children or {}).values())
+        below = list((self.ctx._cell.children or {}).values())
         children = self._listed()
         living = set(below)
         ours = [one for one in children.values() if one.cell is not None and one.cell in living]
@@ -526,7 +527,7 @@ class Supervisor(Inquiries):
             child = cell if one is None or one.cell is None else one.cell
             if one is not None:
                 self._has_ended(one)
-            if child.parent is self.ctx.cell:  # Else it was given to another supervisor while we stopped others.
+            if child.parent is self.ctx._cell:  # Else it was given to another supervisor while we stopped others.
                 await child.node.stop_child(child)
 
     def _is_parked(self, name: str) -> bool:
@@ -615,7 +616,7 @@ class Supervisor(Inquiries):
 
     def _spec_in(self, message: StartChild) -> ChildSpec:
         """The spec that a StartChild means, if we can take it."""
-        own = self.ctx.cell
+        own = self.ctx._cell
         spec = opened(message.spec, own.node)
         if not isinstance(spec, ChildSpec):
             raise SpecError("StartChild", f"takes child(...) or supervisor(...), not {spec!r}")
@@ -690,7 +691,7 @@ class Supervisor(Inquiries):
         problem: HoldfastError | None = None
         if message.older:
             try:
-                rolled_back = self.ctx.cell.node.ports.keeper.roll_back(self._path_of(one), "it was asked for")
+                rolled_back = self.ctx._cell.node.ports.keeper.roll_back(self._path_of(one), "it was asked for")
                 if rolled_back is not None:
                     await rolled_back
             except HoldfastError as error:
@@ -752,7 +753,7 @@ class Supervisor(Inquiries):
             if one.state == RESTARTING and one.due is not None and one.hurried != attempt:
                 one.hurried = attempt
                 one.retry += 1
-                self.ctx.cell.push(Retry(one, one.retry, one.due))
+                self.ctx._cell.push(Retry(one, one.retry, one.due))
 
     def _why_occupied(self) -> str:
         return why_occupied(self)

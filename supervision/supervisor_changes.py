@@ -43,7 +43,7 @@ def new_plan(supervisor: Supervisor, message: ChangeSupervisor | None = None) ->
     Raises:
         SpecError: something in it is not valid. StartIgnored, RemoteCrash: when `init` is asked anew, and raises.
     """
-    node, where = supervisor.ctx.cell.node, supervisor.ctx.path
+    node, where = supervisor.ctx._cell.node, supervisor.ctx.path
     if message is None:
         plan = _asked(supervisor)
     elif message.flags is None and message.children is None:
@@ -91,7 +91,7 @@ def succession(supervisor: Supervisor, known: dict[str, Child], plan: Plan) -> d
     Raises:
         SpecError: a spec changes what belongs to the address of a child that has one.
     """
-    specs = [complete(supervisor.ctx.cell, spec) for spec in plan.children]
+    specs = [complete(supervisor.ctx._cell, spec) for spec in plan.children]
     for spec in specs:
         one = known.get(spec.id)
         if one is None or one.cell is None or one.cell.state is GONE:
@@ -195,7 +195,7 @@ def why_occupied(supervisor: Supervisor) -> str:
 
 def account_of(supervisor: Supervisor) -> Account:
     """What a supervisor leaves to the one that takes its place."""
-    cell = supervisor.ctx.cell
+    cell = supervisor.ctx._cell
     now = cell.node.loop.time()
     return Account(
         supervisor._flags,
@@ -272,7 +272,7 @@ def _saved(supervisor: Supervisor) -> bytes | None:
 
 
 def _restore(supervisor: Supervisor, state: bytes) -> None:
-    node = supervisor.ctx.cell.node
+    node = supervisor.ctx._cell.node
 
     def found(value: Any) -> Any:
         return node.cell_at(value.key).ref if isinstance(value, PackedHandle) else value
@@ -284,12 +284,12 @@ def _restore(supervisor: Supervisor, state: bytes) -> None:
 
 
 def _tell_failed(supervisor: Supervisor, hook: str, error: Exception) -> None:
-    supervisor.ctx.cell.node.emit(HookFailed(supervisor.ctx.path, hook, crash(error)))
+    supervisor.ctx._cell.node.emit(HookFailed(supervisor.ctx.path, hook, crash(error)))
 
 
 def take_over(supervisor: Supervisor, account: Account) -> None:
     """Have a supervisor go on with what another one has left, whose living children it has got."""
-    cell, known = supervisor.ctx.cell, supervisor._children
+    cell, known = supervisor.ctx._cell, supervisor._children
     now = cell.node.loop.time()
     supervisor._flags = account.flags
     supervisor._restarts = tuple(sorted((*supervisor._restarts, *(now - ago for ago in account.restarts))))
@@ -317,7 +317,7 @@ def take_over(supervisor: Supervisor, account: Account) -> None:
 
 def _suspend(supervisor: Supervisor) -> None:
     """Handle no message any more; that those have come who are there is noted all the same."""
-    cell = supervisor.ctx.cell
+    cell = supervisor.ctx._cell
     for errand in supervisor._errands:
         errand.is_urgent = True
     queue = mailbox.queue_of(cell)

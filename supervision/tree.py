@@ -29,7 +29,7 @@ def supervisor(
     rules: Iterable[Rule] = (),
     kind: type[Supervisor] = Supervisor,
 ) -> ChildSpec:
-    """A supervisor with its children, as a spec: start it with `system.start`, or nest it in another one.
+    """Describe a supervisor with its children: start the spec with `system.start`, or nest it in another one.
 
     Args:
         name: the last part of its address.

@@ -1,4 +1,4 @@
-"""What a system lets its user do to live actors; all of it is asked for ahead of messages, and ends in time."""
+"""The control methods of a system for live actors: they come ahead of messages and end in time."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Controls:
     _moves: Moves
 
     @property
-    def node(self) -> Node:
+    def _node(self) -> Node:
         """The node that hosts this process's actors."""
         raise NotImplementedError
 

@@ -1,4 +1,4 @@
-"""Moving live actors between tasks and OS processes: which moves there are, one at a time for each actor."""
+"""Moves live actors between tasks and OS processes: finds the sides, one move at a time for each actor."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Moves:
             CannotMove, ActorStopped, AskTimeout, ProcessUnavailable.
         """
         caller = current.get(None)
-        if caller is not None and caller.cell is cell and caller.in_turn():
+        if caller is not None and caller._cell is cell and caller._in_turn():
             raise CannotMove(cell.path, "a turn of its own waits for it; call this from outside, or from a task")
         settled = self._moved_there(cell, isolation, limits, timeout, gate, known)
         return await self._alone(cell, settled, f"move of {cell.path}", timeout, gate)

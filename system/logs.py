@@ -1,4 +1,4 @@
-"""Events as log records: one for each crash, however many events tell of it, and a limit on floods."""
+"""Writes events as log records: one for each crash, with a limit on floods."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from ..actors.events import (
     JournalStopped,
     LifeAbandoned,
     LogLine,
+    LoopLagged,
     MessageQuarantined,
     Moved,
     ProcessDied,
@@ -37,15 +38,40 @@ from ..actors.events import (
     SafeStateMissed,
     SafeStateOverdue,
     ShutdownError,
+    SnapshotDamaged,
     SnapshotFailed,
     StopOverdue,
     StoreRefused,
     SupervisorGaveUp,
     TrustBreached,
+    TurnsLost,
+    TurnSlow,
 )
 from ..actors.exit_reasons import Crash
 from ..actors.kernel.envelope import Item, item_name
 from ..actors.kernel.message import Message, MessageText, message_of
+from ..ftm.alarms import (
+    Diverged,
+    Masked,
+    NondeterminismFound,
+    Objected,
+    Outvoted,
+    ProtectionCostly,
+    ProtectionLost,
+    RequestsDropped,
+    StatesDiffer,
+)
+from ..ftm.events import (
+    BackgroundWorkLost,
+    FailedOver,
+    MechanismSettled,
+    ReplicaFaulty,
+    ReplicaJoined,
+    ReplicaLost,
+    TurnHung,
+)
+from .mechanism_notes import AdaptationUndone
+from .specification import SpecificationNotKept
 from .transaction.events import ScriptLoaded, TransactionCommitted, TransactionRolledBack
 
 BURST = 10
@@ -137,7 +163,10 @@ class LogSink:
         if structlog is None:
             _write_standard(level, name, fields)
         else:
-            structlog.get_logger(LOGGER).log(level, name, **fields)
+            logger = structlog.get_logger(LOGGER)
+            if not structlog.is_configured():  # Its own default would mix with what the program prints.
+                logger = structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
+            logger.log(level, name, **fields)
 
     def _describe(self, event: Event) -> Fields:
         return describe(event, payloads=self._log_payloads)
@@ -177,8 +206,10 @@ WRITTEN: dict[type, tuple[int, str]] = {
     SafeStateOverdue: (logging.ERROR, "safe state overdue"),
     HeldMessages: (logging.WARNING, "messages held"),
     RolledBack: (logging.ERROR, "rolled back"),
+    TurnsLost: (logging.ERROR, "turns lost"),
     MessageQuarantined: (logging.ERROR, "message quarantined"),
     SnapshotFailed: (logging.ERROR, "snapshot failed"),
+    SnapshotDamaged: (logging.ERROR, "snapshot damaged"),
     JournalFull: (logging.WARNING, "journal full"),
     JournalBlocked: (logging.ERROR, "journal blocked"),
     JournalGoesOn: (logging.INFO, "journal goes on"),
@@ -189,6 +220,26 @@ WRITTEN: dict[type, tuple[int, str]] = {
     ScriptLoaded: (logging.INFO, "code loaded"),
     TransactionCommitted: (logging.INFO, "transaction committed"),
     TransactionRolledBack: (logging.WARNING, "transaction rolled back"),
+    SpecificationNotKept: (logging.ERROR, "specification not kept"),
+    LoopLagged: (logging.WARNING, "loop lagged"),
+    TurnSlow: (logging.WARNING, "turn slow"),
+    AdaptationUndone: (logging.WARNING, "adaptation undone"),
+    BackgroundWorkLost: (logging.ERROR, "background work lost"),
+    Diverged: (logging.ERROR, "replica diverged"),
+    FailedOver: (logging.WARNING, "failed over"),
+    Masked: (logging.WARNING, "fault masked"),
+    MechanismSettled: (logging.INFO, "mechanism settled"),
+    NondeterminismFound: (logging.ERROR, "nondeterminism found"),
+    Objected: (logging.WARNING, "outcome objected to"),
+    Outvoted: (logging.WARNING, "replica outvoted"),
+    ProtectionCostly: (logging.WARNING, "protection costly"),
+    ProtectionLost: (logging.ERROR, "protection lost"),
+    ReplicaFaulty: (logging.ERROR, "replica faulty"),
+    ReplicaJoined: (logging.INFO, "replica joined"),
+    ReplicaLost: (logging.WARNING, "replica lost"),
+    RequestsDropped: (logging.ERROR, "requests dropped"),
+    StatesDiffer: (logging.ERROR, "states differ"),
+    TurnHung: (logging.ERROR, "turn hung"),
 }
 """Level and name of the record that an event becomes; others are not written."""
 
@@ -211,7 +262,9 @@ def describe(event: Event, *, payloads: bool = False) -> Fields:
             fields[name] = str(value)
             if isinstance(event, CRASHES):
                 fields["exception"] = value.traceback
-        elif isinstance(value, (int, float, dict)):
+        elif isinstance(value, dict):
+            fields[name] = {key: round(one, 6) if isinstance(one, float) else one for key, one in value.items()}
+        elif isinstance(value, (int, float)):
             fields[name] = value
         else:
             fields[name] = str(value)
@@ -219,7 +272,7 @@ def describe(event: Event, *, payloads: bool = False) -> Fields:
 
 
 def _structlog() -> Any:
-    """structlog, if the program has set it up, or has set up no logging at all: then it writes to the terminal."""
+    """structlog, if the program has set it up, or has set up no logging at all: then it writes to stderr."""
     if "structlog" not in sys.modules and logging.getLogger(LOGGER).hasHandlers():
         return None
     import structlog  # only now: it is a third of the time that importing holdfast would take

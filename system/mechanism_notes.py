@@ -1,4 +1,4 @@
-"""Which mechanisms addresses have instead of those that their specs declare: kept in the store, for the next root.
+"""Notes in the store of mechanisms that differ from the specs, for the next root.
 
 One note holds all of them, so that a transaction that changes several is there as a whole or not at all: a root that
 dies in the middle of one leaves everything as it was. Another note says what was under way then.
@@ -32,7 +32,7 @@ UNDER_WAY = "adapting "
 
 def part_of(address: str) -> str:
     """Why something is not done to what the mechanism of this address has below it."""
-    how = "attach, detach, compose, transition or update"
+    how = "protect or update"
     return f"it is a part of the mechanism of {address}, whose replicas must stay alike: change that by {how}"
 
 

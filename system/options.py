@@ -1,4 +1,4 @@
-"""What a program asks of its system, checked before anything of it is begun."""
+"""The options of a system, checked before anything is started."""
 
 from __future__ import annotations
 

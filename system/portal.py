@@ -1,4 +1,4 @@
-"""Calls from other threads: `system.from_thread()` makes the handle through which they reach the system's actors."""
+"""Calls from other threads: the handle that `system.from_thread()` returns."""
 
 from __future__ import annotations
 
@@ -74,11 +74,14 @@ class ThreadPortal:
         return self._wait(ref, outcome, timeout)
 
     async def send_async(self, ref: ActorRef[Any], message: Message[Any]) -> None:
-        """As `send`, awaited on the calling thread's own event loop."""
+        """Send as `send` does, awaited on the calling thread's own event loop."""
         await self._come(ref, self._begin(ref, ref.send, message))
 
     async def ask_async(self, ref: ActorRef[Any], message: Message[R], timeout: float = DEFAULT_TIMEOUT) -> R:
-        """As `ask`, awaited on the calling thread's own event loop. Cancelling it ends the wait, never the turn."""
+        """Ask as `ask` does, awaited on the calling thread's own event loop.
+
+        Cancelling it ends the wait, never the turn.
+        """
         return await self._come(ref, self._begin(ref, _ask, ref, message, timeout))
 
     # -- on the system's loop ---------------------------------------------------------------------------------------

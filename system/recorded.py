@@ -1,4 +1,4 @@
-"""What a system lets its user do to recorded actors: quarantine, and snapshots of several actors as one."""
+"""A system's methods for recorded actors: quarantine, and group snapshots."""
 
 from __future__ import annotations
 
@@ -16,10 +16,8 @@ from ..supervision.supervisor import Supervisor
 class Recorded:
     """Control of what the homes keep."""
 
-    @property
-    def homes(self) -> Homes:
-        """All recorded addresses, for those who change the tree."""
-        raise NotImplementedError
+    _homes: Homes
+    """All recorded addresses, for those who change the tree."""
 
     def quarantined(self, actor: ActorRef[Any] | str | None = None) -> list[QuarantinedMessage]:
         """Messages put aside because they have ended their actor's process again and again, oldest first.
@@ -30,7 +28,7 @@ class Recorded:
             actor: only those of this actor, given by ref or path.
         """
         path = actor.path if isinstance(actor, ActorRef) else actor
-        return self.homes.quarantine.messages(path)
+        return self._homes.quarantine.messages(path)
 
     def retry(self, message: QuarantinedMessage) -> None:
         """Have a quarantined message handled as if it had come now. (Whoever asked has got `Quarantined` long ago.)
@@ -38,7 +36,7 @@ class Recorded:
         Raises:
             NotQuarantined: it was tried again, dropped or erased meanwhile. NoSuchActor: its actor was not started yet.
         """
-        self.homes.quarantine.retry(message, self.homes.at(message.address))
+        self._homes.quarantine.retry(message, self._homes.at(message.address))
 
     def drop(self, message: QuarantinedMessage) -> None:
         """Forget a quarantined message; it becomes a dead letter.
@@ -46,7 +44,7 @@ class Recorded:
         Raises:
             NotQuarantined: it was tried again, dropped or erased meanwhile.
         """
-        self.homes.quarantine.drop(message)
+        self._homes.quarantine.drop(message)
 
     async def checkpoint_group(self, actors: Sequence[ActorRef[Any] | str], *, name: str) -> None:
         """Keep one consistent cut of several recorded actors: their states, and the messages between them (R78).
@@ -61,7 +59,7 @@ class Recorded:
         Raises:
             SpecError: there is no actor, or no name. HoldfastError: one of them is not recorded, or the store refused.
         """
-        homes = self.homes
+        homes = self._homes
         paths = list(dict.fromkeys(actor.path if isinstance(actor, ActorRef) else actor for actor in actors))
         if not paths or not isinstance(name, str) or not name:
             raise SpecError("checkpoint_group", f"needs actors and a name, not {paths} and {name!r}")
@@ -70,7 +68,7 @@ class Recorded:
 
     def group_snapshots(self) -> list[str]:
         """The names of the group snapshots there are, oldest first."""
-        return self.homes.groups.names()
+        return self._homes.groups.names()
 
     async def forget_group(self, name: str) -> None:
         """Remove a group snapshot, which takes as much room as the states of its actors do.
@@ -78,8 +76,8 @@ class Recorded:
         Raises:
             NoSuchGroup: there is none of that name. HoldfastError: the store refused.
         """
-        self.homes.groups.forget(name)
-        await self.homes.synced()
+        self._homes.groups.forget(name)
+        await self._homes.synced()
 
     async def restore_group(self, name: str, *, timeout: float = 60.0) -> None:
         """Bring all actors of a group snapshot back to it, with the messages that were under way between them.
@@ -92,12 +90,12 @@ class Recorded:
             NoSuchGroup: there is none of that name. HoldfastError: an actor could not be stopped or started by its
                 supervisor (the others are started all the same), or the store refused.
         """
-        groups = self.homes.groups
+        groups = self._homes.groups
         members = groups.members(name)
         living: list[tuple[ActorRef[Supervisor], str]] = []
         for path in await self._in_start_order([path for path in members if self._is_living(path)], timeout):
             above, _, child = path.rpartition("/")
-            living.append((ActorRef[Supervisor](self.homes.node.cell_at(above)), child))
+            living.append((ActorRef[Supervisor](self._homes.node.cell_at(above)), child))
         for supervisor, child in reversed(living):
             await supervisor.ask(TerminateChild(child), timeout)
         groups.replace(name)
@@ -116,14 +114,14 @@ class Recorded:
 
     def _is_living(self, path: str) -> bool:
         """Whether it has to be stopped; else whoever starts it finds it as it was."""
-        home = self.homes.at(path)
+        home = self._homes.at(path)
         return home is not None and home.cell is not None and not home.cell.is_dead
 
     async def _in_start_order(self, paths: Sequence[str], timeout: float) -> list[str]:
         """As their supervisors would start them: a binding wants its target to be there."""
         places: dict[str, int] = {}
         for above in dict.fromkeys(above for path in paths for above in _ancestors(path)):
-            supervisor = ActorRef[Supervisor](self.homes.node.cell_at(above))
+            supervisor = ActorRef[Supervisor](self._homes.node.cell_at(above))
             children = await supervisor.ask(WhichChildren(), timeout)
             places.update((child.path, place) for place, child in enumerate(children))
         return sorted(paths, key=lambda path: [places[one] for one in (*_ancestors(path)[1:], path)])

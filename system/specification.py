@@ -1,4 +1,4 @@
-"""The specification in force, kept in the store: a root that is started again has the tree that transactions have made.
+"""The specification in force, kept in the store, so that the next root has the tree that transactions made.
 
 The program says what it starts below the root, and each such spec has a note here as soon as a transaction has made
 another one of it: of which the change was made, and what has become of it. The next root that starts that very spec
@@ -44,7 +44,7 @@ class SpecificationSuperseded(Event, frozen=True, eq=False):
 
 
 class SpecificationNotKept(Event, frozen=True, eq=False):
-    """What transactions have made of a spec cannot be stored, or not be had any more: the next root goes without it."""
+    """A spec that transactions have made cannot be stored, or not be had any more: the next root goes without it."""
 
     why: str
 

@@ -7,7 +7,7 @@ import contextlib
 import os
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar, cast, overload
 
 from ..actors.control.drain import drain as drain_queue
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, TreeFailed
@@ -129,7 +129,7 @@ class ActorSystem(Recorded, Controls):
             recovery=recovery,
         )
         self._sink: LogSink | None = None
-        self._node: Node | None = None
+        self._running: Node | None = None
         self._root: Cell | None = None
         self._body: asyncio.Task[Any] | None = None
         self._closing: asyncio.Task[None] | None = None
@@ -146,11 +146,11 @@ class ActorSystem(Recorded, Controls):
     # -- life -------------------------------------------------------------------------------------------------------
 
     async def __aenter__(self) -> ActorSystem:
-        if self._node is not None:
+        if self._running is not None:
             raise HoldfastError(f"system {self.name!r} was entered already; make a new one")
         options = self._options
         file = options.read_recovery_file()
-        node = self._node = Node(self.name, asyncio.get_running_loop(), seed=options.seed)
+        node = self._running = Node(self.name, asyncio.get_running_loop(), seed=options.seed)
         engine = open_journal(options.store, takeover=options.takeover)
         try:
             check_system(engine, self.name)
@@ -169,8 +169,8 @@ class ActorSystem(Recorded, Controls):
         if options.log:
             self._sink = LogSink(self.name, node.loop, log_payloads=options.log_payloads)
             node.events.add_sink(self._sink)
-        self.specifications = Specifications(self._homes, is_kept=options.store is not None)
-        self.mechanism_notes = MechanismNotes(self._homes)
+        self._specifications = Specifications(self._homes, is_kept=options.store is not None)
+        self._mechanism_notes = MechanismNotes(self._homes)
         node.connect(
             Ports(
                 host_for=self._host_for,
@@ -182,12 +182,12 @@ class ActorSystem(Recorded, Controls):
         )
         self._body = asyncio.current_task()
         root = self._root = node.root = node.cell_below(None, f"/{self.name}")
-        flags = self.specifications.root_in_force(root.path, options.flags)
+        flags = self._specifications.root_in_force(root.path, options.flags)
         up = lifecycle.begin(root, Start(Supervisor, (flags, ())))
         if up is not None:
             await up
         root.ended().add_done_callback(self._root_ended)
-        await self.specifications.start_added(lambda spec: root.ref.ask(StartChild(spec), LONG))
+        await self._specifications.start_added(lambda spec: root.ref.ask(StartChild(spec), LONG))
         return self
 
     async def __aexit__(
@@ -203,7 +203,7 @@ class ActorSystem(Recorded, Controls):
 
     async def shutdown(self) -> None:
         """Stop every actor, newest first, and what belongs to the system. A second call changes nothing."""
-        root, node = self._root, self._node
+        root, node = self._root, self._running
         if root is None or node is None:
             return
         self._body = None
@@ -251,7 +251,7 @@ class ActorSystem(Recorded, Controls):
     def _complete(self, spec: ChildSpec, path: str) -> ChildSpec:
         """A child spec with what the recovery file and earlier roots say of its address."""
         file = self._homes.file
-        return self.mechanism_notes.completed(spec if file is None else file.complete(spec, path), path)
+        return self._mechanism_notes.completed(spec if file is None else file.complete(spec, path), path)
 
     def _host_for(self, spec: ChildSpec) -> AddressHost:
         """Where a child's lives are lived."""
@@ -309,13 +309,13 @@ class ActorSystem(Recorded, Controls):
         """Tell of tables of the recovery file that are for nobody so far: perhaps their names are misspelt."""
         file = self._homes.file
         for table, where in file.take_unmet() if file is not None else ():
-            self.node.emit(RecoveryTableUnused(f"/{self.name}", table, where))
+            self._node.emit(RecoveryTableUnused(f"/{self.name}", table, where))
 
     def _root_ended(self, done: asyncio.Future[ExitReason]) -> None:
         """The root supervisor is gone: if nobody asked for that, the body must hear of it."""
         if self._body is None or done.cancelled():
             return
-        last, why = self.node.gave_up, "restart intensity reached"
+        last, why = self._node.gave_up, "restart intensity reached"
         if last is None or done.result() != SHUTDOWN:
             why = f"its root has ended, {done.result()}"
         if last is not None:
@@ -326,15 +326,15 @@ class ActorSystem(Recorded, Controls):
     # -- starting and finding actors --------------------------------------------------------------------------------
 
     @property
-    def node(self) -> Node:
+    def _node(self) -> Node:
         """The node that hosts this process's actors."""
-        if self._node is None:
+        if self._running is None:
             raise HoldfastError(f"system {self.name!r} is not running: use it in `async with`")
-        return self._node
+        return self._running
 
     def from_thread(self) -> ThreadPortal:
-        """A handle for other threads, such as those in which a web framework runs its plain `def` endpoints."""
-        return ThreadPortal(self.node)
+        """Return a handle for other threads, such as those in which a web framework runs its plain `def` endpoints."""
+        return ThreadPortal(self._node)
 
     async def start(self, spec: ChildSpec[A], *, fresh: bool = False) -> ActorRef[A]:
         """Start a child of the root, and wait until it is up; None instead of a ref if it raised `Ignore`.
@@ -347,7 +347,7 @@ class ActorSystem(Recorded, Controls):
         if not isinstance(spec, ChildSpec):
             raise SpecError("start", f"takes child(...) or supervisor(...), not {spec!r}")
         root = self._root_ref()
-        address, known = f"{root.path}/{spec.id}", self.specifications
+        address, known = f"{root.path}/{spec.id}", self._specifications
         if address in known.brought:  # The program says so itself now.
             known.brought.discard(address)
             await root.ask(RemoveChild(spec.id), LONG)
@@ -363,7 +363,7 @@ class ActorSystem(Recorded, Controls):
         Raises:
             NameTaken: the name is in use. StartFailed: `__init__` raised.
         """
-        return cast("ActorRef[A]", self.node.spawn(start, name, mailbox=mailbox).ref)
+        return cast("ActorRef[A]", self._node.spawn(start, name, mailbox=mailbox).ref)
 
     async def stop(
         self, ref: ActorRef[Any], reason: ExitReason = SHUTDOWN, *, drain: bool = False, deadline: float = 5.0
@@ -387,10 +387,10 @@ class ActorSystem(Recorded, Controls):
         cell = ref._cell.living
         check_no_part(cell)
         caller = current.get(None)
-        if caller is None or not is_below(caller.cell, cell):
+        if caller is None or not is_below(caller._cell, cell):
             await self._stop(cell, reason, deadline if drain else None)
             return
-        node = self.node  # In nobody's name: it has to go on when the caller's life is over.
+        node = self._node  # In nobody's name: it has to go on when the caller's life is over.
         task = node.loop.create_task(
             self._stop(cell, reason, deadline if drain else None),
             name=f"stop of {ref.path}",
@@ -412,13 +412,17 @@ class ActorSystem(Recorded, Controls):
         elif not cell.is_dead:
             await lifecycle.stop_in_time(cell, reason)
 
-    def ref(self, path: str, kind: type[A]) -> ActorRef[A]:
-        """A ref to the actor at an address.
+    @overload
+    def ref(self, path: str) -> ActorRef[Any]: ...
+    @overload
+    def ref(self, path: str, kind: type[A]) -> ActorRef[A]: ...
+    def ref(self, path: str, kind: type[Actor] = Actor) -> ActorRef[Any]:
+        """Return a ref to the actor at an address; `kind` is its class, or a base of it, if you want the ref typed.
 
         Raises:
             NoSuchActor: nobody lives there. WrongActor: another class does.
         """
-        return self.node.find_ref(path, kind)
+        return self._node.find_ref(path, kind)
 
     def _root_ref(self) -> ActorRef[Supervisor]:
         root = self._root
@@ -427,11 +431,6 @@ class ActorSystem(Recorded, Controls):
         return ActorRef(root)
 
     # -- several changes as one -------------------------------------------------------------------------------------
-
-    @property
-    def homes(self) -> Homes:
-        """All recorded addresses, for those who change the tree."""
-        return self._homes
 
     def roll_back(self, path: str) -> None:
         """Have a recorded actor that is stopped begin its next life with its snapshot before the newest.
@@ -444,7 +443,7 @@ class ActorSystem(Recorded, Controls):
         self._homes.roll_back(path, "it was asked for")
 
     def transaction(self, *, dry_run: bool = False, timeout: float = 10.0) -> Transaction:
-        """Several changes of the running tree as one: `async with system.transaction() as change: change.add(...)`.
+        """Make several changes of the tree as one: `async with system.transaction() as change: change.add(...)`.
 
         The body collects; when it ends, all is checked, then done. If the body raises, nothing is done.
 
@@ -464,49 +463,49 @@ class ActorSystem(Recorded, Controls):
         Raises:
             UntrustedFile: somebody else could have written it. SpecError: it is no such script.
         """
-        return await load_script(path, self.node).reconfigure(self)
+        return await load_script(path, self._node).reconfigure(self)
 
     # -- names, topics, bindings ------------------------------------------------------------------------------------
 
     def register(self, name: str, ref: ActorRef[Any]) -> None:
         """Give an actor a name beside its address. Raises NameTaken."""
-        self.node.register(name, ref._cell.living)
+        self._node.register(name, ref._cell.living)
 
     def unregister(self, name: str) -> None:
         """Free a name; unknown ones are fine."""
-        self.node.unregister(name)
+        self._node.unregister(name)
 
     def whereis(self, name: str) -> ActorRef[Any]:
-        """The actor with this name. Raises NoSuchActor."""
-        cell = self.node.names.get(name)
+        """Return a ref to the actor with this name. Raises NoSuchActor."""
+        cell = self._node.names.get(name)
         if cell is None:
             raise NoSuchActor(name)
         return cell.ref
 
     async def publish(self, topic: str, message: Message[Any]) -> None:
         """Send to every subscriber of a topic, and return when each has accepted; it waits for room at bounded ones."""
-        await publish(self.node, topic, message, lambda cell: cell.ref.send(message))
+        await publish(self._node, topic, message, lambda cell: cell.ref.send(message))
 
     def bind(self, ref: ActorRef[Any], port: str, target: ActorRef[Any]) -> None:
         """Point a binding elsewhere; the owner sees it from its next turn on. Raises SpecError.
 
         It lasts until the supervisor of the owner is restarted. `change.bind`, in a transaction, is for good.
         """
-        self.node.bind(ref._cell.living, port, target._cell.living)
+        self._node.bind(ref._cell.living, port, target._cell.living)
 
     # -- looking at it ----------------------------------------------------------------------------------------------
 
     def events(self) -> EventStream:
-        """A new stream of events from here on: `async for event in stream`; close it when done."""
-        return self.node.events.listen()
+        """Return a new stream of events from here on: `async for event in stream`; close it when done."""
+        return self._node.events.listen()
 
     @property
     def dead_letters(self) -> int:
         """Messages that nobody handled, so far."""
-        return self.node.numbers.dead_letters
+        return self._node.numbers.dead_letters
 
     def pid_of(self, ref: ActorRef[Any]) -> int:
-        """The OS process an actor lives in now: its own, or this one.
+        """Return the pid of the OS process that an actor lives in now: its own, or this one.
 
         Raises:
             NoSuchActor: it lives nowhere at the moment.
@@ -527,10 +526,10 @@ class ActorSystem(Recorded, Controls):
     @property
     def late_replies(self) -> int:
         """Replies that came when nobody waited any more, so far."""
-        return self.node.numbers.late_replies
+        return self._node.numbers.late_replies
 
     def tree(self) -> list[str]:
-        """The addresses that live now, parents before children."""
+        """List the addresses that live now, parents before children."""
         found: list[str] = []
         waiting = [self._root] if self._root is not None else []
         while waiting:

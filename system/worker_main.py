@@ -1,4 +1,4 @@
-"""The entry point of actor processes: gives a guest what only the composition root knows."""
+"""The entry point of actor processes: gives the guest what only the composition root knows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Help for testing actors: see docs/testing.md.
+"""Tools for testing actors: see docs/testing.md.
 
 The names below are imported when they are first used: pytest loads `holdfast.testing.plugin`, and with it this module,
 before coverage begins to measure.

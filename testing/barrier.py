@@ -23,12 +23,12 @@ from ..actors.process.wire import frames
 from ..actors.process.worker_pool import Worker
 from ..checkpoint.home.recorded_home import switch_of
 from .clock import VirtualClockLoop
-from .schedules.processes import SimulatedWorkers
 
 if TYPE_CHECKING:
     from ..actors.kernel.cell import Cell
     from ..actors.kernel.node import Node
     from ..system.system import ActorSystem
+    from .schedules.processes import SimulatedWorkers
 
 TIMEOUT = 10.0
 """Seconds on the loop's clock."""
@@ -42,7 +42,7 @@ PING = "holdfast.testing:Ping"
 
 
 class NotIdle(HoldfastError, TimeoutError):
-    """What was waited for did not come to rest: `after` so much of something; `busy` says what still moved."""
+    """The system did not come to rest: `after` so much of something; `busy` says what still moved."""
 
     after: str
     busy: tuple[str, ...]
@@ -93,7 +93,7 @@ async def idle(system: ActorSystem, *, timeout: float = TIMEOUT) -> None:
         NotIdle: it went on all that time, or without end at one moment of virtual time; one task at a time may wait
             for this.
     """
-    node = system.node
+    node = system._node
     try:
         async with patience(timeout, node):
             while True:
@@ -162,15 +162,23 @@ def waiter_of(task: asyncio.Task[Any]) -> asyncio.Future[Any] | None:
     return waiter
 
 
+def _simulated(system: ActorSystem) -> SimulatedWorkers | None:
+    """The pool of a simulated run; None: the processes are real."""
+    from .schedules.processes import SimulatedWorkers  # It takes long to import, and few tests simulate.
+
+    pool = system._workers
+    return pool if isinstance(pool, SimulatedWorkers) else None
+
+
 async def _hear(system: ActorSystem) -> bool:
     """One round trip through each actor process. Returns whether anything moved, or may have."""
-    pool = system._workers
-    if isinstance(pool, SimulatedWorkers):  # Their turns are in this loop, and what is on its way is known.
-        return await pool.arrived() or bool(_busy(system.node))
+    simulated = _simulated(system)
+    if simulated is not None:  # Their turns are in this loop, and what is on its way is known.
+        return await simulated.arrived() or bool(_busy(system._node))
     moved = bool(_waiting(system))
     for worker in list(system._workers.by_cell.values()):
         moved |= await _ping(worker)
-    return moved or bool(_busy(system.node))
+    return moved or bool(_busy(system._node))
 
 
 async def _ping(worker: Worker) -> bool:
@@ -217,7 +225,7 @@ class FrameCounter:
 def _waiting(system: ActorSystem) -> list[str]:
     """Actors in real processes that have not handled what they were sent."""
     found: list[str] = []
-    if isinstance(system._workers, SimulatedWorkers):
+    if _simulated(system) is not None:
         return found
     for cell in system._workers.by_cell:
         outlet = cell.more.outlet if cell.more is not None else None

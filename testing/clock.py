@@ -185,14 +185,14 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return self._virtual.now
 
     def next_timer(self) -> float:
-        """When the next timer is due, in seconds on this clock; inf: none is set."""
+        """Return when the next timer is due, in seconds on this clock; inf: none is set."""
         when = self._scheduled[0].when() if self._scheduled else math.inf
         # asyncio runs what is due up to one resolution from now. This much is what is due now, and no later timer.
         self._clock_resolution = math.ulp(max(self._virtual.now, when)) if when < math.inf else self._clock_resolution
         return when
 
     def run_forever(self) -> None:
-        """As every loop; each run may take so many ticks and jumps."""
+        """Run as every loop does; each run may take so many ticks and jumps."""
         self._virtual.jumps = 0
         self.forget_ticks()
         super().run_forever()
@@ -203,7 +203,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     @property
     def most_ticks(self) -> int:
-        """How many ticks at one moment are not too many."""
+        """Return how many ticks at one moment are not too many."""
         return self._virtual.most_ticks
 
     def forget_ticks(self) -> None:
@@ -211,19 +211,19 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         self._virtual.ticks = 0
 
     def has_too_many_ticks(self, ticks: int) -> bool:
-        """Whether so many ticks at one moment are too many."""
+        """Say whether so many ticks at one moment are too many."""
         return ticks > self.most_ticks
 
     def hears_at_once(self) -> bool:
-        """Whether a thread that wakes the loop is heard while other things are due."""
+        """Say whether a thread that wakes the loop is heard while other things are due."""
         return True
 
     def held_back(self) -> int:
-        """How many results of executors are held back until nothing else can happen."""
+        """Count the results of executors that are held back until nothing else can happen."""
         return 0
 
     def at_rest(self) -> bool:
-        """Nothing can happen any more without more time. Returns whether something can now."""
+        """Hear that nothing can happen any more without more time. Returns whether something can now."""
         return False
 
     @contextlib.contextmanager
@@ -247,7 +247,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             expire(why)
 
     def restless(self, why: str) -> NotIdle:
-        """The NotIdle that names what is to run now and what the next timers are."""
+        """Make the NotIdle that names what is to run now and what the next timers are."""
         from .barrier import NotIdle, movers
 
         return NotIdle(why, tuple(movers([*self._ready, *sorted(self._scheduled)])))
@@ -266,7 +266,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         self._virtual.jobs -= 1
 
     def add_reader(self, fd: Any, callback: Callable[[*Ts], Any], *args: *Ts) -> None:
-        """As every loop; but the end of another process is not waited for here."""
+        """Watch a file as every loop does; but the end of another process is not waited for here."""
         if isinstance(fd, int) and _is_pidfd(fd):
             raise RealTimeNeeded("what runs in another process")
         super().add_reader(fd, callback, *args)
@@ -276,11 +276,11 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         raise RealTimeNeeded("a connection to another process")
 
     async def subprocess_exec(self, *args: Any, **options: Any) -> Any:
-        """Refused."""
+        """Refuse to start a process: its time would not be virtual."""
         raise RealTimeNeeded("a subprocess")
 
     async def subprocess_shell(self, *args: Any, **options: Any) -> Any:
-        """Refused."""
+        """Refuse to start a command: its time would not be virtual."""
         raise RealTimeNeeded("a subprocess")
 
     async def shutdown_default_executor(self, *args: Any) -> None:
@@ -300,7 +300,7 @@ def _is_pidfd(fd: int) -> bool:
 
 
 def virtual() -> VirtualClockLoop:
-    """A new loop whose clock begins at 0: for `asyncio.Runner(loop_factory=...)` and pytest-asyncio's factories."""
+    """Make a loop whose clock begins at 0: for `asyncio.Runner(loop_factory=...)` and pytest-asyncio's factories."""
     return VirtualClockLoop()
 
 

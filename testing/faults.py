@@ -1,4 +1,4 @@
-"""Faults at named points, from a seed: what crashes, hangs, comes late, twice, out of order, damaged, or never.
+"""Faults injected at named points from a seed: crash, hang, delay, duplicate, reorder, damage or loss.
 
 A fault is installed on one actor (or one system) by exchanging the function that stands at that point, for as long as
 the context is open. Production code has no hooks for it and pays nothing.
@@ -143,7 +143,7 @@ class Strikes:
         self._undo: list[Callable[[], None]] = []
 
     def next(self, what: object) -> Kind | None:
-        """One chance: the fault that strikes now, if any. `what` passes the point."""
+        """Take one chance, and return the fault that strikes now, if any. `what` passes the point."""
         if self.is_over:  # Other faults, which strike longer, still lead here.
             return None
         self.chances += 1
@@ -166,7 +166,7 @@ class Strikes:
         return strike.kind
 
     def delay(self) -> float:
-        """How long the delay that strikes now is, in seconds."""
+        """Return how long the delay that strikes now is, in seconds."""
         if self.least == self.longest:
             return self.least
         level = self.draw.randrange(LEVELS)
@@ -175,7 +175,7 @@ class Strikes:
         return self.least + (self.longest - self.least) * level / (LEVELS - 1)
 
     def crash(self) -> InjectedCrash:
-        """The exception of a crash that strikes now."""
+        """Return the exception of a crash that strikes now."""
         return InjectedCrash(self.at, self.chances, self.seed)
 
     def at_end(self, undo: Callable[[], None]) -> None:
@@ -183,7 +183,7 @@ class Strikes:
         self._undo.append(undo)
 
     def end(self) -> None:
-        """No more faults: what was exchanged is put back, what was held goes on. A second call changes nothing."""
+        """Inject no more faults; what was exchanged is put back, what was held goes on. Twice is no error."""
         self.is_over = True
         while self._undo:
             self._undo.pop()()
@@ -261,7 +261,7 @@ class Faults:
         return strikes
 
     def end(self) -> None:
-        """End all of them."""
+        """End the injection: all faults are taken back, and none strikes any more."""
         for strikes in reversed(self.installed):
             strikes.end()
 

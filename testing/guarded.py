@@ -1,10 +1,10 @@
-"""A system under guard: at its end the test hears of everything that went wrong and that it did not expect."""
+"""A system under guard: at its end the test hears of everything unexpected that went wrong."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Collection, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 from ..actors.errors import HoldfastError
 from ..actors.events import ActorCrashed, DeadLetter, Event, HookFailed, LifeAbandoned, ProcessDied
@@ -18,8 +18,9 @@ from ..system.system import ActorSystem
 from .clock import RealTimeNeeded, VirtualClockLoop
 from .guard.leaks import Leaks
 from .guard.sends import Reads, SendChecks
-from .schedules.control import ControlledLoop
-from .schedules.processes import SimulatedWorkers
+
+if TYPE_CHECKING:
+    from .schedules.control import ControlledLoop
 
 CRASHES = (ActorCrashed, HookFailed, LifeAbandoned)
 DEATHS = (Signal, Exited, OutOfMemory, Hung)
@@ -59,6 +60,15 @@ class UnexpectedEnd(HoldfastError, AssertionError, text="{problems:\n}"):
     problems: tuple[str, ...]
 
 
+def _is_controlled(loop: asyncio.AbstractEventLoop) -> TypeGuard[ControlledLoop]:
+    """Whether a run is simulated in this loop."""
+    if not isinstance(loop, VirtualClockLoop):
+        return False
+    from .schedules.control import ControlledLoop  # It takes long to import, and few tests simulate.
+
+    return isinstance(loop, ControlledLoop)
+
+
 class GuardedSystem(ActorSystem):
     """An ActorSystem for tests. It notes crashes and dead letters, and checks what is sent.
 
@@ -79,17 +89,21 @@ class GuardedSystem(ActorSystem):
 
     async def __aenter__(self) -> GuardedSystem:
         await super().__aenter__()
-        self.node.events.add_sink(self._note)
-        self._checks = SendChecks(self.node)
+        self._node.events.add_sink(self._note)
+        self._checks = SendChecks(self._node)
         return self
 
     def _make_pool(self, node: Node) -> Workers:
         loop = asyncio.get_running_loop()
-        return SimulatedWorkers(node, loop) if isinstance(loop, ControlledLoop) else super()._make_pool(node)
+        if _is_controlled(loop):
+            from .schedules.processes import SimulatedWorkers
+
+            return SimulatedWorkers(node, loop)
+        return super()._make_pool(node)
 
     def _host_for(self, spec: ChildSpec) -> AddressHost:
-        loop = self.node.loop
-        if spec.isolation == "process" and isinstance(loop, VirtualClockLoop) and not isinstance(loop, ControlledLoop):
+        loop = self._node.loop
+        if spec.isolation == "process" and isinstance(loop, VirtualClockLoop) and not _is_controlled(loop):
             raise RealTimeNeeded(f"{spec.id!r} with isolation='process'")
         return super()._host_for(spec)
 
@@ -148,7 +162,7 @@ class GuardedSystem(ActorSystem):
 
     @property
     def asks(self) -> Mapping[asyncio.Future[Any], tuple[str, object]]:
-        """What was asked, and of whom, by the futures that somebody still holds."""
+        """List what was asked, and of whom, by the futures that somebody still holds."""
         return {} if self._checks is None else self._checks.asks
 
     def read_along(self, reads: Reads) -> None:
@@ -168,7 +182,7 @@ class GuardedSystem(ActorSystem):
             self.letters.append(event)
 
     def problems(self) -> list[str]:
-        """What happened and was not expected, as texts."""
+        """List what happened and was not expected, as texts."""
         found = [
             self._expected_crashes.problem("crashes", self.crashes),
             self._expected_letters.problem("dead letters", self.letters),

@@ -1,4 +1,4 @@
-"""A test that hangs says where: every thread, every task, and every turn of an actor that waits.
+"""A pytest plugin that reports where a test hangs: every thread, task and waiting turn.
 
 A pytest plugin, for `pytest_plugins = ["holdfast.testing.hanging"]` in a conftest.py. It goes by pytest's own option
 `faulthandler_timeout`, and adds three things. pytest prints the stacks of threads only, which for a program of tasks

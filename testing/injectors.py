@@ -1,4 +1,4 @@
-"""How each point's faults are installed: which function is exchanged, and for what. See `faults.POINTS`."""
+"""Installs the faults of each point: which function is exchanged, and for what. See `faults.POINTS`."""
 
 from __future__ import annotations
 

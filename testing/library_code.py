@@ -1,4 +1,4 @@
-"""Whose code something is: this library's, or its user's. The file decides, and neither a folder above it nor a name.
+"""Tells the code of this library from that of its user: the file decides, not the folder above it or a name.
 
 A user's tests may live in a checkout of this library, where everything is below its root, beside it in a folder whose
 name begins as its own, or in a folder called `holdfast` that makes their modules `holdfast.test_bank`.

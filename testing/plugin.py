@@ -258,8 +258,10 @@ def _loop_scope_of(request: pytest.FixtureRequest) -> str:
     Raises:
         pytest.fail.Exception: the test does not run in a loop of pytest-asyncio.
     """
-    marker = request.node.get_closest_marker("asyncio")
-    of_anyio = request.node.get_closest_marker("anyio")
+    closest: dict[str, pytest.Mark] = {}
+    for mark in request.node.iter_markers():
+        closest.setdefault(mark.name, mark)
+    marker, of_anyio = closest.get("asyncio"), closest.get("anyio")
     if of_anyio is not None or "anyio_backend" in request.fixturenames:
         if marker is None or of_anyio is not None:
             why = "runs this test in another one: mark it with @pytest.mark.asyncio instead of @pytest.mark.anyio"

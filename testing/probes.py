@@ -105,7 +105,7 @@ class Anything(Table):
 
 def _take(actor: Any, message: Any) -> object:
     ctx = actor.ctx
-    asked = isinstance(ctx.item, Ask)
+    asked = isinstance(ctx._item, Ask)
     handle = ctx.reply_handle() if asked else None
     actor.hear(Received(message, ctx.sender, handle))
     return handle
@@ -145,7 +145,7 @@ class Probe:
         self._deadline = math.inf
         self._pilot: Pilot | None = None
         self._taps: list[Tap] = []
-        self._events = system.node.events.listen()
+        self._events = system._node.events.listen()
         self.ref: ActorRef[Any] = system.spawn(Start(ProbeActor, (self._hear,)), name)
 
     def _hear(self, heard: Heard) -> None:
@@ -156,12 +156,12 @@ class Probe:
 
     @property
     def path(self) -> str:
-        """Its address."""
+        """The address at which the probe receives."""
         return self.ref.path
 
     @property
     def sender(self) -> ActorRef[Any] | None:
-        """Who sent the message that was expected last; None if it was no actor."""
+        """Return a ref to the sender of the message that was expected last; None if it was no actor."""
         return self._last.sender if self._last is not None else None
 
     @property
@@ -176,7 +176,7 @@ class Probe:
     @overload
     async def expect(self, what: M, *, timeout: float | None = None) -> M: ...
     async def expect(self, what: Any, *, timeout: float | None = None) -> Any:
-        """The next message must be of this type, or equal to this message.
+        """Take the next message, which must be of this type, or equal to this message.
 
         Returns:
             The message; `reply` answers it.
@@ -191,7 +191,7 @@ class Probe:
         return heard.message
 
     async def expect_all(self, *what: Any, timeout: float | None = None) -> tuple[Message[Any], ...]:
-        """The next messages are these, each once, in any order: of these types, or equal to these messages.
+        """Take the next messages, which are these, each once, in any order: of these types, or equal to these messages.
 
         Returns:
             The messages, in the order of `what`. The one that came last is answered by `reply`.
@@ -215,7 +215,7 @@ class Probe:
 
     @contextlib.asynccontextmanager
     async def within(self, seconds: float) -> AsyncGenerator[None]:
-        """All that is expected inside comes within so many seconds together; a `timeout` inside can only be shorter.
+        """Have all that is expected inside come within so many seconds; a `timeout` inside can only be shorter.
 
         Raises:
             Unexpected: the block has taken longer.
@@ -245,7 +245,7 @@ class Probe:
     @overload
     async def expect_event(self, wanted: Callable[[Event], bool], *, timeout: float | None = None) -> Event: ...
     async def expect_event(self, wanted: Any, *, timeout: float | None = None) -> Any:
-        """The next event of the system of this type, or for which this is true, since the probe was made.
+        """Wait for the next event of this type, or for which this is true, since the probe was made.
 
         Events before it are dropped.
 
@@ -255,7 +255,7 @@ class Probe:
         name = f"the event {_name(wanted) if isinstance(wanted, type) else 'that was described'}"
         seconds, others = self._seconds(timeout), list[Event]()
         try:
-            async with patience(seconds, self._system.node):
+            async with patience(seconds, self._system._node):
                 async for event in self._events:
                     if isinstance(event, wanted) if isinstance(wanted, type) else wanted(event):
                         return event
@@ -271,7 +271,7 @@ class Probe:
     async def expect_dead_letter(
         self, what: Any = Message, to: ActorRef[Any] | None = None, *, timeout: float | None = None
     ) -> DeadLetter:
-        """The next dead letter of this type, or equal to this message, at this address if one is given.
+        """Wait for the next dead letter of this type, or equal to this message, at this address if one is given.
 
         A guarded system counts it as one that was expected.
 
@@ -292,7 +292,7 @@ class Probe:
         return cast("DeadLetter", letter)
 
     async def fish(self, wanted: type[M] | Callable[[Any], bool], *, timeout: float | None = None) -> M:
-        """The first message that is of this type, or for which the predicate is true; others before it are dropped.
+        """Take the first message of this type, or for which the predicate is true; others before it are dropped.
 
         Raises:
             Unexpected: none came within `timeout` seconds. NotIdle: virtual time stood still.
@@ -309,7 +309,7 @@ class Probe:
                     return cast("M", heard.message)
 
     async def expect_no_message(self, within: float | None = None) -> None:
-        """Nothing comes until the system is idle, or for `within` seconds.
+        """Make sure that nothing comes until the system is idle, or for `within` seconds.
 
         Raises:
             Unexpected: something did, or had come before.
@@ -320,7 +320,7 @@ class Probe:
         elif not self._inbox:
             self._wake.clear()
             try:
-                async with patience(within, self._system.node):
+                async with patience(within, self._system._node):
                     await self._wake.wait()
             except NotIdle:
                 raise
@@ -332,7 +332,7 @@ class Probe:
     async def expect_down(
         self, ref: ActorRef[Any], reason: ExitReason | type[ExitReason] | None = None, *, timeout: float | None = None
     ) -> Down:
-        """The next thing to come is the DOWN of this ref (after `monitor` or `watch`), for this reason if one is given.
+        """Take the DOWN of this ref (after `monitor` or `watch`), which comes next, for this reason if one is given.
 
         Raises:
             Unexpected: something else came, or nothing within `timeout` seconds. NotIdle: virtual time stood still.
@@ -342,7 +342,7 @@ class Probe:
     async def expect_exit(
         self, ref: ActorRef[Any], reason: ExitReason | type[ExitReason] | None = None, *, timeout: float | None = None
     ) -> Exit:
-        """The next thing to come is the EXIT of this ref (after `link`), for this reason if one is given.
+        """Take the EXIT of this ref (after `link`), which comes next, for this reason if one is given.
 
         Raises:
             Unexpected: something else came, or nothing within `timeout` seconds. NotIdle: virtual time stood still.
@@ -365,7 +365,7 @@ class Probe:
             )
         self._expects = asyncio.current_task()
         try:
-            async with patience(max(seconds, 0.0), self._system.node):
+            async with patience(max(seconds, 0.0), self._system._node):
                 while not self._inbox:
                     self._alive()
                     self._wake.clear()
@@ -502,7 +502,7 @@ class Probe:
         ctx = self.ref._cell.ctx
         if ctx is None:
             raise HoldfastError(f"{self.path} has stopped")
-        context = self._system.node.base_context.copy()
+        context = self._system._node.base_context.copy()
         context.run(current.set, ctx)
         return context
 
@@ -520,7 +520,7 @@ class Probe:
 
     def subscribe(self, topic: str) -> None:
         """Receive what is published there."""
-        self._system.node.topics.subscribe(topic, self.ref._cell)
+        self._system._node.topics.subscribe(topic, self.ref._cell)
 
     async def stop(self) -> None:
         """End the probe's life, and its taps."""
@@ -535,7 +535,7 @@ class Probe:
 
 
 def probe(system: ActorSystem, name: str | None = None) -> Probe:
-    """A probe in a running system.
+    """Start a probe in a running system, as an actor that the test holds in its hand.
 
     Raises:
         NameTaken: a child of the root has this name.

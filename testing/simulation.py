@@ -127,7 +127,7 @@ class Simulation:
 
     @property
     def escaped(self) -> tuple[str, ...]:
-        """What the run has used that no seed decides."""
+        """List what the run has used that no seed decides."""
         return () if self.world is None else tuple(self.world.escaped)
 
     async def begin(
@@ -171,7 +171,7 @@ class Simulation:
             raise
         finally:
             inside.reset(mark)
-        root.node, root.is_up = root.system.node, True
+        root.node, root.is_up = root.system._node, True
         root.system._body = self._test
         self._swaps.put(root.node.clock, "wall", lambda: EPOCH + root.node.loop.time())
         pool = root.system._workers
@@ -188,16 +188,16 @@ class Simulation:
         await self._life.__aexit__(kind, error, trace)
 
     def problems(self) -> list[str]:
-        """What happened and was not expected, as texts."""
+        """List what happened and was not expected, as texts."""
         return [problem for root in self._roots for problem in root.system.problems()]
 
     def asks(self) -> dict[asyncio.Future[Any], tuple[str, object]]:
-        """What was asked, and of whom."""
+        """List what was asked in the run, and of whom."""
         return {future: asked for root in self._roots for future, asked in root.system.asks.items()}
 
     @property
     def are_exceptions_expected(self) -> bool:
-        """Whether exceptions may go unseen."""
+        """Say whether exceptions may go unseen."""
         return any(root.system.are_exceptions_expected for root in self._roots)
 
     async def moment(self, turns: int = 100) -> None:
@@ -261,7 +261,7 @@ class Simulation:
         worker.forked.kill()
 
     def stop_recording(self) -> None:
-        """The test is over: how its actors end belongs to no chart."""
+        """Record no more for the chart: the test is over, and how its actors end is none of it."""
         while self._ends:
             self._ends.pop()()
 
@@ -291,7 +291,7 @@ class RealRun(Simulation):
             options["store"] = f"sqlite:{Path(folder, 'app.db')}"
         system = await self._life.enter_async_context(GuardedSystem(**options))
         self._roots.append(Root(system))
-        self._ends.append(watch_turns(system.node, Tracer(self.trace)))
+        self._ends.append(watch_turns(system._node, Tracer(self.trace)))
         return system
 
     async def moment(self, turns: int = 100) -> None:
@@ -331,7 +331,7 @@ def _kill(root: Root) -> None:
         waiter = waiter_of(task)
         if waiter is not None and not waiter.done() and _is_called_by(task, system, node):
             waiter.set_exception(AskFailed(f"/{node.name}", "the root was killed"))
-    system._node = system._root = None  # It is not running.
+    system._running = system._root = None  # It is not running.
 
 
 def _is_called_by(task: asyncio.Task[Any], system: GuardedSystem, node: Node) -> bool:

@@ -1,4 +1,4 @@
-"""What an engine of your own must do to be a store of holdfast: its conformance suite.
+"""The conformance suite for store engines of your own.
 
     from holdfast.testing.stores import conformance
 

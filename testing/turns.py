@@ -1,4 +1,4 @@
-"""A look into turns, for tests: what is called before and after each turn of a node, or instead of its handler.
+"""Hooks around the turns of a node, for tests: called before and after a turn, or instead of its handler.
 
 Installed by exchanging one function of the run loop, `run_turns`, for one that runs the same turns singly. Without a
 watcher the loop's own function stands there.

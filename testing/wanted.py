@@ -1,4 +1,4 @@
-"""What a test expects of its actors: what its markers and the configuration of pytest say."""
+"""Expectations of a test about its actors, from its markers and from the configuration of pytest."""
 
 from __future__ import annotations
 

@@ -34,9 +34,10 @@ import uvloop
 
 from holdfast.actors.kernel.loop import RunLoop
 from holdfast.actors.process.fork import fork_server, launch
-from holdfast.testing.guard import leaks as guard_of_leaks
-from holdfast.testing.guard.leaks import GRACE, Leaks, end_processes, is_of_test
+from holdfast.testing.guard import process_leaks
+from holdfast.testing.guard.leaks import Leaks
 from holdfast.testing.guard.loop_leaks import LoopLeaks
+from holdfast.testing.guard.process_leaks import GRACE, end_processes, is_of_test
 from tests.pairs import covering
 from tests.waits import Waits
 from tests.warm import WarmServers
@@ -200,7 +201,7 @@ def warm_servers(temporary_folder: None) -> Iterator[WarmServers | None]:
     warm = WarmServers()
     with pytest.MonkeyPatch.context() as patch:
         # What was forked from the warm process does not show that it is the library's own, which has longer to end.
-        patch.setattr(guard_of_leaks, "SHORT_GRACE", guard_of_leaks.GRACE)
+        patch.setattr(process_leaks, "SHORT_GRACE", process_leaks.GRACE)
         yield warm
     warm.close()
 

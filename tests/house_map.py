@@ -20,15 +20,16 @@ def first_line(file: Path) -> str:
 
 
 def folders() -> list[Path]:
-    """All folders of the package, a room's own first."""
-    return [init.parent for room in ROOMS for init in sorted((ROOT / room).rglob("__init__.py"))]
+    """All folders of the package, the root first, and a room's own before those inside it."""
+    return [ROOT, *(init.parent for room in ROOMS for init in sorted((ROOT / room).rglob("__init__.py")))]
 
 
 def text() -> str:
     """The page."""
     parts = [HEAD]
     for folder in folders():
-        parts.append(f"## {folder.relative_to(ROOT)}\n\n{first_line(folder / '__init__.py')}\n")
+        name = "holdfast" if folder == ROOT else folder.relative_to(ROOT)
+        parts.append(f"## {name}\n\n{first_line(folder / '__init__.py')}\n")
         files = sorted(file for file in folder.glob("*.py") if file.name != "__init__.py")
         if files:
             parts.append("| file | |\n|---|---|\n" + "".join(f"| `{f.name}` | {first_line(f)} |\n" for f in files))

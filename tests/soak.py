@@ -211,7 +211,7 @@ class Soak:
             if kind not in ("task", "process"):
                 options["recovery"] = hf.hybrid(interval=0.5)
             if kind == "protected":
-                options["mechanism"] = hf.PBR()
+                options["mechanism"] = hf.ftm.PBR()
             spec = hf.child(kind.replace(" ", "_"), hf.start(Ledger), **options)
             self.refs[kind] = await self._system.start(spec)
 

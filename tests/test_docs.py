@@ -160,3 +160,39 @@ def test_requirements_are_listed_if_tests_cite_them_and_cited_if_they_are_listed
             numbers = range(int(first), int(last or first) + 1)
             cited.update(f"{letter}{number}{suffix}" for number in numbers)
     assert listed == cited
+
+
+def shown(name: str, documents: list[Path]) -> bool:
+    return any(re.search(rf"\b{re.escape(name)}\b", document.read_text("utf-8")) for document in documents)
+
+
+@pytest.mark.parametrize("room", ["", "adapters", "checkpoint", "ftm", "supervision", "system"])
+def test_no_name_is_exported_that_no_document_shows(room: str) -> None:
+    """The reference, the map and lists of what has moved show nothing."""
+    documents = [
+        path
+        for path in DOCUMENTS
+        if "reference" not in path.parts and path.name not in {"CHANGELOG.md", "map.md", "from-0.1-to-0.2.md"}
+    ]
+    names = importlib.import_module(f"holdfast.{room}" if room else "holdfast").__all__
+    assert not [name for name in names if not name.startswith("_") and not shown(name, documents)]
+
+
+@pytest.mark.parametrize("room", ["errors", "events"])
+def test_errors_and_events_are_all_explained(room: str) -> None:
+    """In the tables of one page, each."""
+    text = (ROOT / "docs" / f"{room}.md").read_text("utf-8")
+    names = importlib.import_module(f"holdfast.{room}").__all__
+    assert not [name for name in names if f"{name}`" not in text]
+
+
+def test_the_reference_has_every_public_name() -> None:
+    """As a page of mkdocstrings has it: `::: holdfast.Actor`; rooms of errors and events are there as a whole."""
+    text = "".join(path.read_text("utf-8") for path in sorted((ROOT / "docs" / "reference").glob("*.md")))
+    there = set(re.findall(r"^::: holdfast\.(\S+)$", text, re.MULTILINE))
+    for room in ("", "adapters", "checkpoint", "ftm", "supervision", "system"):
+        module = importlib.import_module(f"holdfast.{room}" if room else "holdfast")
+        errors = set(importlib.import_module("holdfast.errors").__all__)
+        wanted = {f"{room}.{name}".lstrip(".") for name in module.__all__ if name not in errors and name[0] != "_"}
+        assert not wanted - there
+    assert {"errors", "events"} <= there

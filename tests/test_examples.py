@@ -1,4 +1,4 @@
-"""Every program in examples/ runs, and prints what it says it prints."""
+"""Every program in examples/ and examples/tutorial/ runs, and prints what it says it prints."""
 
 import re
 import subprocess
@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-OWN_TESTS = {"rescue_robot", "fastapi_service"}
-"""The first prints times, the second serves until it is told to end."""
+OWN_TESTS = {"rescue_robot", "fastapi_service", "quick_start", "chapter_4_store"}
+"""The first prints times, the second serves until it is told to end, the last two are killed."""
+FOLDER = Path(__file__).parent.parent / "examples"
 EXAMPLES = [
-    path for path in sorted((Path(__file__).parent.parent / "examples").glob("*.py")) if path.stem not in OWN_TESTS
+    path for path in sorted([*FOLDER.glob("*.py"), *FOLDER.glob("tutorial/*.py")]) if path.stem not in OWN_TESTS
 ]
 
 

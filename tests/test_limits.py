@@ -91,7 +91,7 @@ async def died(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
     with system.events() as events:
         os.kill(system.pid_of(ref), signal.SIGKILL)
         async for event in events:
-            if isinstance(event, hf.ActorStarted) and event.address == ref.path:
+            if isinstance(event, hf.events.ActorStarted) and event.address == ref.path:
                 return
 
 
@@ -148,13 +148,13 @@ async def test_the_spec_of_a_child_comes_packed_from_another_process() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         child = hf.child("one", hf.start(Keeper))
         top = await system.start(hf.supervisor("top", children=[child], isolation="process"))
-        spec = await top.ask(hf.GetChildSpec("one"), timeout=60.0)
+        spec = await top.ask(hf.supervision.GetChildSpec("one"), timeout=60.0)
         assert isinstance(spec, Packed), spec
 
 
 async def attach(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
     async with system.transaction(timeout=60.0) as change:
-        change.attach(ref, PBR())
+        change.protect(ref, PBR())
 
 
 @pytest.mark.parametrize("isolation", ["task", "process"])
@@ -199,11 +199,11 @@ async def test_state_and_code_of_a_protected_actor_are_not_replaced() -> None:
         ref = await system.start(hf.child("one", hf.start(Keeper), mechanism=PBR()))
         await system.suspend(ref, timeout=60.0)
         for refused in (system.replace_state(ref, with_more), system.replace_code(ref, Busy)):
-            with pytest.raises(hf.ControlFailed, match=r"detach its mechanism, and attach it again after"):
+            with pytest.raises(hf.errors.ControlFailed, match=r"`protect` it by None, and again after"):
                 await refused
         await system.resume(ref, timeout=60.0)
         async with system.transaction(timeout=60.0) as change:
-            change.detach(ref)
+            change.protect(ref, None)
         await system.replace_state(ref, with_more, timeout=60.0)
         await attach(system, ref)
         assert await ref.ask(Do("goes on"), timeout=60.0) == 2
@@ -236,7 +236,7 @@ class Named(hf.Supervisor):
         self._file = file
 
     def init(self) -> hf.Plan:
-        return hf.Plan.of(hf.Flags(), [hf.child("leaves", hf.start(Leaves, self._file), shutdown=60.0)])
+        return hf.Plan.of(hf.supervision.Flags(), [hf.child("leaves", hf.start(Leaves, self._file), shutdown=60.0)])
 
 
 @pytest.mark.parametrize("shutdown", ["infinity", 60.0])
@@ -253,7 +253,7 @@ async def test_how_long_unknown_children_of_a_supervisor_elsewhere_may_take_is_g
         top = await system.start(spec)
         with system.events() as events:
             await system.stop(top)
-            overdue = [one for one in events.take() if isinstance(one, hf.StopOverdue)]
+            overdue = [one for one in events.take() if isinstance(one, hf.events.StopOverdue)]
     assert (bool(overdue), file.exists()) == ((True, False) if shutdown == "infinity" else (False, True))
 
 
@@ -278,7 +278,7 @@ async def test_c_code_that_keeps_the_interpreter_in_a_start_is_ended_by_hung_aft
         with system.events() as events:
             with contextlib.suppress(hf.StartFailed):
                 await system.start(hf.supervisor("top", children=[child], isolation="process", limits=limits))
-            reasons = [one.reason for one in events.take() if isinstance(one, hf.ProcessDied)]
+            reasons = [one.reason for one in events.take() if isinstance(one, hf.events.ProcessDied)]
         assert [type(one) for one in reasons] == [hf.Hung]
 
 

@@ -1,7 +1,9 @@
 """The shape of the package: one copy of it, what it exports, what importing it costs, and what it must never import."""
 
 import ast
+import importlib
 import json
+import re
 import subprocess
 import sys
 import tomllib
@@ -16,7 +18,6 @@ import holdfast
 from tests import house_map
 
 ROOT = Path(__file__).resolve().parents[1]
-IN_EXTRAS = {"CertificationAuthority"}  # public, and not what a star imports
 BESIDE = {"tests", "benchmarks", "examples", "docs", "build", "dist"}
 SOURCES = sorted(
     path.relative_to(ROOT)
@@ -57,14 +58,50 @@ def test_importing_holdfast_leaves_alone(name: str) -> None:
     assert name not in modules_after_import()
 
 
-def test_all_is_sorted_and_complete() -> None:
-    public = [
-        name for name, value in vars(holdfast).items() if not name.startswith("_") and not isinstance(value, ModuleType)
+def public_names(room: ModuleType) -> list[str]:
+    found = [
+        name
+        for name, value in vars(room).items()
+        if not name.startswith("_") and not isinstance(value, ModuleType) and not name.isupper()
     ]
-    public = sorted({*public, *holdfast._LAZY} - {"TYPE_CHECKING", *IN_EXTRAS})
+    return sorted(found)
+
+
+ROOMS = ["adapters", "checkpoint", "errors", "events", "ftm", "supervision", "system"]
+
+
+def test_all_is_sorted_and_complete() -> None:
+    public = [name for name in holdfast.__all__ if not name.isupper()]
     # `__version__` is public by convention although it begins with an underscore.
-    assert [name for name in holdfast.__all__ if name != "__version__"] == public
+    assert [name for name in public if name != "__version__"] == public_names(holdfast)
     assert list(holdfast.__all__) == sorted(holdfast.__all__)
+    assert len(holdfast.__all__) < 75
+
+
+def test_the_rooms_are_bound_and_only_they() -> None:
+    """`import holdfast as hf` is enough for `hf.ftm.PBR`; other folders are imported by those who want them."""
+    text = (ROOT / "__init__.py").read_text("utf-8")
+    assert re.findall(r"^from holdfast import (\w+) as \1$", text, re.MULTILINE) == ROOMS
+
+
+@pytest.mark.parametrize("name", ROOMS)
+def test_a_room_exports_what_it_lists(name: str) -> None:
+    room = importlib.import_module(f"holdfast.{name}")
+    assert {one for one in public_names(room) if name != "adapters"} <= set(room.__all__)
+    assert list(room.__all__) == sorted(set(room.__all__) & set(vars(room)))
+
+
+@pytest.mark.parametrize("name", ["errors", "events"])
+def test_errors_and_events_have_one_place(name: str) -> None:
+    """No other room exports one, and the package itself only those errors that most programs name."""
+    base = holdfast.HoldfastError if name == "errors" else holdfast.events.Event
+    here = set(importlib.import_module(f"holdfast.{name}").__all__)
+    for other in set(ROOMS) - {name}:
+        room = importlib.import_module(f"holdfast.{other}")
+        kinds = [one for one in room.__all__ if isinstance(getattr(room, one), type)]
+        assert not [one for one in kinds if issubclass(getattr(room, one), base)]
+    kinds = [one for one in holdfast.__all__ if isinstance(getattr(holdfast, one), type)]
+    assert not {one for one in kinds if issubclass(getattr(holdfast, one), base)} - here
 
 
 def test_the_version_is_that_of_the_distribution() -> None:
@@ -74,16 +111,15 @@ def test_the_version_is_that_of_the_distribution() -> None:
 
 def test_a_bare_install_has_all_public_names() -> None:
     modules = {"clingo", "cryptography", "numpy", "pddl", "PIL", "pytest", "rich", "typer", "yaml", "zstandard"}
-    program = f"import sys; sys.modules.update(dict.fromkeys({sorted(modules)})); from holdfast import *; TR, SEC, AD"
+    program = f"import sys; sys.modules.update(dict.fromkeys({sorted(modules)})); from holdfast import *; Actor"
     done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_what_needs_an_extra_says_which_one() -> None:
-    for name in IN_EXTRAS:
-        program = f"import sys; sys.modules['cryptography'] = None; import holdfast; holdfast.{name}"
-        done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True, timeout=60)
-        assert "pip install 'holdfast[sec]'" in done.stderr
+    program = "import sys; sys.modules['cryptography'] = None; import holdfast.ftm.sec.authority"
+    done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True, timeout=60)
+    assert "pip install 'holdfast[sec]'" in done.stderr
 
 
 def test_no_module_imports_pickle() -> None:
@@ -113,6 +149,17 @@ def test_every_folder_of_the_package_is_shipped() -> None:
 def test_the_map_is_up_to_date() -> None:
     """If not: `python -m tests.house_map`."""
     assert (ROOT / "docs" / "map.md").read_text("utf-8") == house_map.text()
+
+
+def test_each_module_stands_on_the_map_once() -> None:
+    folder, found = "", Counter[str]()
+    for line in house_map.text().splitlines():
+        if line.startswith("## "):
+            folder = line.removeprefix("## ").removeprefix("holdfast")
+            found[str(Path(folder, "__init__.py"))] += 1
+        elif line.startswith("| `"):
+            found[str(Path(folder, line.split("`")[1]))] += 1
+    assert found == Counter(map(str, SOURCES))
 
 
 def test_no_folder_is_crowded_and_no_room_has_a_name_twice() -> None:

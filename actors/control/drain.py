@@ -1,4 +1,4 @@
-"""Letting an actor handle what it has before it is stopped."""
+"""Draining: an actor handles what is queued before it is stopped."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ def change_state(actor: Actor, change: Callable[[Any], Any]) -> None:
     """
     with _changing(actor, "replace_state", is_trial=False):
         put_state(actor, change(state_to_change(actor)))
-        actor.ctx.replaced()
+        actor.ctx._replaced()
 
 
 def tried_state(actor: Actor, changes: Iterable[Callable[[Any], Any]], verb: str) -> tuple[Any, list[bytes]]:
@@ -118,7 +118,7 @@ def tried_state(actor: Actor, changes: Iterable[Callable[[Any], Any]], verb: str
     with _changing(actor, verb, is_trial=True):
         for change in changes:
             put_state(actor, change(state_to_change(actor)))
-        saved = actor.ctx.saved()
+        saved = actor.ctx._saved()
         return state_to_change(actor), saved
 
 
@@ -126,7 +126,7 @@ def tried_state(actor: Actor, changes: Iterable[Callable[[Any], Any]], verb: str
 def _changing(actor: Actor, verb: str, *, is_trial: bool) -> Generator[None]:
     """Have the state as it was before, behind a trial and behind whatever raises."""
     ctx = actor.ctx
-    ctx.may_replace()
+    ctx._may_replace()
     kind, before = type(actor), dict(vars(actor))
     hooked = state_to_change(actor) if state_setter(actor) is not None else None
     values = live_state(actor) if state_getter(actor) is None else None

@@ -1,4 +1,4 @@
-"""What can be ordered of a live actor, each order as plain data, so that it can cross a process border.
+"""The orders that can be given to a live actor, as plain data that can cross a process border.
 
 An order is carried out where the actor lives, between two of its turns.
 """

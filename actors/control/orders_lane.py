@@ -1,4 +1,4 @@
-"""Asks on the system lane: an order goes to an actor ahead of all messages, wherever it lives, and is answered."""
+"""The system lane: orders reach an actor ahead of its messages, wherever it lives, and are answered."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ class QueuedOrder(Item):
     def run(actor: Any, item: Any) -> object:
         call: QueuedOrder = item
         ask, ctx = call.ask, actor.ctx
-        if ask.is_done or ask.deadline <= ctx.cell.node.loop.time():
+        if ask.is_done or ask.deadline <= ctx._cell.node.loop.time():
             return None  # Whoever gave it was told that it was not carried out.
-        if ctx.postpones(call):
+        if ctx._postpones(call):
             return None
         ask.started = True
         try:
-            value = call.order.run(ctx.cell, actor)
+            value = call.order.run(ctx._cell, actor)
         except HoldfastError as error:
             ask.fail(error)
         except BaseException as error:  # The user's own code, such as `get_state`: no reason to end the actor.

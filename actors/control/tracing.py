@@ -27,7 +27,7 @@ Coroutine_ = types.CoroutineType
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Statistics:
-    """What an actor has done since its statistics were switched on."""
+    """The counts of an actor's messages and turns since its statistics were switched on."""
 
     since: float
     """Unix time at which they were."""
@@ -253,19 +253,19 @@ class TappedContext:
 
     __slots__ = ()
 
-    def tell(self, cell: Cell, message: Message[Any]) -> None:
+    def _tell(self, cell: Cell, message: Message[Any]) -> None:
         """Count and tell a message that goes out, and send it as the context does."""
-        _own(self).tell(cell, message)
+        _own(self)._tell(cell, message)
         _tap(self).sent(cell.path, message)
 
-    async def send(self, cell: Cell, message: Message[Any]) -> None:
+    async def _send(self, cell: Cell, message: Message[Any]) -> None:
         """Count and tell a message that goes out, and send it as the context does."""
-        await _own(self).send(cell, message)
+        await _own(self)._send(cell, message)
         _tap(self).sent(cell.path, message)
 
-    def ask(self, cell: Cell, message: Message[Any], timeout: float) -> Any:
+    def _ask(self, cell: Cell, message: Message[Any], timeout: float) -> Any:
         """Count and tell a message that goes out, and ask as the context does."""
-        reply = _own(self).ask(cell, message, timeout)
+        reply = _own(self)._ask(cell, message, timeout)
         _tap(self).sent(cell.path, message)
         return reply
 
@@ -283,7 +283,7 @@ def _own(ctx: Any) -> Any:
 
 
 def _tap(ctx: Any) -> TurnTap:
-    return tap_of(ctx.cell)
+    return tap_of(ctx._cell)
 
 
 def _tapped(kind: type[ActorContext]) -> type[ActorContext]:

@@ -188,16 +188,16 @@ class Actor:
         """
 
     def on_exit(self, source: ActorRef[Any], reason: ExitReason) -> Any:
-        """A linked actor ended, and this one traps exits (`ctx.trap_exits`)."""
+        """Hear that a linked actor has ended, if this one traps exits (`ctx.trap_exits`)."""
 
     def on_down(self, source: ActorRef[Any], reason: ExitReason, recovering: bool) -> Any:
-        """A monitored life, or a watched address, ended."""
+        """Hear that a monitored life, or a watched address, has ended."""
 
     def on_undelivered(self, message: Message[Any]) -> Any:
-        """A queued message that will not be handled, because the actor stops; without this it is a dead letter."""
+        """Take a queued message that will not be handled, because the actor stops; without this it is a dead letter."""
 
     def on_safe_state(self, entered: bool) -> Any:
-        """An actor whose recovery method names this one begins to be recovered (True), or is back (False).
+        """Hear that an actor whose recovery method names this one begins to be recovered (True), or is back (False).
 
         May be async. Of several recoveries at a time it hears once: of the first beginning, and of the last end.
         """
@@ -205,7 +205,7 @@ class Actor:
     @on(SafeStateChange)
     def _on_safe_state(self, message: SafeStateChange) -> Any:
         """An ordinary message, in its place, and journaled if we are recorded."""
-        watch(self.ctx.cell, message)
+        watch(self.ctx._cell, message)
         return self.on_safe_state(message.entered)
 
     def on_recovered(self) -> Any:
@@ -239,7 +239,7 @@ class Actor:
 
     async def _stop_children(self) -> None:
         """The life ends: its children go first, newest first."""
-        for child in reversed(list((self.ctx.cell.children or {}).values())):
+        for child in reversed(list((self.ctx._cell.children or {}).values())):
             await child.node.stop_child(child)
 
 
@@ -300,7 +300,7 @@ A = TypeVar("A", bound=Actor)
 
 
 def start(kind: Callable[P, A], *args: P.args, **kwargs: P.kwargs) -> Start[A]:
-    """A recipe for an actor: `start(Account, 100)`. Typed like the class's `__init__`; nothing runs yet.
+    """Make a recipe for an actor: `start(Account, 100)`. Typed like the class's `__init__`; nothing runs yet.
 
     Raises:
         TypeError: `kind` is no Actor class. (Arguments are checked where a child spec is made of it.)

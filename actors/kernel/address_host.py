@@ -1,4 +1,4 @@
-"""How an address lives: what it has accepted (its home), where its turns run (its place), and whom its ends concern.
+"""The host of an address: its home (what it has accepted), its place (where turns run), and its parent.
 
 A home outlives every life at its address, and a place can be exchanged for another while the actor works. Any home
 that hands its messages over goes with any place that takes them, so a new home is one class, and so is a new place.

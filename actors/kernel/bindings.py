@@ -44,7 +44,7 @@ class Binding(Generic[A_co]):
     def __get__(self, actor: Actor | None, owner: type) -> Binding[A_co] | ActorRef[A_co]:
         if actor is None:
             return self
-        bound = actor.ctx.bound(self._name)
+        bound = actor.ctx._bound(self._name)
         if bound is None:
             raise Unbound(actor.ctx.path, self._name)
         return cast("ActorRef[A_co]", bound)

@@ -122,7 +122,7 @@ def in_thread(handler: Callable[[Any, Any], Any]) -> Handler:
         actor.ctx = cast("ActorContext", threaded)
         is_left_behind = False
         try:
-            return await ctx.cell.node.threads.run(_run, threaded, handler, actor, message)
+            return await ctx._cell.node.threads.run(_run, threaded, handler, actor, message)
         except asyncio.CancelledError:
             is_left_behind = True  # The thread goes on, and has to be told no: `ctx` stays what it is.
             raise
@@ -164,20 +164,20 @@ class ThreadContext:
         else:
             setattr(self._ctx, name, value)
 
-    def tell(self, cell: Cell, message: Message[Any]) -> None:
+    def _tell(self, cell: Cell, message: Message[Any]) -> None:
         """Send a tell from the worker thread, through the event loop."""
-        self._on_loop(self._ctx.tell, cell, message)
+        self._on_loop(self._ctx._tell, cell, message)
 
-    def send(self, cell: Cell, message: Message[Any]) -> Any:
+    def _send(self, cell: Cell, message: Message[Any]) -> Any:
         """A ref's send: nothing here can be awaited."""
         if threading.get_ident() != self._thread:
-            return self._ctx.send(cell, message)
+            return self._ctx._send(cell, message)
         raise HoldfastError(f"{self._ctx.path}: a blocking handler cannot await a send; use tell, or `async def`")
 
-    def ask(self, cell: Cell, message: Message[Any], timeout: float) -> Any:
+    def _ask(self, cell: Cell, message: Message[Any], timeout: float) -> Any:
         """A ref's ask: nothing here can be awaited."""
         if threading.get_ident() != self._thread:
-            return self._ctx.ask(cell, message, timeout)
+            return self._ctx._ask(cell, message, timeout)
         raise HoldfastError(f"{self._ctx.path}: a blocking handler cannot await an ask; make it `async def`")
 
     def _on_loop(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
@@ -185,7 +185,7 @@ class ThreadContext:
             return function(*args, **kwargs)
         done: concurrent.futures.Future[Any] = concurrent.futures.Future()
         work = functools.partial(_answer, done, functools.partial(self._checked, function, *args, **kwargs))
-        loop = self._ctx.cell.node.loop
+        loop = self._ctx._cell.node.loop
         with contextlib.suppress(RuntimeError):  # The loop is closed: nobody is left to do it.
             loop.call_soon_threadsafe(work, context=contextvars.copy_context())
         if not wait_on_loop(loop, done):

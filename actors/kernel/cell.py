@@ -402,7 +402,7 @@ class _NextUrgent(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        more: More | None = actor.ctx.cell.more
+        more: More | None = actor.ctx._cell.more
         if more is None or not more.urgent:
             return None
         command = more.urgent.popleft()

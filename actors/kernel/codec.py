@@ -18,6 +18,7 @@ import msgspec
 from ..errors import (
     AskFailed,
     BadMessage,
+    BadReply,
     DamagedValue,
     HoldfastError,
     RemoteCrash,
@@ -217,7 +218,7 @@ class Codec:
         try:
             return self._decode_error(kind, name, body)
         except Exception as error:  # It is made of what another process says: the parameters need not fit.
-            return BadMessage("reply", name or kind, f"an error that cannot be made: {error_text(error)}")
+            return BadReply(name or kind, f"an error that cannot be made: {error_text(error)}")
 
     def _decode_error(self, kind: str, name: str, body: Any) -> HoldfastError:
         if kind == "refusal":

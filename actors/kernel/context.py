@@ -1,4 +1,4 @@
-"""`self.ctx`: what an actor may do besides handling messages. One per life."""
+"""The context, `self.ctx`: what an actor may do besides handling messages. Each life has its own."""
 
 from __future__ import annotations
 
@@ -45,96 +45,96 @@ class Borrowed(list["Ask"]):
 class ActorContext:
     """An actor's view of the runtime. It belongs to one life: after that life's end it refuses to send."""
 
-    __slots__ = ("_asking", "_promised", "_random", "_turn", "cell", "closed")
+    __slots__ = ("_asking", "_cell", "_closed", "_owes", "_random", "_turn")
 
-    may_fail_fast: ClassVar[bool] = True
+    _may_fail_fast: ClassVar[bool] = True
     """Whether an ask may end by what the receiver happens to be doing; a replay could not repeat that."""
 
     def __init__(self, cell: Cell) -> None:
-        self.cell = cell
-        self.closed = False
+        self._cell = cell
+        self._closed = False
         self._asking: Any = None
         self._turn = 0
         self._random: random.Random | None = None
-        self._promised: list[Ask] | None = None  # asks that may be answered later
+        self._owes: list[Ask] | None = None  # asks that may be answered later
 
     # -- who, when --------------------------------------------------------------------------------------------------
 
     @property
-    def item(self) -> Any:
+    def _item(self) -> Any:
         """What is being handled, or was last; it stands in the cell, so that most turns need not touch this object."""
-        return None if self.closed else self.cell.item
+        return None if self._closed else self._cell.item
 
     @property
     def ref(self) -> ActorRef[Any]:
         """A ref to this actor."""
-        return self.cell.ref
+        return self._cell.ref
 
     @property
     def path(self) -> str:
         """The address of this actor."""
-        return self.cell.path
+        return self._cell.path
 
     @property
     def life(self) -> int:
         """The number of this life at the address, from 1."""
-        return self.cell.life
+        return self._cell.life
 
     @property
     def sender(self) -> ActorRef[Any] | None:
-        """Who sent the message in hand; None if it was no actor."""
-        item = self.item
+        """Return a ref to the actor that sent the message in hand; None if no actor did."""
+        item = self._item
         sender: Cell | None = item.sender if isinstance(item, Item) else None
         return None if sender is None else sender.ref
 
     def now(self) -> float:
         """Unix time in seconds; in a journaled actor, that of the input in hand."""
-        return self.cell.node.clock.wall()
+        return self._cell.node.clock.wall()
 
     @property
     def random(self) -> random.Random:
         """A random generator; in a journaled actor the same numbers come again under replay."""
         if self._random is None:
-            self._random = random.Random(self.cell.node.numbers.next_seed())
+            self._random = random.Random(self._cell.node.numbers.next_seed())
         return self._random
 
     def uuid(self) -> uuid.UUID:
-        """A new random UUID, drawn from `random`."""
+        """Return a new random UUID, drawn from `random`."""
         return uuid.UUID(int=self.random.getrandbits(128), version=4)
 
     # -- sending (called by ActorRef for sends inside a turn) -------------------------------------------------------
 
-    def tell(self, cell: Cell, message: Message[Any]) -> None:
+    def _tell(self, cell: Cell, message: Message[Any]) -> None:
         """Send from this actor: the receiver sees the sender."""
         self._alive()
         if type(message) not in cell.table:
             cell.require(message)
-        cell.admit(cell, Envelope(message, self.cell))
+        cell.admit(cell, Envelope(message, self._cell))
 
-    async def send(self, cell: Cell, message: Message[Any]) -> None:
+    async def _send(self, cell: Cell, message: Message[Any]) -> None:
         """Send and wait until it is accepted. Nobody waits for room at itself: that raises MailboxFull, as a tell."""
         self._alive()
-        while cell is not self.cell and (room := cell.room()) is not None:
+        while cell is not self._cell and (room := cell.room()) is not None:
             await room
             self._alive()
         if type(message) not in cell.table:
             cell.require(message)
-        accepted = cell.host.offer(cell, Envelope(message, self.cell))
+        accepted = cell.host.offer(cell, Envelope(message, self._cell))
         if accepted is not None:
             await accepted
 
-    def ask(self, cell: Cell, message: Message[R], timeout: float) -> asyncio.Future[R]:
+    def _ask(self, cell: Cell, message: Message[R], timeout: float) -> asyncio.Future[R]:
         """Ask from this actor: the chain of waiting turns goes along, so that a circle is refused at once."""
         self._alive()
         if type(message) not in cell.table:
             cell.require(message)
-        node = self.cell.node
+        node = self._cell.node
         future: asyncio.Future[R] = node.loop.create_future()
-        chain = self.chain()
+        chain = self._chain()
         if waits_for(self, cell, chain):
             future.set_exception(AskDeadlock(cell.path, tuple(path for path, _ in chain)))
             return future
-        ask = Ask(message, self.cell, chain, timeout, node.loop.time() + timeout, future, cell)
+        ask = Ask(message, self._cell, chain, timeout, node.loop.time() + timeout, future, cell)
         node.deadlines.add(ask)
         try:
             cell.admit(cell, ask)
@@ -143,44 +143,44 @@ class ActorContext:
             raise
         return future
 
-    def chain(self) -> Chain:
+    def _chain(self) -> Chain:
         """This turn, and those that wait for it; nothing in a background task whose turn is over."""
-        if self.is_left_behind():
+        if self._is_left_behind():
             return ()
-        if self._asking is not self.item:
-            self._asking = self.item
-            self._turn = self.cell.node.numbers.next_turn()
-        return ((self.path, self._turn), *chain_of(self.item))
+        if self._asking is not self._item:
+            self._asking = self._item
+            self._turn = self._cell.node.numbers.next_turn()
+        return ((self.path, self._turn), *chain_of(self._item))
 
-    def turn_in(self, chain: Chain) -> bool:
+    def _turn_in(self, chain: Chain) -> bool:
         """Whether this actor's suspended turn is one of those in the chain."""
-        more = self.cell.more
+        more = self._cell.more
         if more is None or more.turn is None:  # Its last turn has ended: nobody waits here.
             return False
-        return self._asking is self.item and (self.path, self._turn) in chain
+        return self._asking is self._item and (self.path, self._turn) in chain
 
-    def is_left_behind(self) -> bool:
+    def _is_left_behind(self) -> bool:
         """Whether a background task asks, and something else than in its turn is being handled now."""
         begun = begun_in.get()
-        return begun is not None and begun is not self.item
+        return begun is not None and begun is not self._item
 
-    def in_turn(self) -> bool:
+    def _in_turn(self) -> bool:
         """Whether a turn of this actor runs, seen from its own code: from a background task it may be idle."""
-        more = self.cell.more
-        return (more is not None and more.turn is not None) or self.cell.node.is_stepping()
+        more = self._cell.more
+        return (more is not None and more.turn is not None) or self._cell.node.is_stepping()
 
     def _alive(self) -> None:
-        if self.closed:
+        if self._closed:
             raise ActorStopped(self.path, "this life is over; its leftovers may not send")
 
     def forward(self, to: ActorRef[Any]) -> None:
         """Hand the message in hand on: the receiver sees the original sender, and its reply goes to the asker."""
         self._alive()
-        item = self.item
+        item = self._item
         if isinstance(item, Ask):
             cell: Cell = to._cell
             cell.require(item.message)
-            self.cell.item = Stashed.of(item)
+            self._cell.item = Stashed.of(item)
             cell.admit(cell, item)
         elif isinstance(item, Envelope):
             to._cell.admit(to._cell, Envelope(item.message, item.sender))
@@ -188,36 +188,36 @@ class ActorContext:
             to._cell.admit(to._cell, message_in(item))  # The item of a timer or a pipe is of this life.
 
     def reply_handle(self) -> ReplyHandle[Any]:
-        """The right to answer the ask in hand later: `return self.ctx.reply_handle()`, keep it, call `reply`."""
-        item = self.item
-        return self.promise(item) if isinstance(item, Ask) else ReplyHandle(None)
+        """Return the right to answer the ask in hand later: `return self.ctx.reply_handle()`, keep it, call `reply`."""
+        item = self._item
+        return self._promise(item) if isinstance(item, Ask) else ReplyHandle(None)
 
-    def promise(self, ask: Ask) -> ReplyHandle[Any]:
+    def _promise(self, ask: Ask) -> ReplyHandle[Any]:
         """A reply handle for an ask, which is remembered while it waits."""
-        promised = self._promised
+        promised = self._owes
         if promised is None:
-            promised = self._promised = []
+            promised = self._owes = []
         elif len(promised) >= 64 and len(promised) & (len(promised) - 1) == 0:  # At each power of two.
             promised[:] = [one for one in promised if not one.is_done]
         promised.append(ask)
         return ReplyHandle(ask)
 
-    def promised(self) -> tuple[Ask, ...]:
+    def _promised(self) -> tuple[Ask, ...]:
         """The asks for which there are reply handles; those that are over may be among them."""
-        return () if type(self._promised) is Borrowed else tuple(self._promised or ())
+        return () if type(self._owes) is Borrowed else tuple(self._owes or ())
 
-    def borrow_promises(self) -> None:
+    def _borrow_promises(self) -> None:
         """What the actor promises is another life's until `keep_promises`: if this one ends before, nothing fails."""
-        self._promised = Borrowed()
+        self._owes = Borrowed()
 
-    def keep_promises(self) -> None:
+    def _keep_promises(self) -> None:
         """The life is the one that answers."""
-        if type(self._promised) is Borrowed:
-            self._promised = list(self._promised)
+        if type(self._owes) is Borrowed:
+            self._owes = list(self._owes)
 
-    def hand_on_promises(self) -> None:
+    def _hand_on_promises(self) -> None:
         """The actor lives elsewhere now, and answers from there."""
-        self._promised = None
+        self._owes = None
 
     async def publish(self, topic: str, message: Message[Any]) -> None:
         """Publish from this actor, and return when every subscriber has accepted; it waits for room at bounded ones.
@@ -225,21 +225,21 @@ class ActorContext:
         Not at itself, for it would wait for its own turn: without recovery what finds its own mailbox full is a dead
         letter there.
         """
-        uplink = self.cell.node.ports.uplink
+        uplink = self._cell.node.ports.uplink
         if uplink is not None:  # The subscribers are known to the root only.
             self._alive()
             require_message(topic, message)
-            await uplink.publish(topic, message, self.cell)
+            await uplink.publish(topic, message, self._cell)
             return
 
         async def send(cell: Cell) -> None:
             try:
-                await self.send(cell, message)
+                await self._send(cell, message)
             except NOT_TAKEN:
                 self._alive()  # Else it is this life that is over, and no fault of the subscriber's.
                 raise
 
-        await publish(self.cell.node, topic, message, send, self.cell)
+        await publish(self._cell.node, topic, message, send, self._cell)
 
     async def flush(self) -> None:
         """Release what this turn has sent so far (a journaled actor otherwise releases at the end of the turn)."""
@@ -247,14 +247,14 @@ class ActorContext:
     # -- later ------------------------------------------------------------------------------------------------------
 
     def tell_after(self, delay: float, message: Message[Any]) -> Timer:
-        """The message comes to this actor itself after `delay` seconds; the timer ends with this life."""
+        """Have a message come to this actor itself after `delay` seconds; the timer ends with this life."""
         self._alive()
-        return Timer(self.cell, message, delay, None)
+        return Timer(self._cell, message, delay, None)
 
     def every(self, interval: float, message: Message[Any]) -> Timer:
-        """The message comes every `interval` seconds; ticks that fall due while one waits are left out."""
+        """Have a message come every `interval` seconds; ticks that fall due while one waits are left out."""
         self._alive()
-        return Timer(self.cell, message, interval, interval)
+        return Timer(self._cell, message, interval, interval)
 
     def pipe_to_self(
         self,
@@ -278,8 +278,8 @@ class ActorContext:
             outcome = Piped(await self._outcome(work, then, failed), None)
         except BaseException as error:
             outcome = Piped(None, self._uncaught(error))
-        if not self.closed:
-            self.cell.push(outcome)
+        if not self._closed:
+            self._cell.push(outcome)
 
     async def _outcome(self, work: Awaitable[T], then: Callable[[T], Message[Any]], failed: Any) -> Message[Any]:
         """The message that background work ends with, whatever becomes of it.
@@ -289,17 +289,17 @@ class ActorContext:
         try:
             result = await work
         except BaseException as error:
-            if self.closed or failed is None:
+            if self._closed or failed is None:
                 raise
             message: Message[Any] = failed(error)
         else:
             message = then(result)
-        self.cell.require(message)
+        self._cell.require(message)
         return message
 
     def _uncaught(self, error: BaseException) -> BaseException:
         """What the end of background work crashes this actor with; raises it if this life is over."""
-        if self.closed:
+        if self._closed:
             raise error
         if isinstance(error, asyncio.CancelledError):  # By whoever else had the work in hand; that is no result.
             return HoldfastError(f"{self.path}: work that was given to pipe_to_self was cancelled")
@@ -310,31 +310,31 @@ class ActorContext:
     def stash(self) -> None:
         """Put the message in hand aside; it comes again after `unstash`. Its turn ends without a reply."""
         self._alive()
-        item = self.item
+        item = self._item
         if isinstance(item, Stashed):
             raise StashError(f"{self.path}: this message was stashed or forwarded already")
         if isinstance(item, Item) and item.of_life:
             raise StashError(f"{self.path}: only a message can be stashed")
-        more = self.cell.extra()
+        more = self._cell.extra()
         if more.stash is None:
             more.stash = deque()
         more.stash.append(item)
         if isinstance(item, Item):
             item.stashed()
-        self.cell.item = Stashed.of(item)
+        self._cell.item = Stashed.of(item)
 
     def unstash(self) -> None:
         """Put all stashed messages back, in order, in front of what is queued."""
         self._alive()
-        more = self.cell.extra()
+        more = self._cell.extra()
         stash = more.stash
         if not stash:
             return
         if more.bound is not None:
             more.bound.count += len(stash)
-        mailbox.put_back(self.cell, stash)
+        mailbox.put_back(self._cell, stash)
         stash.clear()
-        self.cell.schedule()
+        self._cell.schedule()
 
     # -- others -----------------------------------------------------------------------------------------------------
 
@@ -345,10 +345,10 @@ class ActorContext:
             NameTaken: a child of that name is alive. StartFailed: its `__init__` raised.
         """
         self._alive()
-        return cast("ActorRef[A]", self.cell.node.spawn(start, name, parent=self.cell).ref)
+        return cast("ActorRef[A]", self._cell.node.spawn(start, name, parent=self._cell).ref)
 
     def find(self, path: str, kind: type[A]) -> ActorRef[A]:
-        """A ref to the actor at `path`.
+        """Return a ref to the actor at `path`.
 
         In a turn of a recorded actor it is one to the address, whether somebody lives there or not: a replay must go
         the same way again, when perhaps nobody does.
@@ -356,101 +356,101 @@ class ActorContext:
         Raises:
             NoSuchActor: nobody lives there. WrongActor: another class does.
         """
-        return self.cell.node.find_ref(path, kind)
+        return self._cell.node.find_ref(path, kind)
 
     @property
     def trap_exits(self) -> bool:
-        """Whether EXIT signals come to `on_exit` instead of ending this actor."""
-        more = self.cell.more
+        """Say whether EXIT signals come to `on_exit` instead of ending this actor."""
+        more = self._cell.more
         return more is not None and more.trap_exits
 
     @trap_exits.setter
     def trap_exits(self, value: bool) -> None:
-        self.cell.extra().trap_exits = value
+        self._cell.extra().trap_exits = value
 
     def link(self, other: ActorRef[Any]) -> None:
         """Link two lives: an abnormal end of one ends the other."""
         self._alive()
-        links.link(self.cell, other._cell.living)
+        links.link(self._cell, other._cell.living)
 
     def unlink(self, other: ActorRef[Any]) -> None:
         """Remove a link; nothing more comes from it."""
-        links.unlink(self.cell, other._cell.living)
+        links.unlink(self._cell, other._cell.living)
 
     def monitor(self, other: ActorRef[Any]) -> Monitor:
         """`on_down` hears of the end of the present life there."""
         self._alive()
-        return links.monitor(self.cell, other._cell.living, for_good=False)
+        return links.monitor(self._cell, other._cell.living, for_good=False)
 
     def watch(self, other: ActorRef[Any]) -> Monitor:
         """`on_down` hears once, when the address is gone for good."""
         self._alive()
-        return links.monitor(self.cell, other._cell.living, for_good=True)
+        return links.monitor(self._cell, other._cell.living, for_good=True)
 
     def subscribe(self, topic: str) -> None:
         """Get what is published there from now on."""
         self._alive()
-        self.cell.node.topics.subscribe(topic, self.cell)
+        self._cell.node.topics.subscribe(topic, self._cell)
 
     def unsubscribe(self, topic: str) -> None:
         """Receive no more of what is published on a topic."""
-        self.cell.node.topics.unsubscribe(topic, self.cell)
+        self._cell.node.topics.unsubscribe(topic, self._cell)
 
-    def bound(self, port: str) -> ActorRef[Any] | None:
+    def _bound(self, port: str) -> ActorRef[Any] | None:
         """What a binding points to now."""
-        more = self.cell.more
+        more = self._cell.more
         target = more.bindings.get(port) if more is not None else None
         return None if target is None else target.ref
 
     def stop(self, reason: ExitReason = NORMAL) -> None:
         """End this life after the turn in hand."""
         self._alive()
-        self.cell.request_stop(reason)
+        self._cell.request_stop(reason)
 
     # -- control (called between two turns, by what carries orders out) --------------------------------------------
 
-    def depart(self, owe: Callable[[Ask], int]) -> bytes:
+    def _depart(self, owe: Callable[[Ask], int]) -> bytes:
         """Pack the state of an actor that is to be moved; a journaled one takes its last snapshot here instead.
 
         Raises whatever keeps it from being packed.
         """
         from ..migration.luggage import StatePacker
 
-        actor = self.cell.actor
+        actor = self._cell.actor
         assert actor is not None
         return StatePacker(actor, owe).pack()
 
-    def postpones(self, call: Item) -> bool:
+    def _postpones(self, call: Item) -> bool:
         """Whether an order has to wait (a journaled actor takes none before it has caught up); it comes again then."""
         return False
 
     @property
-    def named_variables(self) -> tuple[str, ...] | None:
+    def _named_variables(self) -> tuple[str, ...] | None:
         """The key variables that a recovery file names for this actor; None if none does."""
         return None
 
-    def may_replace(self) -> None:
+    def _may_replace(self) -> None:
         """The state is about to be replaced from outside. Raises ControlFailed if it cannot be now."""
 
-    def replaced(self) -> None:
+    def _replaced(self) -> None:
         """The state was replaced from outside: a journaled actor saves it before anything else happens.
 
         Raises whatever keeps it from being saved.
         """
 
-    def saved(self) -> list[bytes]:
+    def _saved(self) -> list[bytes]:
         """The present state as the actor's home would be told of it, if it has one; nobody is told.
 
         Raises whatever keeps it from being saved.
         """
         return []
 
-    def close(self) -> None:
+    def _close(self) -> None:
         """Refuse everything from now on, because the life is over."""
-        self.closed = True
+        self._closed = True
 
     def create_task(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
-        """A background task that ends with this life; an exception in it crashes the actor."""
+        """Start a background task that ends with this life; an exception in it crashes the actor."""
         self._alive()
         task = self._beside(work, "task")
         task.add_done_callback(self._task_done)
@@ -458,17 +458,17 @@ class ActorContext:
 
     def _beside(self, work: Coroutine[Any, Any, T], what: str) -> asyncio.Task[T]:
         """A task of this life, which knows in what turn it was begun."""
-        tasks, context = self.cell.extra().belongings.tasks, copy_context()
-        context.run(begun_in.set, self.item)
-        task = self.cell.node.loop.create_task(contained(work), name=f"{what} of {self.path}", context=context)
+        tasks, context = self._cell.extra().belongings.tasks, copy_context()
+        context.run(begun_in.set, self._item)
+        task = self._cell.node.loop.create_task(contained(work), name=f"{what} of {self.path}", context=context)
         tasks.add(task)
         task.add_done_callback(tasks.discard)
         task.add_done_callback(lambda _: work.close())  # If it was cancelled before its first step, it never began.
         return task
 
     def _task_done(self, task: asyncio.Task[Any]) -> None:
-        if not task.cancelled() and (error := task.exception()) is not None and not self.closed:
-            self.cell.push(Piped(None, uncontained(error)))
+        if not task.cancelled() and (error := task.exception()) is not None and not self._closed:
+            self._cell.push(Piped(None, uncontained(error)))
 
 
 async def contained(work: Coroutine[Any, Any, T]) -> T:
@@ -517,5 +517,5 @@ def waits_for(asker: ActorContext, cell: Cell, chain: Chain) -> bool:
     """Whether the turn that runs at `cell` is in the chain: an ask to it would wait for itself."""
     ctx = cell.ctx
     if ctx is asker:
-        return asker.in_turn() and not asker.is_left_behind()
-    return ctx is not None and ctx.turn_in(chain)
+        return asker._in_turn() and not asker._is_left_behind()
+    return ctx is not None and ctx._turn_in(chain)

@@ -1,4 +1,4 @@
-"""What stands in a mailbox: bare messages, envelopes, asks, and the runtime's own items.
+"""The items that stand in a mailbox: bare messages, envelopes, asks, and the runtime's own.
 
 The run loop knows nothing of these kinds. It looks up `table[type(item)]` and calls what it finds: a user's handler
 for a message, `run` for everything else.
@@ -149,7 +149,7 @@ def chain_of(item: Any) -> Chain:
 def unhandled(actor: Any, message: Any) -> object:
     """Stands in the table for types without a handler."""
     ctx: ActorContext = actor.ctx
-    ctx.cell.node.dead_letter(ctx.cell, message, f"{type(actor).__name__} has no handler for it")
+    ctx._cell.node.dead_letter(ctx._cell, message, f"{type(actor).__name__} has no handler for it")
     return None
 
 
@@ -189,7 +189,7 @@ class Ask(Item, msgspec.Struct, eq=False):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        cell: Cell = actor.ctx.cell
+        cell: Cell = actor.ctx._cell
         if item.deadline <= cell.node.now:  # Nobody waits any more: not run (unless the wait was only cancelled).
             item.expire()
             return None
@@ -261,7 +261,7 @@ class ReplyHandle(Generic[R]):
 
     @property
     def ask(self) -> Ask | None:
-        """What is to be answered; None if nobody waits."""
+        """Return the ask that is to be answered; None if nobody waits."""
         return self._ask
 
     def reply(self, value: R) -> None:

@@ -187,7 +187,7 @@ def build(cell: Cell, start: Start[Any], context_type: Callable[[Cell], ActorCon
         actor.__init__(*start.args, **start.kwargs)
     except BaseException as error:
         pass_on(cell, error)
-        ctx.close()
+        ctx._close()
         _kill_orphans(cell)
         if cell.more is not None:
             _undo(cell)
@@ -291,7 +291,7 @@ class Stop(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        stop(actor.ctx.cell, item.reason, item)
+        stop(actor.ctx._cell, item.reason, item)
         return LEAVE
 
 
@@ -302,7 +302,7 @@ class Kill(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        killed(actor.ctx.cell)
+        killed(actor.ctx._cell)
         return LEAVE
 
 
@@ -473,9 +473,9 @@ def ended(cell: Cell, reason: ExitReason) -> None:
         more.reason = reason
     if ctx is not None:
         if cell.actor is None or not cell.actor._keeps_promises:
-            for ask in ctx.promised():  # Nobody else can answer these.
+            for ask in ctx._promised():  # Nobody else can answer these.
                 ask.fail(AskFailed(cell.path, str(reason)))
-        ctx.close()
+        ctx._close()
     actor = cell.actor
     if actor is not None and type(actor).on_undelivered is not Actor.on_undelivered:
         cell.extra().last = actor  # It may yet be handed what was queued.

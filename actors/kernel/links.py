@@ -1,4 +1,4 @@
-"""Links and monitors: who hears of an end, and what it does to them. Erlang's rules.
+"""Links and monitors by Erlang's rules: who is told of an end, and what it does to them.
 
 A link is two-sided: an abnormal end ends the other side with the same reason, unless that one traps exits. A monitor is
 one-sided and only informs: of one life (`monitor`), or of the address (`watch`: once, when it is gone for good).
@@ -27,7 +27,7 @@ class Monitor:
         self.life = watcher.life  # a watch ends with the life that set it
 
     def cancel(self) -> None:
-        """No DOWN arrives after this, not even one that is queued already."""
+        """Cancel the monitor: no DOWN arrives after this, not even one that is queued already."""
         self.active = False
         target = self.target
         self.forget()
@@ -36,7 +36,7 @@ class Monitor:
             target.host.told(target, "demonitor", {"watcher": self.watcher.path, "for_good": self.for_good})
 
     def forget(self) -> None:
-        """It is over: its DOWN has been told, or is not wanted."""
+        """Forget the monitor: its DOWN has been told, or is not wanted any more."""
         if self.watcher.more is not None:
             self.watcher.more.ties.watching.pop(self, None)
 
@@ -236,7 +236,7 @@ class Exit(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        cell: Cell = actor.ctx.cell
+        cell: Cell = actor.ctx._cell
         if not item.active:
             return None
         if cell.more is not None and cell.more.trap_exits:

@@ -1,4 +1,4 @@
-"""How a message gets into a mailbox: one `admit` function per situation, swapped when the situation changes.
+"""Mailboxes: one `admit` function per situation of an address, swapped when the situation changes.
 
 `cell.admit(cell, item)` is called for every message; which function stands there says what happens to it. No flag is
 tested per message.
@@ -64,7 +64,7 @@ def admit_gone(cell: Cell, item: Any) -> None:
     if successor is not None:
         successor.admit(successor, item)
     elif isinstance(item, Item):
-        item.undelivered(cell, "it has stopped")
+        item.undelivered(cell, "for good")
     else:
         cell.node.dead_letter(cell, item, "the actor has stopped")
 
@@ -261,7 +261,7 @@ class Hold(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        cell: Cell = actor.ctx.cell
+        cell: Cell = actor.ctx._cell
         queue_of(cell).appendleft(item)
         cell.scheduled = False
         return LEAVE
@@ -330,7 +330,7 @@ class Bounded:
 
 
 def bounded(capacity: int, *, overflow: Overflow = "block") -> Bounded:
-    """A mailbox for at most `capacity` messages.
+    """Describe a mailbox for at most `capacity` messages.
 
     Args:
         capacity: messages, >= 1.

@@ -147,7 +147,7 @@ class Refusal(HoldfastError):
 
     @classmethod
     def schema(cls) -> type[msgspec.Struct]:
-        """The struct that codes this refusal's fields; made with the first use, when all names are known."""
+        """Return the struct that codes this refusal's fields; made with the first use, when all names are known."""
         if "_schema" not in cls.__dict__ or cls._schema is None:
             hints = typing.get_type_hints(cls)
             names = [name for name in hints if name != "_schema" and get_origin(hints[name]) is not typing.ClassVar]

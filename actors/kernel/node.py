@@ -13,7 +13,16 @@ from collections.abc import Callable
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from ..errors import ActorStopped, HoldfastError, NameTaken, NoSuchActor, SpecError, WrongActor, type_name
+from ..errors import (
+    ActorStopped,
+    HoldfastError,
+    NameTaken,
+    NoSuchActor,
+    SpecError,
+    UnknownMessage,
+    WrongActor,
+    type_name,
+)
 from ..events import DeadLetter, Event, EventHub, SupervisorGaveUp
 from ..exit_reasons import KILLED, ExitReason
 from ..persistence import Keeper, NothingKept
@@ -191,8 +200,11 @@ class Node(RunLoop):
             self.events.emit(DeadLetter(cell.path, self.codec.opened(cell, message), why))
 
     def not_taken(self, cell: Cell, message: object, error: HoldfastError) -> None:
-        """A subscriber could not take what was published; one that has ended meanwhile is no subscriber any more."""
-        if not isinstance(error, ActorStopped):
+        """A subscriber could not take what was published.
+
+        One that has ended meanwhile is no subscriber any more, and one that has no handler for it wants other messages.
+        """
+        if not isinstance(error, (ActorStopped, UnknownMessage)):
             self.dead_letter(cell, message, str(error))
 
     def refused(self, cell: Cell, item: Any, no: Refusal) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal
+
+from typing_extensions import TypeVar
 
 from ..errors import ActorRestarting, SpecError
 from .envelope import Ask
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
     from .cell import Cell
     from .context import ActorContext
 
-A_co = TypeVar("A_co", bound="Actor", covariant=True)
+A_co = TypeVar("A_co", bound="Actor", default=Any, covariant=True)
 R = TypeVar("R")
 
 Restarting = Literal["wait", "fail"]
@@ -45,7 +47,7 @@ class ActorRef(Generic[A_co]):
         return self._cell.path
 
     def tell(self, message: Message[Any]) -> None:
-        """Send without waiting.
+        """Send a message without waiting until it is accepted, and without a reply.
 
         Raises:
             UnknownMessage: the actor's class is known and has no handler for it.
@@ -60,7 +62,7 @@ class ActorRef(Generic[A_co]):
         if sender is None:
             cell.admit(cell, message)
         else:
-            sender.tell(cell, message)
+            sender._tell(cell, message)
 
     async def send(self, message: Message[Any]) -> None:
         """Send, and return when the message is accepted: the tell with back-pressure.
@@ -72,7 +74,7 @@ class ActorRef(Generic[A_co]):
         cell = self._cell
         sender = current.get(None)
         if sender is not None:
-            await sender.send(cell, message)
+            await sender._send(cell, message)
             return
         cell.node.check_thread(cell.path)
         while (room := cell.room()) is not None:
@@ -107,7 +109,7 @@ class ActorRef(Generic[A_co]):
         if restarting != "wait" and (failed := _restarting(cell, restarting, sender)) is not None:
             return failed
         if sender is not None:
-            return sender.ask(cell, message, timeout)
+            return sender._ask(cell, message, timeout)
         if type(message) not in cell.table:
             cell.require(message)
         node = cell.node
@@ -149,7 +151,7 @@ def _restarting(cell: Cell, restarting: str, sender: ActorContext | None) -> asy
     """The failed ask to an actor that is not up now; None if the ask is to be made."""
     if restarting != "fail":
         raise SpecError("ask", f"restarting must be 'wait' or 'fail', not {restarting!r}")
-    if cell.is_dead or cell.host.is_up(cell) or (sender is not None and not sender.may_fail_fast):
+    if cell.is_dead or cell.host.is_up(cell) or (sender is not None and not sender._may_fail_fast):
         return None
     future: asyncio.Future[Any] = cell.node.loop.create_future()
     future.set_exception(ActorRestarting(cell.path))

@@ -33,11 +33,11 @@ class Timer:
 
     @property
     def is_active(self) -> bool:
-        """Whether the message may still come."""
+        """Say whether the message of the timer may still come."""
         return self._handle is not None or self._queued
 
     def cancel(self) -> None:
-        """The message does not come any more, not even if it is queued already."""
+        """Cancel the timer: its message does not come any more, not even if it is queued already."""
         if self._handle is not None:
             self._handle.cancel()
         self._handle = None
@@ -46,12 +46,12 @@ class Timer:
             self._cell.more.belongings.timers.discard(self)
 
     def pause(self) -> None:
-        """Its actor is being moved: nothing comes until `resume`."""
+        """Hold the timer while its actor is moved: nothing comes until `resume`."""
         if self._handle is not None:
             self._handle.cancel()  # Kept: what has a handle is armed again.
 
     def resume(self) -> None:
-        """The actor stays after all."""
+        """Let a timer go on that was paused: its actor stays after all."""
         if self._handle is not None:
             self._arm()
 
@@ -64,7 +64,7 @@ class Timer:
     def unpacked(
         cls, cell: Cell, message: Message[Any], left: float | None, interval: float | None, queued: bool
     ) -> Timer:
-        """The timer of an actor that has been moved here."""
+        """Make the timer of an actor that has been moved here again, from its data."""
         timer = cls(cell, message, left or 0.0, interval)
         timer.pause()
         if left is None:
@@ -81,7 +81,7 @@ class Timer:
         self._cell, self._handle, self._queued, self._interval, self._due = cell, None, False, None, 0.0
 
     def belongs_to(self, cell: Cell) -> None:
-        """Its actor lives at this cell from now on."""
+        """Bind the timer to another cell: its actor lives there from now on."""
         self._cell = cell
 
     def _arm(self) -> None:
@@ -99,7 +99,7 @@ class Timer:
             self._arm()
 
     def taken(self) -> bool:
-        """Its turn has come: whether it still counts."""
+        """Note that the turn of the timer's message has come; returns whether the message still counts."""
         counts, self._queued = self._queued, False
         if self._interval is None and self._cell.more is not None:
             self._cell.more.belongings.timers.discard(self)

@@ -1,4 +1,4 @@
-"""Leaving this process, and arriving in it: a life here comes to rest, or begins beside its address."""
+"""The side of a migration that is this process: a life comes to rest here, or begins beside its address."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an actor takes along when it is moved between a task and an OS process: packed here, unpacked there.
+"""Packs and unpacks what an actor takes along when it moves between a task and an OS process.
 
 Handles that only mean something at one place (timers, rights to reply, refs, watches) may be in the state: they are
 packed by what they stand for, and the actor finds handles of the same meaning in their place.
@@ -70,7 +70,7 @@ class StatePacker:
 
     def __init__(self, actor: Actor, owe: Owe) -> None:
         self._actor, self._owe = actor, owe
-        self._timers = list(actor.ctx.cell.extra().belongings.timers)
+        self._timers = list(actor.ctx._cell.extra().belongings.timers)
         self._owed: set[int] = set()
 
     def pack(self) -> bytes:
@@ -86,7 +86,7 @@ class StatePacker:
             packed = encode_value([False, state], where=where)
         except UnsavableValue:  # Once more, variable by variable, and with the handles in it by what they stand for.
             packed = encode_value([True, self._named(where, state)], where=where)
-        lost = sum(not ask.is_done and id(ask) not in self._owed for ask in actor.ctx.promised())
+        lost = sum(not ask.is_done and id(ask) not in self._owed for ask in actor.ctx._promised())
         if lost:
             raise unanswerable(lost)
         return packed
@@ -122,7 +122,7 @@ def pack_rest(actor: Actor) -> dict[str, Any]:
     Raises:
         BadMessage: the message of a timer cannot be coded.
     """
-    cell = actor.ctx.cell
+    cell = actor.ctx._cell
     more, codec = cell.extra(), cell.node.codec
     timers: list[Any] = []
     for timer in more.belongings.timers:
@@ -148,10 +148,10 @@ def unpack(
     Raises:
         HoldfastError, or whatever `set_state` raises: it does not fit.
     """
-    cell = actor.ctx.cell
+    cell = actor.ctx._cell
     codec = cell.node.codec
     cell.extra().trap_exits = rest["trap_exits"]
-    actor.ctx.borrow_promises()
+    actor.ctx._borrow_promises()
     timers: list[Timer] = []
     for name, body, left, interval, queued in rest["timers"]:
         message = codec.decode(cell.table.kind_named(name), body)
@@ -164,7 +164,7 @@ def unpack(
             case "timer":
                 return timers[value.key] if value.key >= 0 else over(cell)
             case "reply":
-                return ReplyHandle[Any](None) if value.key < 0 else actor.ctx.promise(owed(value.key))
+                return ReplyHandle[Any](None) if value.key < 0 else actor.ctx._promise(owed(value.key))
             case "ref":
                 return cell.node.cell_at(value.key).ref
             case _:

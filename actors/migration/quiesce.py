@@ -1,4 +1,4 @@
-"""Moving a life: how the old one is brought to rest between two turns, and the new one held until it is the one.
+"""Brings a moving life to rest between two turns, and holds the new life until it becomes the one.
 
 What both sides of a process border need is here; who decides is `system/live_moves.py`.
 """
@@ -63,8 +63,8 @@ class PackLife(Item):
     def run(actor: Any, item: Any) -> object:
         take: PackLife = item
         ctx = actor.ctx
-        cell: Cell = ctx.cell
-        if take.is_void or ctx.postpones(take) or any(map(_ends, cell.extra().urgent or ())):
+        cell: Cell = ctx._cell
+        if take.is_void or ctx._postpones(take) or any(map(_ends, cell.extra().urgent or ())):
             return None
         take.why = _busy(cell)
         if take.why:
@@ -76,7 +76,7 @@ class PackLife(Item):
                 raise Stays(
                     f"it has children of its own ({', '.join(children)}): have a supervisor start them beside it"
                 )
-            state = ctx.depart(take._owe)
+            state = ctx._depart(take._owe)
             take._taken(actor, state)
         except BaseException as error:  # The user's own code, such as `get_state`: no reason to end the actor.
             take._refused(str(error) if isinstance(error, HoldfastError) else error_text(error))
@@ -221,8 +221,8 @@ def settle(twin: Cell, cell: Cell) -> None:
     ctx, node = twin.ctx, cell.node
     assert ctx is not None
     cell.actor, cell.ctx, cell.context, cell.table = twin.actor, ctx, twin.context, twin.table
-    ctx.cell = cell
-    ctx.keep_promises()
+    ctx._cell = cell
+    ctx._keep_promises()
     mine, its = cell.extra(), twin.extra()
     has, had, ties, tied = mine.belongings, its.belongings, mine.ties, its.ties
     has.timers, has.tasks, mine.stash = had.timers, had.tasks, its.stash
@@ -274,7 +274,7 @@ def part(cell: Cell) -> Cell:
     ctx = cell.ctx
     assert ctx is not None
     old.actor, old.ctx, old.context = cell.actor, ctx, cell.context
-    ctx.cell = old
+    ctx._cell = old
     its = old.extra()
     gone, kept = its.belongings, more.belongings
     gone.timers, kept.timers = kept.timers, Ordered()
@@ -316,7 +316,7 @@ def farewell(old: Cell, stop: Item) -> None:
     """Have the life at a twin end; nobody is told but the actor itself."""
     old.queue = None
     if old.ctx is not None:
-        old.ctx.hand_on_promises()
+        old.ctx._hand_on_promises()
     mailbox.queue_of(old).append(stop)
     lifecycle.up(old)
 

@@ -178,7 +178,7 @@ class GuestMove:
             cell.admit, self._admit = self._admit, None
         more = cell.extra()
         if cell.ctx is not None:
-            cell.ctx.keep_promises()
+            cell.ctx._keep_promises()
         if self._stash:
             more.stash, self._stash = deque(self._stash), []
         if suspended:
@@ -190,7 +190,7 @@ class GuestMove:
 
     def _taken(self, actor: Actor, state: bytes) -> None:
         self._state = state
-        more = actor.ctx.cell.extra()
+        more = actor.ctx._cell.extra()
         self._say("taken", at=now(), trap_exits=more.trap_exits, suspended=bool(more.suspended & mailbox.BY_USER))
 
     def _refused(self, why: str) -> None:
@@ -265,7 +265,7 @@ def _leave(cell: Cell, reason: ExitReason) -> None:
         cell.queue.clear()
     more.urgent = more.stash = None
     if cell.ctx is not None:
-        cell.ctx.hand_on_promises()
+        cell.ctx._hand_on_promises()
     cell.request_stop(reason)
     lifecycle.up(cell)
 

@@ -1,4 +1,4 @@
-"""The end of an actor process: what is known of it, and what it is called."""
+"""The end of an actor process: collects what is known of it, and derives the exit reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an actor's OS process may use."""
+"""Resource limits of an actor's OS process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The actors inside a process besides its own, as the root knows them: an address each, so that they can be reached."""
+"""Stand-ins at the root for the actors inside a process: one address each, so that they can be reached."""
 
 from __future__ import annotations
 

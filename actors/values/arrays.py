@@ -1,4 +1,4 @@
-"""Arrays, scalars and generators of numpy, if the program has imported it."""
+"""Numpy arrays, scalars and generators as plain parts, if the program has imported numpy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Budgets: what bytes from whoever may become in memory, looked at before anything is made of them."""
+"""Budgets: limits on what received bytes may become in memory, checked before anything is built."""
 
 from __future__ import annotations
 

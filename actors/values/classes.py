@@ -1,4 +1,4 @@
-"""Classes of users: Enum, dataclass, Struct, NamedTuple."""
+"""Instances of user-defined classes as plain parts: Enum, dataclass, Struct, NamedTuple."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What writing and reading agree on: the head of the bytes, the marks, and what the builtin types consist of."""
+"""The format that reader and writer share: the header, the marks, and the forms of builtin types."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Making values again from what was packed; nothing is trusted, nothing but what the marks say is made."""
+"""Decodes packed values, trusting nothing: only what the marks allow is built."""
 
 from __future__ import annotations
 

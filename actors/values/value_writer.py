@@ -1,4 +1,4 @@
-"""Lowering a value to a tree of what msgpack has types for, and packing it."""
+"""Encodes values: lowers each to types that msgpack knows, and packs the result."""
 
 from __future__ import annotations
 

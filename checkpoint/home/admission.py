@@ -1,4 +1,4 @@
-"""An admission on its way into the journal: a message from outside counts when it is as safe as it has to be."""
+"""Admission to the journal: a message from outside counts once it is as safe as it has to be."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Asks between recorded actors that were under way when the root ended: asker and receiver find each other again.
+"""Reconnects asks between recorded actors that were under way when the root ended.
 
 The receiver's journal says of such an input whose turn asks, (turn, k). So the receiver, whose home may be open first,
 answers to whoever that is: to the asker's home if that is open, else into the asker's journal, where it finds it.

@@ -1,4 +1,4 @@
-"""The capacity of a recorded actor's mailbox: what is admitted and not begun counts.
+"""The capacity of a recorded actor's mailbox: inputs that are admitted and not begun count.
 
 Everything admitted is journaled, so the home cannot take back what it has fed. A policy that drops queued messages
 therefore feeds one input at a time.

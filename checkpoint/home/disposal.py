@@ -1,4 +1,4 @@
-"""Ends without a turn: what becomes of inputs that nobody will handle, and of a home that is given up or erased."""
+"""Ends inputs that nobody will handle, and homes that are given up or erased."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The homes of a root: what is accepted at each recorded address, from the store or since; and who is to blame."""
+"""All homes of a root: what each recorded address has accepted, from the store or since; and who is to blame."""
 
 from __future__ import annotations
 

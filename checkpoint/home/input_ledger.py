@@ -1,4 +1,4 @@
-"""What one home has accepted and numbered, and what has become of it since the newest snapshot: data and decisions.
+"""The ledger of a home: inputs since the newest snapshot, and what came of them. Data and decisions.
 
 Nothing here writes, sends, or reads a clock. The switch journals each change, and `read_entry` makes the same change
 from the journal's entry: a ledger that is read back equals the one that was lost.

@@ -269,7 +269,8 @@ class JournalHome(RecordedHome):
         restarting = self.parent.is_restarting(cell)
         for topic in (*self.parent.topics(cell), *self.switch.topics):
             cell.node.topics.unsubscribe(topic, inlet(self.switch, topic))
-        drop_all(self.switch, "it has stopped", keep_tells=restarting)
+        diverged = self.switch.life.diverged
+        drop_all(self.switch, "for good" if diverged is None else str(diverged), keep_tells=restarting)
         let_go(self.switch)
         why = "its supervisor has ended" if restarting else "it is not started again"
         self.homes.recoveries.given_up(cell.path, why)

@@ -1,4 +1,4 @@
-"""The journal's limit: at it nothing is admitted until a snapshot has cut it."""
+"""The journal's size limit: when it is reached, nothing is admitted until a snapshot has cut the journal."""
 
 from __future__ import annotations
 

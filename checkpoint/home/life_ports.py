@@ -1,4 +1,4 @@
-"""The way from a home to a life in another process, and back: what such a life may say."""
+"""The port between a home and a life in another process, and what such a life may say."""
 
 from __future__ import annotations
 

@@ -273,7 +273,7 @@ class Outputs:
         parcel: Any = ask.message
         try:
             ctx = target.ctx
-            if ctx is not None and ctx.turn_in(ask.chain):
+            if ctx is not None and ctx._turn_in(ask.chain):
                 raise AskDeadlock(target.path, tuple(path for path, _ in ask.chain))
             ask.message = home.node.codec.message_in(target, parcel.name, parcel.body)
             target.admit(target, ask)

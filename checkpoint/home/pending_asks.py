@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ...actors.errors import AskTimeout, BadMessage, HoldfastError
+from ...actors.errors import AskTimeout, BadMessage, BadReply, HoldfastError
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, ReplyHandle
@@ -75,7 +75,7 @@ class SwitchAsk(RelayedAsk, eq=False):
         try:
             body = self.codec.encode(reply, self.asker)
         except BadMessage as error:
-            self.fail(BadMessage("reply", error.message, error.problem))
+            self.fail(BadReply(error.message, error.problem))
         else:
             self.give(Answer(REPLY, "", body))
 

@@ -1,4 +1,4 @@
-"""The life that runs now, as its home sees it: how far it has come, and whether what it says still counts."""
+"""The current life as its home sees it: how far it has come, and whether its words still count."""
 
 from __future__ import annotations
 

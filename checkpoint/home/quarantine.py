@@ -32,7 +32,7 @@ MOST_ENTRIES = 200
 
 
 class NotQuarantined(HoldfastError, text="message {id} of {actor} is not in quarantine (any more)"):
-    """It was tried again, dropped or erased meanwhile: ask for the list again."""
+    """The message was tried again, dropped or erased meanwhile: ask for the list again."""
 
     actor: str
     id: int
@@ -40,7 +40,7 @@ class NotQuarantined(HoldfastError, text="message {id} of {actor} is not in quar
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class QuarantinedMessage:
-    """A message in quarantine.
+    """A message that was put aside because handling it has ended its actor's process too often.
 
     Attributes:
         address: whose message it is.

@@ -1,4 +1,4 @@
-"""Which addresses are recorded: those whose home has a switch."""
+"""The base of recorded homes: an address is recorded if its home has a switch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a replay leaves out: turns that changed nothing, and turns whose change a later one has written over.
+"""Decides which turns a replay leaves out: those that changed nothing, or were overwritten by later ones.
 
 A superseded turn is left out only if nothing that is replayed between it and the one that supersedes it could have
 seen what it wrote: turns between the two are left out themselves, or supersede something and so do not look.

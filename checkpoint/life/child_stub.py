@@ -1,4 +1,4 @@
-"""A child of a supervisor in this process whose home is at the root: what its supervisor has of it here.
+"""The local stub of a child whose supervisor lives in this process and whose home is at the root.
 
 The supervisor starts and stops it as any other, and decides what follows from its end; what is sent to it goes to its
 home, in order with all else that leaves the process. Its lives are lived here, or by a group at the root.

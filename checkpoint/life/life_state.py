@@ -1,4 +1,4 @@
-"""What a recorded life knows besides the turn in hand: what it began with, its timers, its snapshots and its end."""
+"""The state of a recorded life besides the turn in hand: restored data, timers, snapshots, its end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Do handlers that are declared readonly change nothing? For tests and for finding faults: it takes its time."""
+"""A check, for tests, that handlers declared readonly change nothing. It is slow."""
 
 from __future__ import annotations
 

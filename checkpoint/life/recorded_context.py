@@ -73,12 +73,12 @@ class RecordedContext(ActorContext):
 
     __slots__ = ("_drawn", "recorded")
 
-    may_fail_fast = False
+    _may_fail_fast = False
 
     recorded: Life
     _drawn: int  # the turn that `_random` belongs to
 
-    def in_turn(self) -> bool:
+    def _in_turn(self) -> bool:
         """Whether this code runs in the turn in hand, not in a background task."""
         return self.recorded.feed is not None and not _in_background()
 
@@ -88,7 +88,7 @@ class RecordedContext(ActorContext):
         Raises:
             HoldfastError: this is `__init__`, or a background task.
         """
-        if not self.in_turn():
+        if not self._in_turn():
             self._outside()
         return self.recorded
 
@@ -106,7 +106,7 @@ class RecordedContext(ActorContext):
 
     def now(self) -> float:
         feed = self.recorded.feed
-        return self.cell.node.clock.wall() if feed is None else feed.time
+        return self._cell.node.clock.wall() if feed is None else feed.time
 
     @property
     def random(self) -> random.Random:
@@ -123,32 +123,32 @@ class RecordedContext(ActorContext):
 
     def find(self, path: str, kind: type[A]) -> ActorRef[A]:
         """A ref to the address, whoever lives there: under replay somebody else, or nobody yet (T21)."""
-        if not self.in_turn() and not self.recorded.hook:
+        if not self._in_turn() and not self.recorded.hook:
             return super().find(path, kind)
-        node = self.cell.node
+        node = self._cell.node
         cell = node.cell_at(path)
         return ActorRef(cell) if cell.is_dead else node.find_ref(path, kind)
 
     # -- sending ----------------------------------------------------------------------------------------------------
 
-    def tell(self, cell: Cell, message: Message[Any]) -> None:
-        if not self.in_turn():
+    def _tell(self, cell: Cell, message: Message[Any]) -> None:
+        if not self._in_turn():
             self._outside()
-            super().tell(cell, message)
+            super()._tell(cell, message)
             return
         self._put("tell", cell, message)
 
-    async def send(self, cell: Cell, message: Message[Any]) -> None:
-        if not self.in_turn():
+    async def _send(self, cell: Cell, message: Message[Any]) -> None:
+        if not self._in_turn():
             self._outside()
-            await super().send(cell, message)
+            await super()._send(cell, message)
             return
         await self._accepted(self._put("send", cell, message))
 
     async def _accepted(self, k: int) -> None:
         """Have output `k` leave, and wait until it is accepted."""
         life = self.recorded
-        accepted: asyncio.Future[None] = self.cell.node.loop.create_future()
+        accepted: asyncio.Future[None] = self._cell.node.loop.create_future()
         life.asks[life.turn, k] = accepted, None
         life.release()
         await accepted
@@ -156,23 +156,23 @@ class RecordedContext(ActorContext):
     def _put(self, verb: str, cell: Cell, message: Message[Any], *, seconds: float = 0.0) -> int:
         if type(message) not in cell.table:
             cell.require(message)
-        body = self.cell.node.codec.encode_alike(message, cell.path)
+        body = self._cell.node.codec.encode_alike(message, cell.path)
         return self.recorded.put(verb, cell.path, message_name(type(message)), body, seconds=seconds)
 
-    def ask(self, cell: Cell, message: Message[R], timeout: float) -> asyncio.Future[R]:
-        if not self.in_turn():
+    def _ask(self, cell: Cell, message: Message[R], timeout: float) -> asyncio.Future[R]:
+        if not self._in_turn():
             self._outside()
-            return super().ask(cell, message, timeout)
+            return super()._ask(cell, message, timeout)
         life = self.recorded
         k = self._put("ask", cell, message, seconds=timeout)
-        future: asyncio.Future[R] = self.cell.node.loop.create_future()
+        future: asyncio.Future[R] = self._cell.node.loop.create_future()
         life.asks[life.turn, k] = future, type(message)
         life.release()
         return future
 
     def forward(self, to: ActorRef[Any]) -> None:
-        fed = self.item
-        if not self.in_turn() or not isinstance(fed, Fed):
+        fed = self._item
+        if not self._in_turn() or not isinstance(fed, Fed):
             raise HoldfastError(f"{self.path}: only a message in hand can be forwarded")
         feed = fed.feed
         self.recorded.put("forward", to.path, feed.name, feed.body)
@@ -182,12 +182,12 @@ class RecordedContext(ActorContext):
         return RecordedReplyHandle(feed.id if feed is not None else -1)
 
     async def publish(self, topic: str, message: Message[Any]) -> None:
-        if not self.in_turn():
+        if not self._in_turn():
             self._outside()
             await super().publish(topic, message)
             return
         require_message(topic, message)
-        body = self.cell.node.codec.encode_alike(message, topic)
+        body = self._cell.node.codec.encode_alike(message, topic)
         k = self.recorded.put("publish", topic, message_name(type(message)), body)
         if self.waits_for_room(topic):
             await self._accepted(k)
@@ -202,9 +202,9 @@ class RecordedContext(ActorContext):
     # -- later ------------------------------------------------------------------------------------------------------
 
     def _timer(self, message: Message[Any], delay: float, interval: float) -> Any:
-        self.cell.require(message)
+        self._cell.require(message)
         life = self.acting()
-        name, body = message_name(type(message)), self.cell.node.codec.encode_alike(message, self.path)
+        name, body = message_name(type(message)), self._cell.node.codec.encode_alike(message, self.path)
         in_turn = life.feed is not None
         key = f"{life.turn}.{life.last_k + 1}" if in_turn else life.timer_of_hook(name, body, interval)
         life.put("timer", key, name, body, seconds=delay, interval=interval)
@@ -236,13 +236,13 @@ class RecordedContext(ActorContext):
             task.add_done_callback(lambda _: work.close())
 
     async def _piped(self, turn: int, k: int, work: Any, then: Any, failed: Any) -> None:
-        codec = self.cell.node.codec
+        codec = self._cell.node.codec
         try:
             message = await self._outcome(work, then, failed)
             record = PipeDone(turn, k, message_name(type(message)), codec.encode(message, self.path))
         except BaseException as error:  # Nobody takes it: the actor crashes, once.
             record = PipeDone(turn, k, "", codec.encode_error(remote_crash(self._uncaught(error)))[2])
-        if not self.closed:
+        if not self._closed:
             self.recorded.port.to_home(record)
             if k:
                 self.recorded.pipe_back()
@@ -250,7 +250,7 @@ class RecordedContext(ActorContext):
     # -- stash, links, subscriptions --------------------------------------------------------------------------------
 
     def stash(self) -> None:
-        fed, life = self.item, self.recorded
+        fed, life = self._item, self.recorded
         if not isinstance(fed, Fed) or life.feed is None:
             raise StashError(f"{self.path}: only a message can be stashed")
         if fed.is_stashed:
@@ -270,11 +270,11 @@ class RecordedContext(ActorContext):
 
     def monitor(self, other: ActorRef[Any]) -> Monitor:
         self.acting().put("monitor", other.path)
-        return RecordedMonitor(self.cell, other._cell, for_good=False)
+        return RecordedMonitor(self._cell, other._cell, for_good=False)
 
     def watch(self, other: ActorRef[Any]) -> Monitor:
         self.acting().put("watch", other.path)
-        return RecordedMonitor(self.cell, other._cell, for_good=True)
+        return RecordedMonitor(self._cell, other._cell, for_good=True)
 
     def link(self, other: ActorRef[Any]) -> None:
         self.acting().put("link", other.path)
@@ -288,29 +288,29 @@ class RecordedContext(ActorContext):
     def unsubscribe(self, topic: str) -> None:
         self.acting().put("unsubscribe", topic)
 
-    def depart(self, owe: Callable[[Ask], int]) -> bytes:
+    def _depart(self, owe: Callable[[Ask], int]) -> bytes:
         self.recorded.last_snapshot()
         return b""
 
-    def postpones(self, call: Item) -> bool:
+    def _postpones(self, call: Item) -> bool:
         if self.recorded.is_live:
             return False
         self.recorded.stage.postponed.append(call)
         return True
 
     @property
-    def named_variables(self) -> tuple[str, ...] | None:
+    def _named_variables(self) -> tuple[str, ...] | None:
         return self.recorded.method.key_variables
 
-    def may_replace(self) -> None:
+    def _may_replace(self) -> None:
         problem = self.recorded.may_replace()
         if problem:
             raise ControlFailed(self.path, "replace_state", problem)
 
-    def replaced(self) -> None:
+    def _replaced(self) -> None:
         self.recorded.replaced()
 
-    def saved(self) -> list[bytes]:
+    def _saved(self) -> list[bytes]:
         return [msgspec.msgpack.encode(piece) for piece in self.recorded.replaced_snapshot()]
 
     def stop(self, reason: ExitReason = NORMAL) -> None:
@@ -319,8 +319,8 @@ class RecordedContext(ActorContext):
         else:  # A replayed turn: the life ends when it has caught up.
             self.recorded.stage.stop_wanted = reason
 
-    def close(self) -> None:
-        super().close()
+    def _close(self) -> None:
+        super()._close()
         self.recorded.close()
 
 

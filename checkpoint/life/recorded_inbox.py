@@ -1,4 +1,4 @@
-"""What stands in the mailbox of a recorded life: its inputs, and the commands of its home."""
+"""The mailbox items of a recorded life: its inputs, and the commands of its home."""
 
 from __future__ import annotations
 

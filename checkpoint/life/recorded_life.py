@@ -13,7 +13,7 @@ import types
 from collections.abc import Callable, Coroutine, Generator
 from typing import Any, Final, NoReturn, Protocol, TypeVar
 
-from ...actors.errors import ActorStopped, BadMessage, ControlFailed, HoldfastError, StartFailed, remote_crash
+from ...actors.errors import ActorStopped, BadMessage, BadReply, ControlFailed, HoldfastError, StartFailed, remote_crash
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.actor import Actor, Start
@@ -162,7 +162,7 @@ class Life:
         """The actor was constructed, and cannot begin."""
         cell = self.cell
         assert cell.ctx is not None
-        cell.ctx.close()
+        cell.ctx._close()
         cell.actor = cell.ctx = None
         raise StartFailed(cell.path, why) from error
 
@@ -230,7 +230,7 @@ class Life:
             else:
                 future.set_exception(codec.decode_error(answer.kind, answer.name, answer.body))
         except Exception as error:
-            future.set_exception(BadMessage("reply", "send" if kind is None else message_name(kind), str(error)))
+            future.set_exception(BadReply("send" if kind is None else message_name(kind), str(error)))
 
     # -- turns ------------------------------------------------------------------------------------------------------
 
@@ -326,7 +326,7 @@ class Life:
         try:
             return Answer(REPLY, "", self.cell.node.codec.encode_alike(value, self.cell.path, declared))
         except BadMessage as error:
-            return self.answer_error(BadMessage("reply", error.message, error.problem))
+            return self.answer_error(BadReply(error.message, error.problem))
 
     def put(
         self, verb: str, to: str, name: str = "", body: bytes = b"", *, seconds: float = 0.0, interval: float = 0.0

@@ -1,4 +1,4 @@
-"""Addresses below a supervisor that has a process of its own: their homes are here at the root.
+"""Addresses below a supervisor that lives in another process; their homes are here at the root.
 
 The supervisor in the process wants a child started; the home gives it back what it had, and the life is lived there, or
 here at the root, in a process of its own or by replicas. When the supervisor's process dies, the homes keep what they

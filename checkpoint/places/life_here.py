@@ -1,4 +1,4 @@
-"""Recorded lives that are lived in the root's own loop: "start this child again" means here "bring it back"."""
+"""The place of recorded lives in the root's own loop: to start such a child means to recover it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The process of a supervisor, and who keeps the homes of the addresses below it."""
+"""The place of a supervisor that has its own process, and the homes of the addresses below it."""
 
 from __future__ import annotations
 

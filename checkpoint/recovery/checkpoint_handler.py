@@ -50,10 +50,10 @@ class CheckpointHandler(RecoveryPart):
 
     def _arm(self, home: Switch) -> None:
         """Look at this home as soon as it says so, and when its interval is over."""
-        if self.ctx.closed or not home.method.snapshots:  # Killed: the next one looks at everything.
+        if self.ctx._closed or not home.method.snapshots:  # Killed: the next one looks at everything.
             return
         home.due.on_want = self._arm
-        now = self.ctx.cell.node.loop.time()
+        now = self.ctx._cell.node.loop.time()
         due = home.due.when(now)
         self._at(home.path, due if due is not None else now + home.method.interval)
 
@@ -64,7 +64,7 @@ class CheckpointHandler(RecoveryPart):
             self._wake(when)
 
     def _wake(self, when: float) -> None:
-        loop = self.ctx.cell.node.loop
+        loop = self.ctx._cell.node.loop
         self._timer = when
         if self._handle is not None:
             self._handle.cancel()  # type: ignore[attr-defined]
@@ -74,7 +74,7 @@ class CheckpointHandler(RecoveryPart):
     def look(self, message: LookForDue) -> None:
         """Ask those who are due."""
         # Without `when`, a timer of a nanosecond would follow, and another one while the clock does not move.
-        now = max(message.when, self.ctx.cell.node.loop.time())
+        now = max(message.when, self.ctx._cell.node.loop.time())
         self._timer, self._handle = 0.0, None
         while self._heap and self._heap[0][0] <= now:
             when, path = heapq.heappop(self._heap)

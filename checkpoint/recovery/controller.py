@@ -35,7 +35,7 @@ class RecoveryController(RecoveryPart):
     """
 
     def on_start(self, restored: bool) -> None:
-        recoveries, cell = self._homes.recoveries, self.ctx.cell
+        recoveries, cell = self._homes.recoveries, self.ctx._cell
 
         def wake(path: str) -> None:
             cell.admit(cell, LookAtRecovery(path))
@@ -118,8 +118,8 @@ class RecoveryController(RecoveryPart):
 
     def _watch(self, receiver: Receiver) -> None:
         """A receiver that begins a new life meanwhile has to be told again."""
-        if not self.ctx.closed:
-            self.ctx.monitor(self.ctx.cell.node.cell_at(receiver.path).ref)
+        if not self.ctx._closed:
+            self.ctx.monitor(self.ctx._cell.node.cell_at(receiver.path).ref)
 
     def on_down(self, source: ActorRef[Any], reason: ExitReason, recovering: bool) -> None:
         """A receiver's life has ended."""

@@ -1,4 +1,4 @@
-"""The message handler as an actor: it has written what the homes submit, once for all that a tick has brought.
+"""The message handler as an actor: it has each tick's submissions of all homes written at once.
 
 What waits to be written stands in `homes.journal`, not here: a handler that is killed loses nothing, its next life goes
 on with what it finds. If it does not come in time, the journal does its work itself.
@@ -23,7 +23,7 @@ class MessageHandler(RecoveryPart):
 
     def on_start(self, restored: bool) -> None:
         """Take up what waits, and be woken from now on."""
-        cell = self.ctx.cell
+        cell = self.ctx._cell
         # Not `ref.tell`: that would speak in the name of whoever has submitted something.
         self._homes.journal.wake_handler = lambda: cell.admit(cell, FLUSH)
         self._homes.journal.come()

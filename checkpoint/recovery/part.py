@@ -1,4 +1,4 @@
-"""What the recovery parts have in common: all that they know stands in the homes, and outlives them."""
+"""The base of the recovery parts: everything they know is in the homes, and outlives them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which recoveries there are, and how far each has come: kept with the homes, so that it outlives the controller.
+"""The recoveries of a root and their progress, kept with the homes so that they outlive the controller.
 
 Nothing here waits. The controller does what a recovery asks for; while it is down, the recovery does without.
 """

@@ -1,4 +1,4 @@
-"""Who is in safe state, because of whom: entered with the first of several recoveries, left with the last.
+"""Counts who is in safe state and why: entered with the first recovery, left with the last.
 
 One owner with a count (T27). Each step is taken at once or not at all, so whoever takes it, a receiver is told once.
 """

@@ -15,7 +15,7 @@ class MessageSwitch(RecoveryPart):
     """Tells of messages held, dropped and refused. Holding and letting in is done by the homes (`held_messages.py`)."""
 
     def on_start(self, restored: bool) -> None:
-        recoveries, cell = self._homes.recoveries, self.ctx.cell
+        recoveries, cell = self._homes.recoveries, self.ctx._cell
 
         def wake() -> None:
             cell.admit(cell, LookAtHeld())
@@ -28,6 +28,6 @@ class MessageSwitch(RecoveryPart):
         self._tell()
 
     def _tell(self) -> None:
-        held, node = self._homes.recoveries.held, self.ctx.cell.node
+        held, node = self._homes.recoveries.held, self.ctx._cell.node
         while held:
             node.emit(held.popleft())

@@ -151,7 +151,7 @@ def put_back(actor: Actor, saved: Any) -> None:
 
 def key_names(actor: Actor) -> tuple[str, ...] | None:
     """The key variables that the recovery file names, or the class; None for all attributes."""
-    named = actor.ctx.named_variables
+    named = actor.ctx._named_variables
     if named is not None:
         return named
     # A class with get_state means that, whatever else it says.

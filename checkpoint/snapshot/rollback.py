@@ -1,4 +1,4 @@
-"""Going back: an actor whose supervisor has ended because of it comes back with an older state, or with none.
+"""Rollback: an actor whose supervisor has ended because of it comes back with an older state, or with none.
 
 The older snapshot is put in the place of all that came after it, under the number of the last turn: so numbers of turns
 and outputs go on, nothing that has left is sent again, and the journal is cut just as behind any other snapshot.

@@ -1,4 +1,4 @@
-"""Snapshots as they come home, in pieces or as an image: kept, or tried again when they could not be."""
+"""Receives snapshots at home, in pieces or as an image, and tries again when one could not be kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a home keeps in the store: the snapshot with what the home knew then, and the journal behind it."""
+"""The stored record of a home: the snapshot, what the home knew then, and the journal behind it."""
 
 from __future__ import annotations
 

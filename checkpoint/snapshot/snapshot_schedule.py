@@ -1,4 +1,4 @@
-"""When a snapshot is due: what a home knows of it (data), and the decision (pure).
+"""The schedule of snapshots: what a home knows (data), and whether one is due (a pure decision).
 
 The checkpoint handler acts on this and may die at any moment; what it needs stands here.
 """

@@ -1,4 +1,4 @@
-"""Forgetting what is not replayed: an actor with snapshots alone comes back as its last one has it.
+"""Forgets turns that will not be replayed: with snapshots alone, an actor returns as its last one has it.
 
 The next life is given the number of the last turn to go on from, so numbers of turns and outputs stay unique. In the
 journal what is forgotten stays until the next snapshot; a root that reads it again forgets it again.

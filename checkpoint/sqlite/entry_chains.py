@@ -1,4 +1,4 @@
-"""What is in the file: which entries each address has, found by one scan that notices whether any is missing."""
+"""The chains of journal entries per address, found by one scan that notices whether any entry is missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which input each recorded actor of the root has in hand, in a file that outlives the process.
+"""A mapped file that outlives the process and says which input each recorded actor has in hand.
 
 It is mapped into memory: to say that a turn begins or ends is no system call, and a kill of the process loses nothing.
 After one, whoever opens the store next knows in whose turns it died, and counts that against those inputs: against the

@@ -1,4 +1,4 @@
-"""Who owns the store: one process at a time, told apart by pid and start time, and by an epoch."""
+"""Ownership of a store: one process at a time, told apart by pid and start time, and by an epoch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a store consists of, and that it belongs together: nothing else is opened, written to or removed.
+"""The parts of a store and their common identity: nothing else is opened, written to or removed.
 
 The database and each folder beside it carry the identity of the store, made with it. The database has it as a note, a
 folder in the file `store-id`. While the note says "pending" (a new store, or one of before that gets an identity), a

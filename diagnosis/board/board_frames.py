@@ -1,4 +1,4 @@
-"""What the board and its clients say to each other: binary frames, and nothing that is not exactly one of them.
+"""The binary frames of the power board's protocol; anything else is refused.
 
 A frame is, in network byte order: `HB`, version (1 byte), kind (1), sequence (2), size of the body (2), the body, and
 the CRC-32 of all before it (4). An answer has the sequence of its request; what is broadcast has sequence 0.

@@ -148,7 +148,7 @@ class BoardSimulator(Actor):
 
     def _changed(self, channel: int, on: bool) -> None:
         """Called by connections too, which end a moment after the life."""
-        if not self.ctx.closed:
+        if not self.ctx._closed:
             self.ctx.ref.tell(_Switched(channel, on))
 
     @on(_Switched)

@@ -1,4 +1,4 @@
-"""What hangs together: items in groups that share nothing with each other (union-find)."""
+"""Splits items into groups that share nothing with each other (union-find)."""
 
 from __future__ import annotations
 

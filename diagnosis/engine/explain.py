@@ -1,4 +1,4 @@
-"""Why: the conflicts behind a diagnosis, in plain words.
+"""Explanations: the conflicts behind a diagnosis, in plain words.
 
 A conflict is a set of components that cannot all work, given what was observed (Reiter 1987). Here each is minimal:
 nobody in it can be left out.

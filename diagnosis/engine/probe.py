@@ -1,4 +1,4 @@
-"""What to look at next: the observation that would tell the candidates apart best (de Kleer and Williams 1987).
+"""Chooses the next observation: the one that tells the candidates apart best (de Kleer and Williams 1987).
 
 A candidate forbids an atom not to hold if it still concludes it; it forbids an atom to hold if with it the failures
 could not be. Else it says nothing, and either outcome is taken to be as likely as the other.

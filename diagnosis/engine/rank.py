@@ -1,4 +1,4 @@
-"""Which diagnosis comes first.
+"""Ranks diagnoses: which one comes first.
 
 Fewer components first; among these, what was just repaired last, so that a repair that did not help is not tried for
 ever (O3); then the likelier by prior fault probabilities; then software before hardware: it is quicker to restart a

@@ -1,4 +1,4 @@
-"""What need not be searched: the same diagnoses from far fewer components.
+"""Reduces a diagnosis problem: the same diagnoses from far fewer components.
 
 Between what is observed most atoms have one source. Such an atom is replaced by what it is made from, until only sets
 of components are left that cannot all work. Of these a set that contains another says nothing. Components that are then

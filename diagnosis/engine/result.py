@@ -1,4 +1,4 @@
-"""What a diagnosis says: messages for `/diagnosis`, and the same for ROS diagnostics."""
+"""The result of a diagnosis: messages for `/diagnosis`, and the same for ROS diagnostics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a declaration to a model that can be used, or to all that is wrong with it."""
+"""Checks a declaration: it becomes a model that can be used, or a list of all that is wrong with it."""
 
 from __future__ import annotations
 

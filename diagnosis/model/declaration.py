@@ -1,4 +1,4 @@
-"""What a user says about a system: components, who publishes what from what, and what else is expected of them.
+"""The declaration of a system: components, who publishes what from what, and other expectations.
 
 Plain data, and `System`, which collects it. Nothing is checked here but types; `compile_model` checks the whole.
 """

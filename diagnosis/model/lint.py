@@ -1,4 +1,4 @@
-"""What a model cannot do: components that can never be told apart, or never diagnosed.
+"""Lints a model: finds components that can never be told apart, or never diagnosed.
 
 Judged by the structure alone, given what is observed. The conclusions of two components are compared as the sets of
 observed atoms that depend on them, with nothing observed in between.

@@ -1,4 +1,4 @@
-"""What the power board says of devices: `on(h)`, and whether what they draw is right (D24)."""
+"""An observer of the power board: `on(h)` for devices, and whether what they draw is right (D24)."""
 
 from __future__ import annotations
 

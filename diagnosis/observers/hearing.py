@@ -1,4 +1,4 @@
-"""How observers hear topics: an ear for each, so that it is known which topic a message came on."""
+"""Ears of observers: one for each topic, so that it is known which topic a message came on."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def listen(actor: Actor, topic: str) -> None:
     Publishers never wait for an ear.
     """
     ctx = actor.ctx
-    ear = ctx.cell.node.spawn(
-        Start(Ear, (topic, ctx.ref)), parent=ctx.cell, mailbox=bounded(HEARD, overflow="drop_oldest")
+    ear = ctx._cell.node.spawn(
+        Start(Ear, (topic, ctx.ref)), parent=ctx._cell, mailbox=bounded(HEARD, overflow="drop_oldest")
     )
     ctx.link(ear.ref)

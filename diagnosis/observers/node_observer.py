@@ -1,4 +1,4 @@
-"""Is it running? `running(n)` for actors (D20)."""
+"""An observer of whether actors run: `running(n)` (D20)."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class NodeObserver(Observer):
         asked: list[Literal] = []
         answers: list[Awaitable[bool | None]] = []
         for atom, path in self._actors.items():
-            seen = self._runs(self.ctx.cell.node.find(path))
+            seen = self._runs(self.ctx._cell.node.find(path))
             if seen is None or isinstance(seen, bool):
                 self.verdict(atom, seen)
             else:
@@ -75,7 +75,7 @@ class NodeObserver(Observer):
 
     def _is_new(self, atom: Literal, path: str) -> bool:
         """Whether it has begun another life since the last look, and is to be given time."""
-        cell = self.ctx.cell.node.find(path)
+        cell = self.ctx._cell.node.find(path)
         if cell is None or not cell.life:
             return False
         before, now = self._lives.get(atom), (cell, cell.life)
@@ -114,5 +114,5 @@ class NodeObserver(Observer):
 
 def at_root(observer: Observer) -> None:
     """Refuse an observer that sees only its own process. Raises SpecError."""
-    if observer.ctx.cell.node.ports.uplink is not None:
+    if observer.ctx._cell.node.ports.uplink is not None:
         raise SpecError(observer.ctx.path, f"{type(observer).__name__} must be in the system's own process: a task")

@@ -98,7 +98,7 @@ class Observer(Actor):
     @property
     def now(self) -> float:
         """Seconds on the loop clock (T67)."""
-        return self.ctx.cell.node.loop.time()
+        return self.ctx._cell.node.loop.time()
 
     @property
     def age(self) -> float:

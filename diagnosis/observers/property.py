@@ -133,7 +133,7 @@ class PropertyObserver(Observer):
             self.verdict(atom, None if value is None else limits.holds(value, self.said(atom)))
 
     async def _measure(self) -> dict[Property, float]:
-        cell = self.ctx.cell.node.find(self._path)
+        cell = self.ctx._cell.node.find(self._path)
         if cell is None:
             return {}
         values: dict[Property, float] = {Property.RESTARTS: self._restarts(cell)}

@@ -1,4 +1,4 @@
-"""How good is what is published? Each message gets a score, and their average must be high enough."""
+"""An observer that scores published messages; their average must be high enough."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From samples to verdicts that hold still: limits with hysteresis, filters, and n of m (T52)."""
+"""Turns samples into stable verdicts: limits with hysteresis, filters, and n of m (T52)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a planner is, what it may use, and what it answers."""
+"""The interface of planners: what they may use, and what they answer."""
 
 from __future__ import annotations
 

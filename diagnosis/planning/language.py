@@ -1,4 +1,4 @@
-"""What planning speaks of: formulas, actions, domains and problems, as plain data without any library's classes."""
+"""The language of planning: formulas, actions, domains and problems, as plain data without any library's classes."""
 
 from __future__ import annotations
 

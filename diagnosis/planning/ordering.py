@@ -1,4 +1,4 @@
-"""From a sequence to stages: what may be done at the same time, done as early, or as late, as it can be."""
+"""Turns a sequence of actions into stages that may be done at the same time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a plan does, by the actions as they are written: independent of grounding and of any planner."""
+"""Checks what a plan does by its actions as written, independent of grounding and planner."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a problem is really about: what can be reached at all, what matters to the goals, what hangs together.
+"""Cuts a planning problem down to what can be reached, what matters to the goals, and what hangs together.
 
 Source: the relaxed planning graph of Hoffmann and Nebel 2001 (FF), here with negative literals as facts of their own.
 """

@@ -1,4 +1,4 @@
-"""The problem of repair: from a diagnosis and what was observed to what is to be planned for.
+"""Makes a planning problem of repair from a diagnosis and from what was observed.
 
 The initial state is what was observed and who is good and bad; the goal is that all are good. With optional parts and
 `find_plan(..., degrade=True)` what is beyond repair is left out.

@@ -30,11 +30,10 @@ from .policy import NORMAL, SAFE, Policy
 from .repairer import Repairer
 from .setup import repairer
 from .stock import (
-    attach_mechanism,
     bind_port,
     change_mechanism,
-    compose_mechanism,
     power_up,
+    protect_by,
     restart_child,
     restart_subtree,
     roll_back,
@@ -43,7 +42,6 @@ from .stock import (
     shutdown,
     start_node,
     stop_node,
-    transition_mechanism,
 )
 
 __all__ = [
@@ -81,10 +79,8 @@ __all__ = [
     "SetMode",
     "Touched",
     "action",
-    "attach_mechanism",
     "bind_port",
     "change_mechanism",
-    "compose_mechanism",
     "power_up",
     "repairer",
     "restart_child",
@@ -95,5 +91,5 @@ __all__ = [
     "shutdown",
     "start_node",
     "stop_node",
-    "transition_mechanism",
+    "protect_by",
 ]

@@ -1,4 +1,4 @@
-"""What to do next in a case of repair: pure decisions from the case and from what is known at one moment.
+"""Decides the next step in a case of repair, purely from the case and what is known at one moment.
 
 A case goes round: choose a diagnosis, plan for it, carry the plan out, wait until the symptoms are seen to have gone.
 In each phase `decide` says what comes next, until it says `Close` or `GiveUp`; `judge_results` says it after a plan,

@@ -1,4 +1,4 @@
-"""Which diagnosis to act on, and what is to be planned for it.
+"""Chooses which diagnosis to act on, and what to plan for it.
 
 Pure: observations, diagnosis and ledger in, problem out. Of several diagnoses the one is taken that was tried least in
 this case; then, that with the fewest components; then, that whose components were touched least; then the first by the

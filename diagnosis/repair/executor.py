@@ -1,4 +1,4 @@
-"""Carrying out a plan, and seeing to it that the world goes along.
+"""Executes a plan, and checks that its effects come about.
 
 The steps of a stage are done at the same time. Before each its precondition is checked against what is observed now;
 after it, its effects are waited for in the observations (T60). A step that fails takes with it those that need it, and

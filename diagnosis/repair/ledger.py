@@ -1,4 +1,4 @@
-"""What was tried on whom, and when it may be tried again: cool-down and budget for each component and action (T62)."""
+"""The ledger of attempts: cool-down and budget for each component and action (T62)."""
 
 from __future__ import annotations
 

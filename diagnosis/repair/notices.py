@@ -1,4 +1,4 @@
-"""What repair tells on `/repair`, and what it is told."""
+"""The messages that repair publishes on `/repair`, and those that it takes."""
 
 from __future__ import annotations
 

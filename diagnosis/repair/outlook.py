@@ -1,4 +1,4 @@
-"""What a repairer sees: the observations, the present diagnosis, and until when which of it says nothing.
+"""A repairer's view of the world: observations, the present diagnosis, and until when each says nothing.
 
 Plain data: whoever owns it gives the time, in seconds on one clock; -inf is a time that never was.
 """

@@ -1,4 +1,4 @@
-"""How far repair may go: attempts, waits, modes, whom to leave alone."""
+"""The policy of repair: attempts, waits, modes, and components to leave alone."""
 
 from __future__ import annotations
 

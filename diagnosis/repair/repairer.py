@@ -101,7 +101,7 @@ class Repairer(Actor):
         """Ask for the present diagnosis."""
         above = self.ctx.path.rpartition("/")[0]
         diagnoser = self._diagnoser or f"{above}/{DIAGNOSER}"
-        if self._diagnoser is None and self.ctx.cell.node.find(diagnoser) is not None:
+        if self._diagnoser is None and self.ctx._cell.node.find(diagnoser) is not None:
             self._base = (*self._base, above)
         if self.ctx.life == 1:
             self._outlook.looks_until = self.now() + self._policy.look
@@ -315,7 +315,7 @@ class Repairer(Actor):
 
     @property
     def _arbiter(self) -> Arbiter:
-        return arbiter_of(self.ctx.cell.node)
+        return arbiter_of(self.ctx._cell.node)
 
     def _address(self, step: Step) -> str:
         """What a step acts on, for the arbiter."""
@@ -329,7 +329,7 @@ class Repairer(Actor):
         names = tuple(name for name in components if name not in self._memory.given_up)
         self._memory.given_up |= dict.fromkeys(names, why)
         symptoms, seconds = self._outlook.diagnosis.symptoms, self.now() - case.began
-        self.ctx.cell.node.emit(say.RepairGaveUp(self.ctx.path, names, why))
+        self.ctx._cell.node.emit(say.RepairGaveUp(self.ctx.path, names, why))
         await self._tell(say.GaveUp(case.number, names, symptoms, why, tuple(case.actions), seconds))
 
     # -- what the executor sees and tells ---------------------------------------------------------------------------

@@ -159,7 +159,7 @@ async def _restart(act: Act, node: str, *, addresses: Mapping[str, str], timeout
 
 async def _bind(act: Act, node: str, *, bindings: Mapping[str, tuple[str, str, str]]) -> None:
     address, port, target = bindings[node]
-    here = act.ctx.cell.node
+    here = act.ctx._cell.node
     here.bind(here.find_ref(address, Actor)._cell, port, here.find_ref(target, Actor)._cell)
 
 
@@ -266,56 +266,39 @@ async def _command(act: Act, *names: str, command: Sequence[str]) -> None:
 # -- fault-tolerance mechanisms -------------------------------------------------------------------------------------
 
 
+class ChangePort(Protocol):
+    """What repair needs of a transaction's `change`."""
+
+    def protect(self, target: str, stack: Any) -> None:
+        """Have an actor protected by just this stack of mechanisms."""
+        ...
+
+
 class TransactionPort(Protocol):
     """`system.transaction`: the system gives it, since repair knows nothing of mechanisms."""
 
-    def __call__(self, *, timeout: float) -> AbstractAsyncContextManager[object]:
+    def __call__(self, *, timeout: float) -> AbstractAsyncContextManager[ChangePort]:
         """Collect what is to be done in the block; at its end it is done, or undone."""
         ...
 
 
-def attach_mechanism(
+def protect_by(
     transaction: TransactionPort, mechanism: Any, addresses: Mapping[str, str], **options: Any
 ) -> RepairAction:
-    """`attach_pbr(n)`: protect an actor by a mechanism, while requests flow. The other two take the same.
+    """`protect_pbr(n)`: protect an actor by just this stack of mechanisms, while requests flow.
 
     Args:
         transaction: `system.transaction`.
-        mechanism: its name, its file, one with its settings, or several, outermost first.
+        mechanism: what `change.protect` takes: its name, its file, one with its settings, or several, outermost first.
         addresses: of each component that can be protected so.
         options: those of `RepairAction`; `name` of the action, `cost`, and `timeout`: seconds until it is undone.
     """
-    return _mechanism("attach", transaction, mechanism, addresses, options)
-
-
-def compose_mechanism(
-    transaction: TransactionPort, mechanism: Any, addresses: Mapping[str, str], *, outside: bool = False, **options: Any
-) -> RepairAction:
-    """`compose_tr(n)`: nest one more mechanism inside of those that an actor has, or `outside`."""
-    return _mechanism("compose", transaction, mechanism, addresses, options, outside=outside)
-
-
-def transition_mechanism(
-    transaction: TransactionPort, mechanism: Any, addresses: Mapping[str, str], **options: Any
-) -> RepairAction:
-    """`transition_lfr(n)`: put a mechanism in the place of the one of its sort, or several in the place of all."""
-    return _mechanism("transition", transaction, mechanism, addresses, options)
-
-
-def _mechanism(
-    verb: str,
-    transaction: TransactionPort,
-    mechanism: Any,
-    addresses: Mapping[str, str],
-    options: Mapping[str, Any],
-    **settings: Any,
-) -> RepairAction:
-    whole: dict[str, Any] = {"timeout": CHANGED_WITHIN, "cost": 5, "name": f"{verb}_{_word(mechanism)}", **options}
+    whole: dict[str, Any] = {"timeout": CHANGED_WITHIN, "cost": 5, "name": f"protect_{_word(mechanism)}", **options}
     seconds, cost, name = whole.pop("timeout"), whole.pop("cost"), whole.pop("name")
 
     async def run(act: Act, node: str) -> None:
         async with transaction(timeout=seconds) as change:
-            getattr(change, verb)(addresses[node], mechanism, **settings)
+            change.protect(addresses[node], mechanism)
 
     more = {"grace": 1.0, "timeout": seconds + PATIENCE} | whole
     return _action(name, run, addresses, more, pddl=_mend_text(name, cost, "node"))

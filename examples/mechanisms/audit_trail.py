@@ -1,6 +1,6 @@
 """A mechanism in one file: what is asked of an actor stands in a file before it is computed, and what came of it after.
 
-`change.attach(ref, "audit_trail.py")`, alone or outside of others: `(AuditTrail("bank.log"), hf.PBR())`.
+`change.protect(ref, "audit_trail.py")`, alone or outside of others: `(AuditTrail("bank.log"), hf.ftm.PBR())`.
 """
 
 from __future__ import annotations

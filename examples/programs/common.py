@@ -127,7 +127,7 @@ class Result:
     waits: tuple[float, ...]
     state_bytes: int
     memory: int
-    recoveries: tuple[hf.Recovered, ...]
+    recoveries: tuple[hf.events.Recovered, ...]
 
     @property
     def seconds(self) -> float:
@@ -171,8 +171,8 @@ async def run(
             await drive.through(program.feed())
             state = await system.get_state(ref, timeout=PATIENCE)
             memory = resident_bytes()
-            await system.node.settled()  # The last report of a recovery comes a little after it.
-            recoveries = tuple(event for event in events.take() if isinstance(event, hf.Recovered))
+            await system._node.settled()  # The last report of a recovery comes a little after it.
+            recoveries = tuple(event for event in events.take() if isinstance(event, hf.events.Recovered))
     return Result(
         digest=state_digest(state).hex(),
         verdict=program.judge(state),
@@ -222,7 +222,7 @@ class _Drive:
         answer = self._ref.ask(message, timeout=PATIENCE)
         if kill:
             await asyncio.sleep(0)  # The message leaves for the process.
-            with suppress(hf.NoSuchActor, ProcessLookupError):  # It is still dead from the time before.
+            with suppress(hf.errors.NoSuchActor, ProcessLookupError):  # It is still dead from the time before.
                 os.kill(self._system.pid_of(self._ref), signal.SIGKILL)
         try:
             return await answer

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 from common import DATA, DamagedData, Feed, Program, Timed, Verdict, find_file, main, read_numbers
+from map_demo.grid import Geometry, OccupancyGrid
 from scans import Floats, LikelihoodField, between, compose, end_points, place
 
 import holdfast as hf
-from holdfast.console.demo.grid import Geometry, OccupancyGrid
 
 FILE = "mines_exp1.dat.gz"
 COLUMNS, FIRST_RANGE, BEAMS = 707, 24, 682

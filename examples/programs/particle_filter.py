@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 from common import DATA, Feed, Program, Timed, Verdict, main
+from map_demo.grid import OccupancyGrid
 from planning import Roads
 from scans import Estimate, Floats, LikelihoodField, Start, compose
 from willow import LASER_RANGE, PERIOD, Robot, bearings_of_beams, read_map, steer
 
 import holdfast as hf
-from holdfast.console.demo.grid import OccupancyGrid
 
 START = (27.0, 4.0, 1.1)
 GOAL = (18.0, 37.0)

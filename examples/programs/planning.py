@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from common import DATA, Feed, Program, Timed, Verdict, main
+from map_demo.grid import OccupancyGrid
 from numpy.typing import NDArray
 from scans import Floats
 from scipy.sparse import csr_array
@@ -19,7 +20,6 @@ from scipy.sparse.csgraph import dijkstra
 from willow import PERIOD, Robot, read_map, room_of, steer
 
 import holdfast as hf
-from holdfast.console.demo.grid import OccupancyGrid
 
 Place = tuple[float, float]
 

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 from common import DATA, DamagedData, Feed, MissingData, Program, Timed, Verdict, main
+from map_demo.grid import USABLE_RANGE, Geometry, OccupancyGrid
+from map_demo.log import LaserScan, LogError, killian_court, read_scans
 from scans import Estimate, Floats, LikelihoodField, Start, between, compose, end_points
 
 import holdfast as hf
-from holdfast.console.demo.grid import USABLE_RANGE, Geometry, OccupancyGrid
-from holdfast.console.demo.log import LaserScan, LogError, killian_court, read_scans
 
 FILE = "killian.g2o.zip"
 NEAREST = 0.3  # metres

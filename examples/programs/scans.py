@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from map_demo.grid import Geometry, OccupancyGrid
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.optimize import least_squares
 
 import holdfast as hf
-from holdfast.console.demo.grid import Geometry, OccupancyGrid
 
 Floats = NDArray[np.floating[Any]]
 

@@ -10,11 +10,10 @@ from pathlib import Path
 
 import numpy as np
 from common import find_file, reading
+from map_demo.grid import Geometry, OccupancyGrid
 from numpy.typing import NDArray
 from scans import Floats, LikelihoodField, compose, distances, place
 from scipy.ndimage import maximum_filter
-
-from holdfast.console.demo.grid import Geometry, OccupancyGrid
 
 FILE = "willow-2010-02-18-0.10.pgm.gz"
 RESOLUTION = 0.1  # metres a cell, as the .yaml beside it says

@@ -5,7 +5,9 @@ import holdfast as hf
 
 async def reconfigure(system) -> None:
     async with system.transaction(timeout=60.0) as change:
-        change.attach("/app/bank/alice", hf.PBR())
-        change.compose("/app/bank/alice", hf.TR())  # inside; a file "my_mechanism.py" would do, too
-        change.transition("/app/bank/alice", hf.LFR())
-        change.detach("/app/bank/alice", "tr")
+        change.protect("/app/bank/alice", hf.ftm.PBR())
+        change.protect(
+            "/app/bank/alice", ("pbr", hf.ftm.TR())
+        )  # one more inside; a file "my_mechanism.py" would do, too
+        change.protect("/app/bank/alice", ("lfr", "tr"))  # "tr" is the one that it has
+        change.protect("/app/bank/alice", "lfr")

@@ -1,4 +1,4 @@
-"""What a replica says besides the ends of turns, until home has the turns that it stands behind.
+"""Words of a replica other than turn ends, held back until the home has the turns they follow.
 
 Another leader is asked again for the ends that home does not have, one batch after the other; what it has to say
 besides is ready at once, and may even be about turns that home has never heard of.

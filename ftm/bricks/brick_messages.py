@@ -1,4 +1,4 @@
-"""What bricks say to each other: requests in batches, their outcomes, roles, and states that are transferred."""
+"""The messages between bricks: batches of requests, outcomes, roles, and transferred states."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class Abandon(Message[None]):
 
 
 class Brick(Posting):
-    """What all bricks have in common."""
+    """Base of all bricks: the parts of which a replica of a protected actor is made."""
 
     deterministic = False
 
@@ -63,12 +63,12 @@ class Brick(Posting):
 
     @property
     def leads(self) -> bool:
-        """Whether this replica is the primary (leader)."""
+        """Say whether this replica is the primary (leader)."""
         return self._standing.leads
 
     @property
     def role(self) -> str:
-        """What the mechanism calls this replica's part."""
+        """Return the mechanism's name for the part that this replica plays."""
         return "" if self.mechanism is None else self.mechanism.role_name(leads=self._standing.leads)
 
     @property
@@ -78,7 +78,7 @@ class Brick(Posting):
 
     @property
     def has_peer(self) -> bool:
-        """Whether another replica has all that this one has acknowledged."""
+        """Say whether another replica has all that this one has acknowledged."""
         return self._standing.other.state == "live"
 
     # -- the other replica ------------------------------------------------------------------------------------------
@@ -111,7 +111,7 @@ class Brick(Posting):
 
 
 class Before(Brick):
-    """What is done with a batch before it is computed; without `before` it passes through."""
+    """The brick that does something with a batch before it is computed; without `before` it passes through."""
 
     async def before(self, work: Work) -> Work | None:
         """Prepare a batch. None: none of its requests goes further from here.
@@ -122,7 +122,7 @@ class Before(Brick):
         return work
 
     def message_of(self, request: Request) -> Any:
-        """The message that a request brings to the protected actor; None if it is something else, such as a timer."""
+        """Return the message that a request brings to the protected actor; None if it is a timer or the like."""
         feed, cell = request.feed, self._standing.server.cell
         if feed.kind != MESSAGE or cell is None:
             return None
@@ -154,7 +154,7 @@ class Before(Brick):
 
 
 class After(Brick):
-    """What is done with outcomes before they leave; without `after` they pass through."""
+    """The brick that does something with outcomes before they leave; without `after` they pass through."""
 
     async def after(self, done: Done) -> Done | None:
         """Make outcomes ready to leave. None: they do not, and their requests have been let fall.
@@ -164,7 +164,7 @@ class After(Brick):
         return done
 
     def taken(self) -> None:
-        """The state behind these outcomes has been captured, or is not needed: the next turns may run."""
+        """Go on, for the state behind these outcomes has been captured, or is not needed: the next turns may run."""
         if self._handle is not None:
             self._handle.reply(Taken())
 
@@ -202,7 +202,7 @@ class Proceed(Brick):
 
     @property
     def is_at_work(self) -> bool:
-        """Whether a batch is being computed, or handed over."""
+        """Say whether a batch is being computed, or handed over."""
         return self._task is not None
 
     def take_over(self) -> None:
@@ -210,7 +210,7 @@ class Proceed(Brick):
         self._standing.server.report_to(self)
 
     async def heard(self, outcome: Outcome) -> None:
-        """An ask of the protected actor has an outcome; called before it gets it."""
+        """Hear that an ask of the protected actor has an outcome; called before the actor gets it."""
 
     # -- batches ----------------------------------------------------------------------------------------------------
 
@@ -257,9 +257,9 @@ class Proceed(Brick):
 
     def go_on(self) -> None:
         """See to it that what waits is handled. Called from our turns, and from the protected actor's."""
-        if self._task is not None or self.ctx.closed:
+        if self._task is not None or self.ctx._closed:
             return
-        cell = self.ctx.cell
+        cell = self.ctx._cell
         context = cell.context or lifecycle.open_context(cell)
         if current.get(None) is self.ctx:
             self._task = self.ctx.create_task(self._run())
@@ -293,11 +293,9 @@ class Proceed(Brick):
         brings = bool(pending) or go is not None  # Else home may not have what was handled before.
         if pending and not state.is_over:
             await server.ensure()
+            await self._hand_more()  # A snapshot of what its hooks have left, before anything that stands on it.
             pending = server.returned_first(pending)
         while True:
-            if pending and not state.is_over:
-                await server.ensure()
-                await self._hand_more()  # A snapshot of what its hooks have left, before anything that stands on it.
             ends = await server.run_part(pending)
             live = None
             # What was handled before is decided as it was: `on_recovered` and what follows from it are no part of that.
@@ -395,7 +393,8 @@ class Proceed(Brick):
             self._standing.server.inward(record)
 
     def tell_outward(self, record: Released) -> None:
+        """Tell a message that the protected actor has let out, if this replica leads and is not fenced."""
         standing = self._standing
         if standing.leads and not standing.is_fenced:
             # Called in the protected actor's turn: a plain `tell` would be taken for one of its own.
-            self.ctx.tell(self.out._cell, Outward(standing.epoch, [record]))
+            self.ctx._tell(self.out._cell, Outward(standing.epoch, [record]))

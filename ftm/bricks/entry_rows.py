@@ -1,4 +1,4 @@
-"""Large lists and dicts of plain values, encoded some entries at a time: what was not exchanged is not encoded again.
+"""Encodes large lists and dicts of plain values by rows of entries, and skips entries that did not change.
 
 Numbers, texts and bytes cannot change: an entry that is the very object that it was is as it was. A list of them is
 looked through for each image, and only groups in which an entry is another one are encoded anew. What comes out are the

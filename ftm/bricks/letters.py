@@ -1,4 +1,4 @@
-"""Letters: what bricks of two replicas say to each other, and how over a secured link."""
+"""Letters: the messages between bricks of two replicas, also over a secured link."""
 
 from __future__ import annotations
 

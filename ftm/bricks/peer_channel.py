@@ -1,4 +1,4 @@
-"""Post between bricks of different replicas: each letter is handled once, in the order in which they were sent.
+"""The channel between bricks of different replicas: each letter is handled once, in the order sent.
 
 A letter that has no answer after a while may have been lost on its way, or its answer; or it is still being handled.
 So the other brick is asked (`Recall`): it answers what it has, or says that it never came. Then it is sent again;
@@ -285,7 +285,7 @@ class Posting(Letters):
         outbox = standing.other.brick(self.slot)
         if outbox is None:
             outbox = await self._find(path, self.slot, self.slot)
-            standing.node.bind(self.ctx.cell, "peer", outbox.ref._cell)
+            standing.node.bind(self.ctx._cell, "peer", outbox.ref._cell)
         return outbox
 
     async def _find(self, path: str, slot: str, key: str) -> Outbox:

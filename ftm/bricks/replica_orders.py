@@ -1,4 +1,4 @@
-"""What the root tells the replicas of a group besides their work, and what they tell it of themselves.
+"""Orders of the root to the replicas of a group besides their work, and reports of the replicas.
 
 All orders go to the outermost RequestProtocol of a replica. Each can come twice: the manager that gave it may have died
 before it heard the reply, and the next one gives it again. Twice is once.

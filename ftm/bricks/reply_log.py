@@ -1,4 +1,4 @@
-"""The reply log: what became of each request, so that a duplicate is answered and not handled twice (A46, T5).
+"""The reply log: the outcome of each request, so that a duplicate is answered and not run again (A46, T5).
 
 It is part of the replicated state, and bounded: who asks for an outcome that was evicted is told so, never run again.
 """

@@ -371,7 +371,7 @@ class RequestProtocol(Transfer):
 
     def _order(self, message: Message[Any]) -> asyncio.Future[Any]:
         """Have the replica do it, which obeys us alone."""
-        parent = self.ctx.cell.parent
+        parent = self.ctx._cell.parent
         assert parent is not None
         return parent.ref.ask(Opened(self._standing.opened.put(message)), timeout=FOREVER)
 

@@ -1,4 +1,4 @@
-"""Runs: what a batch comes to when it is computed once more, from the same state, by another version or replica.
+"""Runs: a batch computed once more from the same state, by another version or another replica.
 
 A shadow is a second life of the protected actor in a replica: what it computes is compared, and leaves only if the
 replica that leads takes it over.
@@ -320,6 +320,8 @@ class Deciding(After):
         life = server.life
         if not done.ends or server.state.is_over or (life is None and server.points.previous is None):
             return done
+        if life is not None and life.spoiled is not None:
+            return done  # It has run nothing.
         if life is not None and life.feed is not None:  # A follower's turn waits in the middle: nothing is decided.
             if any(end.id in server.traces.objections for end in done.ends):
                 raise HoldfastError(f"{self._standing.path}: an assertion has failed while a turn waits")

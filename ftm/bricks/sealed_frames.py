@@ -1,4 +1,4 @@
-"""What is said over a secured link: hand-shakes and frames. It can be imported without the extra `sec`."""
+"""The frames of a secured link: hand-shakes and sealed messages. It needs no extra to be imported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The gate of a replica: with a secured link, nothing comes in but over that."""
+"""The gate of a replica: where a link is secured, nothing comes in except over it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a replica stands: what all of its bricks go by. One object per replica, so that all change at once."""
+"""The standing of a replica (role, epoch, peers): one object that all its bricks go by."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When the replicas that compute alike compare their states: behind batches that the leader names beforehand.
+"""Replicas that compute alike compare their states behind batches that the leader names in advance.
 
 Each takes the digest when its own turns have come so far; they need not be there at the same time.
 """

@@ -1,4 +1,4 @@
-"""Images of states in blocks with checksums: what two of them have in common is there once, and is not sent again.
+"""State images in checksummed blocks: blocks that two images share are kept and sent once.
 
 A large state is encoded variable by variable (`checkpoint.image`), and each piece is cut into blocks. A block in which
 nothing has changed is the very object that the last image has; an array is compared where it lies, a list of plain

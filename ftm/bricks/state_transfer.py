@@ -1,4 +1,4 @@
-"""State transfer: another replica is brought to the state of the one that leads, between two batches (T8c).
+"""State transfer: brings another replica to the leader's state between two batches (T8c).
 
 The two RequestProtocols do it: the leader's captures and sends, the follower's takes, and may ask for it again. The
 leader's gives it out, too, when the actor is to live without a mechanism.
@@ -116,7 +116,7 @@ class Transfer(SealedGate):
             await server.ensure()
             state, point = None, server.points.point
             if server.state.has_access:
-                state = server.capture() if point is not None or server.turn >= 0 else None
+                state = self._captured(path) if point is not None or server.turn >= 0 else None
             elif point is not None and server.turn == point.turn and not point.data.size:
                 state = point  # It has begun afresh, and so does the other one.
             elif server.turn >= 0:
@@ -139,6 +139,12 @@ class Transfer(SealedGate):
         if standing.other.path != path:
             raise CannotJoin(path=path, why="another one has taken its place, or it was given up meanwhile")
         return turn
+
+    def _captured(self, path: str) -> ServerState:
+        try:
+            return self._standing.server.capture()
+        except Exception as error:  # What the user's own values and methods raise is no reason to end: we are alone.
+            raise CannotJoin(path=path, why=f"the state cannot be saved: {error}") from error
 
     async def _drain_bricks(self) -> None:
         for cell in list(self._standing.bricks.values()):

@@ -206,7 +206,7 @@ class AdaptationEngine(GroupPart):
                 continue
 
     def _supervisor(self) -> Cell:
-        parent = self.ctx.cell.parent
+        parent = self.ctx._cell.parent
         assert parent is not None
         return parent
 

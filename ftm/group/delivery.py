@@ -1,4 +1,4 @@
-"""What is on its way between the home of a protected address and the replica that leads: data and decisions.
+"""Requests on their way between a protected address's home and its primary: data and decisions.
 
 One batch is out at a time. Another leader gets all again that has no end yet; what a replica had that does not lead any
 more, and has not ended since, counts as inside.

@@ -80,7 +80,7 @@ class Detector(GroupPart):
 
     def on_start(self, restored: bool) -> None:
         """Nothing is known yet: whoever is silent from now on is suspected in its time."""
-        self._clock = OwnClock(self.ctx.cell.node.loop.time(), self._period)
+        self._clock = OwnClock(self.ctx._cell.node.loop.time(), self._period)
         self._look()
 
     @on(ReplicaBeat)
@@ -91,7 +91,7 @@ class Detector(GroupPart):
         if not life or not is_within(replicas.place(name), self.ctx.sender):
             return  # It has died since it said so; or another one has said it.
         accrual = self._known.get((name, life))
-        now = self._clock.at(self.ctx.cell.node.loop.time())
+        now = self._clock.at(self.ctx._cell.node.loop.time())
         if replicas.heard(name, life) or accrual is None:  # It may be another replica of that name.
             self._known = {key: one for key, one in self._known.items() if key[0] != name}
             self._known[name, life] = Accrual(replicas.detection, now, replicas.starved(name))
@@ -106,9 +106,9 @@ class Detector(GroupPart):
             replicas.blame(message.name, message.life, message.why)
 
     def _look(self) -> None:
-        if self.ctx.closed:
+        if self.ctx._closed:
             return  # This life was killed: the next one looks, and this one hears nothing any more.
-        loop = self.ctx.cell.node.loop
+        loop = self.ctx._cell.node.loop
         detection = self._replicas.detection
         if detection.interval / 2 != self._period:  # A change of mechanism has said so.
             self._period = detection.interval / 2

@@ -1,4 +1,4 @@
-"""What is known of a group of replicas, outside of all actors: each of them may die at any moment.
+"""The shared knowledge about one group of replicas; it is outside of all actors, which may die at any moment.
 
 The proxy, the detector and the failover manager act on this; the next life of each goes on where the last one was. What
 is known is data (`membership.py`, `delivery.py`, `reconfiguration.py`); here is what goes to the home and comes from

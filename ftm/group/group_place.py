@@ -1,4 +1,4 @@
-"""The place of a protected actor: the life at its address is lived by a group of replicas.
+"""The place of a protected actor: a group of replicas lives the life at its address.
 
 Its home feeds, holds, journals and answers as for any recorded actor. An actor without recovery has a home as long as
 it is protected: nothing is kept of what it has handled, and when no replica is left it begins afresh.

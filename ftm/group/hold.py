@@ -1,4 +1,4 @@
-"""What failover holds of a protected actor, by leave of the system's arbiter (T63)."""
+"""Failover's hold on a protected actor, granted by the arbiter of the system (T63)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Turns and bricks that do not end, though their process lives.
+"""Finds turns and bricks that do not end although their process lives, and has them replaced or put aside.
 
 A turn is tried once more, and then its message is put aside. Another replica tries; if there is none, the same one,
 from the state before.

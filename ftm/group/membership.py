@@ -1,4 +1,4 @@
-"""Who of a group of replicas is up, is suspected, counts, and leads; and what failover does next: data and decisions.
+"""The members of a group of replicas, their primary and their suspects, and failover's next step: data and decisions.
 
 Nothing here waits, tells, or reads a clock. `replicas.py` has what else belongs to a change of the membership, and
 `failover.py` carries the steps out. They are told which life each replica lives now: a name to a number, 0 for none.

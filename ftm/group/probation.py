@@ -1,4 +1,4 @@
-"""Probation: a stack of mechanisms that has just been changed to is not trusted until it has worked for a while.
+"""Probation: a stack of mechanisms that is new is not trusted until it has worked for a while.
 
 If a replica ends meanwhile by what its own code has done, or the bricks let nothing pass, the stack before comes back.
 Who leads then is brought to that stack before it leads, so that no request ever meets the bad bricks again.

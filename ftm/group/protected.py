@@ -1,4 +1,4 @@
-"""Whether an actor is protected now, by what, who leads, and whether a replica could die."""
+"""The protection status of an actor: its mechanisms, who leads, and whether a replica may die."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ProtectionStatus:
-    """How an actor is protected, as `system.protection` tells it."""
+    """The mechanisms and replicas that protect an actor, as `system.protection` tells of them."""
 
     address: str
     stack: tuple[str, ...]
@@ -35,7 +35,7 @@ class ProtectionStatus:
 
     @property
     def is_protected(self) -> bool:
-        """Whether it has any mechanism."""
+        """Say whether the actor has any mechanism."""
         return bool(self.stack)
 
 

@@ -1,4 +1,4 @@
-"""The proxy: what the home feeds goes out in one batch at a time, and each outcome comes home once (A44, A54)."""
+"""The proxy: sends requests of the home in one batch at a time, and brings each outcome home once (A44, A54)."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class Proxy(GroupPart):
 
     async def _take(self, call: Call) -> Back:
         for part in call.parts:
-            self._hear(self.ctx.cell.node.codec.decode(SAID[part.name], part.body))
+            self._hear(self.ctx._cell.node.codec.decode(SAID[part.name], part.body))
         self._send()
         return Back("", "", b"")
 

@@ -1,4 +1,4 @@
-"""Another stack of mechanisms for a protected actor: how far a change has come, and what follows: data and decisions.
+"""The progress of a change of mechanisms, and the next step of it: data and decisions.
 
 What is under way stands here, outside all actors: the engine (`adaptation_engine.py`) may die at any moment, and its
 next life goes on. Up to the commit a change can be given up; from there on it is carried to its end, for a replica that

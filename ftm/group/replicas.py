@@ -1,4 +1,4 @@
-"""How the root reaches the replicas of a group and their processes, and what it hears of them.
+"""The root's access to the replicas of a group: their processes, what is sent to them, what is heard.
 
 Who of them counts stands in the membership, which is data; here is what a change of it does besides. If the outermost
 mechanism wants that, all that replicas are told, and say, is sealed.
@@ -428,7 +428,7 @@ class GroupPart(Actor):
         """Do something then, instead of what was to be done before."""
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = self.ctx.cell.node.loop.call_later(seconds, call)
+        self._timer = self.ctx._cell.node.loop.call_later(seconds, call)
 
 
 def finish(waiting: Iterable[asyncio.Future[None]]) -> None:

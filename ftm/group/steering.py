@@ -1,4 +1,4 @@
-"""What reaches a protected actor besides messages: orders go to whoever leads, bindings to every replica."""
+"""Steers a protected actor besides its messages: orders go to the leader, bindings to every replica."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def give_order(group: Group | None, cell: Cell, call: QueuedOrder) -> None:
     """
     ask = call.ask
     if isinstance(call.order, (ReplaceState, ReplaceCode, Prepare, Conclude)):
-        why = "it is protected, and all replicas have to be alike: detach its mechanism, and attach it again after"
+        why = "it is protected, and all replicas have to be alike: `protect` it by None, and again after"
         ask.fail(ControlFailed(cell.path, call.order.verb, why))
         return
     primary = None if group is None else group.membership.primary

@@ -1,4 +1,4 @@
-"""Homes of actors without recovery: they stand only as long as a mechanism protects them, and keep nothing.
+"""Homes of actors without recovery: they exist while a mechanism protects the actor, and store nothing.
 
 Only as long as that mechanism is not trusted there is a copy of the state.
 """

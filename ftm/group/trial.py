@@ -1,4 +1,4 @@
-"""The trial of a stack of mechanisms: a replica that is no part of the group plays all of its roles first.
+"""The trial of a stack: a replica outside of the group plays all of its roles first.
 
 Code that has never run is tried where it can hurt nobody: in a process that holds no state, that nobody waits for and
 that is killed in any case. Whatever it does there (raise, hang, block its process, end it), the group does not notice.

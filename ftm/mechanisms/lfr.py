@@ -313,7 +313,7 @@ class Comparing(After):
 
 @dataclasses.dataclass(frozen=True)
 class LFR(Mechanism):
-    """Leader-follower replication.
+    """Leader-follower replication: every replica computes each request, and the leader's replies leave.
 
     Args:
         compare_every: seconds between two comparisons of the states, more where one takes longer than 1 % of that.

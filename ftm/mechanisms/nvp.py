@@ -70,7 +70,7 @@ class Versions(Deciding):
 
 @dataclasses.dataclass(frozen=True)
 class NVP(Mechanism):
-    """N-version programming.
+    """N-version programming: several versions of the class compute each request, and a voter decides.
 
     Args:
         versions: the others besides the protected class: actor classes with the same messages and state, or handlers

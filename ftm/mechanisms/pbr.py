@@ -118,7 +118,7 @@ class StateUpdate(After):
 
 @dataclasses.dataclass(frozen=True)
 class PBR(Mechanism):
-    """Passive replication.
+    """Passive replication: the primary computes each request, and sends its state to a backup.
 
     Args:
         acknowledge: whether replies wait for the backup; without it the last `window` batches may be lost.

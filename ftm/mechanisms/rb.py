@@ -80,7 +80,7 @@ def protected_class(standing: Any) -> type[Actor]:
 
 @dataclasses.dataclass(frozen=True)
 class RB(Mechanism):
-    """Recovery blocks.
+    """Recovery blocks: an alternate computes a request again whose outcome the test has not accepted.
 
     Args:
         alternates: actor classes with the same messages and state, or handlers (functions with `@on`) that replace

@@ -193,7 +193,7 @@ def _remove(folder: str | Path, made: os.stat_result | None = None) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class SEC(Mechanism):
-    """Secured links.
+    """Secured links: replicas prove who they are by certificates, and all that goes between them is sealed.
 
     Args:
         authority: the address of the `CertificationAuthority`.
@@ -238,7 +238,7 @@ class SEC(Mechanism):
         object.__setattr__(self, "suites", tuple(self.suites))
 
     def check(self, kind: type[Actor], where: str = "") -> None:
-        """Whether the extra is installed, and the directory is safe."""
+        """Refuse to go on without the extra, or with a directory that is not safe."""
         super().check(kind, where)
         try:
             importlib.import_module("..sec.link", __package__)
@@ -273,7 +273,7 @@ class SEC(Mechanism):
         epoch: Callable[[], int],
         enrols: Callable[[], list[str]] | None = None,
     ) -> SecuredLink:
-        """This participant's end of its links."""
+        """Open this participant's end of its links."""
         from ..sec.link import Link
         from ..sec.participants import LinkEnd
 

@@ -171,7 +171,7 @@ class Voting(Deciding):
 
 @dataclasses.dataclass(frozen=True)
 class TMR(Mechanism):
-    """Triple modular redundancy.
+    """Triple modular redundancy: three replicas compute each request, and the majority's reply leaves.
 
     Args:
         voter: what decides; not a `Median`: all replicas run the same code, and who differs from it is faulty.

@@ -1,4 +1,4 @@
-"""A protected child of a supervisor in another process, as that process has it: its replicas are the root's.
+"""A protected child as the process of its supervisor has it; its replicas belong to the root.
 
 The cell here stands for the lives that a group at the root lives. Its supervisor starts and stops it as any other, and
 decides what follows from its end; what is sent to it goes to its home, in order with all else that leaves the process.

@@ -1,4 +1,4 @@
-"""Which sides a migration into a group of replicas has, and one out of it."""
+"""Chooses the sides of a migration into a group of replicas, or out of one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Children of a supervisor in another process that are lived at the root: by a group, or in a process of their own.
+"""Children of a supervisor in another process that live at the root: in a group, or in their own process.
 
 The supervisor in the process wants a life; it is lived by processes of the root as always. The death of a replica does
 not concern that supervisor. It hears of the end of the life, and decides what follows. When

@@ -1,4 +1,4 @@
-"""A life that is not recorded is handed over, as the process of its supervisor sees it: it leaves, or comes back.
+"""Hands over a life without recovery, as the process of its supervisor sees it: leaving, or coming back.
 
 It leaves: the life comes to rest with its state packed, and goes on if the group does not come so far. It comes back:
 a new life is begun beside the address, and is disposed of if it is not to be.
@@ -101,7 +101,7 @@ class PlainChild:
 
     def _at_rest(self, actor: Actor, state: bytes, owed: list[list[Any]] | None = None) -> None:
         """The same; `owed` is told when it leaves."""
-        guest, cell = self._guest, actor.ctx.cell
+        guest, cell = self._guest, actor.ctx._cell
         check_sendable(cell)
         bound = cell.extra().bound
         rest, stash = pack_rest(actor), pack(guest, cell, cell.extra().stash or ())

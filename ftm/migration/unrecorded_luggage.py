@@ -1,4 +1,4 @@
-"""What goes along when a life that is not recorded is handed over between a subtree's process and the root.
+"""The luggage of a life without recovery, between a subtree's process and the root.
 
 Whoever waits for a reply is answered over the connection, wherever the asked actor lives then.
 """
@@ -49,7 +49,7 @@ def save_owing(actor: Actor) -> tuple[bytes, dict[int, Ask]]:
         data = save_state(actor)
     except UnsavableValue:
         data = save_state(actor, lambda state: lift(state, told))
-    if lost := sum(not ask.is_done and ask not in owed.values() for ask in actor.ctx.promised()):
+    if lost := sum(not ask.is_done and ask not in owed.values() for ask in actor.ctx._promised()):
         raise unanswerable(lost)
     return data, owed
 
@@ -69,9 +69,9 @@ def restore_owing(actor: Actor, data: bytes, owed: Mapping[int, Ask]) -> None:
         if ask is None:
             return ReplyHandle[Any](None)
         found.add(value.id)
-        return actor.ctx.promise(ask)
+        return actor.ctx._promise(ask)
 
-    actor.ctx.borrow_promises()
+    actor.ctx._borrow_promises()
     restore_state(actor, data, meant=lambda saved: lift(saved, meant))
     if lost := sum(not ask.is_done for number, ask in owed.items() if number not in found):
         raise unanswerable(lost)

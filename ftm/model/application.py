@@ -1,4 +1,4 @@
-"""A of the change model: what an application is like, read from its class."""
+"""The application part (A) of the change model, read from an actor's class."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The change model (F, A, R): which mechanisms, and compositions of them, are right for what there is.
+"""The change model (F, A, R): which mechanisms and compositions suit faults, application and resources.
 
 F are the faults that are to be tolerated, A what the application is like, R what there is to run it on. They are looked
 at in this order: faults have priority, then the application must have what a mechanism needs, then resources must

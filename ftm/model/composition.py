@@ -1,4 +1,4 @@
-"""What must hold of a stack of mechanisms before it is made to run, and how one stack becomes another (T39, T42)."""
+"""Checks a stack of mechanisms before it is run, and the way from one stack to another (T39, T42)."""
 
 from __future__ import annotations
 
@@ -19,16 +19,21 @@ if TYPE_CHECKING:
 ORDER = ("link", "assertion", "replication", "repetition")
 """Layers, outermost first: what is outside sees plain data, what is inside runs once for each replica."""
 PARTS: tuple[Part, ...] = get_args(Part)
+Layer = Mechanism | type[Mechanism] | str | os.PathLike[str]
+"""A mechanism as a change takes it: an instance, a class without settings, a name, or a file."""
 
 
-def layers_of(wanted: Any) -> tuple[Mechanism, ...]:
+def layers_of(wanted: Any, there: Any = None) -> tuple[Mechanism, ...]:
     """Mechanisms as a change takes them: one or several, outermost first; each an instance, a class, a name or a file.
+
+    The name of one that is `there` already means that one, with its settings.
 
     Raises:
         MechanismRefused: something is none, or cannot be loaded.
     """
     several: Iterable[Any] = wanted if isinstance(wanted, (tuple, list)) else (wanted,)
-    return compose(*(_made(one) for one in several))
+    known = {} if there is None else {layer.name: layer for layer in compose(there)}
+    return compose(*(known[one] if isinstance(one, str) and one in known else _made(one) for one in several))
 
 
 def _made(wanted: Any) -> Mechanism:
@@ -133,49 +138,6 @@ def lines_of(path: str, layers: Any) -> list[str]:
 
 
 # -- one stack becomes another ----------------------------------------------------------------------------------------
-
-
-def composed(layers: Any, new: Any, *, outside: bool) -> tuple[Mechanism, ...]:
-    """One more layer: innermost, or outermost."""
-    there, more = compose(layers), layers_of(new)
-    return (*more, *there) if outside else (*there, *more)
-
-
-def replaced(layers: Any, new: Any, *, whole: bool = False) -> tuple[Mechanism, ...]:
-    """One mechanism in the place of the one of the same layer, alone or in a tuple; several in the place of all.
-
-    Args:
-        layers: the stack.
-        new: the mechanism, or several.
-        whole: whether what is new is the whole stack, also if it is only one.
-
-    Raises:
-        MechanismRefused: it has no place.
-    """
-    there, wanted = compose(layers), layers_of(new)
-    if whole or len(wanted) != 1 or len(there) == 1:
-        return wanted
-    (one,) = wanted
-    alike = [index for index, layer in enumerate(there) if layer.layer == one.layer]
-    if len(alike) != 1:
-        why = f"{names_of(there)} has {len(alike)} layers of its sort ({one.layer}): name the whole stack (whole=True)"
-        raise MechanismRefused(one.name, why)
-    return (*there[: alike[0]], one, *there[alike[0] + 1 :])
-
-
-def without(layers: Any, name: str) -> tuple[Mechanism, ...]:
-    """All layers but one.
-
-    Raises:
-        MechanismRefused: there is none of that name, or it is the only one.
-    """
-    there = compose(layers)
-    left = tuple(layer for layer in there if layer.name != name)
-    if len(left) == len(there):
-        raise MechanismRefused(name, f"it is not attached: {names_of(there)} is")
-    if not left:
-        raise MechanismRefused(name, "it is the only one")
-    return left
 
 
 def updated(layers: Any, part: str, code: Any, *, mechanism: str, role: str) -> tuple[Mechanism, ...]:

@@ -1,4 +1,4 @@
-"""What all mechanisms tolerate, need and cost, in one table (Table I of the paper, extended), as data and as text."""
+"""The coverage table (Table I of the paper, extended): what each mechanism tolerates, needs and costs."""
 
 from __future__ import annotations
 

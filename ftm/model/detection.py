@@ -1,4 +1,4 @@
-"""How the replicas of a protected actor are watched, as a word of its mechanism."""
+"""Settings of failure detection, by which a mechanism has its replicas watched."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ...actors.errors import SpecError
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Detection:
-    """How replicas are watched.
+    """Settings by which replicas are watched.
 
     Args:
         interval: seconds between two heartbeats.

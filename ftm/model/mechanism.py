@@ -1,4 +1,4 @@
-"""What a fault-tolerance mechanism is: roles, what each brick does in them, and what it assumes. One file each.
+"""The base of fault-tolerance mechanisms: roles, their bricks, and assumptions. Each has its own file.
 
 A mechanism is a frozen dataclass: its fields are its settings. It is found by name (`find`), by an entry point of the
 group `holdfast.mechanisms`, or loaded from a file or module that the system has never seen (`load`).
@@ -55,7 +55,7 @@ class MechanismRefused(HoldfastError, text="{name}: {problem}"):
 
 @dataclasses.dataclass(frozen=True)
 class Role:
-    """What the bricks of a replica do in one role; what is left out passes through."""
+    """The bricks of a replica in one role; a part that is left out passes everything through."""
 
     before: type[Before] | None = None
     proceed: type[Proceed] | None = None
@@ -116,7 +116,7 @@ class Mechanism(MechanismDeclaration, Described):
     """How its replicas are watched; None: as a mechanism inside says, or as usual."""
 
     def check(self, kind: type[Actor], where: str = "") -> None:
-        """Whether it suits this class.
+        """Refuse a class that the mechanism does not suit.
 
         Raises:
             MechanismRefused: naming what is missing.
@@ -129,20 +129,20 @@ class Mechanism(MechanismDeclaration, Described):
             raise MechanismRefused(name, f"{who}: it compares two runs, and the class says deterministic = False")
 
     def role(self, *, leads: bool) -> Role:
-        """What a replica does that leads, or does not."""
+        """Return the bricks of a replica that leads, or of one that does not."""
         roles = list(self.roles.values()) or [Role()]
         role, name = roles[0] if leads else roles[-1], self.role_name(leads=leads)
         other: dict[str, Any] = {part: kind for (of, part), kind in self.exchanged.items() if of == name}
         return dataclasses.replace(role, **other) if other else role
 
     def role_name(self, *, leads: bool) -> str:
-        """The name of the role of a replica that leads, or does not."""
+        """Return the name of the role of a replica that leads, or does not."""
         names = list(self.roles) or ["single"]
         return names[0] if leads else names[-1]
 
     @property
     def secures(self) -> bool:
-        """Whether it secures the links, and so stands around the protocol instead of behind it."""
+        """Say whether the mechanism secures the links, and so stands around the protocol instead of behind it."""
         return type(self).open_link is not Mechanism.open_link
 
     def open_link(
@@ -153,15 +153,15 @@ class Mechanism(MechanismDeclaration, Described):
         epoch: Callable[[], int],
         enrols: Callable[[], list[str]] | None = None,
     ) -> SecuredLink | None:
-        """One that secures the links (`layer` "link"): the end of them that is at `path`."""
+        """Open the end of the links that is at `path`, for a mechanism that secures them (`layer` "link")."""
         return None
 
     def for_replicas(self) -> Self:
-        """The same, with what only this process can add before replicas in others begin with it."""
+        """Return the mechanism with what only this process can add before replicas in others begin with it."""
         return self
 
     def with_brick(self, role: str, part: str, kind: type[Brick]) -> Self:
-        """The same mechanism, with another brick as `before`, `proceed` or `after` of one role."""
+        """Return the same mechanism, with another brick as `before`, `proceed` or `after` of one role."""
         new = copy.copy(self)
         object.__setattr__(new, "exchanged", {**self.exchanged, (role, part): kind})
         return new

@@ -1,4 +1,4 @@
-"""What a mechanism declares of itself: what it tolerates, needs and costs, and where it stands in a composition."""
+"""The declaration of a mechanism: what it tolerates, needs and costs, and its layer in a composition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the monitoring engine tells, as events; `address` is the protected one."""
+"""Events of the monitoring engine; `address` is the protected one."""
 
 from __future__ import annotations
 

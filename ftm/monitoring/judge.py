@@ -1,4 +1,4 @@
-"""What the monitoring engine decides, as a pure function of what it has seen and when: no clock, no system, no effects.
+"""The decisions of the monitoring engine, as a pure function of what was seen and when.
 
 Four things keep it from flapping (T45). A fault class is present while its rate is high, and gone only when it has been
 low for a while (`Signal`). A resource is smoothed, and a mechanism that is in use may need a little more than there is,

@@ -1,4 +1,4 @@
-"""The monitoring engine: sees to it that a mechanism suits what there is, and has it changed when it does not (A6).
+"""The monitoring engine: watches whether the mechanism in force still suits, and has it changed if not (A6).
 
 It looks at events of the protected address (crashes, mismatches, refused frames, mechanisms that somebody else has
 changed) and at the class of what lives there, measures resources, and lets `Judge` decide. What it decides is an event
@@ -274,7 +274,7 @@ class MonitoringEngine(Actor):
 
     def on_start(self, restored: bool) -> None:
         watch = self._watch
-        watch.listen(self.ctx.cell.node.events)
+        watch.listen(self.ctx._cell.node.events)
         # Timers and tasks have ended with the life before this one.
         if watch.announced is not None:
             self._withdraw("the monitoring engine was restarted")
@@ -283,17 +283,17 @@ class MonitoringEngine(Actor):
         self.ctx.every(watch.judge.settings.interval, MonitorLook())
 
     def _now(self) -> float:
-        return self.ctx.cell.node.loop.time()
+        return self.ctx._cell.node.loop.time()
 
     def _emit(self, kind: type[Event], *parts: Any) -> None:
-        self.ctx.cell.node.emit(kind(self._watch.address, *parts))
+        self.ctx._cell.node.emit(kind(self._watch.address, *parts))
 
     # -- seeing -----------------------------------------------------------------------------------------------------
 
     @on(MonitorLook)
     def _look(self, message: MonitorLook) -> None:
         watch = self._watch
-        there = self.ctx.cell.node.find(watch.address)
+        there = self.ctx._cell.node.find(watch.address)
         if there is not None:
             watch.follow(there.path)
         for kind in watch.take_signs():
@@ -317,7 +317,7 @@ class MonitoringEngine(Actor):
                 judge.changed(found, self._now())
             except ValueError as error:
                 self._emit(MonitoringBlind, f"somebody has changed the mechanism to {label(found)}: {error}")
-        cell = self.ctx.cell.node.find(watch.address)
+        cell = self.ctx._cell.node.find(watch.address)
         kind = None if cell is None else cell_kind(cell)
         if kind is not None and kind is not watch.kind:
             if watch.kind is not None:  # Another version: only what no class says is still true.
@@ -382,7 +382,7 @@ class MonitoringEngine(Actor):
                 self._withdraw(f"it is not wanted any more: {verdict.reason}")
             return
         if verdict.kind == ADAPT:
-            busy = arbiter_of(self.ctx.cell.node).in_the_way(watch.address, Hand.ADAPTATION)
+            busy = arbiter_of(self.ctx._cell.node).in_the_way(watch.address, Hand.ADAPTATION)
             if busy is None:
                 self._announce(verdict)
             else:  # It would be refused.

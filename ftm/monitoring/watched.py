@@ -1,4 +1,4 @@
-"""A watch over a protected actor as it is: the mechanism of its spec, what its class says, changes by transactions."""
+"""A watch over one protected actor: its mechanism, its class, and changes by transactions."""
 
 from __future__ import annotations
 
@@ -63,16 +63,9 @@ def watch_of(
     made.update((layer.name, layer) for layer in present)
 
     async def change(adapt: ChangeStack) -> None:
-        there = system.node.find(adapt.address)
-        protected = there is not None and there.spec.mechanism is not None
         layers = tuple(made[name] for name in adapt.target)
         async with system.transaction(timeout=CHANGED_WITHIN) as step:
-            if not layers:
-                step.detach(adapt.address)
-            elif protected:
-                step.transition(adapt.address, layers, whole=True)
-            else:
-                step.attach(adapt.address, layers)
+            step.protect(adapt.address, layers)
 
     assertions = sum(len(getattr(one, "assertions", ())) for one in made.values())
     versions = sum(len(getattr(one, name, ())) for one in made.values() for name in BRINGS)

@@ -1,4 +1,4 @@
-"""How the state of the protected actor becomes bytes, and bytes become its state again; between two turns only."""
+"""Converts the state of the protected actor to bytes and back, between two turns only."""
 
 from __future__ import annotations
 

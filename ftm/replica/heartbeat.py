@@ -1,4 +1,4 @@
-"""The heart of a replica: it beats as long as the bricks run."""
+"""The heart of a replica: it beats for as long as the bricks run."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Heart(Actor):
     def _watch_turns(self) -> None:
         """Tell of a turn that takes too long; a run that is only one of several has failed then."""
         standing = self._standing
-        now = self.ctx.cell.node.loop.time()
+        now = self.ctx._cell.node.loop.time()
         gap, self._seen = min(now - self._seen, 2 * self._interval), now  # While this process stood still, no turn ran.
         before, self._turns = self._turns, {}
         for server in (standing.server, *standing.server.shadows):

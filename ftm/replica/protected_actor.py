@@ -473,6 +473,8 @@ class Server(lifecycle.HerePlace):
         assert life.feed is None, "a state is captured between two turns, never in the middle of one"
         if point is not None and stands_at(points, life.turn, live=life.is_live):
             return point
+        if life.spoiled is not None:
+            return self._stay(life)
         actor: Any = life.cell.actor
         if has_deltas and point is not None and takes_delta(points):
             delta = encode_value(actor.get_delta(), where=f"{self.address}.get_delta()")
@@ -509,11 +511,34 @@ class Server(lifecycle.HerePlace):
             return
         try:
             made = self._whole(life)
-        except Exception:  # What the user's own values and methods raise: the next turn that leaves it so fails of it.
+        except Exception as error:  # What the user's own values and methods raise.
+            self._spoil(life, error)
             return
         life.is_touched = False
         self.points.stand_changed(made)
         self._note_names(life, made)
+
+    def _spoil(self, life: ServerLife, error: Exception) -> None:
+        """The hooks of a life have left what is no state: that is told, and the state before them stays.
+
+        Nothing is run in this life: it would stand on what nobody else can have. Whoever asks gets the error.
+        """
+        if not life.is_live:
+            return  # What follows may yet make a state of it: else the part that comes to this fails.
+        self.tell_more(Unsaved(str(error)))
+        if self.state.is_lazy or self.points.point is None or self.points.tail:
+            return
+        life.spoiled = error
+        self._stay(life)
+
+    def _stay(self, life: ServerLife) -> ServerState:
+        """Have the state of the point behind what this life has counted and not run."""
+        point = self.points.point
+        assert point is not None
+        made = point_of(life, point.data, point.deltas)
+        made.absent = point.absent
+        self.points.stay(made)
+        return made
 
     def state_digest(self) -> bytes:
         """A digest of the state after the last turn, the same on each replica. Only between two turns.
@@ -590,8 +615,6 @@ class Server(lifecycle.HerePlace):
         begin, state, attempts = time.perf_counter(), self.state, self.attempts
         part = self.part = BatchPart(pending)
         while pending and not state.is_over:
-            if self.life is None and part.begun and not self._goes_on([], self._rest.missed or ENDED):
-                break  # It has ended between two turns, and with it what the first ones have left.
             is_new = self.life is None
             if self.only_computes:  # Hooks have counted in the first run, if they have.
                 await self.ensure_as_given()
@@ -606,6 +629,9 @@ class Server(lifecycle.HerePlace):
             if not chunk:
                 break  # It runs alone, when home has all that comes before it.
             part.begun += chunk
+            if self.life.spoiled is not None:
+                for one in chunk:
+                    attempts.skips.setdefault(one.feed.id, self._failure(one, self.turn, self.life.spoiled))
             at = time.perf_counter()
             why = await self._give((one.feed, attempts.skips.get(one.feed.id)) for one in chunk)
             while why is BLOCKED:
@@ -616,6 +642,8 @@ class Server(lifecycle.HerePlace):
                 attempts.size = size_after(attempts.size, len(chunk), now - at)
                 if (now - begin > PART and not state.is_again) or part.is_cut:
                     break
+                if pending and self.life is None and not self._goes_on([], self._rest.missed or ENDED):
+                    break  # It has ended between two turns, and with it what the first ones have left.
             elif why is UNDONE:
                 self._take_back()
             elif not self._goes_on(chunk, why):
@@ -678,6 +706,7 @@ class Server(lifecycle.HerePlace):
         """
         while True:
             begun, tail = list(self.part.begun), list(self.points.tail)
+            has_run = any(one.feed.id not in self.attempts.skips for one in begun)
             if begun and self._is_unseen():
                 self._note_crash()
                 ends = await self._run_part_again(pending, single=True)
@@ -689,8 +718,8 @@ class Server(lifecycle.HerePlace):
                 if self.state.is_lazy:
                     self._go_on_without_point(ends)
                     return ends
-                if self.points.point is None or not begun:
-                    raise
+                if self.points.point is None or not has_run:
+                    raise  # What `on_start` has left, and no turn.
                 if len(begun) == 1 and self.life is not None and self.life.cell.actor is not None:
                     self._fail(begun[0], ends[-1], error)
                 await self.drop_life()
@@ -741,9 +770,12 @@ class Server(lifecycle.HerePlace):
 
     def _fail(self, request: Request, end: TurnEnd, error: BaseException) -> None:
         """This turn has left what is no state: run again, it fails."""
+        self.attempts.skips[end.id] = self._failure(request, end.turn, error)
+
+    def _failure(self, request: Request, turn: int, error: BaseException) -> TurnEnd:
         codec = self.standing.node.codec
         answer = Answer(*codec.encode_error(error)) if request.feed.is_ask else Answer()
-        self.attempts.skips[end.id] = TurnEnd(end.turn, end.id, FAILED, [], answer)
+        return TurnEnd(turn, request.feed.id, FAILED, [], answer)
 
     def _returned(self) -> list[Feed]:
         life, point = self.life, self.points.point

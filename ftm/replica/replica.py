@@ -173,7 +173,7 @@ class Replica(Supervisor):
 
     def init(self) -> Plan:
         """The protected actor and its state manager; the bricks follow."""
-        setting, cell = self._setting, self.ctx.cell
+        setting, cell = self._setting, self.ctx._cell
         self._standing = standing = Standing(cell, setting.config, self._made)
         self._server = standing.server = Server(standing, Method.of(setting.method))
         self._woven = Woven(setting.config, self._made, {}, {}, [])
@@ -187,7 +187,7 @@ class Replica(Supervisor):
     async def _start_all(self) -> None:
         """Start the protected actor's address, then the bricks as one that does not lead, then the heartbeat."""
         await super()._start_all()
-        setting, node = self._setting, self.ctx.cell.node
+        setting, node = self._setting, self.ctx._cell.node
         self._bind(STATE, "server", self._cell(SERVER))
         for port, path in setting.bindings.items():
             node.bind(self._cell(SERVER), port, node.cell_at(path), is_claimed=port in setting.claimed)
@@ -195,7 +195,7 @@ class Replica(Supervisor):
         woven = await self._start_bricks(self._woven.config, self._woven.layers, leads=False)
         await self._take_up(woven)
         one = Child(child(BEAT, start(Heart, self._standing, setting.name, setting.beat, setting.watch_turns)))
-        one.cell = cell = new_cell(self.ctx.cell, one)
+        one.cell = cell = new_cell(self.ctx._cell, one)
         for port in ("detector", "proxy"):
             node.bind(cell, port, self._standing.part(port))
         self._enlist(one)
@@ -205,7 +205,7 @@ class Replica(Supervisor):
         if one.spec.id != SERVER:
             return super()._launch(one)
         if one.cell is None:
-            one.cell = new_cell(self.ctx.cell, one)
+            one.cell = new_cell(self.ctx._cell, one)
         here = one.cell.node.ports.here
         one.cell.host = AddressHost(FED, self._server, here.parent)
         self._server.start(one.cell)
@@ -218,10 +218,10 @@ class Replica(Supervisor):
         return super().child_exited(cell, life, reason)
 
     def _give_up(self, one: Child, reason: ExitReason, told: ExitReason) -> None:
-        why, setting, cell = f"its {one.spec.id} has ended: {reason}", self._setting, self.ctx.cell
+        why, setting, cell = f"its {one.spec.id} has ended: {reason}", self._setting, self.ctx._cell
         super()._give_up(one, reason, Shutdown(why))
         with suppress(HoldfastError):  # It is between two lives: then it hears of our end.
-            self.ctx.tell(self._standing.part("detector"), Broken(setting.name, cell.life, why))
+            self.ctx._tell(self._standing.part("detector"), Broken(setting.name, cell.life, why))
 
     def _cell(self, name: str) -> Cell:
         cell = self._children[name].cell
@@ -229,7 +229,7 @@ class Replica(Supervisor):
         return cell
 
     def _bind(self, name: str, port: str, target: Cell) -> None:
-        self.ctx.cell.node.bind(self._cell(name), port, target)
+        self.ctx._cell.node.bind(self._cell(name), port, target)
 
     # -- weaving ----------------------------------------------------------------------------------------------------
 
@@ -316,9 +316,9 @@ class Replica(Supervisor):
         """
         asked = {name: self._cell(name).ref.ask(AwaitHandled(), timeout=FOREVER) for name in names}
         ended = {name: self._cell(name).ended() for name in names}
-        end, held = self.ctx.cell.node.loop.time() + SETTLED_WITHIN, list[Work]()
+        end, held = self.ctx._cell.node.loop.time() + SETTLED_WITHIN, list[Work]()
         for name in names:
-            left = max(0.0, end - self.ctx.cell.node.loop.time())
+            left = max(0.0, end - self.ctx._cell.node.loop.time())
             await asyncio.wait((asked[name], ended[name]), timeout=left, return_when=asyncio.FIRST_COMPLETED)
             if asked[name].done():
                 await asked[name]
@@ -375,7 +375,7 @@ class Replica(Supervisor):
         standing, woven = self._standing, self._woven
         for owner, port, target in self._wiring(woven):
             if port == "gate":
-                self.ctx.cell.node.bind(owner, port, target)
+                self.ctx._cell.node.bind(owner, port, target)
         outermost = standing.layers[0] if standing.layers else None
         old = standing.link
         if old is not None and old.mechanism == outermost:
@@ -393,7 +393,7 @@ class Replica(Supervisor):
         await server.drop_life()
 
     def _bind_all(self, woven: Woven) -> None:
-        node = self.ctx.cell.node
+        node = self.ctx._cell.node
         for owner, port, target in self._wiring(woven):
             if port != "gate":
                 node.bind(owner, port, target)

@@ -1,4 +1,4 @@
-"""A life of the protected actor inside a replica, and what stands in its mailbox besides its inputs."""
+"""A life of the protected actor inside a replica, and the items of its mailbox besides inputs."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class ServerContext(RecordedContext):
 
     @property
     def ref(self) -> ActorRef[Any]:
-        return self.cell.node.cell_at(self.path).ref
+        return self._cell.node.cell_at(self.path).ref
 
     def create_task(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
         if self._server.only_computes:  # The run that counts has begun it too: the actor does not end of this one.
@@ -124,6 +124,7 @@ class ServerLife(Life):
         self.let_out: list[Out] = []  # of the turn in hand, beside `outs`: it has left, or is held back
         self.begun_names: set[str] = set()  # the variables of the actor when `__init__` had run
         self.is_touched = False  # by its hooks, since the point at which it has begun
+        self.spoiled: Exception | None = None  # its hooks have left what is no state: why
         self.has_begun_tasks = False  # in turns since the last point
         self.saving.is_needed = server.state.has_access
 

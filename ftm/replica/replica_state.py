@@ -1,4 +1,4 @@
-"""The state of a replica beside its rewind points: the part in hand, what its turns have let out, and what goes home.
+"""The state of a replica besides its rewind points: the part in hand, what turns let out, what goes home.
 
 All here is data and decisions about it; the server (`protected_actor.py`) carries them out.
 """

@@ -1,4 +1,4 @@
-"""Rewind points: states as bytes at which the protected actor's life begins, and to which it can be taken back.
+"""Rewind points: states as bytes from which the protected actor's life begins, or to which it returns.
 
 A replica has a point behind each part that it has handed over, and knows what was handed over since. All here is data
 and decisions about it; the server (`protected_actor.py`) carries them out.
@@ -75,8 +75,12 @@ class RewindPoints:
     def skip_to(self, turn: int) -> None:
         """Count these turns as used, though they have left nothing."""
         if self.point is not None:
-            self.point = msgspec.structs.replace(self.point, turn=turn)
-            self.marks = [UNKNOWN] * len(self.point.deltas)
+            self.stay(msgspec.structs.replace(self.point, turn=turn))
+
+    def stay(self, point: ServerState) -> None:
+        """Have the same state behind turns that have left nothing; no difference leads to it."""
+        self.point, self.tail = point, []
+        self.marks = [UNKNOWN] * len(point.deltas)
 
     def keep_tail(self, requests: list[Request], ends: list[TurnEnd]) -> None:
         """Remember requests that are handed over: a life that begins at the point handles them again."""

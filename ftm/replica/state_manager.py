@@ -1,4 +1,4 @@
-"""The state manager of a replica: captures the state of the protected actor, rewinds it, takes that of another."""
+"""The state manager of a replica: captures and rewinds the actor's state, and takes over another's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How two participants agree on a session: X25519, signed by both, bound to names, lives and epoch.
+"""The hand-shake of two participants: X25519, signed by both, bound to names, lives and epoch.
 
     initiator                                                              responder
     Hello   certificate, one-time key, random, life, epoch, suites   ->

@@ -1,4 +1,4 @@
-"""Who a participant of secured links is: its key file, its certificate from the authority, whom it trusts."""
+"""The identity of a participant in secured links: its key file, its certificate, and whom it trusts."""
 
 from __future__ import annotations
 

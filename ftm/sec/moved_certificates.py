@@ -1,4 +1,4 @@
-"""Certificates of a protected actor that moves: for its new address before it goes, and no longer for its old one."""
+"""Certificates of a protected actor that moves: issued for the new address, revoked for the old one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the participants of secured links are named and known, and how their authority is asked."""
+"""Names and records of participants in secured links, and their requests to the authority."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can be wrong with keys, certificates, hand-shakes and frames."""
+"""Errors of keys, certificates, hand-shakes and frames."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ PARAMETERS = frozenset({"reply", "message", "state"})
 
 
 class AssertionFailed(HoldfastError, text="{actor}: {why}"):
-    """What was computed for a request cannot be right, whoever computed it: nothing was changed."""
+    """The outcome that was computed for a request cannot be right, whoever computed it: nothing was changed."""
 
     actor: str
     why: str

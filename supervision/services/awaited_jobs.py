@@ -1,4 +1,4 @@
-"""Jobs that somebody waits for: the handle, and the task that follows a job to its end in its caller's name."""
+"""Awaited jobs: the handle, and the task that follows a job to its end on behalf of its caller."""
 
 from __future__ import annotations
 
@@ -63,16 +63,16 @@ class Job(Generic[R]):
 
     @property
     def path(self) -> str:
-        """Its address, that of its supervisor until it has one."""
+        """The address of the job; that of its supervisor until it has one."""
         return self._where if self._cell is None else self._cell.path
 
     @property
     def is_done(self) -> bool:
-        """Whether the job is over."""
+        """Say whether the job is over."""
         return self._future.done()
 
     async def outcome(self, timeout: float | None = None) -> Ok[None, R] | Failed[None] | None:
-        """How it ended; None if it is not over after `timeout` seconds, and it goes on. May be asked again."""
+        """Wait for the end of the job, as often as you like; None after `timeout` seconds, and the job goes on."""
         await asyncio.wait((self._future,), timeout=timeout)
         if not self._future.done():
             return None
@@ -135,7 +135,7 @@ async def follow(job: Job[Any], started: asyncio.Future[ActorRef[Any]], linked: 
             await cell.ended()
             raise AskFailed(job.path, "it was ended before it began")
         if linked is not None:
-            link(linked.cell, cell)
+            link(linked._cell, cell)
         value = await _result(cell)
         if job.kind is not None:
             value = _decoded(cell, job.kind, value)

@@ -70,9 +70,9 @@ class JobActor(Actor):
         try:
             value = await self._call()
             if self._is_coded and self._handle is not None:
-                value = self.ctx.cell.node.codec.encode(value, self.ctx.path)
+                value = self.ctx._cell.node.codec.encode(value, self.ctx.path)
         except asyncio.CancelledError:
-            if not self.ctx.closed and not self._is_ended:
+            if not self.ctx._closed and not self._is_ended:
                 # Not by us: the function has cancelled its own task, or what it waited for was cancelled.
                 task = asyncio.current_task()
                 is_own = task is not None and task.cancelling()
@@ -96,7 +96,7 @@ class JobActor(Actor):
             return await function(*self._args)
         threaded = ThreadContext(self.ctx)
         try:
-            found = await self.ctx.cell.node.threads.run(_in_thread, threaded, function, self._args)
+            found = await self.ctx._cell.node.threads.run(_in_thread, threaded, function, self._args)
         finally:
             threaded._is_over = True
         return await found if inspect.isawaitable(found) else found

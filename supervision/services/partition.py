@@ -25,13 +25,13 @@ from ..tree import supervisor
 
 
 class Route(Message[ActorRef[Any]]):
-    """Which partition is this key's; the reply is its ref."""
+    """Ask which partition a key belongs to; the reply is a ref to that partition."""
 
     key: Any
 
 
 class CountPartitions(Message[int]):
-    """How many partitions there are now."""
+    """Ask how many partitions there are now."""
 
 
 class ResizePartitions(RuntimeOrder[int]):
@@ -41,7 +41,7 @@ class ResizePartitions(RuntimeOrder[int]):
 
 
 def partition_of(key: object, count: int) -> int:
-    """The partition of a key: `abs(key) % count` for an int, a stable hash of its type and value for anything else.
+    """Return the partition of a key: `abs(key) % count` for an int, else by a stable hash of its type and value.
 
     The same in every process and at every time, so that a key can be stored with the partition that it belongs to.
 
@@ -129,7 +129,7 @@ class PartitionSupervisor(UniformSupervisor):
             number = partition_of(message.key, self._now)
         except HoldfastError as error:
             return self._fail(error)
-        return self.ctx.cell.node.cell_at(f"{self.ctx.path}/{number}").ref
+        return self.ctx._cell.node.cell_at(f"{self.ctx.path}/{number}").ref
 
     @on(CountPartitions, readonly=True)
     def _count_partitions(self, message: CountPartitions) -> int:
@@ -183,7 +183,7 @@ def partitions(
     isolation: Isolation = "task",
     limits: Limits | None = None,
 ) -> ChildSpec:
-    """Several copies of one child under a supervisor, as a spec. `Route(key)` asks it for the copy of a key.
+    """Describe several copies of one child under a supervisor. `Route(key)` asks it for the copy of a key.
 
     Args:
         name: the last part of the supervisor's address; the copies are `name/0`, `name/1`, ...

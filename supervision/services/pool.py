@@ -16,6 +16,7 @@ from ...actors.events import StoreRefused
 from ...actors.exit_reasons import SHUTDOWN
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Actor, Start, on, start
+from ...actors.kernel.context import ActorContext
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.mailbox import Bounded
 from ...actors.kernel.message import Message, RuntimeOrder
@@ -40,7 +41,7 @@ DRAIN_SECONDS = 5.0
 
 
 class PoolStatus(msgspec.Struct, frozen=True):
-    """How a pool is: its workers, how many of them are up, how many are on their way out, what waits at the router."""
+    """The state of a pool: its workers, how many are up, how many on their way out, what waits at the router."""
 
     size: int
     up: int
@@ -111,19 +112,19 @@ class PoolSupervisor(UniformSupervisor):
     def _added(self) -> list[str]:
         """The recorded workers that an earlier life of ours has added, the lowest number first."""
         above = child_key(self.ctx.path, "")
-        names = (key.removeprefix(above) for key in self.ctx.cell.node.ports.keeper.notes(above))
+        names = (key.removeprefix(above) for key in self.ctx._cell.node.ports.keeper.notes(above))
         return sorted((name for name in names if name.isdecimal()), key=int)
 
     def _note(self, name: str, value: bytes | None) -> None:
         """Keep in mind that there is a recorded worker more than at the start. Raises HoldfastError."""
         if self._worker.has_home:
-            self.ctx.cell.node.ports.keeper.note(child_key(self.ctx.path, name), value)
+            self.ctx._cell.node.ports.keeper.note(child_key(self.ctx.path, name), value)
 
     def _try_to_note(self, one: Child, value: bytes | None) -> None:
         try:
             self._note(one.spec.id, value)
         except HoldfastError as error:
-            self.ctx.cell.node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
+            self.ctx._cell.node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
 
     def _check(self, plan: Plan) -> None:
         *workers, router = (spec.id for spec in plan.children) if plan.children else ("",)
@@ -178,7 +179,7 @@ class PoolSupervisor(UniformSupervisor):
             while len(self._crew) < message.size:
                 await self._grow()
         self._leaving.update(one.spec.id for one in going)
-        gone = [self.ctx.cell.node.loop.create_future() for _ in going]
+        gone = [self.ctx._cell.node.loop.create_future() for _ in going]
         for one, future in zip(going, gone, strict=True):
             self._errand(self._let_go(one, message.deadline, future))
         for future in gone:
@@ -232,7 +233,7 @@ def pool(
     shutdown: Shutdown = "infinity",
     rules: Iterable[Rule] = (),
 ) -> ChildSpec:
-    """Several workers of one class and a router in front of them, as a spec. `pool_of` gives a ref to it.
+    """Describe several workers of one class and a router in front of them. `pool_of` gives a ref to it.
 
     The router takes what the workers' class handles, tells, sends and asks, and forwards it: sender, deadline and chain
     stay. While no worker can take a message (none is up, or all are full: a bounded mailbox with the policy "block"),
@@ -295,21 +296,21 @@ class HasNode(Protocol):
     """What has a node: an actor system."""
 
     @property
-    def node(self) -> Node: ...
+    def _node(self) -> Node: ...
 
 
-def pool_of(system: HasNode, path: str, kind: type[A]) -> ActorRef[A]:
-    """A ref to a pool, typed as one to a worker: what is sent there goes to one of them.
+def pool_of(system: HasNode | ActorContext, path: str, kind: type[A]) -> ActorRef[A]:
+    """Return a ref to a pool, typed as one to a worker: what is sent there goes to one of them.
 
     Args:
-        system: the actor system; in an actor, `self.ctx.cell`.
+        system: the actor system; in an actor, `self.ctx`.
         path: the pool's address.
         kind: the class of the workers.
 
     Raises:
         NoSuchActor: nobody lives there. WrongActor: it is no pool, or one of other workers.
     """
-    node = system.node
+    node = system._cell.node if isinstance(system, ActorContext) else system._node
     node.find_ref(path, PoolSupervisor)
     cell = node.find_ref(f"{path}/{ROUTER}", Router)._cell
     made = cell.more.start if cell.more is not None else None

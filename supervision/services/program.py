@@ -40,7 +40,7 @@ SLACK = 5.0
 
 
 class ProgramStatus(msgspec.Struct, frozen=True):
-    """How a program is: its pid, seconds since its start, and its last lines of output, oldest first."""
+    """The state of a program: its pid, seconds since its start, and its last lines of output, oldest first."""
 
     pid: int
     uptime: float
@@ -101,7 +101,7 @@ class Program(Actor):
 
     async def on_start(self, restored: bool) -> None:
         """Start the program and wait until it is ready; if it is not, it is stopped and the start has failed."""
-        cell, own = self.ctx.cell, self.ctx.path
+        cell, own = self.ctx._cell, self.ctx.path
         remains, before = cell.node.remains, cell.node.kept.get(cell)
         if left := [ended for ended, address in remains.items() if address == own]:
             await asyncio.wait(left)  # The last life was killed: its program must be gone before the next one begins.
@@ -126,7 +126,7 @@ class Program(Actor):
     ) -> KeptProgram:
         order = self._order
         kept = KeptProgram(
-            self.ctx.cell.node,
+            self.ctx._cell.node,
             command,
             env={**_environment(order.env), **(more or {})},
             cwd=order.cwd,
@@ -136,13 +136,13 @@ class Program(Actor):
             stdin=stdin,
         )
         kept.denied.add_done_callback(functools.partial(self._denied, command[0]))
-        _Leash(self.ctx.cell, kept)
+        _Leash(self.ctx._cell, kept)
         return kept
 
     def _denied(self, program: str, denied: asyncio.Future[str]) -> None:
         """It cannot be ended: somebody has to know."""
         why = f"it cannot be ended from here, and runs on until somebody else ends it ({denied.result()})"
-        self.ctx.cell.node.emit(HookFailed(self.ctx.path, "stop", exit_reasons.crash(ProgramFailed(program, why))))
+        self.ctx._cell.node.emit(HookFailed(self.ctx.path, "stop", exit_reasons.crash(ProgramFailed(program, why))))
 
     async def _until_ready(self, kept: KeptProgram, sign: Sign) -> None:
         """Wait for the sign.
@@ -151,8 +151,8 @@ class Program(Actor):
             ProgramFailed: it did not come in time, or the program ended before.
         """
         timeout = self._order.ready_timeout
-        waiting = self.ctx.cell.node.loop.create_task(
-            reached(sign, self.ctx.cell.node.threads), name=f"ready of {self.ctx.path}"
+        waiting = self.ctx._cell.node.loop.create_task(
+            reached(sign, self.ctx._cell.node.threads), name=f"ready of {self.ctx.path}"
         )
         try:
             first: set[asyncio.Future[Any]] = {waiting, kept.ended}
@@ -181,7 +181,7 @@ class Program(Actor):
     def _line(self, stream: str, text: str) -> None:
         self._lines.append(text)
         self._parts.pop(stream, None)
-        node = self.ctx.cell.node
+        node = self.ctx._cell.node
         if node.events.has_listeners:
             node.emit(LogLine(self.ctx.path, stream, text))
         if self._sign is not None:
@@ -200,15 +200,15 @@ class Program(Actor):
     def _started(self, started: asyncio.Future[int]) -> None:
         """It runs. Told from here, for it may have ended before `on_start` goes on."""
         if not started.cancelled() and started.exception() is None:
-            self.ctx.cell.node.emit(ProcessStarted(self.ctx.path, started.result()))
+            self.ctx._cell.node.emit(ProcessStarted(self.ctx.path, started.result()))
 
     def _ended(self, ended: asyncio.Future[ExitReason]) -> None:
         """Nothing of the program is left: our life ends for the reason it ended for."""
-        node, kept = self.ctx.cell.node, self._kept
+        node, kept = self.ctx._cell.node, self._kept
         assert kept is not None
         if kept.pid > 0:
             node.emit(ProcessDied(self.ctx.path, kept.pid, ended.result()))
-        if self._is_up and not self.ctx.closed:
+        if self._is_up and not self.ctx._closed:
             self.ctx.stop(ended.result())
 
     @on(ProgramInfo, readonly=True)
@@ -231,7 +231,7 @@ class Program(Actor):
             into.end()
 
     def _now(self) -> float:
-        return self.ctx.cell.node.loop.time()
+        return self.ctx._cell.node.loop.time()
 
     # -- stop -------------------------------------------------------------------------------------------------------
 
@@ -261,7 +261,7 @@ class Program(Actor):
         except (Exception, asyncio.CancelledError) as error:  # The user's own way: the rest of the ladder is left.
             if isinstance(error, asyncio.CancelledError) and _is_cancelled():
                 raise
-            self.ctx.cell.node.emit(HookFailed(self.ctx.path, "stop", exit_reasons.crash(error)))
+            self.ctx._cell.node.emit(HookFailed(self.ctx.path, "stop", exit_reasons.crash(error)))
         return kept.ended.done()
 
     async def _ask(self, kept: KeptProgram) -> None:
@@ -330,7 +330,7 @@ def program(
     significant: bool = False,
     rules: Iterable[Rule] = (),
 ) -> ChildSpec:
-    """An external program as a child.
+    """Describe an external program as a child: any command, started and stopped like an actor.
 
     It ends with its actor, and with the process that hosts that, however it ends; its descendants end with it. Its
     output is logged. Exit code 0 is a normal end, any other `Exited(code)`, a signal `Signal(number)`. `ProgramInfo`

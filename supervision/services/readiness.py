@@ -1,4 +1,4 @@
-"""Signs that a program is ready: what it prints, what it opens, how long it lives, or what a function says."""
+"""Signs that a program is ready: what it prints, what it opens, how long it has run, or what a function says."""
 
 from __future__ import annotations
 

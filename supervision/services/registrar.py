@@ -1,4 +1,4 @@
-"""The actor behind a registry: who holds which key, who waits for which lock. Users reach it through `Registry`.
+"""The actor behind a registry: it knows the holders of keys and the waiters for locks.
 
 It runs no code of its users: what they decide with functions is decided in the caller (`registry.py`). A key comes as
 its bytes, so that 1, 1.0 and True are three keys, the same from every process.
@@ -204,7 +204,7 @@ class RegistryActor(Actor):
 
     def on_start(self, restored: bool) -> None:
         """Go on with the book that earlier lives at this address have kept, without those who are dead by now."""
-        cell = self.ctx.cell
+        cell = self.ctx._cell
         book = cell.node.kept.get(cell)
         if not isinstance(book, Book):
             book = cell.node.kept[cell] = Book(dict(self._first_meta))
@@ -294,7 +294,7 @@ class RegistryActor(Actor):
     @on(Lock)
     def _lock(self, message: Lock) -> ReplyHandle[Any] | None:
         """Queue for the lock of a key; whoever has asked first gets it."""
-        item = self.ctx.item
+        item = self.ctx._item
         handle = self.ctx.reply_handle()
         sender = item.sender if isinstance(item, Ask) else None
         if sender is not None and not is_living(sender, message.life):
@@ -349,7 +349,7 @@ class RegistryActor(Actor):
     # -- ends -------------------------------------------------------------------------------------------------------
 
     def on_down(self, source: ActorRef[Any], reason: ExitReason, recovering: bool) -> None:
-        """A holder's life is over, unless it is brought back with its state: then it holds what it held."""
+        """Let go what a holder held whose life is over, unless it is brought back with its state."""
         if not recovering:
             self._drop_dead(source._cell, told=True)
 
@@ -388,7 +388,7 @@ class RegistryActor(Actor):
             holdings.monitor.cancel()
 
     def _tell_listeners(self, message: Message[Any]) -> None:
-        node = self.ctx.cell.node
+        node = self.ctx._cell.node
         for name in self._listeners:
             cell = node.find(name) if name.startswith("/") else node.names.get(name)
             if cell is None:

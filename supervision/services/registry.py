@@ -72,7 +72,7 @@ def registry(
     restart: Restart = "permanent",
     shutdown: Shutdown = 5.0,
 ) -> ChildSpec:
-    """A registry, as a child spec. Use it through `Registry(ref)`.
+    """Describe a registry, as a child spec. Use it through `Registry(ref)`.
 
     Args:
         name: the last part of its address.
@@ -166,36 +166,36 @@ class Registry(Generic[K, V]):
     # -- anybody's entries ------------------------------------------------------------------------------------------
 
     async def lookup(self, key: K) -> list[RegistryEntry[K, V]]:
-        """The entries for a key, oldest first."""
+        """Return the entries for a key, oldest first."""
         return self._entries(await self._ask(Find(pack_key(key))))
 
     async def whereis(self, key: K) -> ActorRef[Any] | None:
-        """The first holder of a key; None if nobody holds it."""
+        """Return the first holder of a key; None if nobody holds it."""
         rows = await self._ask(Find(pack_key(key)))
         return rows[0].holder if rows else None
 
     async def keys(self, holder: ActorRef[Any] | None = None) -> list[K]:
-        """The keys of one holder, the calling actor if none is given; a key with several entries comes as often."""
+        """List the keys of one holder, else of the calling actor; a key with several entries comes as often."""
         return [key_of(row.key) for row in await self._ask(Find(None, holder or _own_ref()))]
 
     async def values(self, key: K, holder: ActorRef[Any] | None = None) -> list[V]:
-        """The values of a key, those of one holder if it is given."""
+        """Return the values of a key, those of one holder if it is given."""
         return [row.value for row in await self._ask(Find(pack_key(key), holder))]
 
     async def match(self, key: K, test: Callable[[V], bool]) -> list[RegistryEntry[K, V]]:
-        """The entries for a key whose value passes the test."""
+        """Return the entries for a key whose value passes the test."""
         return [entry for entry in await self.lookup(key) if test(entry.value)]
 
     async def select(self, test: Callable[[RegistryEntry[K, V]], bool]) -> list[RegistryEntry[K, V]]:
-        """All entries that pass the test."""
+        """Return all entries that pass the test."""
         return [entry for entry in self._entries(await self._ask(Find())) if test(entry)]
 
     async def count(self) -> int:
-        """How many entries there are."""
+        """Count the entries that there are."""
         return await self._ask(Count())
 
     async def count_match(self, key: K, test: Callable[[V], bool]) -> int:
-        """How many entries for a key pass the test."""
+        """Count the entries for a key that pass the test."""
         return len(await self.match(key, test))
 
     async def dispatch(
@@ -300,7 +300,7 @@ def _check_key(key: object) -> None:
 def _life() -> int:
     """The calling actor's life, that of a recorded one not told: its replay has to send the same."""
     ctx = current.get(None)
-    return ctx.life if ctx is not None and ctx.may_fail_fast else 0
+    return ctx.life if ctx is not None and ctx._may_fail_fast else 0
 
 
 def _own_ref() -> ActorRef[Any]:

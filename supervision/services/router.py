@@ -51,13 +51,13 @@ class Router(Actor):
         worker_kind: Any = worker.kind  # (mypy takes no class for hashable)
         kind = routing_to(worker_kind)
         object.__setattr__(self, "__class__", kind)
-        self.ctx.cell.table = kind._table
+        self.ctx._cell.table = kind._table
 
     # -- one message ------------------------------------------------------------------------------------------------
 
     def route(self, message: Message[Any]) -> None:
         """The handler of all messages: hand the one in hand on."""
-        item = self.ctx.item
+        item = self.ctx._item
         if self._routing == "broadcast":
             self._to_all(item)
             return
@@ -67,7 +67,7 @@ class Router(Actor):
         free = [cell for cell in crew if cell.path not in waiting] if waiting else crew
         if crew and not free:
             item.fail(AskDeadlock(crew[0].path, tuple(path for path, _ in chain)))
-            self.ctx.cell.item = Stashed.of(item)
+            self.ctx._cell.item = Stashed.of(item)
             return
         able = [cell for cell in free if cell.has_room]
         if able:
@@ -77,7 +77,7 @@ class Router(Actor):
 
     def _workers(self) -> list[Child]:
         """The workers, as their supervisor sees them: it is our own too, and lives in the same process."""
-        parent = self.ctx.cell.parent
+        parent = self.ctx._cell.parent
         supervisor: Any = None if parent is None else parent.actor
         crew: list[Child] = [] if supervisor is None else supervisor._crew
         return crew
@@ -86,7 +86,7 @@ class Router(Actor):
         """Who may get the message, by what the workers are in; with a key there is only one."""
         crew = self._workers()
         if self._routing == "hash" and crew:
-            first = partition_of(self._key_of(self.ctx.item), len(crew))
+            first = partition_of(self._key_of(self.ctx._item), len(crew))
             found = next(filter(self._is_there, (*crew[first:], *crew[:first])), None)
             return iter(() if found is None else (found,))
         return filter(self._is_there, crew)
@@ -167,8 +167,8 @@ class Router(Actor):
 
     def _hold(self, item: Any, full: list[Cell]) -> None:
         """Put the message back and handle no other before `look_again`; commands are still obeyed."""
-        cell = self.ctx.cell
-        self.ctx.cell.item = Stashed.of(item)
+        cell = self.ctx._cell
+        self.ctx._cell.item = Stashed.of(item)
         if isinstance(item, Ask):
             item.started = False
         if cell.more is not None and cell.more.bound is not None and mailbox.counts(item):
@@ -185,7 +185,7 @@ class Router(Actor):
         except SendError:
             return  # It has ended: its supervisor tells us of the next one.
         if room is None:
-            self.ctx.cell.node.loop.call_soon(self.look_again)
+            self.ctx._cell.node.loop.call_soon(self.look_again)
             return
         self._rooms.append(room)
         room.add_done_callback(self._room)
@@ -196,13 +196,13 @@ class Router(Actor):
 
     def look_again(self) -> None:
         """Something has changed: a worker is up, or has room."""
-        if not self._is_held or self.ctx.closed:
+        if not self._is_held or self.ctx._closed:
             return
         self._is_held = False
         for room in self._rooms:
             room.cancel()
         self._rooms.clear()
-        cell = self.ctx.cell
+        cell = self.ctx._cell
         mailbox.resume(cell, mailbox.BY_ITSELF)
 
 

@@ -42,7 +42,7 @@ def tasks(
     shutdown: Shutdown = "infinity",
     isolation: Isolation = "task",
 ) -> ChildSpec:
-    """A task supervisor, as a child spec. Use it through `Tasks(ref)`.
+    """Describe a task supervisor, as a child spec. Use it through `Tasks(ref)`.
 
     Args:
         name: the last part of its address.
@@ -222,7 +222,7 @@ class Tasks:
         isolation: Isolation = "task",
         shutdown: Shutdown = PATIENCE,
     ) -> AsyncGenerator[Any, None]:
-        """A job for each item: `async for result in jobs.stream(fetch, urls, max_concurrency=8)`.
+        """Run a job for each item: `async for result in jobs.stream(fetch, urls, max_concurrency=8)`.
 
         The source is pulled only as fast as results are taken: never more than `max_concurrency` items are between
         the two. Leaving the loop early ends the jobs that still run (at once, if the stream is closed by
@@ -255,7 +255,7 @@ class Tasks:
         *,
         on_timeout: Literal["leave", "kill_task"] = "leave",
     ) -> list[Ok[None, R] | Failed[None] | None]:
-        """How several jobs ended, in their order; None for those that are not over after `timeout` seconds."""
+        """Wait for the ends of several jobs, in their order; None for those not over after `timeout` seconds."""
         every = list(jobs)
         if every:
             await asyncio.wait([job._future for job in every], timeout=timeout)
@@ -266,7 +266,7 @@ class Tasks:
         return [await job.outcome() if is_over else None for job, is_over in zip(every, over, strict=True)]
 
     async def children(self) -> list[ActorRef[Actor]]:
-        """The jobs that there are now, oldest first."""
+        """List the jobs that there are now, oldest first."""
         node = self.ref._cell.node
         return [cast("ActorRef[Actor]", node.cell_at(info.path).ref) for info in await self.ref.ask(WhichChildren())]
 
@@ -292,7 +292,8 @@ class Tasks:
         started.add_done_callback(seen)
         work = follow(job, started, ctx if linked else None)
         task = node.loop.create_task(work, name=f"job of {self.ref.path}", context=node.base_context.copy())
-        own = (node.root or self.ref._cell) if ctx is None else ctx.cell  # Who is no actor lives as long as the system.
+        # Who is no actor lives as long as the system.
+        own = (node.root or self.ref._cell) if ctx is None else ctx._cell
         keep = own.extra().belongings.tasks
         keep.add(task)
         task.add_done_callback(keep.discard)

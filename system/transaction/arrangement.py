@@ -1,4 +1,4 @@
-"""What a transaction makes of the tree: who has which children, in which order, by which flags, and which names.
+"""The tree that a transaction leads to: children of each supervisor, their order, flags and names.
 
 The steps say so in the draft. At the commit all supervisors that they are about follow it at once, and their recipes
 with them, so that a restart of a supervisor keeps it.
@@ -79,7 +79,7 @@ class Arrangement:
         """
         for place in self._places:
             self.step = self._steps[place].text
-            cell = place.living(system.node)
+            cell = place.living(system._node)
             if is_elsewhere(cell) or place not in self._rearranged:
                 continue
             if why := busy(cell):
@@ -88,7 +88,7 @@ class Arrangement:
                 is_taken = child_of(cell, name) is not None or name in (cell.children or {})
                 if child.has_moved and is_taken and name not in place.was.children:
                     raise wrong(place.path, f"it has a child {name!r} already")
-        return self._names_ready(system.node)
+        return self._names_ready(system._node)
 
     def _names_ready(self, node: Node) -> str:
         for name, (step, before, after) in self._names.items():
@@ -104,7 +104,7 @@ class Arrangement:
     def commit(self, system: ActorSystem) -> None:
         """Have the tree and the names be as the steps say, at once."""
         self._arrange(system)
-        node, after = system.node, {name: place for name, (_, _, place) in self._names.items()}
+        node, after = system._node, {name: place for name, (_, _, place) in self._names.items()}
         for name, place in after.items():
             if place is None or node.names.get(name) is not place.living(node):
                 node.unregister(name)
@@ -113,7 +113,7 @@ class Arrangement:
                 node.register(name, place.living(node))
 
     def _arrange(self, system: ActorSystem) -> None:
-        cells = {place: place.living(system.node) for place in self._places}
+        cells = {place: place.living(system._node) for place in self._places}
         here = {
             place: cell.actor
             for place, cell in cells.items()
@@ -128,7 +128,7 @@ class Arrangement:
         ]
         was = {child: f"{cells[_left(child)].path}/{child.name}" for child in moved}
         if moved or self.successions:
-            settle_bindings(system.node.root)
+            settle_bindings(system._node.root)
         taken = {child: _taken(child, self.handings[child], here, cells) for child in moved}
         for place, supervisor in here.items():
             _arrange(place, supervisor, taken)
@@ -138,8 +138,8 @@ class Arrangement:
         now = {old: new for old, new in now.items() if old != new}
         left = {one.left for one in self.successions}
         renamed = Renamed(now)
-        if now and system.node.root is not None:  # First: what comes now is called by addresses as they are now.
-            renamed.keep(system.node.root)
+        if now and system._node.root is not None:  # First: what comes now is called by addresses as they are now.
+            renamed.keep(system._node.root)
         for place in (one.place for one in reversed(self.successions)):
             place.was.start = _start_after(place, renamed.start(_start_before(place)), taken)
         for place, supervisor in here.items():
@@ -150,8 +150,8 @@ class Arrangement:
             elif not isinstance(cell.host.place, OutsidePlace):  # Else it stands in the recipe of one above it.
                 respec(cell, place.was.start)
         if now:
-            system.homes.move(now)
-            system.mechanism_notes.moved(now)
+            system._homes.move(now)
+            system._mechanism_notes.moved(now)
         for place, cell in cells.items():
             if place.is_noted and is_elsewhere(cell):  # It hears of it later, and may die before.
                 for child in place.children.values():
@@ -159,7 +159,7 @@ class Arrangement:
                         taken[child].spec if child in taken else child.was.start and planned_spec(child, in_force=True)
                     )
                     if spec is not None:
-                        system.homes.note(child_key(cell.path, child.name), pack_data(spec, f"child {child.name!r}"))
+                        system._homes.note(child_key(cell.path, child.name), pack_data(spec, f"child {child.name!r}"))
         for child in moved:  # Before anything else is said to their processes.
             for cell in every_cell(taken[child].cell) if was[child] in now else ():
                 cell.host.place.readdress(cell, was[child], now[was[child]])
@@ -174,12 +174,12 @@ class Arrangement:
             if start is not None and isinstance(cell.host.place, OutsidePlace):
                 cell.host.told(cell, "recipe", {"start": pack_recipe(start, cell.path)})
         if now:
-            tell_bindings(system.node.root, {new: old for old, new in now.items()})
+            tell_bindings(system._node.root, {new: old for old, new in now.items()})
 
     async def finish(self, system: ActorSystem) -> None:
         """Tell those that live in other processes."""
         for place in self._told:
-            cell = place.living(system.node) if not place.is_planned else None
+            cell = place.living(system._node) if not place.is_planned else None
             if cell is not None and is_elsewhere(cell):
                 flags, specs = recipe_flags(cell), recipe_specs(cell)
                 ref: ActorRef[Supervisor] = ActorRef(cell)
@@ -341,7 +341,7 @@ def _readdress(
         above.children = {**(above.children or {}), child.name: cell}
         cell.parent = above
     for supervisor in here.values():
-        cell = supervisor.ctx.cell
+        cell = supervisor.ctx._cell
         below = cell.children or {}
         first = {name: below[name] for name in supervisor._children if name in below}
         cell.children = {**first, **below}
@@ -362,7 +362,7 @@ def _respecify(place: DraftPlace, supervisor: Supervisor) -> None:
             continue
         if child.comes_last:
             try:
-                child.cell = one.cell = new_cell(supervisor.ctx.cell, one)
+                child.cell = one.cell = new_cell(supervisor.ctx._cell, one)
             except HoldfastError:
                 pass  # Its start will say so.
         elif one.cell is not None:

@@ -1,9 +1,9 @@
-"""What is written in the body of a transaction: operations are collected, and carried out when it ends."""
+"""The object that the body of a transaction calls: it collects operations, carried out when the body ends."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ...actors.control.orders import Change as StateChange
@@ -12,7 +12,7 @@ from ...actors.kernel.actor import Actor, Start
 from ...supervision.spec import ChildSpec, Isolation, Strategy
 from . import living
 from .draft import Target
-from .mechanisms import Attach, Compose, Detach, DetachLayer, Isolate, OnProtection, Protect, Transition, Update
+from .mechanisms import Isolate, OnProtection, Protect, Update
 from .operation import Operation, Step, text_of
 from .reparenting import Reparent
 from .running import StartAgain, StopChild
@@ -21,6 +21,7 @@ from .wiring import Bind, RegisterName, Unbind, UnregisterName
 
 if TYPE_CHECKING:
     from ...ftm.events import MechanismSettled
+    from ...ftm.model.composition import Layer
     from ..system import ActorSystem
 
 
@@ -92,7 +93,7 @@ class Change:
         self.step(RegisterName(name, target))
 
     def unregister(self, name: str) -> None:
-        """Free a name."""
+        """Free a name that an actor has beside its address."""
         self.step(UnregisterName(name))
 
     # -- live actors --------------------------------------------------------------------------------------------------
@@ -115,35 +116,18 @@ class Change:
 
     # -- fault tolerance ----------------------------------------------------------------------------------------------
 
-    def protect(self, target: Target, mechanism: Any) -> None:
-        """Have an actor protected by just this mechanism, or by just these, outermost first, whatever it has now.
+    def protect(self, target: Target, stack: Layer | Sequence[Layer] | None) -> None:
+        """Have an actor protected by just this stack of mechanisms, whatever it has now; its life goes on.
 
-        None: by none. Its life goes on, and only the bricks that differ are touched.
+        Only the bricks that differ from those that it has are touched.
+
+        Args:
+            target: the actor.
+            stack: one mechanism or several, outermost first; None or an empty sequence: none. Each is one such as
+                `PBR()`, the name of one, or a file or module that defines one. The name of one that the actor has
+                means that one, with its settings: `("pbr", TR())` adds one inside.
         """
-        self.step(Protect(target, mechanism))
-
-    def attach(self, target: Target, mechanism: Any) -> None:
-        """Protect an actor by a mechanism, or by several, outermost first; its life goes on.
-
-        A mechanism is one such as `PBR()`, its name, or a file or module that defines one.
-        """
-        self.step(Attach(target, mechanism))
-
-    def detach(self, target: Target, mechanism: str = "") -> None:
-        """Have it live as its spec says without a mechanism; its life goes on. With a name: without that one alone."""
-        self.step(DetachLayer(target, mechanism) if mechanism else Detach(target))
-
-    def compose(self, target: Target, mechanism: Any, *, outside: bool = False) -> None:
-        """Nest one more mechanism inside of those that it has, or outside."""
-        self.step(Compose(target, mechanism, outside=outside))
-
-    def transition(self, target: Target, mechanism: Any, *, whole: bool = False) -> None:
-        """Put a mechanism in the place of the one of its sort, or several in the place of all, outermost first.
-
-        A tuple of one is that one. With `whole=True` what is given is the whole stack, also if it is only one. Only the
-        bricks that differ are touched.
-        """
-        self.step(Transition(target, mechanism, whole=whole))
+        self.step(Protect(target, stack))
 
     def update(self, target: Target, brick: str, new: Any, *, mechanism: str = "", role: str = "") -> None:
         """Give one brick new code.
@@ -160,17 +144,17 @@ class Change:
     # -- all of it ----------------------------------------------------------------------------------------------------
 
     def step(self, operation: Operation) -> None:
-        """One more operation, of whatever kind."""
+        """Collect one more operation, of whatever kind."""
         self._operations.append(operation)
 
     @property
     def operations(self) -> tuple[Operation, ...]:
-        """What was collected so far."""
+        """Return the operations that were collected so far."""
         return tuple(self._operations)
 
     @property
     def steps(self) -> tuple[Step, ...]:
-        """The steps, in order."""
+        """Return the steps of the transaction, in the order in which they are taken."""
         return tuple(Step(n, one.verb, one.target, one.text) for n, one in enumerate(self._operations, 1))
 
     async def settled(self) -> tuple[MechanismSettled, ...]:
@@ -184,10 +168,10 @@ class Change:
 
     @property
     def difference(self) -> tuple[str, ...]:
-        """How the tree changes: lines with `-` go, lines with `+` come. Known after the checks."""
+        """List how the tree changes: lines with `-` go, lines with `+` come. Known after the checks."""
         return tuple(self._difference or ())
 
     def describe(self) -> str:
-        """The steps, and how the tree changes (known after the checks), in words."""
+        """Say in words which steps there are, and how the tree changes (known after the checks)."""
         lines = [f"{step.number}. {step.text}" for step in self.steps] or ["nothing to do"]
         return "\n".join([*lines, *(self._difference or ())])

@@ -1,4 +1,4 @@
-"""The tree as it will be: checks look at this, and each operation changes it as it will change the real one."""
+"""The draft of the tree: each operation is checked against it, and changes it as it will change the tree."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a transaction that was not carried out says."""
+"""Errors of transactions that were refused or failed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What transactions tell on the event stream; `address` is the root's."""
+"""Events of transactions; `address` is the root's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A child whose old or new supervisor lives in another process: its life goes on, and the root exchanges who decides.
+"""Hands a child to or from a supervisor in another process; the root exchanges who decides about it.
 
 The new supervisor, in its process, has the child started as a candidate; the root does not begin the life that is so
 wanted, for it has one. At the commit that life is the one, and the old supervisor is told that it has lost the child.
@@ -128,11 +128,11 @@ class Handing:
             return
         if place.rework is not None or place.relocation is not None:
             raise wrong(place.path, "it goes to another process's supervisor: change it in a transaction of its own")
-        cell = place.living(system.node)
+        cell = place.living(system._node)
         if not place.is_protected and place_of(cell) != "process":
             work = functools.partial(system._moves.move, cell, "process", None, MOVED_WITHIN, known=place.spec)
             self._is_lodged |= await self._lodging.done(system, work)
-        above = self._above.living(system.node)
+        above = self._above.living(system._node)
         if not is_elsewhere(above) or (self._asked is above and self._life == above.life and not self._has_failed()):
             return
         await self._withdraw()
@@ -144,7 +144,7 @@ class Handing:
         if not place.is_protected:
             spec = dataclasses.replace(spec, isolation="process")
         asked = supervisor.ask(StartChild(spec, candidate=self._candidate), START_TIMEOUT)
-        self._start = system.node.loop.create_task(_reply(asked), name=f"room for {place.path}")
+        self._start = system._node.loop.create_task(_reply(asked), name=f"room for {place.path}")
         self._start.add_done_callback(seen)
 
     def _has_failed(self) -> bool:
@@ -161,7 +161,7 @@ class Handing:
         """What is in the way of giving it away at this instant; "" if nothing is."""
         if not self._is_needed:
             return ""
-        cell = self._place.living(system.node)
+        cell = self._place.living(system._node)
         old, at = cell.host.parent, cell.host.place
         if not (self._place.is_protected or isinstance(at, WorkerPlace)):
             return f"{cell.path} has no process of its own"
@@ -171,7 +171,7 @@ class Handing:
             return f"{cell.path} is on its way to live elsewhere"
         if isinstance(old, FarParent) and (why := old.why_busy(cell)):
             return why
-        if is_elsewhere(self._above.living(system.node)) and (
+        if is_elsewhere(self._above.living(system._node)) and (
             self._parent is None or self._has_failed() or not self._parent.is_expected
         ):
             return f"{self._above.path} has not made room for {self._place.name!r} yet"
@@ -201,7 +201,7 @@ class Handing:
         await self._settle(system)
 
     async def _settle(self, system: ActorSystem) -> None:
-        cell = self._place.now(system.node)
+        cell = self._place.now(system._node)
         if self._is_lodged and cell is not None:
             await system._moves.move(cell, "task", None, self._timeout)
 

@@ -1,4 +1,4 @@
-"""Recipes of supervisors: a change of the tree is written into them, so that a restart of a supervisor keeps it.
+"""Writes changes of the tree into the recipes of supervisors, so that their restarts keep them.
 
 A supervisor whose class has an `init` of its own is asked anew at each start, and its recipe left alone.
 """

@@ -25,11 +25,11 @@ class OnLiving(Operation):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = self._found = draft.find(self._at, parts=self.on_parts)
         self.target, self.between_turns_of = place.path, (place,)
-        place.check_lived_in(system.node)
+        place.check_lived_in(system._node)
 
     def cell(self, system: ActorSystem) -> Cell:
         """Who lives there now. Raises NoSuchActor."""
-        return self._place.living(system.node)
+        return self._place.living(system._node)
 
 
 class OnSharedWork(OnLiving):
@@ -140,7 +140,7 @@ class ReplaceActorCode(OnRework):
 def check_unprotected(place: DraftPlace) -> None:
     """Refuse what would change one replica of a protected actor, and not the others. Raises SpecError."""
     if place.spec is not None and place.spec.mechanism is not None:
-        raise wrong(place.path, "it is protected by a mechanism: detach that, and attach it again after")
+        raise wrong(place.path, "it is protected by a mechanism: `protect` it by None, and again after")
 
 
 def _is_actor(kind: object) -> bool:

@@ -1,4 +1,4 @@
-"""Operations on where an actor lives, and on its mechanisms: attach, detach, compose, exchange, update a brick."""
+"""Operations on where an actor lives, and on its mechanisms: one stack in the place of another, update a brick."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class OnProtection(OnPlace):
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
-        if (busy := arbiter_of(system.node).in_the_way(self.target, Hand.ADAPTATION)) is not None:
+        if (busy := arbiter_of(system._node).in_the_way(self.target, Hand.ADAPTATION)) is not None:
             raise busy
         place = self._place
         assert place.spec is not None
@@ -139,14 +139,18 @@ class Protect(OnProtection):
 
     @property
     def text(self) -> str:
-        if self._mechanism is None:
+        if self._is_none:
             return f"protect {self.target} by no mechanism"
         return f"protect {self.target} by {mechanism_text(self._after or self._mechanism)}"
 
+    @property
+    def _is_none(self) -> bool:
+        return self._mechanism is None or (isinstance(self._mechanism, (tuple, list)) and not self._mechanism)
+
     def _wanted(self, before: Any) -> tuple[Any, ...] | None:
-        if self._mechanism is None:
+        if self._is_none:
             return None
-        layers: tuple[Any, ...] = rules().layers_of(self._mechanism)
+        layers: tuple[Any, ...] = rules().layers_of(self._mechanism, before)
         return layers
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
@@ -158,111 +162,11 @@ class Protect(OnProtection):
             raise wrong(self.target, f"{why}: name the mechanism in its spec, and it begins with it")
 
 
-class Attach(Protect):
-    """The same for an actor that has no mechanism yet."""
-
-    verb: ClassVar[str] = "attach"
-
-    @property
-    def text(self) -> str:
-        return f"attach {mechanism_text(self._after or self._mechanism)} to {self.target}"
-
-    def _wanted(self, before: Any) -> tuple[Any, ...] | None:
-        if before is not None:
-            raise wrong(self.target, f"it has {mechanism_text(before)} already: detach that first, or use `protect`")
-        return super()._wanted(before)
-
-
-class Detach(OnProtection):
-    """Have a protected actor live without a mechanism."""
-
-    verb: ClassVar[str] = "detach"
-    lacks: ClassVar[str] = "it has no mechanism"
-
-    @property
-    def text(self) -> str:
-        return f"detach the mechanism of {self.target}"
-
-    def _wanted(self, before: Any) -> None:
-        return None
-
-
-class Adapt(OnProtection):
-    """Base: a protected actor goes on with another stack of mechanisms; its replicas live on."""
-
-    lacks: ClassVar[str] = "it has no mechanism yet: attach one"
-
-    async def check(self, system: ActorSystem, draft: Draft) -> None:
-        await super().check(system, draft)
-        if described(self._after) == described(self._was):
-            raise wrong(self.target, f"it has just that already: {mechanism_text(self._was)}")
-
-    @property
-    def _from_to(self) -> str:
-        if self._was is None:
-            return ""
-        return f" (from {mechanism_text(self._was)} to {mechanism_text(self._after)})"
-
-
-class Compose(Adapt):
-    """Nest one more mechanism: inside of those that are there, or outside."""
-
-    verb: ClassVar[str] = "compose"
-
-    def __init__(self, target: Target, mechanism: Any, *, outside: bool) -> None:
-        super().__init__(target)
-        self._mechanism, self._outside = mechanism, outside
-
-    @property
-    def text(self) -> str:
-        where = "outside" if self._outside else "inside"
-        return f"compose {self.target} with {mechanism_text(self._mechanism)} {where}{self._from_to}"
-
-    def _wanted(self, before: Any) -> tuple[Any, ...]:
-        layers: tuple[Any, ...] = rules().composed(before, self._mechanism, outside=self._outside)
-        return layers
-
-
-class Transition(Adapt):
-    """Another mechanism in the place of the one of its sort; several in the place of all."""
-
-    verb: ClassVar[str] = "transition"
-
-    def __init__(self, target: Target, mechanism: Any, *, whole: bool = False) -> None:
-        super().__init__(target)
-        self._mechanism, self._whole = mechanism, whole
-
-    @property
-    def text(self) -> str:
-        return f"transition of {self.target} to {mechanism_text(self._mechanism)}{self._from_to}"
-
-    def _wanted(self, before: Any) -> tuple[Any, ...]:
-        layers: tuple[Any, ...] = rules().replaced(before, self._mechanism, whole=self._whole)
-        return layers
-
-
-class DetachLayer(Adapt):
-    """Take one mechanism out of several."""
-
-    verb: ClassVar[str] = "detach"
-
-    def __init__(self, target: Target, name: str) -> None:
-        super().__init__(target)
-        self._name = name
-
-    @property
-    def text(self) -> str:
-        return f"detach {self._name} from {self.target}{self._from_to}"
-
-    def _wanted(self, before: Any) -> tuple[Any, ...]:
-        layers: tuple[Any, ...] = rules().without(before, self._name)
-        return layers
-
-
-class Update(Adapt):
+class Update(OnProtection):
     """New code for one brick."""
 
     verb: ClassVar[str] = "update"
+    lacks: ClassVar[str] = "it has no mechanism yet: protect it first"
 
     def __init__(self, target: Target, brick: str, new: Any, *, mechanism: str, role: str) -> None:
         super().__init__(target)
@@ -273,6 +177,11 @@ class Update(Adapt):
         new = self._new.__name__ if isinstance(self._new, type) else str(self._new)
         which = " ".join(one for one in (self._of, self._role, self._brick) if one)
         return f"update {which} of {self.target} to {new}"
+
+    async def check(self, system: ActorSystem, draft: Draft) -> None:
+        await super().check(system, draft)
+        if described(self._after) == described(self._was):
+            raise wrong(self.target, f"it has just that already: {mechanism_text(self._was)}")
 
     def _wanted(self, before: Any) -> tuple[Any, ...]:
         layers: tuple[Any, ...] = rules().updated(before, self._brick, self._new, mechanism=self._of, role=self._role)

@@ -1,4 +1,4 @@
-"""One step of a transaction: what every operation can do, whoever adds it."""
+"""The base of operations, the steps of a transaction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a transaction has a live actor go on: as a task, in a process of its own, as replicas behind mechanisms.
+"""Takes a live actor elsewhere in a transaction: to a task, a process, or replicas behind mechanisms.
 
 The new place is made ready and the actor comes to rest beside what runs; it waits at a gate that the commit opens. What
 its spec says from then on is in force, and what runs follows it: if the life ends on the way, the next one is moved.
@@ -46,19 +46,19 @@ class Gated:
 
     def begin(self, system: ActorSystem, work: Coroutine[Any, Any, object]) -> None:
         """Have it done; with a gate that `work` was given it waits there."""
-        cell = self._place.living(system.node)
+        cell = self._place.living(system._node)
         self._path = cell.path
-        self.task = system.node.loop.create_task(
+        self.task = system._node.loop.create_task(
             to_its_end(cell.path, asyncio.ensure_future(work)),
             name=self._text,
-            context=system.node.base_context.copy(),
+            context=system._node.base_context.copy(),
         )
         self.task.add_done_callback(seen)
 
     async def reach(self, system: ActorSystem, work: Callable[[Gate], Coroutine[Any, Any, object]]) -> None:
         """Have it begun, if it is not, and wait until it is ready."""
         if self.task is None:
-            self._gate = Gate(system.node.loop)
+            self._gate = Gate(system._node.loop)
             self.begin(system, work(self._gate))
         gate, task = self._gate, self.task
         assert gate is not None
@@ -70,7 +70,7 @@ class Gated:
 
     async def done(self, system: ActorSystem, work: Callable[[Gate], Coroutine[Any, Any, bool]]) -> bool:
         """Have it done at once, at an open gate. Whoever waits no more has to give it up."""
-        self._gate = Gate(system.node.loop)
+        self._gate = Gate(system._node.loop)
         self._gate.open()
         self.begin(system, work(self._gate))
         assert self.task is not None
@@ -150,20 +150,20 @@ class Relocation(StagedWork):
             return
         if self._adapts and self._grant is None:
             path = self._place.path
-            self._grant = arbiter_of(system.node).claim(path, Hand.ADAPTATION, self._text)
-            system.mechanism_notes.begun(path, self._text)
+            self._grant = arbiter_of(system._node).claim(path, Hand.ADAPTATION, self._text)
+            system._mechanism_notes.begun(path, self._text)
         if not self._comes_last:
             await self._move.reach(system, lambda gate: self._work(system, gate))
 
     def _work(self, system: ActorSystem, gate: Gate | None) -> Coroutine[Any, Any, object]:
-        cell, moves = self._place.living(system.node), system._moves
+        cell, moves = self._place.living(system._node), system._moves
         wanted, before = self._after.mechanism, self.before.mechanism
         if not self._adapts:
             return moves.move(cell, self._after.isolation, self._after.limits, MOVED_WITHIN, gate)
         if wanted is None:
             return moves.unprotect(cell, MOVED_WITHIN, gate)
         if before is None:
-            return moves.protect(cell, system.homes, wanted, MOVED_WITHIN, gate, self._begun)
+            return moves.protect(cell, system._homes, wanted, MOVED_WITHIN, gate, self._begun)
         return moves.adapt(cell, wanted, MOVED_WITHIN, gate, self._begun)
 
     def _begun(self, probation: Probation) -> None:
@@ -175,7 +175,7 @@ class Relocation(StagedWork):
 
     def ready(self, system: ActorSystem) -> str:
         """Whether it is at rest, and everything is ready for it."""
-        cell = self._place.living(system.node) if not self._place.is_planned else None
+        cell = self._place.living(system._node) if not self._place.is_planned else None
         if cell is None or self._move.task is None or self._move.is_waiting:
             return ""
         return f"{cell.path} is not at rest any more"
@@ -186,7 +186,7 @@ class Relocation(StagedWork):
         """From here on its spec says so."""
         if self._place.is_planned or not (self._adapts or self._is_elsewhere):
             return
-        cell = self._place.living(system.node)
+        cell = self._place.living(system._node)
         now = cell.spec if isinstance(cell.spec, ChildSpec) else recipe_spec(cell)
         if now is not None and self._is_elsewhere and not (self._adapts and self._moves):
             replace_place(cell, dataclasses.replace(now, isolation=self._after.isolation))
@@ -207,7 +207,7 @@ class Relocation(StagedWork):
             assert self._move.task is not None
             await asyncio.shield(self._move.task)
             if self._adapts and self._moves:
-                cell = self._place.living(system.node)
+                cell = self._place.living(system._node)
                 await system._moves.move(cell, self._after.isolation, self._after.limits, MOVED_WITHIN)
         finally:
             self._settle(system)
@@ -217,9 +217,9 @@ class Relocation(StagedWork):
         if not self._adapts:
             return
         self._give_back(system)
-        notes, path = system.mechanism_notes, self._place.path
+        notes, path = system._mechanism_notes, self._place.path
         before, after = self.before.mechanism, self._after.mechanism
-        cell = self._place.now(system.node)
+        cell = self._place.now(system._node)
         if cell is not None:  # Else its next life begins as its spec says.
             after = mechanism_of(cell)
         probation = self.probation
@@ -245,14 +245,14 @@ class Relocation(StagedWork):
         try:
             await self._move.give_up()
             if self._grant is not None:
-                system.mechanism_notes.over(self._place.path)
+                system._mechanism_notes.over(self._place.path)
         finally:
             self._give_back(system)
 
     def _give_back(self, system: ActorSystem) -> None:
         grant, self._grant = self._grant, None
         if grant is not None:
-            arbiter_of(system.node).release(grant)
+            arbiter_of(system._node).release(grant)
 
 
 def seen(done: asyncio.Future[Any]) -> None:

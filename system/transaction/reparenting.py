@@ -1,4 +1,4 @@
-"""Moving a child to another supervisor: its life goes on, only its address changes.
+"""Moves a child to another supervisor: its life goes on, and only its address changes.
 
 So does that of a supervisor, with all below it, if all its supervisors live in the root's process, and stay there. Else
 another one takes its place (`succession.py`). Actors come to rest where a turn could be repeated under another address;
@@ -146,7 +146,7 @@ class Regrouping(StagedWork):
             if waits:  # Perhaps for what those here have to answer.
                 await rest.give_up()
             else:
-                await rest.reach(system, functools.partial(system._moves.pause, one.living(system.node), MOVED_WITHIN))
+                await rest.reach(system, functools.partial(system._moves.pause, one.living(system._node), MOVED_WITHIN))
         if waits or self._why_not_moved(system):
             await self._let_go(system)
             return
@@ -169,7 +169,7 @@ class Regrouping(StagedWork):
             return why
         for place, handing in self._moved:
             assert place.was.below is not None
-            old = place.was.below.living(system.node)
+            old = place.was.below.living(system._node)
             if why := handing.ready(system) or ("" if is_elsewhere(old) else self._is_busy(old, place)):
                 return why
         return ""
@@ -178,7 +178,7 @@ class Regrouping(StagedWork):
         """Have those whose links are secured be certified where they go; requests flow meanwhile."""
         own = {self._top, *(place for place, _ in self._handings)}
         for one in addressed(self._top):
-            cell = one.now(system.node) if one.is_protected and not one.is_planned else None
+            cell = one.now(system._node) if one.is_protected and not one.is_planned else None
             if cell is None or cell.path == one.path or (one not in own and one.has_moved):  # That is another step's.
                 continue
             if one not in self._certificates:
@@ -211,7 +211,7 @@ class Regrouping(StagedWork):
         for one in addressed(self._top):
             # Who is reworked rests for that, and is saved; replicas are only told.
             rests = not one.is_planned and (one.rework is None or one.is_protected)
-            cell = one.now(system.node) if rests else None
+            cell = one.now(system._node) if rests else None
             switch = switch_of(cell) if cell is not None else None
             runs_again = switch is not None and (switch.method.replays or one.is_protected)
             if runs_again and one not in self._rests:
@@ -220,7 +220,7 @@ class Regrouping(StagedWork):
 
     def _unsteady(self, system: ActorSystem) -> str:
         """Why replicas that are to rest cannot hear of another address just now."""
-        cells = [one.now(system.node) for one, _ in self._resting(system)]
+        cells = [one.now(system._node) for one, _ in self._resting(system)]
         found = [cell.path for cell in cells if cell is not None and not cell.host.place.is_steady(cell)]
         return f"a replica of {found[0]} is being replaced" if found else ""
 
@@ -228,9 +228,9 @@ class Regrouping(StagedWork):
         """Why the others are not so far that addresses can change; they are asked for what is missing."""
         # Those that are reworked are saved at the commit.
         reworked = [place for place in self._draft.places() if place.rework is not None]
-        own = [place.now(system.node) for place in (*reworked, *(one for one, _ in self._resting(system)))]
+        own = [place.now(system._node) for place in (*reworked, *(one for one, _ in self._resting(system)))]
         settled = {switch_of(cell) for cell in own if cell is not None}
-        others = [switch for switch in system.homes if switch not in settled]
+        others = [switch for switch in system._homes if switch not in settled]
         settle_senders(others, self._asked)
         return WAITING if any(map(is_unsettled, others)) else ""
 
@@ -248,7 +248,7 @@ class Regrouping(StagedWork):
         if why := self._others_settle(system) or self._unsteady(system):
             return why
         for resting, rest in self._resting(system):
-            switch = switch_of(resting.living(system.node))
+            switch = switch_of(resting.living(system._node))
             if not rest.is_waiting:
                 return f"{resting.path} is not at rest"
             if switch is not None and switch.method.replays and not is_saved(switch):

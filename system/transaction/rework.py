@@ -1,4 +1,4 @@
-"""What a transaction changes in one live actor: its state, its code, whether it is suspended.
+"""Holds one live actor while a transaction changes its state, its code, or whether it is suspended.
 
 The actor is held between two of its turns and tries what is wanted of it. At the commit it goes on with what it has
 tried, or, if the transaction is given up, as before: it has handled nothing in between.
@@ -66,7 +66,7 @@ class Rework(StagedWork):
         if place.is_supervisor:
             raise wrong(place.path, "a supervisor is changed by its own operations: add, remove, strategy ...")
         if place.is_protected:
-            raise wrong(place.path, "it is protected by a mechanism: detach that, and attach it again after")
+            raise wrong(place.path, "it is protected by a mechanism: `protect` it by None, and again after")
         if place.cell is not None and not lives_here(place.cell) and not place.cell.is_dead:
             wanted.pack(place.path)
         self._wanted.append(wanted)
@@ -81,7 +81,7 @@ class Rework(StagedWork):
         if self._is_ordered:
             return
         while True:
-            cell = self._place.living(system.node)
+            cell = self._place.living(system._node)
             await self._claim(system, cell)
             life, self._held = cell.life, None
             try:
@@ -117,7 +117,7 @@ class Rework(StagedWork):
     def ready(self, system: ActorSystem) -> str:
         """Whether the life that was prepared is the one."""
         place = self._place
-        cell = place.living(system.node)
+        cell = place.living(system._node)
         if self._is_ordered:
             return busy(cell) if lives_here(cell) else ""
         if lives_here(cell):
@@ -129,7 +129,7 @@ class Rework(StagedWork):
 
     def commit(self, system: ActorSystem) -> None:
         """It goes on with what it has prepared: here at once; elsewhere as soon as it hears so, before all else."""
-        cell = self._place.living(system.node)
+        cell = self._place.living(system._node)
         if self._is_ordered:
             if self.suspended is not None:
                 self._tell(cell, Suspend() if self.suspended else Resume())
@@ -185,7 +185,7 @@ class Rework(StagedWork):
         """Wait until an actor in another process has heard it."""
         if self._concluded is None:
             return
-        cell = self._place.living(system.node)
+        cell = self._place.living(system._node)
         switch = switch_of(cell)
         before = 0 if switch is None else len(switch.arrival.unsaved)
         try:
@@ -202,7 +202,7 @@ class Rework(StagedWork):
         """It goes on as before."""
         if self._is_ordered:
             return
-        cell = self._place.now(system.node)
+        cell = self._place.now(system._node)
         try:
             if cell is not None and self._lock is not None:
                 await order(cell, Conclude(self._attempt, False, None), CONCLUDED_WITHIN)

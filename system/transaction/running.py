@@ -1,4 +1,4 @@
-"""Operations on whether a child runs: stop one whose spec stays, start it again."""
+"""Operations that stop a child and keep its spec, or start it again."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class StopChild(OnChild):
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = draft.find(self._at)
-        place.check_lived_in(system.node)
+        place.check_lived_in(system._node)
         if place.parent is None or not place.parent.is_supervisor or place.spec is None:
             raise wrong(place.path, "no supervisor looks after it")
         if place.is_planned:
@@ -65,14 +65,14 @@ class StopChild(OnChild):
     def ready(self, system: ActorSystem) -> str:
         place = self._place
         assert place.was.below is not None
-        if child_of(place.was.below.living(system.node), self._name) is None:
+        if child_of(place.was.below.living(system._node), self._name) is None:
             raise NoSuchActor(self.target)
         return ""
 
     async def finish(self, system: ActorSystem) -> None:
         place = self._place
         assert place.parent is not None
-        await stop_child(place.parent.living(system.node), self._name)
+        await stop_child(place.parent.living(system._node), self._name)
 
 
 async def stop_child(supervisor: Cell, name: str) -> None:
@@ -110,7 +110,7 @@ class StartAgain(OnChild):
     def _supervisor(self, system: ActorSystem) -> Cell:
         """Who has it until the transaction is in force: there it is started, and goes from there if it is moved."""
         assert self._place.was.below is not None
-        return self._place.was.below.living(system.node)
+        return self._place.was.below.living(system._node)
 
     async def prepare(self, system: ActorSystem) -> None:
         supervisor = self._supervisor(system)

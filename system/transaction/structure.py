@@ -63,7 +63,7 @@ class Newcomer:
         above, place = self._above, self.place
         if above is None:
             return
-        cell = above.living(system.node)
+        cell = above.living(system._node)
         if self._asked is cell and self._life == cell.life and place.name in (cell.children or {}):
             return  # It is being restarted.
         self._asked, self._life = cell, cell.life
@@ -88,7 +88,7 @@ class Newcomer:
         above, place = self._above, self.place
         if above is None:
             return ""
-        supervisor = above.living(system.node)
+        supervisor = above.living(system._node)
         if supervisor is not self._asked or supervisor.life != self._life:
             return f"{above.path} has been restarted"
         cell = (supervisor.children or {}).get(place.name)
@@ -109,7 +109,7 @@ class Newcomer:
             return
         assert self.place.parent is not None
         try:
-            await self._start(self.place.parent.living(system.node), in_force=True)
+            await self._start(self.place.parent.living(system._node), in_force=True)
         except (AlreadyPresent, AlreadyStarted):
             pass  # Its supervisor was restarted, and knows it from its recipe.
 
@@ -238,11 +238,11 @@ class RemoveActor(Operation):
 
     async def finish(self, system: ActorSystem) -> None:
         place = self._place
-        cell, above = place.now(system.node), place.parent
+        cell, above = place.now(system._node), place.parent
         if cell is not None:
             await system.stop(cell.ref)
         elif above is not None and above.is_supervisor:  # It does not run; its spec is there.
-            supervisor: ActorRef[Supervisor] = ActorRef(above.living(system.node))
+            supervisor: ActorRef[Supervisor] = ActorRef(above.living(system._node))
             try:
                 await supervisor.ask(RemoveChild(place.name), START_TIMEOUT)
             except (NoSuchChild, ActorStopped):
@@ -328,7 +328,7 @@ def named_spec(supervisor: Target, spec: ChildSpec | Start[Any], taken: set[str]
     if made.id != NAMELESS:
         return made
     path = text_of(supervisor)
-    above = system.node.find(path)
+    above = system._node.find(path)
     known = set((above.children if above is not None else None) or ())
     prefix, number = made.start.kind.__name__.lower(), 1
     while f"{prefix}-{number}" in known or f"{path}/{prefix}-{number}" in taken:

@@ -1,4 +1,4 @@
-"""A supervisor that another one takes the place of, where the root cannot just give it another address.
+"""Replaces a supervisor by a new one, where it cannot just be given another address.
 
 The new one is started beside it, at the new address and without children. All its children are moved there, each as if
 it were moved alone; at the commit, when it has none any more, all that others have tied to the old one is tied to the
@@ -85,7 +85,7 @@ class Elsewhere(NewSupervisor):
 
     async def prepare(self, system: ActorSystem) -> None:
         if self._forwarded is None:
-            self._forwarded = system.homes.addresses.left(self._place.path)
+            self._forwarded = system._homes.addresses.left(self._place.path)
         await self._newcomer.prepare(system)
 
     def ready(self, system: ActorSystem) -> str:
@@ -93,7 +93,7 @@ class Elsewhere(NewSupervisor):
 
     async def release(self, system: ActorSystem) -> None:
         await self._newcomer.release(erase=False)
-        system.homes.addresses.put_back(self._forwarded or {})
+        system._homes.addresses.put_back(self._forwarded or {})
 
 
 class Beside(NewSupervisor):
@@ -108,7 +108,7 @@ class Beside(NewSupervisor):
             return
         await self.release(system)
         assert self._place.parent is not None
-        above, node = self._place.parent.living(system.node), system.node
+        above, node = self._place.parent.living(system._node), system._node
         spec = complete(above, planned_spec(self._place, in_force=False))
         cell = self._cell = Cell(node, above, spec.id, node.ports.host_for(spec))
         cell.spec, cell.extra().start = spec, spec.start
@@ -164,7 +164,7 @@ class Succession:
 
     async def wind_down(self, system: ActorSystem) -> None:
         """Have nothing be in the way of its end, as far as that is its own."""
-        cell = self.left.living(system.node)
+        cell = self.left.living(system._node)
         if self._winding == (cell, cell.life):
             return
         self._winding = cell, cell.life
@@ -173,14 +173,14 @@ class Succession:
 
     async def give_up(self, system: ActorSystem) -> None:
         """Nobody takes its place."""
-        cell, winding, self._winding = self.left.now(system.node), self._winding, None
+        cell, winding, self._winding = self.left.now(system._node), self._winding, None
         if cell is not None and winding is not None:
             with contextlib.suppress(AskFailed, ActorStopped):
                 await order(cell, WindDown(0), CONCLUDED_WITHIN)
 
     async def hold(self, system: ActorSystem) -> None:
         """Have it give orders no more, if it lives in another process."""
-        cell = self.left.living(system.node)
+        cell = self.left.living(system._node)
         if not is_elsewhere(cell) or self._held == (cell, cell.life):
             return
         life, self._is_asked = cell.life, True
@@ -193,7 +193,7 @@ class Succession:
     async def let_go(self, system: ActorSystem) -> None:
         """It goes on."""
         is_asked, self._is_asked, self._held = self._is_asked, False, None
-        cell = self.left.now(system.node)
+        cell = self.left.now(system._node)
         if is_asked and cell is not None:  # Also if its answer was not waited for.
             with contextlib.suppress(AskFailed, ActorStopped):  # It is another life by now.
                 await order(cell, Conclude(self._attempt, False, None), CONCLUDED_WITHIN)
@@ -204,7 +204,7 @@ class Succession:
         Raises:
             HoldfastError: it cannot be done any more.
         """
-        cell = self.left.living(system.node)
+        cell = self.left.living(system._node)
         if is_elsewhere(cell):
             if self._held != (cell, cell.life) or not cell.host.is_up(cell) or cell.host.place.is_ending:
                 return f"{cell.path} has not stood down yet"
@@ -225,7 +225,7 @@ class Succession:
 
     def leave_tree(self, system: ActorSystem) -> tuple[str, str]:
         """The old one is below nobody any more; returns its address, and that of the new one."""
-        old, new = self.left.living(system.node), self.place.living(system.node)
+        old, new = self.left.living(system._node), self.place.living(system._node)
         self._ends, self._was, above = old, old.path, old.parent
         assert above is not None
         one = child_of(above, old.name)
@@ -242,7 +242,7 @@ class Succession:
 
     def commit(self, system: ActorSystem) -> None:
         """From here on the new one is the one; its children are below it already."""
-        old, new = self._ends, self.place.living(system.node)
+        old, new = self._ends, self.place.living(system._node)
         _hand_over(old, new)
         waiting = _end(old, new, self._was)
         if self._account is not None:

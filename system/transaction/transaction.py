@@ -102,14 +102,14 @@ class Transaction:
     async def _check(self, deadline: float) -> None:
         """All checks of all steps, each against the tree as it will be."""
         change, system = self._change, self._system
-        draft = self._draft = Draft(system.node, self._arrangement, self._timeout)
+        draft = self._draft = Draft(system._node, self._arrangement, self._timeout)
         before = draft.lines()
         for operation in change.operations:
             await self._in_time(operation.text, deadline, lambda one=operation: one.check(system, draft))  # type: ignore[misc]
             refuse_self(operation)
         try:
             draft.check()
-            system.specifications.check(draft.root)
+            system._specifications.check(draft.root)
         except HoldfastError as error:
             raise TransactionRefused("the tree as it would be", said(error)) from error
         change._difference = difference(before, draft.lines())
@@ -126,7 +126,7 @@ class Transaction:
         waiting = ""
         try:
             async with asyncio.timeout_at(deadline):
-                await system.specifications.prepare()
+                await system._specifications.prepare()
                 for operation in operations:
                     at, failed = operation, operation.text
                     begun.append(operation)  # Before it is prepared: it may be cancelled in the middle.
@@ -147,7 +147,7 @@ class Transaction:
                     if late is not None:
                         await late.prepare(system)
             failed, waiting = "commit", ""
-            system.homes.journal.barrier()
+            system._homes.journal.barrier()
             self._commit()  # In the same step of the loop in which all were ready.
         except BaseException as error:
             if isinstance(error, TimeoutError):
@@ -165,7 +165,7 @@ class Transaction:
     def _commit(self) -> None:
         """Put all of it in force, with no wait in between: there is no way back from here."""
         try:
-            with self._system.homes.journal.together():
+            with self._system._homes.journal.together():
                 for text, commit in [
                     (self._arrangement.step, self._arrangement.commit),
                     *((one.text, one.commit) for one in self._change.operations),
@@ -181,8 +181,8 @@ class Transaction:
     def _note(self, system: ActorSystem) -> None:
         """What the children of the root are from now on, for the next root."""
         assert self._draft is not None
-        mechanisms = {**self._draft.mechanisms(), **system.mechanism_notes.declared()}
-        system.specifications.changed(*self._draft.below_root(), mechanisms)
+        mechanisms = {**self._draft.mechanisms(), **system._mechanism_notes.declared()}
+        system._specifications.changed(*self._draft.below_root(), mechanisms)
 
     async def _release(self, begun: list[Operation]) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Let go of what was prepared, last one first; a cancellation waits until that is over."""
@@ -198,7 +198,7 @@ class Transaction:
                 except Exception as error:  # The others are let go of all the same, and this is told.
                     kept.append(f"{operation.text}: {said(error)}")
 
-        work = self._system.node.loop.create_task(release_all(), name="release of a transaction")
+        work = self._system._node.loop.create_task(release_all(), name="release of a transaction")
         cancelled: asyncio.CancelledError | None = None
         while not work.done():
             try:
@@ -216,8 +216,8 @@ class Transaction:
         """There is no way back: what is left goes on even if nobody waits for it any more."""
         system, shared = self._system, self._shared
         # In nobody's name: it has to go on when the life is over from whose turn it was begun.
-        context = system.node.base_context.copy()
-        work = system.node.loop.create_task(self._finish_all(), name="end of a transaction", context=context)
+        context = system._node.base_context.copy()
+        work = system._node.loop.create_task(self._finish_all(), name="end of a transaction", context=context)
         shared.behind.add(work)
         work.add_done_callback(shared.behind.discard)
         if not self._removes_caller():
@@ -241,7 +241,7 @@ class Transaction:
     def _removes_caller(self) -> bool:
         """Whether the turn that called us belongs to an actor that goes: its end waits for that turn."""
         caller = current.get(None)
-        place = self._draft.by_cell.get(caller.cell) if caller is not None and self._draft is not None else None
+        place = self._draft.by_cell.get(caller._cell) if caller is not None and self._draft is not None else None
         while place is not None:
             if place.is_leaving or place.is_stopped:
                 return True
@@ -254,12 +254,12 @@ class Transaction:
 
     @property
     def _address(self) -> str:
-        root = self._system.node.root
+        root = self._system._node.root
         return root.path if root is not None else ""
 
     def _emit(self, event: Any) -> None:
-        if self._system.node.events.has_listeners:
-            self._system.node.emit(event)
+        if self._system._node.events.has_listeners:
+            self._system._node.emit(event)
 
 
 def refuse_self(operation: Operation) -> None:
@@ -269,7 +269,7 @@ def refuse_self(operation: Operation) -> None:
         TransactionRefused: it would.
     """
     caller = current.get(None)
-    if caller is not None and any(place.cell is caller.cell for place in operation.between_turns_of):
+    if caller is not None and any(place.cell is caller._cell for place in operation.between_turns_of):
         raise TransactionRefused(
             operation.text, f"{caller.path} cannot change itself within its own turn: spawn a task"
         )

@@ -35,7 +35,7 @@ class Bind(Operation):
         self._bound = draft.find(self._to)
         self.target = owner.path
         for place in (owner, self._bound):
-            place.check_lived_in(system.node, before_commit=False)
+            place.check_lived_in(system._node, before_commit=False)
         kind = owner.kind
         if kind is not None and self._port not in kind._bindings:
             known = ", ".join(sorted(kind._bindings)) or "none"
@@ -47,14 +47,14 @@ class Bind(Operation):
         assert self._bound is not None
         for place in (self._owner, self._bound):
             if not place.comes_last:
-                place.living(system.node)
+                place.living(system._node)
         return ""
 
     def commit(self, system: ActorSystem) -> None:
         assert self._owner is not None
         assert self._bound is not None
-        owner, target = self._owner.living(system.node), self._bound.living(system.node)
-        system.node.bind(owner, self._port, target)
+        owner, target = self._owner.living(system._node), self._bound.living(system._node)
+        system._node.bind(owner, self._port, target)
         rebind(owner, self._port, target.path)
 
 
@@ -75,7 +75,7 @@ class Unbind(Operation):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         owner = self._owner = draft.find(self._at)
         self.target = owner.path
-        owner.check_lived_in(system.node)
+        owner.check_lived_in(system._node)
         if self._port not in owner.bindings:
             raise wrong(owner.path, f"its binding {self._port!r} points nowhere already, as far as is known here")
         if owner.cell is not None and not owner.cell.host.place.is_here:
@@ -84,12 +84,12 @@ class Unbind(Operation):
 
     def ready(self, system: ActorSystem) -> str:
         assert self._owner is not None
-        self._owner.living(system.node)
+        self._owner.living(system._node)
         return ""
 
     def commit(self, system: ActorSystem) -> None:
         assert self._owner is not None
-        owner = self._owner.living(system.node)
+        owner = self._owner.living(system._node)
         more = owner.extra()
         more.bindings.pop(self._port, None)
         rebind(owner, self._port, None)
@@ -113,7 +113,7 @@ class RegisterName(Operation):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = draft.find(self._at)
         self.target = place.path
-        place.check_lived_in(system.node)
+        place.check_lived_in(system._node)
         holder = holder_of(self._name, draft)
         if holder is not None and holder is not place:
             raise NameTaken(self._name)

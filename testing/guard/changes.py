@@ -1,4 +1,4 @@
-"""Changes: what of a value is another than it was when it was handed on, and where in it that is.
+"""Finds what has changed in a value since it was handed on, and where in it.
 
 A value is kept as its bytes, so nobody has to copy it, and compared by them.
 """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import itertools
 import operator
 import os
 import signal
@@ -11,13 +10,9 @@ import sys
 import sysconfig
 import threading
 import weakref
-from collections.abc import Callable, Collection, Iterable
-from time import monotonic
+from collections.abc import Callable, Collection
 from typing import Any, ClassVar
 
-import psutil
-
-from ..library_code import is_file_of_library
 from .loop_leaks import LoopLeaks
 from .thread_leaks import ThreadLeaks
 
@@ -26,10 +21,6 @@ TOLD = {
     "threads": "thread was left running",
     "descriptors": "descriptor was left open",
 }
-GRACE = 5.0
-"""Real seconds that the library's own processes may take to end."""
-SHORT_GRACE = 1.0
-"""Real seconds that a process of the test's may take: one that it has told to end, and not waited for."""
 OPEN_FILES = "/proc/self/fd"
 FILE: Callable[[os.stat_result], tuple[int, int]] = operator.attrgetter("st_dev", "st_ino")
 """Which file a descriptor is of."""
@@ -69,6 +60,8 @@ class Leaks(LoopLeaks):
         """Child processes that did not end in time; they are killed."""
         if pids() <= self._children:
             return []
+        from .process_leaks import children, end_processes  # It takes psutil, which few tests need.
+
         return end_processes(lambda: [child for child in children() if child.pid not in self._children])
 
     def threads(self) -> list[str]:
@@ -188,35 +181,22 @@ def _inode(target: str) -> int:
     return int(target.partition("[")[2].rstrip("]"))
 
 
-def children() -> list[psutil.Process]:
-    """Our living descendants.
-
-    By the kernel's own lists of children, where it keeps them: psutil reads every process of the machine, which is too
-    slow to be done twice for each test.
-    """
-    if (found := _descendants()) is None:
-        return [child for child in psutil.Process().children(recursive=True) if is_of_test(child)]
-    living: list[psutil.Process] = []
-    for pid in found:
-        try:
-            living.append(psutil.Process(pid))
-        except psutil.Error:
-            pass
-    return [child for child in living if is_of_test(child)]
-
-
 def pids() -> set[int]:
     """The numbers of our descendants; those that have ended may be among them."""
     try:
         os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     except ChildProcessError:  # There are none, which is told in a tenth of the time of a look at the lists.
         return set()
-    found = _descendants()
-    return {child.pid for child in psutil.Process().children(recursive=True)} if found is None else set(found)
+    found = descendants()
+    if found is None:
+        from .process_leaks import all_children
+
+        return {child.pid for child in all_children()}
+    return set(found)
 
 
-def _descendants() -> list[int] | None:
-    """By the kernel's lists; None where it keeps none."""
+def descendants() -> list[int] | None:
+    """The numbers of our descendants by the kernel's lists; None where it keeps none."""
     found = _children_of("self")
     if found is None:
         return None
@@ -241,45 +221,3 @@ def _children_of(pid: str) -> list[int] | None:
         except OSError:  # The thread, or all of it, ended meanwhile.
             pass
     return found
-
-
-def is_of_test(child: psutil.Process) -> bool:
-    """Tell a test's process from the resource tracker, which multiprocessing keeps until the interpreter ends."""
-    try:
-        return child.is_running() and "multiprocessing.resource_tracker" not in " ".join(child.cmdline())
-    except psutil.Error:
-        return False
-
-
-def is_of_library(child: psutil.Process) -> bool:
-    """Whether a process is one of the library's own (a fork server, what it has forked, a reaper with its program)."""
-    try:
-        line = itertools.takewhile(lambda process: process.pid != os.getpid(), (child, *child.parents()))
-        return any(is_file_of_library(word) for process in line for word in process.cmdline())
-    except psutil.Error:
-        return False
-
-
-def end_processes(find: Callable[[], Iterable[psutil.Process]], grace: float | None = None) -> list[str]:
-    """Give the processes that `find` finds time to end, kill the rest, and say which those were.
-
-    Args:
-        grace: seconds for those that are not the library's own; SHORT_GRACE if it is not said.
-    """
-    short = SHORT_GRACE if grace is None else grace
-    began = monotonic()
-    described: list[str] = []
-    killed: list[psutil.Process] = []
-    while left := [process for process in find() if process not in killed]:
-        passed = monotonic() - began
-        late = [one for one in left if passed >= GRACE or (passed >= short and not is_of_library(one))]
-        for process in late:
-            try:
-                described.append(f"{process.pid} {process.status()} {' '.join(process.cmdline())}")
-                process.kill()
-            except psutil.Error:
-                pass
-        killed += late
-        psutil.wait_procs(left, timeout=0.05)
-    psutil.wait_procs(killed, timeout=1.0)
-    return described

@@ -1,4 +1,4 @@
-"""What is made in an event loop, told to whoever notes it: futures, tasks, timers, and exceptions that nobody takes.
+"""Reports what an event loop makes: futures, tasks, timers, and exceptions that nobody takes.
 
 The methods of the loop's class are exchanged, once, and stay so. To exchange those of each new loop takes longer, in
 all that is done with that loop.

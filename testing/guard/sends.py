@@ -126,7 +126,7 @@ class SendChecks(TurnWatcher):
             if sent is not None:
                 self._compare(sent, "when it was sent again")
                 self._forget(sent)
-            sent = self._keep(Handed(message, body, None if giver is None else giver.cell, cell.path, None))
+            sent = self._keep(Handed(message, body, None if giver is None else giver._cell, cell.path, None))
             if cell.actor is None:  # Its turns are elsewhere: an answer from there says that they are over.
                 self._near[cell].append(sent)
         sent.turns += 1
@@ -185,7 +185,7 @@ class SendChecks(TurnWatcher):
         if type(reply) in PLAIN:
             return
         ctx = current.get(None)
-        giver: Cell = ask.to if ctx is None else ctx.cell
+        giver: Cell = ask.to if ctx is None else ctx._cell
         if giver.actor is None or not may_change(reply) or is_of_library(type(ask.message)):
             return
         body = self._images.of(reply)
@@ -348,7 +348,7 @@ class Doors:
         for name in ("tell", "send"):
             self._swaps.put(ActorRef, name, self._through_ref(getattr(ActorRef, name)))
         self._swaps.put(ActorRef, "ask", self._through_ask(ActorRef.ask))
-        self._swaps.put(ActorContext, "send", self._through_context(ActorContext.send))
+        self._swaps.put(ActorContext, "_send", self._through_context(ActorContext._send))
         self._swaps.put(Ask, "answer", self._through_answer(Ask.answer))
 
     @staticmethod

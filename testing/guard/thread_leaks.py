@@ -27,24 +27,46 @@ LIBRARIES = tuple(
 """Files below one of these are another library's: a thread that they start is of a pool, or is kept for later."""
 
 
+class ThreadStarts:
+    """`Thread.start`, exchanged once for one that tells whoever notes it, and left so.
+
+    To exchange it for each test has the interpreter forget, twice, what it knows of the classes of threads.
+    """
+
+    def __init__(self) -> None:
+        self.notes: list[ThreadLeaks] = []
+        start: Any = threading.Thread.start
+        notes = self.notes
+
+        def noted(thread: threading.Thread) -> None:
+            frame = _starter(sys._getframe(1)) if notes and not isinstance(thread, Onlooker) else None
+            if frame is not None:
+                where = f"{frame.f_code.co_filename}:{frame.f_lineno}"
+                for one in notes:
+                    one.started(thread, where)
+            start(thread)
+
+        noted.starts = self  # type: ignore[attr-defined]  # so that the next test finds them
+        Swaps().put(threading.Thread, "start", noted)
+
+    @staticmethod
+    def standing() -> ThreadStarts:
+        """What stands at the class, or a new one."""
+        found = vars(threading.Thread.start).get("starts")
+        return found if isinstance(found, ThreadStarts) else ThreadStarts()
+
+
 class ThreadLeaks:
     """Notes from here to `told` which threads are started, and where."""
 
     def __init__(self) -> None:
         self._started: list[tuple[threading.Thread, str]] = []
-        self._swaps = Swaps()
-        self._swaps.put(threading.Thread, "start", self._noting(threading.Thread.start))
+        self._notes = ThreadStarts.standing().notes
+        self._notes.append(self)
 
-    def _noting(self, start: Any) -> Any:
-        started = self._started
-
-        def noted(thread: threading.Thread) -> None:
-            frame = _starter(sys._getframe(1))
-            if frame is not None and not isinstance(thread, Onlooker):
-                started.append((thread, f"{frame.f_code.co_filename}:{frame.f_lineno}"))
-            start(thread)
-
-        return noted
+    def started(self, thread: threading.Thread, where: str) -> None:
+        """A thread is about to start."""
+        self._started.append((thread, where))
 
     def told(self) -> list[str]:
         """The threads that do not end; nothing is noted any more."""
@@ -56,8 +78,9 @@ class ThreadLeaks:
         return [f"{thread.name}, started at {where}" for thread, where in self._started if thread.is_alive()]
 
     def close(self) -> None:
-        """Note nothing any more."""
-        self._swaps.undo()
+        """Note nothing any more; a second call changes nothing."""
+        if self in self._notes:
+            self._notes.remove(self)
 
 
 def _starter(frame: FrameType | None) -> FrameType | None:

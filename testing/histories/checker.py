@@ -1,4 +1,4 @@
-"""Whether a history is linearizable: whether its operations could have taken effect one after the other.
+"""Checks whether a history is linearizable: whether its operations could have taken effect one after the other.
 
 There must be an order of them that the model allows, in which no operation stands before one whose outcome was there
 before it was invoked. An operation whose outcome nobody knows may stand anywhere after its invocation, or nowhere.
@@ -75,7 +75,7 @@ class Linearization:
         return True
 
     def verify(self) -> None:
-        """Nothing: it is as it should be."""
+        """Do nothing, for the history is as it should be."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class Violation:
 def linearizable(
     history: History | Iterable[Operation], model: Model[Any], *, most_steps: int = MOST_STEPS
 ) -> Linearization | Violation:
-    """Whether the history could have happened one operation after the other, as the model allows.
+    """Check whether the history could have happened one operation after the other, as the model allows.
 
     Args:
         history: what was asked and heard, or operations with times of your own.

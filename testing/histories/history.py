@@ -57,12 +57,12 @@ class Operation:
         return f"{self.client}: {self.told()}"
 
     def told(self) -> str:
-        """What was asked of whom, and what came back."""
+        """Say in words what was asked of whom, and what came back."""
         return f"{f'{self.to} ' if self.to else ''}{self.message!r} -> {self.outcome!r}"
 
 
 def same_outcome(heard: object, expected: object) -> bool:
-    """Whether two outcomes are one: equal replies, or errors of one class with equal arguments."""
+    """Say whether two outcomes are one: equal replies, or errors of one class with equal arguments."""
     if isinstance(expected, BaseException):
         return type(heard) is type(expected) and heard.args == expected.args
     return bool(heard == expected)
@@ -88,7 +88,7 @@ class Model(Generic[S]):
 
 
 class History:
-    """What clients do, written down while they do it.
+    """A record of what clients do, written down while they do it.
 
     `ask` and `tell` do both. For what is no ask of an actor there are `begin`, and then `end` or `forget`; an operation
     that neither follows is one of which nobody knows whether it took effect.
@@ -104,26 +104,27 @@ class History:
 
     @property
     def operations(self) -> list[Operation]:
+        """Return all operations, in the order in which they were invoked, without those that surely had no effect."""
         return list(self._all.values())
 
     def begin(self, client: str, message: object, *, to: str = "", at: float = 0.0) -> int:
-        """An operation is invoked. Returns its number, for `end` and `forget`."""
+        """Note that an operation is invoked. Returns its number, for `end` and `forget`."""
         number = next(self._numbers)
         self._all[number] = Operation(client, message, next(self._clock), to=to, at=at)
         return number
 
     def end(self, number: int, outcome: object) -> None:
-        """Its outcome is known: the reply, or a Refusal."""
+        """Note the outcome of an operation: the reply, or a Refusal."""
         self._all[number] = replace(self._all[number], end=next(self._clock), outcome=outcome)
 
     def forget(self, number: int) -> None:
-        """It surely had no effect: it was refused, or never handled."""
+        """Take an operation out that surely had no effect: it was refused, or never handled."""
         del self._all[number]
 
     def ask(
         self, ref: ActorRef[Any], message: Message[R], timeout: float = DEFAULT_TIMEOUT, *, client: str | None = None
     ) -> asyncio.Future[R]:
-        """As `ref.ask`, and write it down: for tests and programs, not for the turns of actors.
+        """Ask as `ref.ask` does, and write it down: for tests and programs, not for the turns of actors.
 
         A reply and a Refusal are outcomes. After an error that says that the message was surely not handled (SendError,
         AskTimeout with `handled=False`) the operation is forgotten. After any other (a time-out, a crash, a lost
@@ -169,7 +170,7 @@ class History:
         return told
 
     def tell(self, ref: ActorRef[Any], message: Message[Any], *, client: str | None = None) -> None:
-        """As `ref.tell`, and write it down: it takes effect some time, or never."""
+        """Tell as `ref.tell` does, and write it down: it takes effect some time, or never."""
         number = self._begin(ref, message, client)
         try:
             ref.tell(message)

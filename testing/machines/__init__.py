@@ -1,1 +1,1 @@
-"""Machines of Hypothesis over a running system, whose schedule is drawn and shrunk with the rules."""
+"""State machines of Hypothesis over a running system; the schedule is drawn and shrunk with the rules."""

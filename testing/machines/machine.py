@@ -141,11 +141,11 @@ class ActorMachine(RuleBasedStateMachine):
             return self._runner.run(coro)
 
     def start(self, spec: ChildSpec[A]) -> ActorRef[A]:
-        """As `system.start`."""
+        """Start a child of the root of this example's system, as `system.start` does."""
         return self.run(self.system.start(spec))
 
     def spawn(self, start: Start[A], name: str | None = None) -> ActorRef[A]:
-        """As `system.spawn`."""
+        """Start an actor that nobody restarts, as `system.spawn` does."""
 
         async def spawned() -> ActorRef[A]:
             return self.system.spawn(start, name)
@@ -223,7 +223,7 @@ class ActorMachine(RuleBasedStateMachine):
         return self.run(kills())
 
     def crash_root(self, *, power: bool = False) -> None:
-        """As `simulation.crash_root`: `system` is a new one then, to which the rule gives its tree."""
+        """Crash the root as `simulation.crash_root` does: the rule gives the new `system` its tree."""
         self.system = self.run(self._simulation.crash_root(power=power))
 
     def inject(self, ref: ActorRef[Any], *, at: str, **options: Any) -> Strikes:

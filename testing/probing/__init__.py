@@ -1,1 +1,1 @@
-"""What probes are made of, beside the probe itself."""
+"""The building blocks of probes, besides the probe itself."""

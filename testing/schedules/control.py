@@ -1,4 +1,4 @@
-"""A loop whose every step is chosen: which actor has the next turn, and which task or callback of the loop runs next.
+"""An event loop whose every step is chosen: the next actor's turn, and the next task or callback.
 
 What the loop promises is kept. Callbacks that are no steps of tasks are called in the order in which they were
 scheduled, and before the steps of tasks that were scheduled after them: who awaits a future goes on after the callbacks

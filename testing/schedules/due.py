@@ -1,4 +1,4 @@
-"""The callbacks of a loop that are due, and which of them may be called next.
+"""The due callbacks of a loop, and which of them may be called next.
 
 What asyncio promises is kept. Callbacks that are no steps of tasks are called in the order in which they were
 scheduled, and before the steps of tasks that were scheduled after them; a task's steps are in order among themselves.

@@ -1,4 +1,4 @@
-"""Livelock: what goes on for ever while virtual time stands still.
+"""Detects livelock: work that goes on for ever while virtual time stands still.
 
 A round is over when all that waited at its beginning has had its turn: each message in a mailbox, each callback that
 was due. What these send and schedule is of the next round. So there are as many rounds at one moment as the longest

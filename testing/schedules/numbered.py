@@ -1,4 +1,4 @@
-"""What asyncio and anyio keep in sets, in the same order in each run.
+"""Gives the sets that asyncio and anyio keep the same order in each run.
 
 Tasks are in sets there, and sets of them come back: `asyncio.wait`, `all_tasks`, the children that a `TaskGroup`
 cancels. By default the order of such a set is that of the addresses of objects, which no seed decides. Here tasks and

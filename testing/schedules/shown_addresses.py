@@ -1,4 +1,4 @@
-"""Addresses in what is sent: the default text of an object shows where it lies in memory, which no seed decides."""
+"""Finds objects in sent data that are shown by their memory address, which no seed decides."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a program asks the world for: random numbers and the time. In a simulated run both are the seed's.
+"""Random numbers and time of a simulated run: both come from the seed.
 
 `random`, `uuid`, `secrets`, `os.urandom`, numpy's global generator, the functions of `time` and the clocks of
 `datetime` are exchanged for the thread of the run. What cannot be exchanged is told: threads, sockets and processes of

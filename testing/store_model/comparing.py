@@ -1,4 +1,4 @@
-"""Comparing: equal means of the same type, too, down to the sign of a zero."""
+"""Strict comparison: equal values of equal types, down to the sign of a zero."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes into an engine and the model alike, and what each may leave behind when it is broken off."""
+"""Writes into an engine and its model alike, and what each may leave behind when it is interrupted."""
 
 from __future__ import annotations
 

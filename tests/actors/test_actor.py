@@ -100,7 +100,7 @@ async def test_what_is_no_message_is_refused_with_advice(send: str, isolation: A
             ("hello", "class MyMessage(hf.Message[...])"),
             (Any_, "send an instance, Any_(...)"),
         ):
-            with pytest.raises(hf.BadMessage) as caught:
+            with pytest.raises(hf.errors.BadMessage) as caught:
                 await getattr(ref, send)(no_message)  # A tell would return None, were it not refused.
             assert advice in str(caught.value)
             assert "@on(str)" not in str(caught.value)
@@ -123,7 +123,7 @@ class Babbler(hf.Actor):
                     sending = send(no_message)
                     if sending is not None:
                         await sending
-                except hf.BadMessage as error:
+                except hf.errors.BadMessage as error:
                     refused.append(str(error))
         return refused
 
@@ -141,7 +141,7 @@ async def test_what_an_actor_sends_that_is_no_message_is_refused_alike(to: Any, 
         for error, where in zip(refused, ["/app/to"] * 6 + ["/babble"] * 2, strict=True):
             assert f"to {where}: " in error
             assert "class MyMessage(hf.Message[...])" in error or "send an instance, Add(...)" in error
-        with pytest.raises(hf.BadMessage, match=r"to /babble: messages are instances of a class of their own"):
+        with pytest.raises(hf.errors.BadMessage, match=r"to /babble: messages are instances of a class of their own"):
             await system.publish("/babble", cast("Any", "hello"))
 
 

@@ -187,7 +187,7 @@ async def test_queued_asks_fail_when_the_actor_ends_for_good(system: hf.ActorSys
     worker = system.spawn(hf.start(Worker, gate))
     first = worker.ask(Work("x"))
     queued = [worker.ask(Quick("never")) for _ in range(3)]
-    await system.node.loop.create_task(asyncio.sleep(0))
+    await system._node.loop.create_task(asyncio.sleep(0))
     getattr(worker, end)()
     gate.set()
     for ask in queued:
@@ -224,7 +224,7 @@ async def test_a_circle_of_asks_is_refused_at_once(system: hf.ActorSystem, lengt
         async def ring(self, message: Ring) -> str:
             try:
                 return await message.way[0].ask(Ring(message.way[1:]))
-            except hf.AskDeadlock as error:
+            except hf.errors.AskDeadlock as error:
                 return f"{error.actor} {error.chain}"
 
     ring = [system.spawn(hf.start(Careful), f"a{n}") for n in range(length)]
@@ -440,7 +440,7 @@ async def test_forwarding_a_timer_s_message_delivers_it(system: hf.ActorSystem) 
     timed = system.spawn(hf.start(Timed, worker))
     await timed.ask(Seen())
     await asyncio.sleep(0.01)  # the timer is due
-    await system.node.settled()
+    await system._node.settled()
     assert await worker.ask(Seen()) == ["tick"]
 
 
@@ -475,7 +475,7 @@ async def test_time_outs_that_are_all_different_do_not_accumulate(system: hf.Act
     for number in range(100):
         await worker.ask(Quick(), timeout=1.0 + number / 1000)
     await asyncio.sleep(2.0)
-    assert not system.node.deadlines._queues
+    assert not system._node.deadlines._queues
 
 
 async def test_every_ask_under_churn_has_one_outcome(system: hf.ActorSystem) -> None:

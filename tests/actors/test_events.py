@@ -89,7 +89,7 @@ async def test_streams_end_with_the_system() -> None:
 
 
 async def test_a_listener_that_falls_behind_loses_the_oldest_and_is_told_how_many(system: hf.ActorSystem) -> None:
-    with system.node.events.listen(most=2) as stream:
+    with system._node.events.listen(most=2) as stream:
         for name in "abcd":
             system.spawn(hf.start(One), name)
         assert stream.missed == 2
@@ -98,10 +98,10 @@ async def test_a_listener_that_falls_behind_loses_the_oldest_and_is_told_how_man
 
 async def test_with_nobody_looking_no_event_is_made(system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch) -> None:
     emitted: list[Any] = []
-    hub = system.node.events
+    hub = system._node.events
     monkeypatch.setattr(hub, "emit", emitted.append)
     system.spawn(hf.start(One)).tell(Do(lambda _: 1 / 0))
-    await system.node.settled()
+    await system._node.settled()
     assert emitted == []
     stream = system.events()
     system.spawn(hf.start(One))
@@ -112,7 +112,7 @@ async def test_with_nobody_looking_no_event_is_made(system: hf.ActorSystem, monk
 
 async def test_a_sink_sees_events_at_once(system: hf.ActorSystem) -> None:
     seen: list[str] = []
-    system.node.events.add_sink(lambda event: seen.append(event.address))
+    system._node.events.add_sink(lambda event: seen.append(event.address))
     system.spawn(hf.start(One), "a")
     assert seen == ["/t/a"]
     with system.events():
@@ -129,7 +129,7 @@ async def test_a_sink_sees_events_at_once(system: hf.ActorSystem) -> None:
         ChildRestarted("/t/a", hf.Signal(9), 1),
     ],
 )
-def test_events_cross_a_process_border_with_their_fields(event: hf.Event) -> None:
+def test_events_cross_a_process_border_with_their_fields(event: hf.events.Event) -> None:
     back = event_from(type(event).__name__, event_data(event))
     assert back is not None
     assert type(back) is type(event)

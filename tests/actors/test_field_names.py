@@ -133,8 +133,8 @@ async def test_a_message_with_such_fields_is_handled_as_any_other(
 
 
 async def test_a_pool_and_the_status_of_an_actor_know_such_a_message(system: hf.ActorSystem) -> None:
-    await system.start(hf.pool("pool", hf.start(Other), size=2))
-    pool = hf.pool_of(system, f"/{system.name}/pool", Other)
+    await system.start(hf.supervision.pool("pool", hf.start(Other), size=2))
+    pool = hf.supervision.pool_of(system, f"/{system.name}/pool", Other)
     assert await pool.ask(Odd("plain")) == "b"
     pool.tell(Odd("plain"))
     assert await pool.ask(Odd("plain")) == "b"

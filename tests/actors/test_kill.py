@@ -32,7 +32,7 @@ async def test_killing_a_suspended_turn_ends_the_life_without_hooks(system: hf.A
             told.append("finally")
 
     polite = system.spawn(hf.start(Polite))
-    system.node._idle.clear()
+    system._node._idle.clear()
     polite.tell(Do(work))
     await asyncio.sleep(0)
     await pause(steps)
@@ -110,7 +110,7 @@ async def test_a_turn_that_swallows_its_kill_is_abandoned_and_may_not_send(
         assert [event.address for event in stream.take() if isinstance(event, LifeAbandoned)] == [stubborn.path]
     assert set(attempts) == {"refused"}
     async with asyncio.timeout(30):
-        await system.node.settled()  # it is counted no more
+        await system._node.settled()  # it is counted no more
     assert await stubborn.ask(DoNow(lambda actor: actor.ctx.life)) == 2
 
 
@@ -169,7 +169,7 @@ async def test_a_stop_that_comes_when_a_turn_has_just_failed_finds_the_asker_ans
 
     async def work(actor: Doer) -> None:
         await asyncio.sleep(0)
-        loop.call_soon(actor.ctx.cell.request_stop)  # Comes behind this turn and ahead of the actor's next slice.
+        loop.call_soon(actor.ctx._cell.request_stop)  # Comes behind this turn and ahead of the actor's next slice.
         raise RuntimeError("boom")
 
     ref = system.spawn(hf.start(Doer))

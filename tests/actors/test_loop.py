@@ -61,7 +61,7 @@ async def test_a_timeout_that_is_over_in_the_first_step_of_a_fresh_runner(system
             return "timed out"
         return "never"
 
-    system.node._idle.clear()  # so that the turn gets a runner whose task has not begun
+    system._node._idle.clear()  # so that the turn gets a runner whose task has not begun
     asks = [system.spawn(hf.start(Doer)).ask(Do(work)) for _ in range(2 * RUNNERS)]
     assert set(await asyncio.gather(*asks)) == {"timed out"}
 
@@ -170,7 +170,7 @@ async def test_whatever_a_plain_handler_raises_ends_its_own_life_only(doer: Doer
 async def test_sys_exit_in_a_tell_does_not_end_the_program(doer: Doers, system: hf.ActorSystem) -> None:
     victim = doer()
     victim.tell(DoNow(lambda _: sys.exit("bye")))
-    await system.node.settled()
+    await system._node.settled()
     assert victim._cell.is_dead
 
 
@@ -291,7 +291,7 @@ async def test_a_cancel_before_the_runner_s_task_has_begun_reaches_the_turn_in_i
             return error.args, asyncio.current_task() is task
         return None, False
 
-    system.node._idle.clear()
+    system._node._idle.clear()
     asked, other = doer().ask(Do(work)), doer().ask(DoNow(lambda _: tasks[0].cancel("why")))  # in one slice
     assert await asked == (("why",), True)
     assert await other
@@ -379,8 +379,8 @@ async def test_no_runner_is_lost_or_kept_beyond_the_few_idle_ones(doer: Doers, s
     gate.set()
     await asyncio.gather(*asks)
     await pause(5)
-    assert len(system.node._runners) <= RUNNERS
-    assert system.node.turns_held == 0
+    assert len(system._node._runners) <= RUNNERS
+    assert system._node.turns_held == 0
 
 
 async def test_settled_waits_for_suspended_turns(doer: Doers, system: hf.ActorSystem) -> None:
@@ -392,5 +392,5 @@ async def test_settled_waits_for_suspended_turns(doer: Doers, system: hf.ActorSy
 
     for _ in range(3):
         doer().tell(Do(work))
-    await system.node.settled()
+    await system._node.settled()
     assert len(done) == 3

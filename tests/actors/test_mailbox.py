@@ -87,7 +87,7 @@ async def seen(box: hf.ActorRef[Box], gate: asyncio.Event) -> list[int]:
     return await box.ask(Seen())
 
 
-def letters(stream: hf.EventStream) -> list[int]:
+def letters(stream: hf.events.EventStream) -> list[int]:
     return [event.message.n for event in stream.take() if isinstance(event, DeadLetter)]
 
 
@@ -377,7 +377,7 @@ async def test_without_the_hook_it_is_a_dead_letter(system: hf.ActorSystem) -> N
             box.tell(Put(number))
         box.stop()
         gate.set()
-        await system.node.settled()
+        await system._node.settled()
         box.tell(Put(3))
         assert letters(stream) == [1, 2, 3]
     assert system.dead_letters == 3

@@ -233,7 +233,7 @@ class Mailbox(RuleBasedStateMachine):
 
     async def calm(self) -> None:
         """Nothing more happens; at most one turn is held at the gate."""
-        node, held = self.system.node, int(self.holding is not None)
+        node, held = self.system._node, int(self.holding is not None)
         for _ in range(10_000):
             await asyncio.sleep(0)
             if not node.awake and node.turns_held == held and (not held or self.log.handled == self.handled):

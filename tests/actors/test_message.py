@@ -142,7 +142,7 @@ async def test_refs_arrays_times_and_enums_travel_inside_messages(system: hf.Act
     data = np.arange(6, dtype=">f4").reshape(2, 3)
     when = datetime.datetime(2026, 1, 2, tzinfo=datetime.UTC)
     sent = Rich(ref, [other, ref], data, when, Mode.FAST, Add(3))
-    got = through(system.node.codec, sent)
+    got = through(system._node.codec, sent)
     assert (got.who, got.others, got.when, got.mode, got.inner) == (ref, [other, ref], when, Mode.FAST, Add(3))
     assert got.data.dtype == data.dtype
     np.testing.assert_array_equal(got.data, data)
@@ -168,7 +168,7 @@ def test_an_array_keeps_shape_type_and_elements(codec: Codec, array: np.ndarray)
 
 
 def test_an_array_of_objects_is_refused(codec: Codec) -> None:
-    with pytest.raises(hf.BadMessage, match="objects"):
+    with pytest.raises(hf.errors.BadMessage, match="objects"):
         codec.encode(np.array([object()]), "/t/x")
 
 
@@ -178,7 +178,7 @@ class Box(hf.Message[None]):
 
 
 def test_what_cannot_be_coded_is_named_by_type_and_field(codec: Codec) -> None:
-    with pytest.raises(hf.BadMessage) as refused:
+    with pytest.raises(hf.errors.BadMessage) as refused:
         codec.encode(Box("x", object()), "/t/x")
     assert refused.value.actor == "/t/x"
     assert refused.value.message.endswith("Box")
@@ -187,7 +187,7 @@ def test_what_cannot_be_coded_is_named_by_type_and_field(codec: Codec) -> None:
 
 
 def test_a_message_beyond_the_limit_is_refused_and_the_large_field_named(codec: Codec) -> None:
-    with pytest.raises(hf.BadMessage, match=r"'content'.*in parts"):
+    with pytest.raises(hf.errors.BadMessage, match=r"'content'.*in parts"):
         codec.encode(Box("x", bytes(MAX_BYTES)), "/t/x")
     assert codec.encode(Box("x", bytes(MAX_BYTES - 100)), "/t/x")
 
@@ -213,18 +213,18 @@ def test_a_refusal_with_wrong_fields_is_a_programming_error(values: Any, named: 
         hf.ActorStopped("/t/a", "normal"),
         hf.MailboxFull("/t/a", 3),
         hf.UnknownMessage("/t/a", "m.M"),
-        hf.BadMessage("/t/a", "m.M", "why"),
-        hf.AskDeadlock("/t/a", ("/t/b",)),
+        hf.errors.BadMessage("/t/a", "m.M", "why"),
+        hf.errors.AskDeadlock("/t/a", ("/t/b",)),
         hf.AskTimeout("/t/a", 2.0, False),
         hf.AskTimeout("/t/a", 2.0, None),
         hf.AskFailed("/t/a", "killed"),
-        hf.ReplayDiverged("/t/a", 3, 1),
+        hf.errors.ReplayDiverged("/t/a", 3, 1),
         hf.StartFailed("/t/a", "why"),
-        hf.NameTaken("/t/a"),
-        hf.NoSuchActor("/t/a"),
-        hf.WrongActor("/t/a", "A", "B"),
+        hf.errors.NameTaken("/t/a"),
+        hf.errors.NoSuchActor("/t/a"),
+        hf.errors.WrongActor("/t/a", "A", "B"),
         hf.SpecError("here", "why"),
-        hf.Unbound("/t/a", "port"),
+        hf.errors.Unbound("/t/a", "port"),
     ],
     ids=lambda error: type(error).__name__,
 )
@@ -251,7 +251,7 @@ def test_a_refusal_of_a_class_that_is_not_loaded_keeps_its_name_and_fields(codec
 
 def test_a_refusal_whose_fields_have_wrong_types_is_not_built(codec: Codec) -> None:
     got = codec.decode_error("refusal", message_name(Overdrawn), msgspec.msgpack.encode(["five"]))
-    assert isinstance(got, hf.BadMessage)
+    assert isinstance(got, hf.errors.BadMessage)
     assert "cannot be made" in str(got)
 
 

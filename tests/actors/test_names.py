@@ -32,7 +32,7 @@ async def test_a_registered_name_finds_its_actor(system: hf.ActorSystem) -> None
 async def test_a_name_has_one_holder(system: hf.ActorSystem) -> None:
     one, other = system.spawn(hf.start(One)), system.spawn(hf.start(One))
     system.register("leader", one)
-    with pytest.raises(hf.NameTaken, match="leader"):
+    with pytest.raises(hf.errors.NameTaken, match="leader"):
         system.register("leader", other)
     system.register("leader", one)  # again, by its holder: fine
     assert system.whereis("leader") == one
@@ -43,7 +43,7 @@ async def test_an_actor_may_have_several_names(system: hf.ActorSystem) -> None:
     for name in ("a", "b"):
         system.register(name, one)
     system.unregister("a")
-    with pytest.raises(hf.NoSuchActor):
+    with pytest.raises(hf.errors.NoSuchActor):
         system.whereis("a")
     assert system.whereis("b") == one
 
@@ -54,7 +54,7 @@ async def test_names_end_with_the_life(system: hf.ActorSystem) -> None:
     with pytest.raises(hf.RemoteCrash):
         await one.ask(Do(lambda _: 1 / 0))
     assert await one.ask(Do(lambda actor: actor.ctx.life)) == 2
-    with pytest.raises(hf.NoSuchActor, match="leader"):
+    with pytest.raises(hf.errors.NoSuchActor, match="leader"):
         system.whereis("leader")
 
 
@@ -79,7 +79,7 @@ async def test_the_dead_cannot_be_registered(system: hf.ActorSystem) -> None:
 async def test_a_ref_is_found_by_address_and_class(system: hf.ActorSystem) -> None:
     special = system.spawn(hf.start(Special), "special")
     assert system.ref("/t/special", Special) == system.ref("/t/special", One) == special
-    with pytest.raises(hf.WrongActor) as wrong:
+    with pytest.raises(hf.errors.WrongActor) as wrong:
         system.ref("/t/special", Other)
     assert (wrong.value.actor, wrong.value.expected.rpartition(".")[2]) == ("/t/special", "Other")
 
@@ -87,16 +87,16 @@ async def test_a_ref_is_found_by_address_and_class(system: hf.ActorSystem) -> No
 @pytest.mark.parametrize("path", ["/t/nobody", "/t/one/below", "/else", "/tt/one", "one", "", "/t/one/"])
 async def test_nobody_lives_at_other_addresses(system: hf.ActorSystem, path: str) -> None:
     system.spawn(hf.start(One), "one")
-    with pytest.raises(hf.NoSuchActor):
+    with pytest.raises(hf.errors.NoSuchActor):
         system.ref(path, One)
 
 
 async def test_an_address_is_unique_among_the_living_and_free_after_an_end(system: hf.ActorSystem) -> None:
     one = system.spawn(hf.start(One), "one")
-    with pytest.raises(hf.NameTaken, match="/t/one"):
+    with pytest.raises(hf.errors.NameTaken, match="/t/one"):
         system.spawn(hf.start(One), "one")
     one.kill()
-    await system.node.settled()
+    await system._node.settled()
     again = system.spawn(hf.start(One), "one")
     assert again == one  # refs compare by address
     assert await one.ask(Do(lambda actor: actor.ctx.path)) == "/t/one"

@@ -36,6 +36,6 @@ def test_every_policy_is_decided_and_those_that_drop_are_known() -> None:
     [(0, "block", "capacity"), (True, "block", "capacity"), (1.5, "block", "capacity"), (1, "fail", "overflow")],
 )
 def test_what_is_none_is_refused(capacity: Any, overflow: Any, problem: str) -> None:
-    for choose in (hf.bounded, hf.held, lambda capacity, overflow: check("it", capacity, overflow)):
+    for choose in (hf.bounded, hf.checkpoint.held, lambda capacity, overflow: check("it", capacity, overflow)):
         with pytest.raises(hf.SpecError, match=f"{problem} must be"):
             choose(capacity, overflow=overflow)

@@ -146,7 +146,7 @@ async def test_on_stop_may_still_answer(system: hf.ActorSystem) -> None:
 
     ref = system.spawn(hf.start(Polite))
     asked = ref.ask(Question(), LONG)
-    await system.node.settled()
+    await system._node.settled()
     await system.stop(ref)
     assert await asked == "late"
 
@@ -162,13 +162,13 @@ async def test_a_recorded_actor_keeps_its_promises_over_a_crash(system: hf.Actor
 
 async def test_who_waits_for_a_lock_hears_that_the_registry_is_gone(system: hf.ActorSystem) -> None:
     """Its locks belong to its address: they outlive its lives, and end with it."""
-    spec = hf.registry("names")
-    names: hf.Registry[str, Any] = hf.Registry(await system.start(spec), LONG)
+    spec = hf.supervision.registry("names")
+    names: hf.supervision.Registry[str, Any] = hf.supervision.Registry(await system.start(spec), LONG)
     async with names.lock("k"):
         waiting = asyncio.ensure_future(names.lock("k").__aenter__())
-        await system.node.settled()
+        await system._node.settled()
         names.ref.kill()
-        await system.node.settled()
+        await system._node.settled()
         assert not waiting.done()
         await system.stop(names.ref)
         with pytest.raises(hf.ActorStopped):

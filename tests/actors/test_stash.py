@@ -64,7 +64,7 @@ async def test_stashed_messages_come_back_in_order_before_later_ones(system: hf.
     for number in (1, 2):
         shop.tell(Item(number))
     asked = shop.ask(Item(3))
-    await system.node.settled()
+    await system._node.settled()
     shop.tell(Open())
     shop.tell(Item(4))
     assert await asked == 3
@@ -75,7 +75,7 @@ async def test_stashed_messages_come_back_in_order_before_later_ones(system: hf.
 async def test_a_stashed_ask_has_no_reply_until_it_is_handled(system: hf.ActorSystem) -> None:
     shop = system.spawn(hf.start(Shop))
     asked = shop.ask(Item(1))
-    await system.node.settled()
+    await system._node.settled()
     assert not asked.done()
     await shop.ask(Open())
     assert await asked == 1
@@ -110,7 +110,7 @@ async def test_one_message_instance_sent_twice_is_two_messages(system: hf.ActorS
     shop.tell(same)
     shop.tell(same)
     await shop.ask(Open())
-    await system.node.settled()
+    await system._node.settled()
     assert await shop.ask(Seen()) == [7, 7]
 
 
@@ -118,7 +118,7 @@ async def test_stashing_twice_in_a_turn_is_an_error(system: hf.ActorSystem) -> N
     shop = system.spawn(hf.start(Shop))
     with system.events() as stream:
         shop.tell(Twice())
-        await system.node.settled()
+        await system._node.settled()
         assert any("stashed or forwarded already" in str(getattr(event, "reason", "")) for event in stream.take())
 
 
@@ -139,7 +139,7 @@ async def test_the_stash_is_not_lost_in_a_crash(system: hf.ActorSystem) -> None:
         await shop.ask(Crash())
     shop.tell(Item(3))
     await shop.ask(Open())
-    await system.node.settled()
+    await system._node.settled()
     assert await shop.ask(Seen()) == [1, 2, 3]
     assert shop._cell.life == 2
 
@@ -148,7 +148,7 @@ async def test_stashed_asks_fail_when_the_actor_ends_for_good(system: hf.ActorSy
     shop = system.spawn(hf.start(Shop))
     asked = shop.ask(Item(1))
     shop.tell(Item(2))
-    await system.node.settled()
+    await system._node.settled()
     await system.stop(shop)
     with pytest.raises(hf.ActorStopped):
         await asked
@@ -159,9 +159,9 @@ async def test_a_stashed_message_takes_no_place_until_it_comes_back(system: hf.A
     shop = system.spawn(hf.start(Shop), mailbox=hf.bounded(3, overflow="reject"))
     for number in range(6):
         shop.tell(Item(number))
-        await system.node.settled()
+        await system._node.settled()
     await shop.ask(Open())
-    await system.node.settled()
+    await system._node.settled()
     assert await shop.ask(Seen()) == list(range(6))
     for number in range(3):
         shop.tell(Item(number))

@@ -128,7 +128,7 @@ async def test_a_name_clash_of_children_is_refused(system: hf.ActorSystem) -> No
     with pytest.raises(AlreadyStarted):
         await system.start(hf.child("one", hf.start(Plain)))
     system.spawn(hf.start(Plain), "two")
-    with pytest.raises(hf.NameTaken):
+    with pytest.raises(hf.errors.NameTaken):
         await system.start(hf.child("two", hf.start(Plain)))
     assert system.tree() == ["/t", "/t/one", "/t/two"]
 
@@ -151,7 +151,7 @@ async def test_on_stop_runs_after_a_crash_with_the_crash(system: hf.ActorSystem)
     one = system.spawn(hf.start(Hooked, told))
     with pytest.raises(hf.RemoteCrash):
         await one.ask(Do(lambda _: 1 / 0))
-    await system.node.settled()
+    await system._node.settled()
     assert [type(entry) for entry in told[2:]] == [hf.Crash]
     assert told[2].type_name == "ZeroDivisionError"
 
@@ -161,7 +161,7 @@ async def test_on_stop_does_not_run_when_killed(system: hf.ActorSystem) -> None:
     one = system.spawn(hf.start(Hooked, told))
     await one.ask(Do(lambda _: None))
     one.kill()
-    await system.node.settled()
+    await system._node.settled()
     assert told == ["starting", "started"]
 
 
@@ -180,7 +180,7 @@ async def test_stop_ends_the_turn_in_hand_first(system: hf.ActorSystem) -> None:
     one.stop()
     gate.set()
     assert await asked == "done"
-    await system.node.settled()
+    await system._node.settled()
     assert told == ["starting", "started", hf.SHUTDOWN]
 
 
@@ -286,7 +286,7 @@ async def test_children_end_with_their_parent_however_it_ends(system: hf.ActorSy
     child = await top.ask(Do(lambda actor: actor.ctx.spawn(hf.start(Plain), "child")))
     await child.ask(Do(lambda actor: actor.ctx.spawn(hf.start(Plain), "grandchild") and None))
     top.tell(Do(lambda _: 1 / 0)) if end == "crash" else getattr(top, end)()
-    await system.node.settled()
+    await system._node.settled()
     assert system.tree() == ["/t"]
     with pytest.raises(hf.ActorStopped):
         await child.ask(Do(print))
@@ -457,7 +457,7 @@ async def test_on_stop_may_say_why_the_life_ends(
     with system.events() as events:
         ref.tell(Do(lambda actor: actor.ctx.stop(hf.Shutdown("mine"))))
         assert str(await ended) == reason
-        await system.node.settled()
+        await system._node.settled()
         kinds = [type(event).__name__ for event in events.take()]
     assert told == ["shutdown (mine)"]
     assert ("ChildRestarted" in kinds) is restarted
@@ -479,8 +479,8 @@ async def test_who_stops_with_a_crash_has_crashed(system: hf.ActorSystem, isolat
     with system.events() as events:
         ref.tell(Give())
         await ended
-        await system.node.settled()
-        told = [event for event in events.take() if isinstance(event, hf.ActorCrashed)]
+        await system._node.settled()
+        told = [event for event in events.take() if isinstance(event, hf.events.ActorCrashed)]
     assert [(event.address, str(event.reason)) for event in told] == [("/t/a", "Up: it gives up")]
 
 

@@ -129,7 +129,7 @@ async def test_timers_set_in_an_init_that_fails_do_not_come(system: hf.ActorSyst
         system.spawn(hf.start(Failing), "failing")
     await asyncio.sleep(0)
     assert system.tree() == ["/t"]
-    assert system.node.topics.names() == []
+    assert system._node.topics.names() == []
     assert not kept[0].is_active
 
 

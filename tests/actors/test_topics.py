@@ -16,6 +16,9 @@ class News(hf.Message[None]):
 class Seen(hf.Message[list[int]]): ...
 
 
+class Other(hf.Message): ...
+
+
 class Do(hf.Message[Any]):
     work: Any
 
@@ -71,7 +74,7 @@ async def test_subscriptions_at_run_time(system: hf.ActorSystem) -> None:
     await reader.ask(Do(lambda actor: actor.ctx.unsubscribe("/never")))
     await system.publish("/news", News(2))
     assert await reader.ask(Seen()) == [1]
-    assert system.node.topics.names() == []
+    assert system._node.topics.names() == []
 
 
 async def test_an_actor_publishes_with_itself_as_sender(actor_system: GuardedSystem, probe: Probe) -> None:
@@ -88,7 +91,7 @@ async def test_a_restarted_actor_is_subscribed_as_its_class_says_and_no_more(sys
     with pytest.raises(hf.RemoteCrash):
         await reader.ask(Do(lambda _: 1 / 0))
     await reader.ask(Seen())
-    assert system.node.topics.names() == ["/more", "/news"]
+    assert system._node.topics.names() == ["/more", "/news"]
 
 
 async def test_a_stopped_subscriber_is_forgotten(actor_system: GuardedSystem, probe: Probe) -> None:
@@ -96,7 +99,7 @@ async def test_a_stopped_subscriber_is_forgotten(actor_system: GuardedSystem, pr
     probe.subscribe("/news")
     await probe.stop()
     await actor_system.publish("/news", News(1))
-    assert actor_system.node.topics.names() == []
+    assert actor_system._node.topics.names() == []
 
 
 @pytest.mark.parametrize("inside", [False, True])
@@ -135,6 +138,20 @@ async def test_a_subscriber_that_cannot_take_it_does_not_keep_it_from_the_others
     assert await full.ask(Seen()) in ([0], [0, 1])
 
 
+@pytest.mark.parametrize("inside", [False, True])
+async def test_a_subscriber_gets_only_what_it_has_a_handler_for(system: hf.ActorSystem, inside: bool) -> None:
+    """The rest is for others, and no dead letter."""
+    reader = system.spawn(hf.start(Subscriber))
+    editor = system.spawn(hf.start(Reader))
+    for message in (News(1), Seen(), News(2), Other()):
+        if inside:
+            await editor.ask(Do(lambda actor, message=message: actor.ctx.publish("/news", message)))
+        else:
+            await system.publish("/news", message)
+    assert await reader.ask(Seen()) == [1, 2]
+    assert system.dead_letters == 0
+
+
 async def test_a_slow_subscriber_holds_the_publisher_back(system: hf.ActorSystem) -> None:
     gate = asyncio.Event()
     slow = system.spawn(hf.start(Subscriber), mailbox=hf.bounded(1))
@@ -146,7 +163,7 @@ async def test_a_slow_subscriber_holds_the_publisher_back(system: hf.ActorSystem
     assert not waiting.done()
     gate.set()
     await waiting
-    await system.node.settled()
+    await system._node.settled()
     assert await slow.ask(Seen()) == [0, 1]
 
 

@@ -95,7 +95,7 @@ async def make(name: str, cells: int) -> None:
             for n in (1, 2, 3):
                 await ref.ask(Add(n))
             async for one in stream:
-                if isinstance(one, hf.SnapshotTaken) and one.turn >= 3:
+                if isinstance(one, hf.events.SnapshotTaken) and one.turn >= 3:
                     break
         ref.tell(Lock())
         for n in (4, 5):

@@ -82,15 +82,19 @@ async def words(ref: hf.ActorRef[Any]) -> list[str]:
 
 async def over(system: hf.ActorSystem) -> None:
     """Wait until no recovery is under way and the controller has told of all."""
-    recoveries = system.homes.recoveries
+    recoveries = system._homes.recoveries
     await until(lambda: not recoveries.all() and not recoveries._untold and not recoveries.held)
 
 
 def part(system: hf.ActorSystem, name: str) -> hf.ActorRef[Any]:
     """A part of the recovery: "" is their supervisor."""
-    return system.node.cell_at(f"/app/recovery/{name}".rstrip("/")).ref
+    return system._node.cell_at(f"/app/recovery/{name}".rstrip("/")).ref
 
 
-def phases(events: list[hf.Event], address: str) -> list[tuple[int, str]]:
+def phases(events: list[hf.events.Event], address: str) -> list[tuple[int, str]]:
     """(attempt, phase) of those that were told of."""
-    return [(one.attempt, one.phase) for one in events if isinstance(one, hf.RecoveryPhase) and one.address == address]
+    return [
+        (one.attempt, one.phase)
+        for one in events
+        if isinstance(one, hf.events.RecoveryPhase) and one.address == address
+    ]

@@ -63,7 +63,7 @@ async def step(system: hf.ActorSystem, pool: hf.ActorRef[Any], plan: random.Rand
             await top.ask(hf.RestartChild("ledger", fresh=True), timeout=30.0)
         case "delete":
             say("fresh")
-            spec = await top.ask(hf.GetChildSpec("ledger"), timeout=30.0)
+            spec = await top.ask(hf.supervision.GetChildSpec("ledger"), timeout=30.0)
             await top.ask(hf.TerminateChild("ledger"), timeout=30.0)
             await top.ask(hf.DeleteChild("ledger"), timeout=30.0)
             await top.ask(hf.StartChild(spec), timeout=30.0)

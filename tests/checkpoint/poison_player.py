@@ -52,9 +52,9 @@ class Patient(Worker):
 
 
 async def main(store: str, kind: type[Worker], first: bool) -> None:
-    told: list[hf.Event] = []
+    told: list[hf.events.Event] = []
     async with hf.ActorSystem("app", store=f"sqlite:{store}", log=False) as system:
-        system.node.events.add_sink(told.append)
+        system._node.events.add_sink(told.append)
         recovery = hf.hybrid(interval=1000.0, max_deliveries=DELIVERIES)
         sick, well = [
             await system.start(hf.child(name, hf.start(kind), recovery=recovery)) for name in ("sick", "well")
@@ -64,7 +64,7 @@ async def main(store: str, kind: type[Worker], first: bool) -> None:
             await asyncio.gather(sick.send(Work(kills=True)), sick.send(Work()), well.send(Work()))
         have = [await one.ask(Get(), timeout=60.0) for one in (sick, well)]
         held = [(one.address, one.attempts) for one in system.quarantined()]
-        events = sum(isinstance(event, hf.MessageQuarantined) for event in told)
+        events = sum(isinstance(event, hf.events.MessageQuarantined) for event in told)
         sys.stdout.write(json.dumps([have, held, events]))
 
 

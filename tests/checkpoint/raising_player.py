@@ -66,12 +66,12 @@ async def main(store: str, life: str) -> None:
                     await ref.send(Ping())
                 while not all(marker.exists() for marker in markers):
                     await asyncio.sleep(0)
-                await system.homes.settled()
+                await system._homes.settled()
                 os.kill(os.getpid(), signal.SIGKILL)
             pings = [await ref.ask(Seen(), timeout=50.0) for ref in refs]
             told = events.take()
-        crashes = sorted(event.address for event in told if isinstance(event, hf.ActorCrashed))
-        restarted = sorted(event.address for event in told if isinstance(event, hf.ChildRestarted))
+        crashes = sorted(event.address for event in told if isinstance(event, hf.events.ActorCrashed))
+        restarted = sorted(event.address for event in told if isinstance(event, hf.events.ChildRestarted))
         print(json.dumps([pings, crashes, restarted]))
 
 

@@ -106,7 +106,7 @@ async def main(store: str, how: str, order: str, life: str) -> None:
                 await asyncio.sleep(0)
             if how == "saved":  # The debt is in the snapshot alone.
                 await system.checkpoint(oracle)
-            await system.homes.settled()
+            await system._homes.settled()
             os.kill(os.getpid(), signal.SIGKILL)
         answers: list[int] = []
         while len(answers) < 2:

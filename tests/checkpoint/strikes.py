@@ -12,7 +12,7 @@ import holdfast as hf
 from holdfast.checkpoint.home.recorded_home import switch_of
 from tests.checkpoint.players import Doer, Sink, start, until
 
-E = TypeVar("E", bound=hf.Event)
+E = TypeVar("E", bound=hf.events.Event)
 NEVER = 3600.0
 
 
@@ -34,7 +34,7 @@ def strike(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
         os.kill(pid, signal.SIGKILL)
 
 
-async def event(stream: hf.EventStream, kind: type[E]) -> E:
+async def event(stream: hf.events.EventStream, kind: type[E]) -> E:
     async with asyncio.timeout(30.0):
         async for one in stream:
             if isinstance(one, kind):
@@ -42,11 +42,11 @@ async def event(stream: hf.EventStream, kind: type[E]) -> E:
     raise AssertionError(f"no {kind.__name__}")
 
 
-async def struck(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> hf.Recovered:
+async def struck(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> hf.events.Recovered:
     """Strike, and wait until it is back."""
     with system.events() as stream:
         strike(system, ref)
-        return await event(stream, hf.Recovered)
+        return await event(stream, hf.events.Recovered)
 
 
 def let_through(gate: Path) -> None:

@@ -74,7 +74,8 @@ OUTCOMES = {
     "a reply": "7",
     "a refusal": "refused: not now",
     "a crash": "RemoteCrash: ValueError: boom",
-    "nonsense": "BadMessage: object to reply: a value of type object cannot be sent",
+    "nonsense": "BadReply: a reply could not be sent, though its turn has run: object: "
+    "a value of type object cannot be sent",
 }
 
 

@@ -100,7 +100,7 @@ async def test_work_that_ends_without_a_message_crashes_the_actor_once(
             worker.tell(Begin(how))
             async with asyncio.timeout(30.0):
                 async for event in stream:
-                    if isinstance(event, hf.ActorCrashed):
+                    if isinstance(event, hf.events.ActorCrashed):
                         break
         assert await worker.ask(Lives(), timeout=30.0) == (2, [])
         if method is not None:  # Nothing is held for it any more.

@@ -149,4 +149,4 @@ async def test_what_has_sent_something_comes_before_what_a_hook_puts_back(
         ref.kill()
     assert await asyncio.gather(*put) == [1, 2]
     assert await ref.ask(Read(), timeout=25.0) == [3, 1, 2]
-    assert not [one for one in events.take() if isinstance(one, hf.RecoveryFailed)]
+    assert not [one for one in events.take() if isinstance(one, hf.events.RecoveryFailed)]

@@ -143,7 +143,7 @@ async def test_nothing_is_lost_doubled_or_reordered_whoever_dies(system: hf.Acto
             for victim in chance.sample(members, chance.choice((1, 1, 1, 2))):
                 try:
                     pid = system.pid_of(victim)
-                except hf.NoSuchActor:
+                except hf.errors.NoSuchActor:
                     continue  # It is being recovered.
                 if pid == os.getpid():
                     victim.kill()

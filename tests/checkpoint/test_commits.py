@@ -154,7 +154,7 @@ async def test_without_room_what_can_be_refused_is_and_the_rest_waits(engine: An
         commits.admit(Effect("accepted", done))
         await ticks()
         assert done[-1] == "accepted"
-    assert [type(one) for one in events] == [hf.JournalBlocked, hf.JournalGoesOn]
+    assert [type(one) for one in events] == [hf.events.JournalBlocked, hf.events.JournalGoesOn]
 
 
 async def test_a_failed_sync_stops_it_for_good(engine: Any) -> None:
@@ -176,7 +176,7 @@ async def test_a_failed_sync_stops_it_for_good(engine: Any) -> None:
                 call()
         await ticks()
         assert done == ["message refused"]
-    assert [type(one) for one in events] == [hf.JournalStopped]
+    assert [type(one) for one in events] == [hf.events.JournalStopped]
 
 
 async def test_without_a_thread_to_be_had_the_loop_itself_waits_for_the_disk(
@@ -241,14 +241,14 @@ async def test_nothing_counts_before_the_sync(engine: Any, isolation: str) -> No
         engine.let_sync.set()
         doer = await start(system, isolation, "doer", hf.start(Doer), recovery=hf.hybrid(interval=1000.0))
         sink = system.spawn(hf.start(Sink), "sink")
-        await system.homes.settled()
+        await system._homes.settled()
         engine.let_sync.clear()
         reply = doer.ask(Do(["add a", "tell out"], sink), timeout=30.0)
         sent = asyncio.ensure_future(doer.send(Note("b")))
         waiting: list[asyncio.Future[Any]] = [reply, sent]
         done, _ = await asyncio.wait(waiting, timeout=0.1)
         assert done == set()
-        home = system.homes.at(doer.path)
+        home = system._homes.at(doer.path)
         assert home is not None
         assert home.turn == 0  # on_start: nothing was fed.
         engine.let_sync.set()
@@ -261,18 +261,18 @@ async def test_the_death_of_an_actor_before_the_sync_feeds_nothing_twice(engine:
     async with hf.ActorSystem("app", log=False, store=engine, durability="fsync", intensity=1000) as system:
         engine.let_sync.set()
         doer = await start(system, isolation, "doer", hf.start(Doer), recovery=hf.hybrid(interval=1000.0))
-        await system.homes.settled()
+        await system._homes.settled()
         engine.let_sync.clear()
         replies = [doer.ask(Note(text), timeout=30.0) for text in "abc"]
         await ticks()
         with system.events() as events:
             doer.kill()
             async for event in events:
-                if isinstance(event, hf.Recovered):
+                if isinstance(event, hf.events.Recovered):
                     break
         later = doer.ask(Note("d"), timeout=30.0)
         await asyncio.sleep(0.05)
-        home = system.homes.at(doer.path)
+        home = system._homes.at(doer.path)
         assert home is not None
         assert home.turn == 0  # The new life has been fed nothing that is not safe.
         engine.let_sync.set()
@@ -327,13 +327,13 @@ async def test_what_was_published_and_has_no_room_is_a_dead_letter_and_the_other
         with system.events() as events:
             await station.ask(Spread("b"), timeout=30.0)
             assert await other.ask(Seen(), timeout=30.0) == ["a", "b"]
-            await system.homes.settled()
-            letters = [one for one in events.take() if isinstance(one, hf.DeadLetter)]
+            await system._homes.settled()
+            letters = [one for one in events.take() if isinstance(one, hf.events.DeadLetter)]
             assert [(one.address, "no room" in one.why) for one in letters] == [(doer.path, True)]
             engine.full = False
             async with asyncio.timeout(30.0):
                 async for event in events:
-                    if isinstance(event, hf.JournalGoesOn):
+                    if isinstance(event, hf.events.JournalGoesOn):
                         break
         assert await doer.ask(Seen(), timeout=30.0) == ["a"]
 
@@ -351,7 +351,7 @@ async def test_a_turn_that_ends_without_room_answers_when_there_is(engine: Any, 
         await until(gate.exists)
         engine.full = True
         Path(f"{gate}.open").touch()
-        home = system.homes.at(doer.path)
+        home = system._homes.at(doer.path)
         assert home is not None
         await until(lambda: home.turn == 1)
         await asyncio.sleep(0.1)
@@ -372,7 +372,7 @@ async def test_a_snapshot_has_timers_and_topics_that_have_not_taken_effect_yet(
         await until(gate.exists)
         engine.let_sync.clear()
         Path(f"{gate}.open").touch()
-        home = system.homes.at(doer.path)
+        home = system._homes.at(doer.path)
         assert home is not None
         await until(lambda home=home: home.turn == 1)
         assert home.life.port is not None
@@ -385,7 +385,7 @@ async def test_a_snapshot_has_timers_and_topics_that_have_not_taken_effect_yet(
         engine.let_sync.set()
     async with hf.ActorSystem("app", log=False, store=f"sqlite:{tmp_path / 'app.db'}") as system:
         doer = await system.start(hf.child("doer", hf.start(Doer), recovery=recovery))
-        home = system.homes.at(doer.path)
+        home = system._homes.at(doer.path)
         assert home is not None
         assert (len(home.timers.saved()), list(home.topics)) == (1, ["/news"])
 
@@ -408,7 +408,7 @@ async def test_a_real_disk_without_room(tmp_path: Path) -> None:
             await fill()
         refused = accepted.pop()
         db.execute("PRAGMA max_page_count = 100000")
-        await until(lambda: system.homes.journal.blocked is None)
+        await until(lambda: system._homes.journal.blocked is None)
         await doer.ask(Note("last"), timeout=30.0)
         assert await doer.ask(Seen(), timeout=30.0) in ([*accepted, "last"], [*accepted, refused, "last"])
     async with hf.ActorSystem("app", log=False, store=f"sqlite:{tmp_path / 'app.db'}") as system:
@@ -420,7 +420,7 @@ async def test_a_killed_message_handler_loses_nothing(isolation: str, tmp_path: 
     store = f"sqlite:{tmp_path / 'app.db'}"
     async with hf.ActorSystem("app", log=False, store=store, durability="fsync", intensity=1000) as system:
         doer = await start(system, isolation, "doer", hf.start(Doer), recovery=hf.hybrid(interval=0.05))
-        await until(lambda: system.homes.journal.wake_handler is not None)  # It is up.
+        await until(lambda: system._homes.journal.wake_handler is not None)  # It is up.
         handler = system.ref("/app/recovery/messages", hf.Actor)
         replies: list[Any] = []
         for n in range(300):

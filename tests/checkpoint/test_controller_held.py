@@ -26,9 +26,9 @@ class Held:
 
     def __init__(self, point: str = "release") -> None:
         self.reached, self.go_on = asyncio.Event(), asyncio.Event()
-        self.hooks = hf.recovery_hooks(before={point: self._wait}, timeout=30.0)  # type: ignore[dict-item]
+        self.hooks = hf.checkpoint.recovery_hooks(before={point: self._wait}, timeout=30.0)  # type: ignore[dict-item]
 
-    async def _wait(self, step: hf.RecoveryStep) -> None:
+    async def _wait(self, step: hf.checkpoint.RecoveryStep) -> None:
         self.reached.set()
         await self.go_on.wait()
 
@@ -40,7 +40,7 @@ class Held:
     async def let_go(self, system: hf.ActorSystem) -> None:
         """Let it go on, and see that it comes to its end."""
         self.go_on.set()
-        await until(lambda: not system.homes.recoveries.all())
+        await until(lambda: not system._homes.recoveries.all())
         self.go_on.clear()
         self.reached.clear()
 
@@ -62,7 +62,7 @@ async def test_tells_beyond_the_capacity(
     held = Held()
     capacity = 1 if overflow == "latest" else 3
     async with running(store, recovery_hooks=held.hooks) as system:
-        ref = await doer(system, isolation, held=hf.held(capacity, overflow=overflow))
+        ref = await doer(system, isolation, held=hf.checkpoint.held(capacity, overflow=overflow))
         await ref.ask(Note("before"))
         await system.suspend(ref)
         ref.tell(Note("waits"))
@@ -74,13 +74,13 @@ async def test_tells_beyond_the_capacity(
                     ref.tell(Note(str(n)))
                 except hf.MailboxFull:
                     failures += 1
-            letters = [one.message.text for one in stream.take() if isinstance(one, hf.DeadLetter)]
+            letters = [one.message.text for one in stream.take() if isinstance(one, hf.events.DeadLetter)]
             if store is not None:  # What a root would find that is started now.
                 home: Any = ref._cell.host.home.switch  # type: ignore[attr-defined]
-                stored = Switch(system.homes, ref._cell, hf.hybrid(), system.homes.journal)
+                stored = Switch(system._homes, ref._cell, hf.hybrid(), system._homes.journal)
                 assert list(stored.open) == list(home.open), "drops are journaled"
             await held.let_go(system)
-            told = await event(stream, hf.HeldMessages)
+            told = await event(stream, hf.events.HeldMessages)
         expected = ["before", "waits", *kept]
         assert await ref.ask(Seen(), timeout=30.0) == expected
         assert failures == refused
@@ -98,7 +98,7 @@ async def test_tells_beyond_the_capacity(
 async def test_sends_and_asks_wait_at_block_and_come_behind_what_is_held(isolation: str) -> None:
     held = Held()
     async with running(recovery_hooks=held.hooks) as system:
-        ref = await doer(system, isolation, held=hf.held(2))
+        ref = await doer(system, isolation, held=hf.checkpoint.held(2))
         await held.strike(system, ref)
         ref.tell(Note("1"))
         ref.tell(Note("2"))
@@ -120,7 +120,7 @@ async def test_held_asks_keep_their_deadline(isolation: str) -> None:
     """T20: in time it is answered, else not run."""
     held = Held()
     async with running(recovery_hooks=held.hooks) as system:
-        ref = await doer(system, isolation, held=hf.held(10))
+        ref = await doer(system, isolation, held=hf.checkpoint.held(10))
         await held.strike(system, ref)
         late, patient = ref.ask(Note("late"), timeout=0.05), ref.ask(Note("patient"), timeout=30.0)
         with pytest.raises(hf.AskTimeout):
@@ -134,7 +134,7 @@ async def test_held_asks_keep_their_deadline(isolation: str) -> None:
 async def test_an_ask_that_loses_its_place_hears_of_it(isolation: str, overflow: Any) -> None:
     held = Held()
     async with running(recovery_hooks=held.hooks) as system:
-        ref = await doer(system, isolation, held=hf.held(1, overflow=overflow))
+        ref = await doer(system, isolation, held=hf.checkpoint.held(1, overflow=overflow))
         await held.strike(system, ref)
         first, second = ref.ask(Note("first"), timeout=30.0), ref.ask(Note("second"), timeout=30.0)
         loser, winner = (second, first) if overflow in ("reject", "drop_newest") else (first, second)
@@ -148,8 +148,8 @@ async def test_a_send_from_a_recorded_turn_waits_too(isolation: str) -> None:
     held = Held()
     hooks = held.hooks
     async with running() as system:
-        system.homes.recoveries.hooks = hooks
-        ref, sender = await doer(system, isolation, held=hf.held(2)), await doer(system, "task", "sender")
+        system._homes.recoveries.hooks = hooks
+        ref, sender = await doer(system, isolation, held=hf.checkpoint.held(2)), await doer(system, "task", "sender")
         await held.strike(system, ref)
         sent = sender.ask(Do(["send a", "send b", "add done"], ref), timeout=30.0)
         await until(lambda: ref._cell.host.home.switch.ledger.backlog(-1) >= 2)  # type: ignore[attr-defined]
@@ -202,14 +202,14 @@ class Talker(hf.Actor):
 @pytest.mark.parametrize("publisher", ["outside", "task", "process", "recorded"])
 async def test_each_topic_has_its_own_rule(store: str | None, isolation: str, publisher: str) -> None:
     held = Held()
-    rules = {"/scan": hf.held(1, overflow="latest"), "*": hf.held(100, overflow="reject")}
+    rules = {"/scan": hf.checkpoint.held(1, overflow="latest"), "*": hf.checkpoint.held(100, overflow="reject")}
     async with running(store) as system:
         ref = await start(system, isolation, "driver", hf.start(Driver), recovery=hf.hybrid(3600.0, held=rules))
         kind: Any = "process" if publisher == "process" else "task"
         recovery = hf.hybrid() if publisher == "recorded" else None
         talker = await system.start(hf.child("talker", hf.start(Talker), isolation=kind, recovery=recovery))
         await system.publish("/scan", Scan(-1))
-        system.homes.recoveries.hooks = held.hooks
+        system._homes.recoveries.hooks = held.hooks
         for _ in range(2):
             await held.strike(system, ref)
             if publisher == "outside":
@@ -233,9 +233,9 @@ async def test_a_bounded_mailbox_keeps_its_own_rule_as_well(isolation: str) -> N
     held = Held()
     async with running() as system:
         options: Any = {"mailbox": hf.bounded(2, overflow="reject")}
-        recovery = hf.hybrid(3600.0, held=hf.held(5))
+        recovery = hf.hybrid(3600.0, held=hf.checkpoint.held(5))
         ref = await start(system, isolation, "doer", hf.start(Doer), recovery=recovery, **options)
-        system.homes.recoveries.hooks = held.hooks
+        system._homes.recoveries.hooks = held.hooks
         await held.strike(system, ref)
         ref.tell(Note("1"))
         ref.tell(Note("2"))
@@ -250,7 +250,7 @@ async def test_a_bounded_mailbox_keeps_its_own_rule_as_well(isolation: str) -> N
 async def test_whoever_waits_hears_when_the_actor_is_given_up(isolation: str) -> None:
     held = Held()
     async with running(recovery_hooks=held.hooks) as system:
-        ref = await doer(system, isolation, held=hf.held(1))
+        ref = await doer(system, isolation, held=hf.checkpoint.held(1))
         ref.kill()
         await held.reached.wait()
         ref.tell(Note("held"))
@@ -283,7 +283,7 @@ async def test_nothing_of_a_dead_or_replaying_life_gets_out(
         await ref.ask(Do(["tell one", "ask two", "send three", "after 3600", "subscribe /none"], notes), timeout=30.0)
         unfinished = ref.ask(Do(["tell four", f"pipe {gate}", f"gate {gate}x", "tell five"], notes), timeout=20.0)
         await until(lambda: Path(f"{gate}x").exists())
-        system.homes.recoveries.hooks = held.hooks
+        system._homes.recoveries.hooks = held.hooks
         await held.strike(system, ref)
         for _ in range(20):
             await asyncio.sleep(0.005)

@@ -32,7 +32,7 @@ class Overlap(RuleBasedStateMachine):
             f"/m/{name}": await self.system.start(hf.child(name, hf.start(Wheels))) for name in ("wheels", "arm")
         }
         await self.system.start(hf.child("recorded", hf.start(Wheels), recovery=hf.hybrid()))
-        self.recoveries = self.system.homes.recoveries
+        self.recoveries = self.system._homes.recoveries
 
     def changed(self, path: str, before: set[str], after: set[str]) -> None:
         for receiver, told in self.expected.items():

@@ -29,7 +29,7 @@ async def test_each_phase_is_told_of_once_with_its_time(store: str | None, isola
             await until(lambda: robot._cell.life == 2 and robot._cell.host.home.switch.life.is_released)  # type: ignore[attr-defined]
             await over(system)
             events = stream.take()
-    told = [one for one in events if isinstance(one, hf.RecoveryPhase)]
+    told = [one for one in events if isinstance(one, hf.events.RecoveryPhase)]
     assert phases(events, robot.path) == [(1, phase) for phase in ["detect", *ORDER]]
     assert {one.recovery for one in told} == {1}
     assert all(one.seconds >= 0 for one in told)
@@ -41,18 +41,18 @@ async def test_hooks_are_called_in_order_and_the_recovery_waits_for_them(isolati
     called: list[tuple[str, str]] = []
     released: list[bool] = []
 
-    def note(step: hf.RecoveryStep) -> None:
+    def note(step: hf.checkpoint.RecoveryStep) -> None:
         called.append((step.when, step.phase))
         released.append(robot._cell.host.home.switch.life.is_released)  # type: ignore[attr-defined]
 
-    async def note_later(step: hf.RecoveryStep) -> None:
+    async def note_later(step: hf.checkpoint.RecoveryStep) -> None:
         await asyncio.sleep(0.01)
         note(step)
 
     sides: dict[str, Any] = {"before": {}, "after": {}}
     for index, (when, phase) in enumerate(POINTS):
         sides[when][phase] = note if index % 2 else note_later
-    async with running(recovery_hooks=hf.recovery_hooks(**sides)) as system:
+    async with running(recovery_hooks=hf.checkpoint.recovery_hooks(**sides)) as system:
         ref = await wheels(system)
         robot = await planner(system, isolation)
         called.clear()
@@ -74,8 +74,8 @@ async def test_hooks_are_called_in_order_and_the_recovery_waits_for_them(isolati
 @pytest.mark.parametrize("isolation", ["task", "process"])
 async def test_a_child_has_hooks_of_its_own_besides_those_of_the_system(isolation: str) -> None:
     called: list[str] = []
-    hooks = hf.recovery_hooks(before={"restart": lambda step: called.append("the system's")})
-    own = hf.recovery_hooks(before={"restart": lambda step: called.append(f"its own, of {step.address}")})
+    hooks = hf.checkpoint.recovery_hooks(before={"restart": lambda step: called.append("the system's")})
+    own = hf.checkpoint.recovery_hooks(before={"restart": lambda step: called.append(f"its own, of {step.address}")})
     async with running(recovery_hooks=hooks) as system:
         robot, other = await doer(system, isolation, hooks=own), await doer(system, isolation, "other")
         await struck(system, robot)
@@ -84,7 +84,7 @@ async def test_a_child_has_hooks_of_its_own_besides_those_of_the_system(isolatio
 
 
 async def test_hooks_below_a_process_are_refused_with_what_to_do(isolation: str) -> None:
-    own = hf.recovery_hooks(before={"restart": print})
+    own = hf.checkpoint.recovery_hooks(before={"restart": print})
     async with running() as system:
         if isolation == "subtree":
             with pytest.raises(hf.SpecError):
@@ -96,24 +96,24 @@ async def test_hooks_below_a_process_are_refused_with_what_to_do(isolation: str)
 @pytest.mark.parametrize("point", POINTS)
 @pytest.mark.parametrize("fault", ["raises", "hangs", "swallows"])
 async def test_a_hook_that_fails_or_hangs_stops_nothing(point: tuple[str, str], fault: str) -> None:
-    async def bad(step: hf.RecoveryStep) -> None:
+    async def bad(step: hf.checkpoint.RecoveryStep) -> None:
         if fault == "raises":
             raise OSError("no luck")
         await asyncio.sleep(3600.0)
 
-    def bad_now(step: hf.RecoveryStep) -> None:
+    def bad_now(step: hf.checkpoint.RecoveryStep) -> None:
         raise OSError("no luck")
 
     when, phase = point
     hook = bad_now if fault == "swallows" else bad
     sides: Any = {when: {phase: hook}}
-    async with running(recovery_hooks=hf.recovery_hooks(**sides, timeout=0.05)) as system:
+    async with running(recovery_hooks=hf.checkpoint.recovery_hooks(**sides, timeout=0.05)) as system:
         ref = await wheels(system)
         robot = await planner(system, "task")
         await robot.ask(Note("one"))
         with system.events() as stream:
             robot.kill()
-            failed = await event(stream, hf.RecoveryHookFailed)
+            failed = await event(stream, hf.events.RecoveryHookFailed)
         await over(system)
         assert (failed.address, failed.hook) == (robot.path, f"{when} {phase}")
         assert ("no luck" in failed.reason) == (fault != "hangs")
@@ -130,7 +130,7 @@ async def test_a_part_is_killed_at_every_point(point: tuple[str, str], victim: s
     """T18: the recovery ends all the same, and safe state is entered and left once."""
     killed = 0
 
-    async def kill(step: hf.RecoveryStep) -> None:
+    async def kill(step: hf.checkpoint.RecoveryStep) -> None:
         nonlocal killed
         if not killed:
             killed += 1
@@ -138,7 +138,7 @@ async def test_a_part_is_killed_at_every_point(point: tuple[str, str], victim: s
             await asyncio.sleep(0.01)
 
     sides: Any = {point[0]: {point[1]: kill}}
-    async with running(recovery_hooks=hf.recovery_hooks(**sides)) as system:
+    async with running(recovery_hooks=hf.checkpoint.recovery_hooks(**sides)) as system:
         ref = await wheels(system)
         robot, notes = await planner(system, "task"), await sink(system)
         await robot.ask(Do(["tell one", "add one"], notes))
@@ -146,7 +146,7 @@ async def test_a_part_is_killed_at_every_point(point: tuple[str, str], victim: s
             strike(system, robot)
             asked = robot.ask(Do(["tell two", "add two"], notes), timeout=30.0)
             assert await asked == "2"
-            await until(lambda: not system.homes.recoveries.all())
+            await until(lambda: not system._homes.recoveries.all())
             await until(
                 lambda: part(system, "controller")._cell.life > 0 and bool(part(system, "controller")._cell.actor)
             )
@@ -161,7 +161,7 @@ async def test_a_part_is_killed_at_every_point(point: tuple[str, str], victim: s
 @pytest.mark.parametrize("victim", PARTS)
 async def test_a_part_that_is_down_for_good_is_not_waited_for(isolation: str, victim: str) -> None:
     called: list[str] = []
-    hooks = hf.recovery_hooks(before={"restart": lambda step: called.append("x")}, timeout=3600.0)
+    hooks = hf.checkpoint.recovery_hooks(before={"restart": lambda step: called.append("x")}, timeout=3600.0)
     async with running(recovery_hooks=hooks) as system:
         ref = await wheels(system)
         robot = await planner(system, isolation)
@@ -173,7 +173,7 @@ async def test_a_part_that_is_down_for_good_is_not_waited_for(isolation: str, vi
             await until(lambda: part(system, victim)._cell.actor is None)
         async with asyncio.timeout(30.0):
             await struck(system, robot)
-            await until(lambda: not system.homes.recoveries.all())
+            await until(lambda: not system._homes.recoveries.all())
         assert await words(ref) == ["safe", "free"]
         assert await robot.ask(Seen()) == ["one"]
         if victim:  # Their supervisor is started again, perhaps in time.
@@ -184,19 +184,19 @@ async def test_a_controller_that_ends_for_good_with_a_hook_in_hand(isolation: st
     """The recovery waits for that hook, which would take an hour; not for a controller that is no more."""
     reached = asyncio.Event()
 
-    async def wait(step: hf.RecoveryStep) -> None:
+    async def wait(step: hf.checkpoint.RecoveryStep) -> None:
         reached.set()
         await asyncio.sleep(3600.0)
 
-    async with running(recovery_hooks=hf.recovery_hooks(before={"restart": wait}, timeout=7200.0)) as system:
+    async with running(recovery_hooks=hf.checkpoint.recovery_hooks(before={"restart": wait}, timeout=7200.0)) as system:
         ref = await wheels(system)
         robot = await planner(system, isolation)
         with system.events() as stream:
             robot.kill()
             await reached.wait()
             await system.stop(part(system, "controller"))
-            await event(stream, hf.Recovered)
-        await until(lambda: not system.homes.recoveries.all())
+            await event(stream, hf.events.Recovered)
+        await until(lambda: not system._homes.recoveries.all())
         assert await words(ref) == ["safe", "free"]
 
 
@@ -251,7 +251,7 @@ async def test_the_actor_ends_again_in_each_phase(isolation: str, point: tuple[s
     """R44, T17: whatever there is of its life is killed; what was done stays done, what was not is done."""
     times = 0
 
-    async def again(step: hf.RecoveryStep) -> None:
+    async def again(step: hf.checkpoint.RecoveryStep) -> None:
         nonlocal times
         times += 1
         if times <= 2:
@@ -263,7 +263,7 @@ async def test_the_actor_ends_again_in_each_phase(isolation: str, point: tuple[s
                 await until(lambda: cell.life != life or cell.state != "running")
 
     sides: Any = {point[0]: {point[1]: again}}
-    async with running(recovery_hooks=hf.recovery_hooks(**sides)) as system:
+    async with running(recovery_hooks=hf.checkpoint.recovery_hooks(**sides)) as system:
         ref = await wheels(system)
         robot, notes = await planner(system, isolation), await sink(system)
         times = -1000
@@ -281,11 +281,11 @@ async def test_a_child_that_is_terminated_in_the_middle_stays_away(isolation: st
     """Its recovery waits at a hook when the supervisor gives the child up."""
     reached, go_on = asyncio.Event(), asyncio.Event()
 
-    async def wait(step: hf.RecoveryStep) -> None:
+    async def wait(step: hf.checkpoint.RecoveryStep) -> None:
         reached.set()
         await go_on.wait()
 
-    async with running(recovery_hooks=hf.recovery_hooks(before={"restart": wait}, timeout=30.0)) as system:
+    async with running(recovery_hooks=hf.checkpoint.recovery_hooks(before={"restart": wait}, timeout=30.0)) as system:
         await wheels(system)
         robot = await planner(system, isolation)
         with system.events() as stream:
@@ -293,7 +293,7 @@ async def test_a_child_that_is_terminated_in_the_middle_stays_away(isolation: st
             await reached.wait()
             assert robot._cell.state == "down"
             stopping = asyncio.ensure_future(system.stop(robot))
-            kept = await event(stream, hf.SafeStateKept)
+            kept = await event(stream, hf.events.SafeStateKept)
             go_on.set()
             await stopping
         assert kept.address == robot.path
@@ -305,11 +305,11 @@ async def test_a_sibling_has_it_started_anew_in_the_middle(kind: Any) -> None:
     """one_for_all: the start that waits at a hook is given up; there is one new life, not two."""
     reached, go_on = asyncio.Event(), asyncio.Event()
 
-    async def wait(step: hf.RecoveryStep) -> None:
+    async def wait(step: hf.checkpoint.RecoveryStep) -> None:
         reached.set()
         await go_on.wait()
 
-    recovery = hf.hybrid(3600.0, hooks=hf.recovery_hooks(before={"restart": wait}, timeout=30.0))
+    recovery = hf.hybrid(3600.0, hooks=hf.checkpoint.recovery_hooks(before={"restart": wait}, timeout=30.0))
     async with running() as system:
         children = [
             hf.child("sibling", hf.start(Doer)),
@@ -333,11 +333,11 @@ async def test_a_sibling_has_it_started_anew_in_the_middle(kind: Any) -> None:
 async def test_a_system_ends_in_the_middle_of_a_recovery(isolation: str) -> None:
     reached = asyncio.Event()
 
-    async def wait(step: hf.RecoveryStep) -> None:
+    async def wait(step: hf.checkpoint.RecoveryStep) -> None:
         reached.set()
         await asyncio.sleep(3600.0)
 
-    async with running(recovery_hooks=hf.recovery_hooks(before={"restart": wait}, timeout=7200.0)) as system:
+    async with running(recovery_hooks=hf.checkpoint.recovery_hooks(before={"restart": wait}, timeout=7200.0)) as system:
         await wheels(system)
         robot = await planner(system, isolation)
         strike(system, robot)
@@ -355,7 +355,7 @@ async def test_a_recovery_that_is_given_up_is_over_and_the_next_one_counts_anew(
             strike(system, robot)
             await until(lambda: robot._cell.is_dead)
             await over(system)
-            told = [one for one in stream.take() if isinstance(one, hf.RecoveryPhase)]
+            told = [one for one in stream.take() if isinstance(one, hf.events.RecoveryPhase)]
     assert [(one.recovery, one.attempt, one.phase) for one in told] == [
         (1, 1, "detect"),
         *((2, 1, one) for one in ORDER),

@@ -45,7 +45,7 @@ class Player(hf.Actor):
 async def failure(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> str:
     with system.events() as stream:
         strike(system, ref)
-        return (await event(stream, hf.RecoveryFailed)).reason
+        return (await event(stream, hf.events.RecoveryFailed)).reason
 
 
 async def player(system: hf.ActorSystem, isolation: str) -> hf.ActorRef[Player]:
@@ -149,6 +149,6 @@ async def test_a_message_that_the_actor_does_not_know_is_a_dead_letter(isolation
             await other.ask(Do(["tell unknown"], blind), timeout=30.0)
             async with asyncio.timeout(30.0):
                 async for one in stream:
-                    if isinstance(one, hf.DeadLetter):
+                    if isinstance(one, hf.events.DeadLetter):
                         break
         assert await ref.ask(Roll(), timeout=30.0)

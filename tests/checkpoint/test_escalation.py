@@ -26,11 +26,11 @@ async def two_snapshots(system: hf.ActorSystem) -> None:
     await add(system, "c")
 
 
-async def rolled_back(system: hf.ActorSystem, isolation: str) -> list[hf.RolledBack]:
+async def rolled_back(system: hf.ActorSystem, isolation: str) -> list[hf.events.RolledBack]:
     with system.events() as stream:
         await escalate(system, isolation)
         await seen(system)
-        return [one for one in stream.take() if isinstance(one, hf.RolledBack)]
+        return [one for one in stream.take() if isinstance(one, hf.events.RolledBack)]
 
 
 async def test_the_second_time_an_older_snapshot_comes_back_and_only_to_whom_it_was_due(
@@ -77,7 +77,7 @@ async def test_the_method_says_what_comes_back(
         await add(system, "new")
         with system.events() as stream:
             at(system).tell(Do(["raise again"]))
-            await back(stream, hf.ChildRestarted, "/app/top")
+            await back(stream, hf.events.ChildRestarted, "/app/top")
         if options["on_escalate"] != "restore":  # What was undone does not come back, not as an "older" one either.
             assert not {"b", "c"} & set(await seen(system))
     if store is not None and options["on_escalate"] != "restore":
@@ -110,7 +110,7 @@ async def test_what_has_left_stays_out_and_what_was_not_handled_stays_queued(
         await at(system).send(Do(["add last"]))
         with system.events() as stream:
             Path(f"{gate}.open").touch()
-            await back(stream, hf.RolledBack)
+            await back(stream, hf.events.RolledBack)
         expected = [*(["a"] if to == "older_snapshot" else []), "queued", "last"]
         assert await seen(system) == expected
         assert await notes.ask(Notes()) == ["undone", "queued"]
@@ -132,7 +132,7 @@ async def test_a_turn_that_has_let_something_out_ends_with_the_state_it_began_wi
         dead = system.dead_letters
         with system.events() as stream:
             at(system).kill()
-            await back(stream, hf.RolledBack)
+            await back(stream, hf.events.RolledBack)
         Path(f"{gate}.open").touch()
         await seen(system)
         await add(system, "new")
@@ -173,13 +173,13 @@ async def test_who_is_started_by_hand_after_an_escalation_has_left_it_behind(sto
         await add(system, "a")
         with system.events() as stream:
             at(system).tell(Do(["raise it"]))
-            await back(stream, hf.SupervisorGaveUp, "/app/top")
+            await back(stream, hf.events.SupervisorGaveUp, "/app/top")
         await until(lambda: "/app/top" not in system.tree())
         await system.ref("/app", hf.Supervisor).ask(hf.RestartChild("top"), timeout=20.0)
         assert await seen(system) == ["a"]
         with system.events() as stream:
             top(system).kill()
-            await back(stream, hf.ChildRestarted, "/app/top")
+            await back(stream, hf.events.ChildRestarted, "/app/top")
         assert await seen(system) == ["a"]
 
 
@@ -198,7 +198,7 @@ async def test_an_escalation_through_two_supervisors_counts_for_the_one_it_began
                 ref = system.ref(path, hf.Actor)
         with system.events() as stream:
             ref.kill()
-            event = await back(stream, hf.RolledBack, path)
+            event = await back(stream, hf.events.RolledBack, path)
         assert event.to_turn > 0
         await until(lambda: path in system.tree())
         assert await system.ref(path, hf.Actor).ask(Seen(), timeout=20.0) == ["a"]
@@ -210,9 +210,9 @@ async def test_what_is_restarted_by_hand_or_killed_is_no_escalation(store: str |
         await add(system, "a")
         with system.events() as stream:
             top(system).kill()
-            await back(stream, hf.ChildRestarted, "/app/top")
+            await back(stream, hf.events.ChildRestarted, "/app/top")
             assert await seen(system) == ["a"]
-            assert not [one for one in stream.take() if isinstance(one, hf.RolledBack)]
+            assert not [one for one in stream.take() if isinstance(one, hf.events.RolledBack)]
 
 
 @pytest.mark.asyncio(loop_factories=["virtual"])
@@ -240,7 +240,7 @@ async def test_a_child_whose_restore_fails_again_and_again_goes_back_the_second_
         with system.events() as stream:
             with contextlib.suppress(hf.HoldfastError):
                 await at(system).ask(Do(["raise it"]))
-            event = await back(stream, hf.RolledBack)
+            event = await back(stream, hf.events.RolledBack)
         assert "2 time(s)" in event.reason
         assert await seen(system) == ["a"]
 
@@ -253,7 +253,7 @@ async def test_a_child_is_started_with_an_older_snapshot_by_hand(store: str | No
         with system.events() as stream:
             await top(system).ask(hf.RestartChild("doer", older=True), timeout=20.0)
             async with asyncio.timeout(60.0):
-                event = await back(stream, hf.RolledBack)
+                event = await back(stream, hf.events.RolledBack)
         assert await seen(system) == ["a", "b"], "it was saved when it was stopped, and before"
         assert event.from_turn > event.to_turn > 0
 
@@ -263,11 +263,11 @@ async def test_without_an_older_snapshot_nothing_is_started_by_hand(store: str |
     async with running(store) as system:
         await system.start(tree(isolation, doing(isolation), doing(isolation, "new")))
         await add(system, "a")
-        with pytest.raises(hf.ControlFailed, match="there is no older snapshot"):
+        with pytest.raises(hf.errors.ControlFailed, match="there is no older snapshot"):
             await top(system).ask(hf.RestartChild("doer", older=True, running=True), timeout=20.0)
         assert await seen(system) == ["a"]
         await top(system).ask(hf.TerminateChild("new"), timeout=20.0)
-        with pytest.raises(hf.ControlFailed, match="there is no older snapshot"):
+        with pytest.raises(hf.errors.ControlFailed, match="there is no older snapshot"):
             await top(system).ask(hf.RestartChild("new", older=True), timeout=20.0)
-        counted = await top(system).ask(hf.CountChildren())
+        counted = await top(system).ask(hf.supervision.CountChildren())
         assert (counted.specs, counted.active) == (2, 1), "it stays stopped"

@@ -91,7 +91,7 @@ async def test_what_is_not_named_is_not_saved(tmp_path: Path) -> None:
         with system.events() as stream:
             await ref.ask(Drive(1.5))
             async for one in stream:
-                if isinstance(one, hf.SnapshotTaken) and one.turn >= 1:
+                if isinstance(one, hf.events.SnapshotTaken) and one.turn >= 1:
                     break
         ref.kill()
         assert await ref.ask(Where()) == (0.0, 1)
@@ -177,12 +177,12 @@ def test_every_setting_of_a_method_can_stand_in_the_file() -> None:
         check_readonly=True,
         safe_state=["/app/wheels", "/app/arm"],
         safe_state_timeout=4,
-        held=hf.held(10, overflow="latest"),
+        held=hf.checkpoint.held(10, overflow="latest"),
     )
     assert file.method_for("/topics", Doer) == hf.hybrid(
         pacing="original",
-        safe_state=hf.safe_state("/app/wheels", enter=Note("stop"), leave=Note("go")),
-        held={"/scan": hf.held(1, overflow="latest"), "*": hf.held(100)},
+        safe_state=hf.checkpoint.safe_state("/app/wheels", enter=Note("stop"), leave=Note("go")),
+        held={"/scan": hf.checkpoint.held(1, overflow="latest"), "*": hf.checkpoint.held(100)},
     )
 
 
@@ -282,7 +282,7 @@ async def test_a_fresh_start_and_a_change_of_specs_see_the_file_too(tmp_path: Pa
         top = await system.start(hf.supervisor("top", children=[spec]))
         ref = system.ref("/app/top/x", Doer)
         await ref.ask(Note("one"))
-        await top.ask(hf.ChangeSupervisor(children=(spec, hf.child("y", hf.start(Doer)))))
+        await top.ask(hf.supervision.ChangeSupervisor(children=(spec, hf.child("y", hf.start(Doer)))))
         await top.ask(hf.TerminateChild("x"))
         await top.ask(hf.RestartChild("x"))
         assert await system.ref("/app/top/x", Doer).ask(Seen()) == ["one"]
@@ -300,7 +300,7 @@ async def test_a_table_that_is_for_nobody_is_told_of(tmp_path: Path, isolation: 
     async with hf.ActorSystem("app", log=False, recovery=str(path)) as system:
         await start(system, isolation, "doer", hf.start(Doer))
         stream = system.events()
-    told = [(one.table, one.where) for one in stream.take() if isinstance(one, hf.RecoveryTableUnused)]
+    told = [(one.table, one.where) for one in stream.take() if isinstance(one, hf.events.RecoveryTableUnused)]
     other = ("/app/doer", 2) if isolation == "subtree" else ("/app/of-*/doer", 1)
     names = [other, ("/app/doter", 3), ("tests.checkpoint.players:Hooks", 4)]
     assert sorted(told) == sorted((name, f"{path}, line {line}, [{name}]") for name, line in names)

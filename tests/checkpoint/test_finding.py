@@ -56,8 +56,8 @@ async def test_what_it_tells_nobody_is_a_dead_letter(system: hf.ActorSystem) -> 
     ref = await finder(system, "task")
     with system.events() as events:
         assert await ref.ask(Tell("/app/nobody")) == 1
-        await system.node.settled()
-        assert [one.address for one in events.take() if isinstance(one, hf.DeadLetter)] == ["/app/nobody"]
+        await system._node.settled()
+        assert [one.address for one in events.take() if isinstance(one, hf.events.DeadLetter)] == ["/app/nobody"]
 
 
 class Picky(hf.Actor):
@@ -156,7 +156,7 @@ async def test_a_binding_that_the_program_has_changed_is_met_by_no_turn_before(t
         assert await ref.ask(Note("one")) == 1
         if saved:
             await system.checkpoint(ref)
-        system.homes.journal.close()  # As if it had been killed: no snapshot at its end.
+        system._homes.journal.close()  # As if it had been killed: no snapshot at its end.
     async with running(store) as system:
         if not saved:
             with pytest.raises(hf.StartFailed, match="replay"):

@@ -60,7 +60,7 @@ async def test_after_an_append_that_raised_nothing_is_acknowledged(tmp_path: Pat
             with pytest.raises(StoreFailed, match="ZeroDivisionError: in append"):
                 await doer.ask(Note("lost"))
             engine.break_at(None)  # What it has written nobody knows: it stays refused.
-        assert [event for event in told.take() if isinstance(event, hf.JournalStopped)]
+        assert [event for event in told.take() if isinstance(event, hf.events.JournalStopped)]
     async with hf.ActorSystem("app", log=False, store=OneFile(tmp_path / "my.store")) as system:
         doer = await system.start(hf.child("doer", hf.start(Doer), recovery=hf.hybrid(interval=1000.0)))
         assert await doer.ask(Seen()) == ["one"]

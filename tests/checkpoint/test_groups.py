@@ -110,7 +110,7 @@ async def test_an_ask_under_way_is_answered_once_more(isolation: str, store: str
         two.tell(Do([f"gate {gate}"]))
         await until(gate.exists)
         one.tell(Do(["ask hello"], two))  # It waits behind the gate.
-        await until(lambda: any(switch.calls.asks for switch in system.homes))
+        await until(lambda: any(switch.calls.asks for switch in system._homes))
         await system.checkpoint_group([one, two], name="asking")
         Path(f"{gate}.open").touch()
         assert await one.ask(Seen(), timeout=20.0) == ["hello:1"]
@@ -146,11 +146,11 @@ async def test_a_root_that_dies_on_the_way_back_finishes_it_at_its_next_start(tm
                 one.tell(Pass(7, 0, ring))
             assert await total(ring, 2) == 2 * EACH + 14
         async with running(store) as system:
-            engine: Any = Mortal(system.homes.journal.engine, step)
-            system.homes.journal.engine = engine
+            engine: Any = Mortal(system._homes.journal.engine, step)
+            system._homes.journal.engine = engine
             with contextlib.suppress(OSError):
-                system.homes.groups.replace("cut")
-            died, system.homes.journal.engine = engine.is_dead, engine.real
+                system._homes.groups.replace("cut")
+            died, system._homes.journal.engine = engine.is_dead, engine.real
         async with running(store) as system:
             ring = [await system.start(hf.child(f"p{step}-{n}", hf.start(Purse, n), recovery=RECOVERY)) for n in (0, 1)]
             undone = step > 1  # Before its first word nothing was begun.
@@ -166,14 +166,14 @@ async def test_what_is_not_wanted_any_more_is_forgotten_for_good(store: str | No
             await system.checkpoint_group(ring, name=name)
         assert system.group_snapshots() == ["a", "c", "b"]
         await system.forget_group("c")
-        with pytest.raises(hf.NoSuchGroup, match="'c'"):
+        with pytest.raises(hf.errors.NoSuchGroup, match="'c'"):
             await system.forget_group("c")
         assert system.group_snapshots() == ["a", "b"]
     if store is not None:
         async with running(store) as system:
             assert system.group_snapshots() == ["a", "b"]
             ring = await purses(system, "task")
-            with pytest.raises(hf.NoSuchGroup):
+            with pytest.raises(hf.errors.NoSuchGroup):
                 await system.restore_group("c")
             await system.restore_group("a")
 
@@ -230,7 +230,7 @@ async def test_what_cannot_be_done_is_said(system: hf.ActorSystem) -> None:
     plain = await system.start(hf.child("plain", hf.start(Doer)))
     with pytest.raises(hf.HoldfastError, match="only actors with recovery"):
         await system.checkpoint_group([plain], name="x")
-    with pytest.raises(hf.NoSuchGroup, match="'x'"):
+    with pytest.raises(hf.errors.NoSuchGroup, match="'x'"):
         await system.restore_group("x")
     for actors, name in (([], "x"), ([plain], "")):
         with pytest.raises(hf.SpecError, match="needs actors and a name"):

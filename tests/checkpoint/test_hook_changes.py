@@ -16,6 +16,7 @@ from holdfast.checkpoint.snapshot.image_writer import Imaging
 from holdfast.checkpoint.snapshot.state_image import IMAGE_BYTES
 from holdfast.ftm.bricks.brick_messages import Done
 from holdfast.ftm.group.group import Group
+from tests.checkpoint.players import until
 from tests.ftm.test_failover import group_of, pid_of, two_again
 
 IN_TIME = 25.0
@@ -98,9 +99,14 @@ class Loose(Hall):
 
 
 class Slow(Loose):
-    """Takes its time when it comes back."""
+    """Takes its time when it comes back, and says by a file that it does."""
+
+    def __init__(self, note: str) -> None:
+        super().__init__()
+        self.note = note
 
     async def on_recovered(self) -> None:  # type: ignore[override]  # either is called
+        Path(self.note).touch()
         await asyncio.sleep(0.1)
         super().on_recovered()
 
@@ -133,15 +139,15 @@ class Calm(Hall):
 PLACES: dict[str, dict[str, Any]] = {
     "task": {},
     "process": {"isolation": "process"},
-    "pbr": {"mechanism": hf.PBR()},
-    "lfr": {"mechanism": hf.LFR()},
-    "tr": {"mechanism": hf.TR()},
-    "tmr": {"mechanism": hf.TMR()},
+    "pbr": {"mechanism": hf.ftm.PBR()},
+    "lfr": {"mechanism": hf.ftm.LFR()},
+    "tr": {"mechanism": hf.ftm.TR()},
+    "tmr": {"mechanism": hf.ftm.TMR()},
 }
 
 
-async def started(system: hf.ActorSystem, place: str, kind: type[Hall] = Hall) -> hf.ActorRef[Any]:
-    spec = hf.child("hall", hf.start(kind), recovery=hf.hybrid(interval=3600.0), **PLACES[place])
+async def started(system: hf.ActorSystem, place: str, kind: type[Hall] = Hall, *args: Any) -> hf.ActorRef[Any]:
+    spec = hf.child("hall", hf.start(kind, *args), recovery=hf.hybrid(interval=3600.0), **PLACES[place])
     ref: hf.ActorRef[Any] = await system.start(spec)
     if "mechanism" in PLACES[place]:
         await two_again(ref)
@@ -184,7 +190,7 @@ async def test_who_falls_again_and_again_between_two_turns_is_given_up(place: st
             await system.start(above)
         async with asyncio.timeout(IN_TIME):
             async for event in events:
-                if isinstance(event, hf.SupervisorGaveUp):
+                if isinstance(event, hf.events.SupervisorGaveUp):
                     return
 
 
@@ -239,10 +245,11 @@ async def test_who_dies_of_the_first_message_behind_the_change_comes_back_with_i
 
 @pytest.mark.parametrize("how", ["it falls", "it falls, and is slow", "its turn fails", "its leader dies"])
 async def test_replicas_that_die_before_they_say_more_than_the_first_end_come_back_with_the_change(
-    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, how: str
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, how: str
 ) -> None:
     """The next life of the leader begins, and its hook changes the state before anything else is handled."""
-    ref = await started(system, "pbr", Slow if "slow" in how else Loose)
+    note = tmp_path / "note"
+    ref = await (started(system, "pbr", Slow, str(note)) if "slow" in how else started(system, "pbr", Loose))
     group, take_done = group_of(ref), Group.take_done
     asked: list[Any] = [asyncio.ensure_future(ref.ask(Enter(1), IN_TIME))]
     assert await ref.ask(Entered(), IN_TIME) == []
@@ -269,6 +276,8 @@ async def test_replicas_that_die_before_they_say_more_than_the_first_end_come_ba
                     os.kill(pid_of(system, ref, name), signal.SIGKILL)
 
     monkeypatch.setattr(Group, "take_done", take_and_kill)
+    if "slow" in how:  # What is asked now waits for the hook.
+        await until(note.exists)
     asked.append(ref.ask(Enter(2), IN_TIME))
     assert await asyncio.gather(*asked) == [1, 2]
     assert is_over
@@ -291,7 +300,7 @@ async def test_a_state_that_the_hook_leaves_as_it_was_is_not_saved_again(
             async with asyncio.timeout(IN_TIME):
                 while not await is_up(system, ref, life):
                     await asyncio.sleep(0.005)
-        assert not [one for one in events.take() if isinstance(one, hf.SnapshotTaken)]
+        assert not [one for one in events.take() if isinstance(one, hf.events.SnapshotTaken)]
 
 
 class Moody(Hall):
@@ -320,8 +329,8 @@ async def test_a_recovery_that_fails_says_that_the_replay_went_elsewhere(
         is_told = False
         async with asyncio.timeout(IN_TIME):
             async for one in events:
-                is_told |= isinstance(one, hf.RecoveryFailed) and "diverged" in one.reason
-                if isinstance(one, hf.ChildStartFailed):
+                is_told |= isinstance(one, hf.events.RecoveryFailed) and "diverged" in one.reason
+                if isinstance(one, hf.events.ChildStartFailed):
                     assert is_told
                     assert "diverged" in one.reason
                     break
@@ -339,6 +348,6 @@ async def test_what_a_hook_changes_while_background_work_is_out_is_not_saved(sys
         ref.kill()
         async with asyncio.timeout(IN_TIME):
             async for one in events:
-                if isinstance(one, hf.RecoveryFailed):
+                if isinstance(one, hf.events.RecoveryFailed):
                     assert "diverged" in one.reason
                     break

@@ -58,7 +58,11 @@ async def test_ignore_in_the_first_on_start_is_an_ignored_start(
             await top(system).ask(hf.RestartChild("doer"), timeout=20.0)
             assert await seen(system) == []
             told = stream.take()
-        assert not [one for one in told if isinstance(one, (hf.RecoveryFailed, hf.ActorCrashed, hf.ChildStartFailed))]
+        assert not [
+            one
+            for one in told
+            if isinstance(one, (hf.events.RecoveryFailed, hf.events.ActorCrashed, hf.events.ChildStartFailed))
+        ]
 
 
 async def test_ignore_in_the_on_start_of_a_restored_actor_keeps_what_it_has(
@@ -92,7 +96,7 @@ async def test_a_supervisor_whose_child_does_not_start_ends_with_shutdown_and_ha
             with pytest.raises(hf.StartFailed, match=r"bad could not be started.*never"):
                 await system.start(spec)
             told = stream.take()
-        assert not [one for one in told if isinstance(one, hf.ActorCrashed) and one.address == "/app/top"]
+        assert not [one for one in told if isinstance(one, hf.events.ActorCrashed) and one.address == "/app/top"]
 
 
 async def test_the_end_of_a_supervisor_that_cannot_start_is_a_shutdown(tmp_path: Path) -> None:
@@ -105,7 +109,7 @@ async def test_the_end_of_a_supervisor_that_cannot_start_is_a_shutdown(tmp_path:
         top(system).kill()
         with system.events() as stream:
             async for one in stream:
-                if isinstance(one, hf.ChildStartFailed) and one.address == "/app/top":
+                if isinstance(one, hf.events.ChildStartFailed) and one.address == "/app/top":
                     assert cell.extra().reason == hf.SHUTDOWN
                     break
         mood.unlink()

@@ -228,4 +228,4 @@ def test_key_variables_and_version_are_checked_with_the_class() -> None:
     with pytest.raises(TypeError, match=r"Wrong.schema_version must be a whole number, not '2'"):
         type("Wrong", (hf.Actor,), {"schema_version": "2"})
     with pytest.raises(TypeError, match="key_variables must be names"):
-        hf.wrap(Point, key_variables="x")
+        hf.adapters.wrap(Point, key_variables="x")

@@ -27,7 +27,7 @@ class Parent(hf.Actor):
 
     @hf.on(Seen, readonly=True)
     def children(self, message: Seen) -> list[str]:
-        return sorted(self.ctx.cell.children or {})
+        return sorted(self.ctx._cell.children or {})
 
 
 async def recovered(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:

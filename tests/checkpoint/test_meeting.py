@@ -55,7 +55,7 @@ async def test_a_hung_process_is_ended_and_its_actor_recovered(store: str | None
         await add(system, "one")
         with system.events() as stream:
             at(system).tell(Do([f"hang {tmp_path / 'hung'}"]))
-            died = await event(stream, hf.ChildTerminated)
+            died = await event(stream, hf.events.ChildTerminated)
             assert isinstance(died.reason, hf.Hung)
             await back(stream)
         assert (await seen(system))[0] == "one"
@@ -99,7 +99,7 @@ async def stopped(system: hf.ActorSystem, how: str) -> None:
         async with asyncio.timeout(20.0):
             while (await top(system).ask(hf.WhichChildren()))[0].state != "stopped":
                 await asyncio.sleep(0.005)
-        assert not any(isinstance(one, hf.ChildRestarted) for one in stream.take())
+        assert not any(isinstance(one, hf.events.ChildRestarted) for one in stream.take())
 
 
 @pytest.mark.parametrize("how", ["NORMAL", "SHUTDOWN", "terminate"])
@@ -134,7 +134,7 @@ async def test_who_is_deleted_is_erased_unless_that_is_not_wanted(
         await add(system, "else", name="other")
         await top(system).ask(hf.TerminateChild("doer"), timeout=20.0)
         await top(system).ask(hf.DeleteChild("doer", erase=erase), timeout=20.0)
-        known = set(system.node.ports.keeper.known("/app"))  # type: ignore[attr-defined]
+        known = set(system._node.ports.keeper.known("/app"))  # type: ignore[attr-defined]
         assert ("/app/top/doer" in known) is not erase
         await top(system).ask(hf.StartChild(spec), timeout=20.0)
         assert await seen(system) == ([] if erase else ["one"])
@@ -164,7 +164,7 @@ async def test_what_the_store_refuses_to_forget_is_an_error_and_can_be_forgotten
         if how == "start fresh":
             await top(system).ask(hf.DeleteChild("doer", erase=False), timeout=20.0)
         with monkeypatch.context() as broken:
-            broken.setattr(system.homes.journal, "erase", refuse)
+            broken.setattr(system._homes.journal, "erase", refuse)
             with pytest.raises(hf.HoldfastError, match="the disk is gone"):
                 await top(system).ask(order, timeout=20.0)
         there = await top(system).ask(hf.WhichChildren(), timeout=20.0)
@@ -188,7 +188,7 @@ async def test_what_was_erased_stays_erased_when_the_store_is_opened_again(tmp_p
             await add(system, "one", name=name)
         await top(system).ask(hf.TerminateChild("doer"), timeout=20.0)
         await top(system).ask(hf.DeleteChild("doer"), timeout=20.0)
-        await system.node.settled()
+        await system._node.settled()
     async with running(store) as system:
         await system.start(tree(isolation, doing(isolation), doing(isolation, "other")))
         assert (await seen(system), await seen(system, "other")) == ([], ["one"])
@@ -223,9 +223,9 @@ async def test_what_waits_for_an_actor_that_begins_afresh_is_a_dead_letter_or_fa
             await root.ask(hf.TerminateChild("top"), timeout=20.0)
             with pytest.raises(hf.ActorStopped):
                 await asked
-            assert not [one for one in stream.take() if isinstance(one, hf.DeadLetter)]
+            assert not [one for one in stream.take() if isinstance(one, hf.events.DeadLetter)]
             await root.ask(hf.RestartChild("top", fresh=True), timeout=20.0)
-            dead = [one for one in stream.take() if isinstance(one, hf.DeadLetter)]
+            dead = [one for one in stream.take() if isinstance(one, hf.events.DeadLetter)]
         assert [cast("Do", one.message).steps[0] for one in dead] == [f"gate {gate}", "add lost"]
         assert await seen(system) == []
 
@@ -269,7 +269,7 @@ async def test_static_children_of_a_restarted_supervisor_are_restored_and_keep_t
         at(system).tell(Do(["add queued"]))
         with system.events() as stream:
             top(system).kill()
-            await back(stream, hf.ChildRestarted, "/app/top")
+            await back(stream, hf.events.ChildRestarted, "/app/top")
         let_through(gate)
         assert await seen(system) == ["one", "held", "queued"]
         assert await seen(system, "other") == ["else"]
@@ -290,10 +290,10 @@ async def test_each_attempt_counts_once_also_one_that_fails_inside_the_recovery(
         with system.events() as stream:
             at(system).kill()
             async for one in stream:  # A supervisor in a process may be heard before the root tells of the recovery.
-                if isinstance(one, hf.ChildRestarted) and one.address == "/app/top/doer":
+                if isinstance(one, hf.events.ChildRestarted) and one.address == "/app/top/doer":
                     restarted.append(one.attempt)
-                failed += isinstance(one, hf.RecoveryFailed)
-                gave_up = gave_up or isinstance(one, hf.SupervisorGaveUp)
+                failed += isinstance(one, hf.events.RecoveryFailed)
+                gave_up = gave_up or isinstance(one, hf.events.SupervisorGaveUp)
                 if gave_up and failed >= 3:
                     break
         assert (restarted, failed) == ([1, 2, 3], 3)
@@ -313,7 +313,7 @@ async def test_the_supervisor_answers_while_a_child_is_recovered_and_later_sibli
         await until(gate.exists)
         states = {one.id: one.state for one in await top(system).ask(hf.WhichChildren(), timeout=30.0)}
         assert states == {"doer": "recovering", "later": "restarting"}
-        assert (await top(system).ask(hf.CountChildren(), timeout=30.0)).specs == 2
+        assert (await top(system).ask(hf.supervision.CountChildren(), timeout=30.0)).specs == 2
         let_through(gate)
         assert await seen(system) == ["one"]
         assert await seen(system, "later") == []
@@ -340,7 +340,7 @@ async def test_the_supervisor_answers_while_a_recorded_child_starts_by_order(
         infos = await top(system).ask(hf.WhichChildren(), timeout=30.0)
         assert [(one.id, one.state) for one in infos] == [("late", "recovering")]
         again = await asyncio.gather(top(system).ask(hf.StartChild(late), timeout=30.0), return_exceptions=True)
-        assert isinstance(again[0], hf.AlreadyStarted)
+        assert isinstance(again[0], hf.errors.AlreadyStarted)
         assert not asked.done()
         if end == "up":
             let_through(gate)
@@ -423,5 +423,5 @@ async def test_a_watch_fires_once_when_the_actor_is_gone_for_good(store: str | N
         assert await guard.ask(Seen()) == []
         await top(system).ask(hf.TerminateChild("doer"), timeout=20.0)
         await until(lambda: "/app/top/doer" not in system.tree())
-        await system.node.settled()
+        await system._node.settled()
         assert await guard.ask(Seen()) == ["gone False"]

@@ -68,7 +68,7 @@ async def test_what_becomes_of_state_and_queue(how: str, store: str | None, gate
             at(system).tell(Do(["add queued"]))
             await end(system, how, spec, gate)
             if "Child" not in how:
-                await back(stream, hf.Recovered)
+                await back(stream, hf.events.Recovered)
         told = [one for one in await seen(system) if one != "turn"]
         expected = ENDS[how]
         assert ("state" in told) is (expected["its state"] == "kept")

@@ -170,7 +170,7 @@ async def test_what_is_lost_is_counted_and_an_answer_owed_fails_at_once(isolatio
         await ref.ask(Seen())
         with system.events() as stream:
             strike(system, ref)
-            lost = await event(stream, hf.TurnsLost)
+            lost = await event(stream, hf.events.TurnsLost)
         assert (lost.address, lost.count) == (ref.path, 5)
         with pytest.raises(hf.AskFailed, match="lost"):
             await owed
@@ -226,12 +226,12 @@ async def test_replay_alone_never_takes_a_snapshot_and_says_when_its_journal_is_
         outcomes = await asyncio.gather(*(ref.ask(Note("x")) for _ in range(100)), return_exceptions=True)
         refused = [one for one in outcomes if isinstance(one, hf.MailboxFull)]
         assert 10 < 100 - len(refused) < 5_000 / 200
-        full = await event(stream, hf.JournalFull)
+        full = await event(stream, hf.events.JournalFull)
         assert "takes no snapshots" in full.way_out
         with pytest.raises(hf.MailboxFull):
             await ref.send(Note("x"))  # It would wait for ever.
         await system.stop(ref)
-        assert not [one for one in stream.take() if isinstance(one, hf.SnapshotTaken)]
+        assert not [one for one in stream.take() if isinstance(one, hf.events.SnapshotTaken)]
 
 
 async def test_replay_alone_brings_everything_back_over_stops_and_moves(tmp_path: Path) -> None:
@@ -248,7 +248,7 @@ async def test_replay_alone_brings_everything_back_over_stops_and_moves(tmp_path
                 await system.set_isolation(ref, "task")
             if n == 2:
                 assert await ref.ask(Seen()) == ["0", "1", "there", "2"]
-                with pytest.raises(hf.ControlFailed, match="replay_only takes no snapshots"):
+                with pytest.raises(hf.errors.ControlFailed, match="replay_only takes no snapshots"):
                     await system.replace_state(ref, lambda state: state)
 
 
@@ -261,7 +261,7 @@ async def test_a_replay_waits_as_long_as_there_was_between_its_messages(pacing: 
     """R39, R76: nine seconds of messages; what comes meanwhile is held, and handled behind them."""
     loop = asyncio.get_running_loop()
     async with hf.ActorSystem("app", log=False) as system:
-        system.node.clock.wall = lambda: 1000.0 + loop.time()
+        system._node.clock.wall = lambda: 1000.0 + loop.time()
         ref = await system.start(hf.child("doer", hf.start(Doer), recovery=hf.hybrid(NEVER, pacing=pacing)))
         for n in range(4):
             ref.tell(Do(["world", f"add {n}"]))
@@ -272,7 +272,7 @@ async def test_a_replay_waits_as_long_as_there_was_between_its_messages(pacing: 
             ref.kill()
             ref.tell(Note("new"))
             again = await ref.ask(Seen(), timeout=100.0)
-            told = [one for one in stream.take() if isinstance(one, hf.ReplayPaced)]
+            told = [one for one in stream.take() if isinstance(one, hf.events.ReplayPaced)]
         assert loop.time() - before == pytest.approx(seconds, abs=0.01)
         assert again == [*seen, "new"], "ctx.now() is what it was (T24)"
         if seconds:
@@ -287,7 +287,7 @@ async def test_handlers_that_take_their_time_do_not_make_a_paced_replay_longer()
     """R70 measured the sum of both; here a replay takes no longer than what was recorded, if handlers keep up."""
     loop = asyncio.get_running_loop()
     async with hf.ActorSystem("app", log=False) as system:
-        system.node.clock.wall = lambda: 1000.0 + loop.time()
+        system._node.clock.wall = lambda: 1000.0 + loop.time()
         ref = await system.start(hf.child("slow", hf.start(Slow), recovery=hf.hybrid(NEVER, pacing="original")))
         for _ in range(5):
             ref.tell(Note("x"))
@@ -314,7 +314,7 @@ async def test_a_crash_or_a_stop_in_a_paced_replay(store: str | None) -> None:
     """The next one begins again from the beginning (T17); a stop does not wait for it."""
     loop = asyncio.get_running_loop()
     async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
-        system.node.clock.wall = lambda: 1000.0 + loop.time()
+        system._node.clock.wall = lambda: 1000.0 + loop.time()
         ref = await system.start(hf.child("doer", hf.start(Doer), recovery=hf.hybrid(NEVER, pacing="original")))
         for n in range(5):
             ref.tell(Note(str(n)))
@@ -458,7 +458,7 @@ async def test_a_move_whose_snapshot_cannot_be_kept_is_given_up(
     await ref.ask(Note("kept"))
     with monkeypatch.context() as broken:
         broken.setattr(of_arrivals, "cut", full)
-        with pytest.raises(hf.CannotMove, match="could not be kept"):
+        with pytest.raises(hf.errors.CannotMove, match="could not be kept"):
             await system.set_isolation(ref, there)
     assert await ref.ask(Seen()) == ["kept"]
     await system.set_isolation(ref, there)
@@ -469,6 +469,6 @@ async def test_a_move_whose_snapshot_cannot_be_taken_is_given_up(system: hf.Acto
     ref = await doer(system, "task", "checkpoint_only")
     await ref.ask(Note("kept"))
     await ref.ask(Do(["spoil"]))
-    with pytest.raises(hf.CannotMove):
+    with pytest.raises(hf.errors.CannotMove):
         await system.set_isolation(ref, "process")
     assert await ref.ask(Seen()) == ["kept"]

@@ -50,9 +50,9 @@ class Move(hf.Message[float]):
     by: float
 
 
-RobotActor = hf.wrap(Robot, "RobotActor")
-Chosen = hf.wrap(Robot, "Chosen", methods={Move: "move", Turn: "turn"}, key_variables=["x"])
-robot = hf.calls(Robot)
+RobotActor = hf.adapters.wrap(Robot, "RobotActor")
+Chosen = hf.adapters.wrap(Robot, "Chosen", methods={Move: "move", Turn: "turn"}, key_variables=["x"])
+robot = hf.adapters.calls(Robot)
 
 
 class Scan(hf.Message):
@@ -91,15 +91,15 @@ class Navigator:
 class State(hf.Message[list[int]]): ...
 
 
-def navigator(bus: hf.Bus) -> Navigator:
+def navigator(bus: hf.adapters.Bus) -> Navigator:
     """All there is to write: what the program calls subscribing and publishing."""
     return Navigator(bus.subscribe, bus.publish)
 
 
-NavigatorActor = hf.wrap(
+NavigatorActor = hf.adapters.wrap(
     navigator, "NavigatorActor", methods={State: "state"}, callbacks={"/goal": Goal, "/scan": Scan}
 )
-Direct = hf.wrap(Robot, "Direct", callbacks={"/turn": (Turn, "turn")}, methods={Move: "move"})
+Direct = hf.adapters.wrap(Robot, "Direct", callbacks={"/turn": (Turn, "turn")}, methods={Move: "move"})
 
 
 class Out(hf.Actor):
@@ -149,7 +149,9 @@ async def test_a_callback_style_program_is_fed_from_topics_and_recovered(isolati
         await system.publish("/goal", Goal(10))
         for n in (1, 2, 3):
             await system.publish("/scan", Scan(n))
-            with contextlib.suppress(ProcessLookupError, hf.NoSuchActor):  # It is still dead from the time before.
+            with contextlib.suppress(
+                ProcessLookupError, hf.errors.NoSuchActor
+            ):  # It is still dead from the time before.
                 strike(system, ref)
         assert await ref.ask(State(), timeout=30.0) == [10, 10, -1, 20, -2, 30, -3]
         assert await out.ask(Notes()) == ["10:1", "10:2", "10:3"]
@@ -165,7 +167,7 @@ async def test_a_topic_can_feed_a_method(system: hf.ActorSystem) -> None:
 class Announcer:
     """Publishes from whatever is called: a callback of its own, or a method that a topic or a message calls."""
 
-    def __init__(self, bus: hf.Bus) -> None:
+    def __init__(self, bus: hf.adapters.Bus) -> None:
         self._bus = bus
         bus.subscribe("/goal", self.on_goal)
 
@@ -180,7 +182,7 @@ class Announcer:
         return [1]
 
 
-AnnouncerActor = hf.wrap(
+AnnouncerActor = hf.adapters.wrap(
     Announcer, "AnnouncerActor", methods={State: "state"}, callbacks={"/goal": Goal, "/turn": (Turn, "on_turn")}
 )
 
@@ -197,7 +199,7 @@ async def test_what_any_call_of_a_program_sends_leaves_with_it(isolation: str) -
 
 
 class Clockwork:
-    def __init__(self, bus: hf.Bus) -> None:
+    def __init__(self, bus: hf.adapters.Bus) -> None:
         self.ticks = list[float]()
         self._bus = bus
         bus.every(1.0, self.tick)
@@ -206,7 +208,7 @@ class Clockwork:
         self.ticks.append(self._bus.now() + self._bus.random.random())
 
 
-ClockworkActor = hf.wrap(Clockwork, "ClockworkActor", callbacks={"/scan": Scan})
+ClockworkActor = hf.adapters.wrap(Clockwork, "ClockworkActor", callbacks={"/scan": Scan})
 
 
 @pytest.mark.parametrize("recovery", [None, hf.hybrid(NEVER), hf.hybrid(1.5)])
@@ -224,7 +226,7 @@ async def test_a_programs_timers_go_on_over_crashes(system: hf.ActorSystem, reco
 
 
 async def test_what_a_program_may_not_do_with_its_bus(system: hf.ActorSystem) -> None:
-    def late(bus: hf.Bus) -> Any:
+    def late(bus: hf.adapters.Bus) -> Any:
         class Late:
             def state(self) -> list[int]:
                 bus.subscribe("/scan", print)
@@ -232,24 +234,24 @@ async def test_what_a_program_may_not_do_with_its_bus(system: hf.ActorSystem) ->
 
         return Late()
 
-    def hasty(bus: hf.Bus) -> Any:
+    def hasty(bus: hf.adapters.Bus) -> Any:
         bus.publish("/scan", Scan(1))
 
-    def lost(bus: hf.Bus) -> Any:
+    def lost(bus: hf.adapters.Bus) -> Any:
         bus.subscribe("/elsewhere", print)
 
-    ref = system.spawn(hf.start(hf.wrap(late, callbacks={"/scan": Scan}, methods={State: "state"})), "late")
+    ref = system.spawn(hf.start(hf.adapters.wrap(late, callbacks={"/scan": Scan}, methods={State: "state"})), "late")
     with pytest.raises(hf.RemoteCrash, match="registered while the program is made"):
         await ref.ask(State())
     with pytest.raises(hf.StartFailed, match="sends from its callbacks"):
-        system.spawn(hf.start(hf.wrap(hasty, callbacks={"/scan": Scan})), "hasty")
+        system.spawn(hf.start(hf.adapters.wrap(hasty, callbacks={"/scan": Scan})), "hasty")
     with pytest.raises(hf.StartFailed, match="does not say what comes on '/elsewhere'"):
-        system.spawn(hf.start(hf.wrap(lost, callbacks={"/scan": Scan})), "lost")
+        system.spawn(hf.start(hf.adapters.wrap(lost, callbacks={"/scan": Scan})), "lost")
 
 
 async def test_a_class_that_is_not_found_by_its_name_cannot_live_in_a_process(system: hf.ActorSystem) -> None:
     with pytest.raises(hf.HoldfastError, match="Elsewhere"):
-        await system.start(hf.child("x", hf.start(hf.wrap(Robot, "Elsewhere")), isolation="process"))
+        await system.start(hf.child("x", hf.start(hf.adapters.wrap(Robot, "Elsewhere")), isolation="process"))
 
 
 class Rest:
@@ -258,18 +260,18 @@ class Rest:
 
 def test_what_does_not_fit_is_refused_when_it_is_wrapped() -> None:
     with pytest.raises(TypeError, match=r"Rest.all takes \*parts"):
-        hf.wrap(Rest)
+        hf.adapters.wrap(Rest)
     with pytest.raises(TypeError, match="Robot has no method 'fly'"):
-        hf.wrap(Robot, methods={Move: "fly"})
+        hf.adapters.wrap(Robot, methods={Move: "fly"})
     with pytest.raises(TypeError, match=r"Robot.move cannot be called with .*Turn: it has no field 'by'"):
-        hf.wrap(Robot, methods={Turn: "move"})
+        hf.adapters.wrap(Robot, methods={Turn: "move"})
     with pytest.raises(TypeError, match="is no class"):
-        hf.wrap(navigator)
+        hf.adapters.wrap(navigator)
     with pytest.raises(TypeError, match="two handlers"):
-        hf.wrap(navigator, callbacks={"/a": Scan, "/b": Scan})
+        hf.adapters.wrap(navigator, callbacks={"/a": Scan, "/b": Scan})
     with pytest.raises(AttributeError, match="no public method '_hidden'"):
         robot.__getattr__("_hidden")
-    assert hf.calls(Robot) is robot
+    assert hf.adapters.calls(Robot) is robot
     assert robot.look() == robot.look("all", [])
 
 
@@ -291,14 +293,14 @@ class Arms:
         return self.left.angle
 
 
-ArmsActor = hf.wrap(Arms, "ArmsActor", key_variables=["left.angle"])
+ArmsActor = hf.adapters.wrap(Arms, "ArmsActor", key_variables=["left.angle"])
 
 
 @pytest.mark.parametrize("recovery", [None, hf.hybrid()])
 async def test_control_sees_the_programs_variables(system: hf.ActorSystem, recovery: Any) -> None:
     ref = await system.start(hf.child("robot", hf.start(RobotActor, 1.0), recovery=recovery))
     assert await system.get_state(ref) == {"x": 1.0, "log": []}
-    with pytest.raises(hf.ControlFailed):
+    with pytest.raises(hf.errors.ControlFailed):
         await system.replace_state(ref, wrong)
     assert await system.replace_state(ref, farther) == {"x": 11.0, "log": []}
     await system.set_isolation(ref, "process")
@@ -309,6 +311,6 @@ async def test_control_sees_the_programs_variables(system: hf.ActorSystem, recov
 
 async def test_control_sees_variables_inside_others(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("arms", hf.start(ArmsActor)))
-    assert await ref.ask(hf.calls(Arms).lift(2.0)) == 2.0
+    assert await ref.ask(hf.adapters.calls(Arms).lift(2.0)) == 2.0
     assert await system.replace_state(ref, lambda state: {"left.angle": state["left.angle"] + 1}) == {"left.angle": 3.0}
-    assert await ref.ask(hf.calls(Arms).lift(0.0)) == 3.0
+    assert await ref.ask(hf.adapters.calls(Arms).lift(0.0)) == 3.0

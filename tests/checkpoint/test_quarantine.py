@@ -36,7 +36,7 @@ async def test_what_kills_again_and_again_is_listed_with_how_often_and_since_whe
     isolation: str, store: str | None, tmp_path: Path
 ) -> None:
     async with running(store) as system:
-        system.node.clock.wall = lambda: 1234.5
+        system._node.clock.wall = lambda: 1234.5
         doer = await poisoned(system, isolation, tmp_path / "deaths")
         (one,) = system.quarantined()
         assert one == system.quarantined(doer)[0] == system.quarantined(doer.path)[0]
@@ -58,7 +58,7 @@ async def test_a_second_try_is_handled_once_or_put_aside_again(
             await doer.ask(bad, timeout=30.0)
         (one,) = system.quarantined()
         system.retry(one)
-        with pytest.raises(hf.NotQuarantined):
+        with pytest.raises(hf.errors.NotQuarantined):
             system.retry(one)
         await doer.ask(Do(["add next"], sink), timeout=30.0)
         (again,) = system.quarantined()
@@ -68,8 +68,8 @@ async def test_a_second_try_is_handled_once_or_put_aside_again(
         with system.events() as letters:
             system.drop(again)
             assert system.quarantined() == []
-            await system.homes.settled()
-        assert [type(one.message) for one in letters.take() if isinstance(one, hf.DeadLetter)] == [Do]
+            await system._homes.settled()
+        assert [type(one.message) for one in letters.take() if isinstance(one, hf.events.DeadLetter)] == [Do]
 
 
 async def test_a_second_try_that_goes_well_is_an_ordinary_message(isolation: str, tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ async def test_it_survives_restarts_of_the_root_and_so_does_its_end(isolation: s
     async with running(store) as system:
         (one,) = system.quarantined()
         assert isinstance(one.message, hf.Message) is False  # Its class is not known before its actor is.
-        with pytest.raises(hf.NoSuchActor):
+        with pytest.raises(hf.errors.NoSuchActor):
             system.retry(one)
         doer = await start(system, isolation, "doer", hf.start(Doer), recovery=RECOVERY)
         assert system.quarantined() == before
@@ -121,15 +121,15 @@ async def test_many_that_have_come_and_gone_take_no_room(tmp_path: Path) -> None
     store = f"sqlite:{tmp_path / 'app.db'}"
     async with running(store) as system:
         doer = await poisoned(system, "process", tmp_path / "deaths")
-        home = system.homes.at(doer.path)
+        home = system._homes.at(doer.path)
         assert home is not None
         (first,) = system.quarantined()
         for _ in range(150):
-            system.homes.quarantine.hold(home, home.record("message", "x:Y", b"", None), batch := Batch())
+            system._homes.quarantine.hold(home, home.record("message", "x:Y", b"", None), batch := Batch())
             batch.commit(home.journal)
             system.drop(system.quarantined()[1])
-            await system.homes.settled()
-        assert len(system.homes.journal.load("quarantine").entries) < 200
+            await system._homes.settled()
+        assert len(system._homes.journal.load("quarantine").entries) < 200
         assert system.quarantined() == [first]
     async with running(store) as system:
         assert len(system.quarantined()) == 1

@@ -208,7 +208,7 @@ async def test_links_do_not_fire_when_the_other_is_recovered(system: hf.ActorSys
     linked, ref = await doer(system, "task", "linked"), await doer(system, isolation)
     await linked.ask(Do(["link"], ref))
     await struck(system, ref)
-    await system.node.settled()
+    await system._node.settled()
     assert linked._cell.life == 1
 
 
@@ -217,7 +217,7 @@ async def test_links_fire_when_the_other_is_gone_for_good(system: hf.ActorSystem
     await ref.ask(Do(["add kept", "link"], other))
     with system.events() as stream:
         other.kill()
-        await event(stream, hf.Recovered)
+        await event(stream, hf.events.Recovered)
     assert await ref.ask(Seen()) == ["kept"]
 
 
@@ -235,7 +235,7 @@ async def test_hooks_run_in_their_order(system: hf.ActorSystem, isolation: str, 
     with system.events() as stream:
         await ref.ask(Note("2"))
         strike(system, ref)
-        await event(stream, hf.Recovered)
+        await event(stream, hf.events.Recovered)
     told = log.read_text().split("\n")[:-1]
     replayed = ["note 2"] if "note 2" in told[2:] and told.count("note 2") == 2 else []
     assert told == ["note 1", "note 2", "init", "start True", *replayed, "recovered 2"]

@@ -118,7 +118,7 @@ async def test_what_was_put_aside_again_is_not_handled_twice(
             assert await asked[n - 1] == n
         await ref.ask(Do([]), timeout=30.0)
         assert await ref.ask(Seen(), timeout=30.0) == list("abcd")
-    assert not [one for one in events.take() if isinstance(one, hf.ActorCrashed | hf.TrustBreached)]
+    assert not [one for one in events.take() if isinstance(one, hf.events.ActorCrashed | hf.events.TrustBreached)]
 
 
 async def test_a_stashed_message_that_crashes_later_is_not_run_again(system: hf.ActorSystem, isolation: str) -> None:
@@ -166,7 +166,7 @@ async def test_background_work_that_fails_crashes_the_actor_once(
     ref = await doer(system, isolation)
     with system.events() as stream:
         await ref.ask(Do([f"burst {tmp_path}/runs", "add kept"]))
-        await event(stream, hf.Recovered)
+        await event(stream, hf.events.Recovered)
     await struck(system, ref)
     assert await ref.ask(Seen()) == ["kept"]
     assert (tmp_path / "runs").read_text() == "x", "not begun again"
@@ -177,13 +177,13 @@ async def test_what_is_published_during_recovery_is_not_lost(system: hf.ActorSys
     await ref.ask(Do(["subscribe /news"]))
     published: list[str] = []
 
-    def publish(event: hf.Event) -> None:
-        if isinstance(event, hf.ChildRestarted):  # The old life is over, the new one has not begun.
+    def publish(event: hf.events.Event) -> None:
+        if isinstance(event, hf.events.ChildRestarted):  # The old life is over, the new one has not begun.
             published.append(str(len(published)))
-            for cell in system.node.topics.subscribers("/news"):
+            for cell in system._node.topics.subscribers("/news"):
                 cell.ref.tell(Note(published[-1]))
 
-    system.node.events.add_sink(publish)
+    system._node.events.add_sink(publish)
     for _ in range(3):
         await struck(system, ref)
     assert await ref.ask(Seen()) == published == ["0", "1", "2"]
@@ -235,12 +235,12 @@ async def test_a_snapshot_that_fails_is_told_and_tried_again(system: hf.ActorSys
     await snapshot_after(system, ref, 1)
     with system.events() as stream:
         await ref.ask(Do(["add 2", "spoil"]))
-        assert "spoiled" in (await event(stream, hf.SnapshotFailed)).reason
-        await event(stream, hf.SnapshotFailed)
+        assert "spoiled" in (await event(stream, hf.events.SnapshotFailed)).reason
+        await event(stream, hf.events.SnapshotFailed)
         await struck(system, ref)
         assert await ref.ask(Seen()) == ["1", "2"], "the older snapshot and the journal are still there"
         await ref.ask(Do(["mend"]))
-        assert (await event(stream, hf.SnapshotTaken)).turn >= 3
+        assert (await event(stream, hf.events.SnapshotTaken)).turn >= 3
     assert ref._cell.life == 2
 
 

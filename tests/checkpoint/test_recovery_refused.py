@@ -29,8 +29,11 @@ async def test_replay_of_an_actor_that_is_not_deterministic_diverges(system: hf.
     await ref.ask(Do([], notes))
     with system.events() as stream:
         ref.kill()
-        assert "diverged at turn 1, output 1" in (await event(stream, hf.RecoveryFailed)).reason
-        await event(stream, hf.SupervisorGaveUp)
+        waiting = ref.ask(Do([], notes), timeout=30.0)
+        assert "diverged at turn 1, output 1" in (await event(stream, hf.events.RecoveryFailed)).reason
+        await event(stream, hf.events.SupervisorGaveUp)
+    with pytest.raises(hf.ActorStopped, match="diverged at turn 1"):
+        await waiting
     noted = await notes.ask(Notes())
     assert len(noted) == 1
 
@@ -38,6 +41,32 @@ async def test_replay_of_an_actor_that_is_not_deterministic_diverges(system: hf.
 def test_a_class_that_says_it_is_not_deterministic_is_refused() -> None:
     with pytest.raises(hf.SpecError, match="Honest is not deterministic"):
         hf.child("honest", hf.start(Honest), recovery=hf.hybrid())
+
+
+@pytest.mark.parametrize("deep", [0, 1, 2])
+async def test_a_message_is_quarantined_before_anybody_else_falls(
+    system: hf.ActorSystem, deep: int, tmp_path: Path
+) -> None:
+    """With the defaults: the root allows three restarts in five seconds, other supervisors one, and they escalate."""
+    spec: hf.ChildSpec = hf.child("doer", hf.start(Doer), isolation="process", recovery=hf.hybrid())
+    path = "/app"
+    for number in range(deep):
+        spec = hf.supervisor(f"s{number}", children=[spec])
+    await system.start(spec)
+    path += "".join(f"/s{number}" for number in reversed(range(deep))) + "/doer"
+    ref, notes = system.ref(path, Doer), await sink(system)
+    await ref.ask(Note("before"))
+    bad = Do([f"die {tmp_path}/deaths"], notes)
+    with system.events() as events:
+        if deep:
+            ref.tell(bad)  # An ask ends with the supervisor that gives up.
+        else:
+            with pytest.raises(hf.Quarantined):
+                await ref.ask(bad, timeout=30.0)
+        assert (await event(events, hf.events.MessageQuarantined)).deliveries == 3
+    assert (tmp_path / "deaths").read_text() == "xxx"
+    assert len(system.quarantined()) == 1
+    assert await system.ref(path, Doer).ask(Seen(), timeout=30.0)
 
 
 async def test_a_message_that_kills_its_process_again_and_again_is_quarantined(
@@ -51,7 +80,7 @@ async def test_a_message_that_kills_its_process_again_and_again_is_quarantined(
         after = ref.ask(Do(["tell 1", "ask good", "tell 2"], notes), timeout=30.0)
         with pytest.raises(hf.Quarantined):
             await bad
-        assert (await event(stream, hf.MessageQuarantined)).deliveries == 3
+        assert (await event(stream, hf.events.MessageQuarantined)).deliveries == 3
     await after
     await struck(system, ref)
     assert (tmp_path / "deaths").read_text() == "xxx"
@@ -67,7 +96,7 @@ async def test_deaths_that_the_runtime_ordered_do_not_quarantine(system: hf.Acto
         gate.unlink()
         with system.events() as stream:
             ref.kill()
-            await event(stream, hf.Recovered)
+            await event(stream, hf.events.Recovered)
     let_through(gate)
     assert await asked == "0"
 
@@ -141,9 +170,9 @@ async def test_a_replay_is_followed_by_a_snapshot_so_that_the_next_need_not_repe
     await ref.ask(Note("one"))
     with system.events() as stream:
         strike(system, ref)
-        assert (await event(stream, hf.SnapshotTaken)).turn == 1
+        assert (await event(stream, hf.events.SnapshotTaken)).turn == 1
         strike(system, ref)
-        back = await event(stream, hf.Recovered)
+        back = await event(stream, hf.events.Recovered)
         if back.life == 2:  # In one process the snapshot is told of before the recovery that led to it.
-            back = await event(stream, hf.Recovered)
+            back = await event(stream, hf.events.Recovered)
     assert (back.life, back.replayed) == (3, 0)

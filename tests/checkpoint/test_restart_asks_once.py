@@ -41,6 +41,6 @@ async def test_who_was_refused_is_not_answered_later() -> None:
         oracle = system.ref("/app/oracle", Oracle)
         oracle.tell(Open())  # It has still the handle that it had then.
         await oracle.ask(Asked())
-        await system.node.settled()
+        await system._node.settled()
         asker.kill()
         assert await asker.ask(Answers()) == [-1]

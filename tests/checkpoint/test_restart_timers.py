@@ -55,8 +55,8 @@ async def left_behind(folder: Path, setting: Set, *, saved: bool) -> str:
         assert await alarm.ask(Ticks()) == 0
         if saved:
             await system.checkpoint(alarm)
-        await system.homes.settled()
-        left = killed(system.homes.journal.engine, live)
+        await system._homes.settled()
+        left = killed(system._homes.journal.engine, live)
     return f"sqlite:{left}/app.db"
 
 
@@ -65,9 +65,9 @@ async def left_behind(folder: Path, setting: Set, *, saved: bool) -> str:
 async def test_a_timer_has_run_on_while_the_root_was_away(tmp_path: Path, saved: bool, later: float) -> None:
     store = await left_behind(tmp_path, Set(3600.0), saved=saved)
     async with hf.ActorSystem("app", store=store, log=False) as system:
-        system.node.clock.wall = lambda: time.time() + later
+        system._node.clock.wall = lambda: time.time() + later
         alarm = await system.start(ALARM)
-        home = system.homes.at(alarm.path)
+        home = system._homes.at(alarm.path)
         assert home is not None
         ((_, _, left, _),) = home.timers.saved().values()
         assert left == pytest.approx(10.0 if later > 0 else 3600.0, abs=5.0)
@@ -80,7 +80,7 @@ async def test_what_was_due_while_the_root_was_away_comes_once_at_once(
 ) -> None:
     store = await left_behind(tmp_path, Set(100.0, every), saved=saved)
     async with hf.ActorSystem("app", store=store, log=False) as system:
-        system.node.clock.wall = lambda: time.time() + 1_000.0
+        system._node.clock.wall = lambda: time.time() + 1_000.0
         alarm = await system.start(ALARM)
         while not await alarm.ask(Ticks()):
             pass

@@ -113,7 +113,7 @@ async def test_what_cannot_be_migrated_is_refused_and_kept(
 
 async def look(store: str) -> tuple[bytes | None, int]:
     async with hf.ActorSystem("app", store=store, log=False) as system:
-        saved: Saved = system.homes.journal.load("/app/x")
+        saved: Saved = system._homes.journal.load("/app/x")
         return saved.snapshot, saved.turn
 
 
@@ -125,7 +125,7 @@ async def test_what_an_earlier_holdfast_has_recorded_is_read(
     copied(name, tmp_path)
     recovery = hf.hybrid(interval=NEVER)
     async with hf.ActorSystem("app", store=f"sqlite:{tmp_path / name}", log=False) as system:
-        assert system.homes.journal.load("/app/record").entries, "there is something to replay"
+        assert system._homes.journal.load("/app/record").entries, "there is something to replay"
         spec = hf.child("record", hf.start(Record, cells), isolation=isolation, recovery=recovery)
         ref = await system.start(spec)
         assert await ref.ask(Show(), timeout=20.0) == expected(cells)
@@ -146,7 +146,7 @@ async def test_digests_quarantine_and_group_of_an_earlier_holdfast_are_read(tmp_
     copied("checked.db", tmp_path)
     store = f"sqlite:{tmp_path / 'checked.db'}"
     async with hf.ActorSystem("app", store=store, log=False) as system:
-        entries = system.homes.journal.load("/app/record").entries
+        entries = system._homes.journal.load("/app/record").entries
         assert any(entry[0] == "end" and len(entry) == 6 for _, entry in entries), "there are digests to compare"
         ref = await system.start(hf.child("record", hf.start(Record, 10), isolation=isolation, recovery=CHECKED))
         assert await ref.ask(Show(), timeout=20.0) == expected(10)
@@ -164,7 +164,7 @@ async def test_a_snapshot_of_a_later_holdfast_is_refused(tmp_path: Path) -> None
     store = f"sqlite:{tmp_path / 'app.db'}"
     await recorded(store, Stubborn)
     async with hf.ActorSystem("app", store=store, log=False) as system:
-        journal = system.homes.journal
+        journal = system._homes.journal
         saved = journal.load("/app/x")
         assert saved.snapshot is not None
         later = msgspec.structs.replace(decode_meta(saved.snapshot), format=9)

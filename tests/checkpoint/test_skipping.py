@@ -154,10 +154,10 @@ async def pilot(system: hf.ActorSystem, isolation: str = "task", **options: Any)
     return await start(system, isolation, "pilot", hf.start(Pilot), recovery=recovery)
 
 
-async def skipped(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> hf.TurnsSkipped:
+async def skipped(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> hf.events.TurnsSkipped:
     with system.events() as stream:
         strike(system, ref)
-        return await event(stream, hf.TurnsSkipped)
+        return await event(stream, hf.events.TurnsSkipped)
 
 
 async def test_readonly_turns_are_left_out(system: hf.ActorSystem, isolation: str) -> None:

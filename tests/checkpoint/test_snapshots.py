@@ -31,13 +31,13 @@ async def canvas(system: hf.ActorSystem, isolation: str, *arguments: Any, **opti
 
 def handler(system: hf.ActorSystem) -> Any:
     """Whoever is the checkpoint handler now."""
-    return system.node.find(HANDLER)
+    return system._node.find(HANDLER)
 
 
-async def taken(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> hf.SnapshotTaken:
+async def taken(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> hf.events.SnapshotTaken:
     with system.events() as stream:
         await system.checkpoint(ref, timeout=20.0)
-        return await event(stream, hf.SnapshotTaken)
+        return await event(stream, hf.events.SnapshotTaken)
 
 
 def running(store: str | None) -> hf.ActorSystem:
@@ -64,7 +64,7 @@ async def test_what_has_not_changed_is_not_written_again_and_all_of_it_comes_bac
         before = await ref.ask(Digest())
         with system.events() as stream:
             strike(system, ref)
-            recovered = await event(stream, hf.Recovered)
+            recovered = await event(stream, hf.events.Recovered)
         assert await ref.ask(Digest(), timeout=20.0) == before
         assert recovered.replayed == 1, "what no snapshot has: a change; the look is left out"
 
@@ -97,7 +97,7 @@ async def test_a_snapshot_is_in_the_store_when_checkpoint_returns(store: str | N
         await ref.ask(Paint(3, 5))
         await system.checkpoint(ref, timeout=20.0)
         switch: Any = ref._cell.host.home.switch  # type: ignore[attr-defined]
-        saved = system.homes.journal.load(ref.path)
+        saved = system._homes.journal.load(ref.path)
         assert saved.turn == switch.turn
         assert not saved.entries
         before = await ref.ask(Digest())
@@ -111,9 +111,9 @@ async def test_a_snapshot_is_taken_every_so_many_messages(system: hf.ActorSystem
     with system.events() as stream:
         for _ in range(19):
             await ref.ask(Write("x"))
-        assert not [one for one in stream.take() if isinstance(one, hf.SnapshotTaken)]
+        assert not [one for one in stream.take() if isinstance(one, hf.events.SnapshotTaken)]
         await ref.ask(Write("x"))
-        first = await event(stream, hf.SnapshotTaken)
+        first = await event(stream, hf.events.SnapshotTaken)
         assert 19 <= first.turn <= 21
 
 
@@ -122,10 +122,10 @@ async def test_a_snapshot_is_taken_after_so_many_bytes_of_journal(system: hf.Act
     with system.events() as stream:
         for _ in range(4):
             await ref.ask(Write("x" * 10_000))
-        assert not [one for one in stream.take() if isinstance(one, hf.SnapshotTaken)]
+        assert not [one for one in stream.take() if isinstance(one, hf.events.SnapshotTaken)]
         for _ in range(3):
             await ref.ask(Write("x" * 10_000))
-        await event(stream, hf.SnapshotTaken)
+        await event(stream, hf.events.SnapshotTaken)
 
 
 async def test_a_snapshot_is_taken_when_the_interval_is_over_and_only_of_what_has_changed(
@@ -134,9 +134,9 @@ async def test_a_snapshot_is_taken_when_the_interval_is_over_and_only_of_what_ha
     ref = await canvas(system, isolation, 10, interval=0.05)
     await ref.ask(Write("x"))
     with system.events() as stream:
-        await event(stream, hf.SnapshotTaken)
+        await event(stream, hf.events.SnapshotTaken)
         await asyncio.sleep(0.3)  # There is nothing to wait for: nothing shall happen.
-        assert not [one for one in stream.take() if isinstance(one, hf.SnapshotTaken)]
+        assert not [one for one in stream.take() if isinstance(one, hf.events.SnapshotTaken)]
 
 
 async def test_whoever_wants_a_snapshot_gets_it_however_often_the_handler_dies(
@@ -161,7 +161,7 @@ async def test_the_interval_goes_on_with_the_next_handler(system: hf.ActorSystem
     await until(lambda: handler(system).life > 1)
     await ref.ask(Write("x"))
     with system.events() as stream:
-        await event(stream, hf.SnapshotTaken)
+        await event(stream, hf.events.SnapshotTaken)
 
 
 async def test_what_cannot_be_saved_is_told_tried_again_and_nothing_is_lost(
@@ -171,18 +171,18 @@ async def test_what_cannot_be_saved_is_told_tried_again_and_nothing_is_lost(
     await system.checkpoint(ref, timeout=20.0)
     await ref.ask(Spoil(True))
     with system.events() as stream:
-        failed = await event(stream, hf.SnapshotFailed)
+        failed = await event(stream, hf.events.SnapshotFailed)
         assert "spoiled" in failed.reason
-        again = await event(stream, hf.SnapshotFailed)
+        again = await event(stream, hf.events.SnapshotFailed)
         assert again.reason == failed.reason
-    with pytest.raises(hf.CheckpointFailed, match="spoiled"):
+    with pytest.raises(hf.errors.CheckpointFailed, match="spoiled"):
         await system.checkpoint(ref, timeout=20.0)
     await ref.ask(Spoil(False))
     await system.checkpoint(ref, timeout=20.0)
     assert (await taken_after(system, ref)).written_bytes < 300_000, "the images before it are still good"
 
 
-async def taken_after(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> hf.SnapshotTaken:
+async def taken_after(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> hf.events.SnapshotTaken:
     await ref.ask(Write("x"))
     return await taken(system, ref)
 

@@ -25,14 +25,14 @@ class Adder(hf.Actor):
 
     @hf.on(Add)
     async def add(self, message: Add) -> int:
-        if self.ctx.cell.life > 1:
+        if self.ctx._cell.life > 1:
             self.items.append(message.n)
             return len(self.items)
         loop = asyncio.get_running_loop()
         self.items.append(-1)
         try:
             if message.end == "kill":
-                loop.call_soon(self.ctx.cell.kill)
+                loop.call_soon(self.ctx._cell.kill)
                 await asyncio.Event().wait()
             await asyncio.sleep(0)
         finally:  # It comes behind this turn and ahead of the actor's next slice.

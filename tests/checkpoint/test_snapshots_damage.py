@@ -79,7 +79,7 @@ async def test_a_damaged_newest_pack_costs_nothing(tmp_path: Path, where: str, c
         with system.events() as stream:
             ref = await begun(system, CELLS, compress=compress)
             assert await ref.ask(Digest(), timeout=20.0) == before
-            (said,) = [one for one in stream.take() if isinstance(one, hf.SnapshotDamaged)]
+            (said,) = [one for one in stream.take() if isinstance(one, hf.events.SnapshotDamaged)]
         assert "snapshot file" in said.reason
         assert said.address == ref.path
 
@@ -107,7 +107,7 @@ async def test_as_many_as_are_kept_can_be_fallen_back_on(
         with system.events() as stream:
             ref = await begun(system, 10, keep=keep)
             assert await ref.ask(Digest()) == before
-            assert [one for one in stream.take() if isinstance(one, hf.SnapshotDamaged)]
+            assert [one for one in stream.take() if isinstance(one, hf.events.SnapshotDamaged)]
 
 
 async def test_a_pack_that_all_snapshots_need_is_missed_loudly(tmp_path: Path) -> None:
@@ -252,4 +252,4 @@ async def test_a_snapshot_whose_life_ends_before_it_is_kept_leaves_no_pack(
             await system.checkpoint(ref, timeout=20.0)
             await asyncio.gather(*saves())
         assert len(numbers) == (2 if order == "before the next one" else 3)
-        assert numbers[0] not in system.homes.journal.packs("/app/sheet")
+        assert numbers[0] not in system._homes.journal.packs("/app/sheet")

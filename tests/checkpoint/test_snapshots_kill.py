@@ -88,7 +88,7 @@ async def test_the_forked_writer_dies_in_the_middle_of_a_snapshot(system: hf.Act
             problem = wish.exception()
             assert problem is None or "died" in str(problem), f"round {number}"
             broken += problem is not None
-        failed = [one for one in stream.take() if isinstance(one, hf.SnapshotFailed)]
+        failed = [one for one in stream.take() if isinstance(one, hf.events.SnapshotFailed)]
     assert broken >= 3
     assert failed, "a writer that was killed has written nothing that counts"
     os.kill(system.pid_of(ref), signal.SIGKILL)

@@ -110,7 +110,7 @@ def running(path: Path) -> hf.ActorSystem:
 async def test_what_was_stashed_in_it_and_handled_since_is_replayed_after_a_restart_of_the_root(tmp_path: Path) -> None:
     async with running(tmp_path / "app.db") as system:
         ref = await begun(system)
-        held = Held(system.homes.journal)
+        held = Held(system._homes.journal)
         ref.tell(Aside("early"))
         await ref.ask(Words())
         wish = asyncio.ensure_future(system.checkpoint(ref, timeout=20.0))
@@ -128,7 +128,7 @@ async def test_what_was_stashed_in_it_and_handled_since_is_replayed_after_a_rest
 async def test_one_that_is_late_for_a_crash_does_not_count(tmp_path: Path) -> None:
     async with running(tmp_path / "app.db") as system:
         ref = await begun(system)
-        held = Held(system.homes.journal)
+        held = Held(system._homes.journal)
         ref.tell(Open())
         ref.tell(Aside("one"))
         await ref.ask(Words())
@@ -136,7 +136,7 @@ async def test_one_that_is_late_for_a_crash_does_not_count(tmp_path: Path) -> No
         await asyncio.to_thread(held.has_begun.wait, 20.0)
         with system.events() as stream:
             ref.kill()
-            recovered = await event(stream, hf.Recovered)
+            recovered = await event(stream, hf.events.Recovered)
             assert recovered.replayed >= 3
         held.may_go.set()
         await wish
@@ -152,7 +152,7 @@ async def test_an_actor_is_released_before_the_snapshot_of_what_was_replayed(tmp
         assert await ref.ask(Words()) == ["1"]
         with system.events() as events:
             os.kill(system.pid_of(ref), 9)
-            assert (await event(events, hf.Recovered)).replayed
+            assert (await event(events, hf.events.Recovered)).replayed
             assert not file.exists()
             file.touch()
             assert await ref.ask(Words(), timeout=60.0) == ["1"]

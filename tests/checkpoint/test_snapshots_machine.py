@@ -65,7 +65,7 @@ class Snapshots(RuleBasedStateMachine):
         async def strike() -> None:
             assert self.ref is not None
             self.ref.kill()
-            await self.system.node.settled()
+            await self.system._node.settled()
 
         self.runner.run(strike())
 

@@ -91,7 +91,7 @@ class Asker(hf.Actor):
             await asyncio.sleep(0)
         try:
             CALLS[message.what][0]()
-        except hf.NotDeterministic:
+        except hf.errors.NotDeterministic:
             if not message.swallow:
                 raise
         return "it was let through"
@@ -204,7 +204,7 @@ async def test_the_first_turn_that_a_replay_handles_otherwise_is_named(
             ref.kill()
             async with asyncio.timeout(30.0):
                 async for event in events:
-                    if isinstance(event, hf.RecoveryFailed):
+                    if isinstance(event, hf.events.RecoveryFailed):
                         why = event.reason
                         break
         assert "turn 2: after tests.checkpoint.test_strict:Put" in why

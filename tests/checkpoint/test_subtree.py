@@ -106,7 +106,7 @@ async def test_a_child_is_stopped_restarted_and_deleted_by_its_supervisor(system
     assert await at(system, "one").ask(Seen()) == ["kept"]
     await house.ask(TerminateChild("one"))
     await house.ask(DeleteChild("one"))
-    with pytest.raises(hf.NoSuchActor):
+    with pytest.raises(hf.errors.NoSuchActor):
         at(system, "one")
 
 
@@ -189,7 +189,7 @@ async def test_the_subtree_stopped_and_started_again_has_its_state(system: hf.Ac
     await at(system, "inner/deep").ask(Note("kept"))
     root = system.ref("/app", hf.Supervisor)
     await root.ask(TerminateChild("team"))
-    with pytest.raises(hf.NoSuchActor):
+    with pytest.raises(hf.errors.NoSuchActor):
         at(system, "inner/deep")
     await root.ask(RestartChild("team"))
     assert await at(system, "inner/deep").ask(Seen()) == ["kept"]
@@ -221,7 +221,7 @@ async def test_nothing_is_lost_or_doubled_however_the_process_dies(system: hf.Ac
         sent[name].append(text)
         asks.append(at_any(system, name).ask(Note(text), timeout=20.0))
         if rng.random() < 0.06:
-            with contextlib.suppress(hf.NoSuchActor, ProcessLookupError):  # It is between two lives already.
+            with contextlib.suppress(hf.errors.NoSuchActor, ProcessLookupError):  # It is between two lives already.
                 kill_process(system)
         await asyncio.sleep(rng.random() * 0.004)
     await asyncio.gather(*asks)
@@ -231,4 +231,4 @@ async def test_nothing_is_lost_or_doubled_however_the_process_dies(system: hf.Ac
 
 def at_any(system: hf.ActorSystem, name: str) -> hf.ActorRef[Any]:
     """By address, also while nobody lives there."""
-    return system.node.cell_at(f"/app/team/{name}").ref
+    return system._node.cell_at(f"/app/team/{name}").ref

@@ -272,8 +272,8 @@ async def test_what_on_stop_does_is_in_force_when_it_comes_back(isolation: str, 
 def forbidden(ctx: Any, ref: hf.ActorRef[Any]) -> dict[str, Any]:
     """What neither `__init__` nor a background task may do. (What `__init__` sends comes from nobody.)"""
     return {
-        "tell": lambda: ctx.tell(ref._cell, Act()),
-        "ask": lambda: ctx.ask(ref._cell, Act(), 1.0),
+        "tell": lambda: ctx._tell(ref._cell, Act()),
+        "ask": lambda: ctx._ask(ref._cell, Act(), 1.0),
         "every": lambda: ctx.every(NEVER, Tick("x")),
         "tell_after": lambda: ctx.tell_after(NEVER, Tick("x")),
         "subscribe": lambda: ctx.subscribe("/x"),

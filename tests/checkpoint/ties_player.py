@@ -84,15 +84,15 @@ async def main(store: str, order: str, saved: str, life: str) -> None:
             await watcher.ask(Tie(others))
             if saved == "saved":
                 await system.checkpoint(watcher)
-            await system.homes.settled()
+            await system._homes.settled()
             os.kill(os.getpid(), signal.SIGKILL)
-        await system.node.settled()
+        await system._node.settled()
         for other in others:
             other.tell(Crash())
         told: list[str] = []
         while len(told) < 4:
             told = await watcher.ask(Told())
-        await system.node.settled()
+        await system._node.settled()
         print(json.dumps(await watcher.ask(Told())))
 
 

@@ -54,7 +54,7 @@ async def add(system: hf.ActorSystem, *words: str, name: str = "doer") -> None:
         await at(system, name).ask(Do([f"add {word}"]), timeout=20.0)
 
 
-async def back(stream: hf.EventStream, kind: Any = hf.Recovered, address: str = "/app/top/doer") -> Any:
+async def back(stream: hf.events.EventStream, kind: Any = hf.events.Recovered, address: str = "/app/top/doer") -> Any:
     """Wait for what is told of an address."""
     async for event in stream:
         if isinstance(event, kind) and event.address == address:
@@ -76,7 +76,7 @@ async def escalate(system: hf.ActorSystem, isolation: str) -> None:
             await with_crash
         except hf.RemoteCrash:
             pass
-        await back(stream, hf.ChildRestarted, "/app/top")
+        await back(stream, hf.events.ChildRestarted, "/app/top")
     await until(lambda: "/app/top/doer" in system.tree() and at(system)._cell.host.is_up(at(system)._cell))
 
 

@@ -65,7 +65,7 @@ async def main(store: str, order: str, life: str) -> None:
             asker.tell(Go(str(marker)))
             while not marker.exists():
                 await asyncio.sleep(0)
-            await system.homes.settled()
+            await system._homes.settled()
             os.kill(os.getpid(), signal.SIGKILL)
         print(await asker.ask(Outcome(), timeout=50.0))
 

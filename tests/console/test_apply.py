@@ -98,7 +98,7 @@ async def reconfigure(system):
 async def test_a_script_is_carried_out_in_the_running_system(system: hf.ActorSystem, path: Path, grow: Path) -> None:
     with system.events() as stream:
         status, output, errors = await holdfast("apply", grow, "--socket", path)
-        loaded = [event for event in stream.take() if isinstance(event, hf.ScriptLoaded)]
+        loaded = [event for event in stream.take() if isinstance(event, hf.events.ScriptLoaded)]
     assert (status, errors) == (DONE, "")
     assert "1. add /app/left/greeter\n2. register /app/left/greeter as 'greeter'\n" in output
     assert output.endswith("done\n")
@@ -216,7 +216,7 @@ async def test_a_module_that_others_may_write_is_not_imported(
     module.chmod(0o600)
     with system.events() as stream:
         status, _, errors = await holdfast("apply", script, "--socket", path)
-        told = [event.path for event in stream.take() if isinstance(event, hf.ScriptLoaded)]
+        told = [event.path for event in stream.take() if isinstance(event, hf.events.ScriptLoaded)]
     assert (status, errors) == (DONE, "")
     assert os.path.realpath(module) in told
     assert "/app/left/x" in system.tree()

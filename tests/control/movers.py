@@ -341,8 +341,8 @@ def lives_in(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> Any:
     return "task" if system.pid_of(ref) == os.getpid() else "process"
 
 
-def moved(stream: hf.EventStream) -> list[tuple[str, str]]:
-    return [(event.origin, event.to) for event in stream.take() if isinstance(event, hf.Moved)]
+def moved(stream: hf.events.EventStream) -> list[tuple[str, str]]:
+    return [(event.origin, event.to) for event in stream.take() if isinstance(event, hf.events.Moved)]
 
 
 class Shutter(hf.Actor):

@@ -41,7 +41,7 @@ async def test_code_is_replaced_for_good(system: hf.ActorSystem, start_one: Star
 
 async def test_code_is_replaced_in_suspended_actors_only(system: hf.ActorSystem, start_one: Starter) -> None:
     one = await start_one(hf.start(Account))
-    with pytest.raises(hf.NotSuspended, match="must be suspended first"):
+    with pytest.raises(hf.errors.NotSuspended, match="must be suspended first"):
         await system.replace_code(one, Cents)
     assert await one.ask(Add(1)) == 1
 
@@ -49,7 +49,7 @@ async def test_code_is_replaced_in_suspended_actors_only(system: hf.ActorSystem,
 async def test_a_migration_that_fails_leaves_the_old_class(system: hf.ActorSystem, start_one: Starter) -> None:
     one = await start_one(hf.start(Account))
     await system.suspend(one)
-    with pytest.raises(hf.ControlFailed, match=r"replace_code of .* failed: RuntimeError: no way from there"):
+    with pytest.raises(hf.errors.ControlFailed, match=r"replace_code of .* failed: RuntimeError: no way from there"):
         await system.replace_code(one, Cents, cannot)
     await system.resume(one)
     assert await one.ask(Add(1)) == 1
@@ -83,7 +83,7 @@ async def test_replaced_code_outlives_its_supervisor(system: hf.ActorSystem, way
         await gone
         async with asyncio.timeout(30.0):
             async for event in stream:
-                if isinstance(event, hf.ActorStarted) and event.address == "/app/top":
+                if isinstance(event, hf.events.ActorStarted) and event.address == "/app/top":
                     break
     assert await system.ref("/app/top/inner/one", Cents).ask(Add(1), timeout=30.0) == 100
 

@@ -163,9 +163,9 @@ async def test_a_state_is_replaced_where_the_actor_lives(
 async def test_a_change_that_raises_leaves_the_state_alone(system: hf.ActorSystem, start_one: Starter) -> None:
     one = await start_one(hf.start(Account))
     assert await one.ask(Add(1)) == 1
-    with pytest.raises(hf.ControlFailed, match=r"replace_state of .*/one failed: KeyError: 'no such account'"):
+    with pytest.raises(hf.errors.ControlFailed, match=r"replace_state of .*/one failed: KeyError: 'no such account'"):
         await system.replace_state(one, spoil)
-    with pytest.raises(hf.ControlFailed, match="the state must be a dict of variables"):
+    with pytest.raises(hf.errors.ControlFailed, match="the state must be a dict of variables"):
         await system.replace_state(one, no_state)
     assert await system.get_state(one) == {"total": 1, "seen": [1]}
     assert await one.ask(Add(1)) == 2
@@ -212,11 +212,11 @@ async def test_a_replaced_state_survives_a_kill_together_with_what_follows(
 
 async def test_a_state_that_the_class_refuses_half_way_is_put_back(system: hf.ActorSystem, start_one: Starter) -> None:
     one = await start_one(hf.start(Strict))
-    with pytest.raises(hf.ControlFailed, match="ValueError: in debt"):
+    with pytest.raises(hf.errors.ControlFailed, match="ValueError: in debt"):
         await system.replace_state(one, in_debt)
     assert await system.get_state(one) == {"total": 0, "seen": [], "level": 1}
     hooked = await system.start(hf.child("hooked", hf.start(StrictWhole)))
-    with pytest.raises(hf.ControlFailed, match="ValueError: too many"):
+    with pytest.raises(hf.errors.ControlFailed, match="ValueError: too many"):
         await system.replace_state(hooked, reverse)
     assert await system.get_state(hooked) == [1, 2]
 
@@ -253,7 +253,7 @@ async def test_what_a_suspended_actor_unstashes_waits_too(system: hf.ActorSystem
     cell = one._cell
     assert cell.ctx is not None
     cell.ctx.unstash()  # as a background task of the actor may
-    await system.node.settled()
+    await system._node.settled()
     assert await system.get_state(one) == {"seen": []}
     await system.resume(one)
     assert await one.ask(Total()) == 1
@@ -268,7 +268,7 @@ async def test_a_replaced_state_that_cannot_be_saved_is_undone(tmp_path: Path, i
         limits = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, limits[1]))  # large states are files
         try:
-            with pytest.raises(hf.ControlFailed, match="the new state could not be saved"):
+            with pytest.raises(hf.errors.ControlFailed, match="the new state could not be saved"):
                 await system.replace_state(one, large)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -284,10 +284,10 @@ def _strike(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
         os.kill(pid, signal.SIGKILL)
 
 
-async def _recovered(stream: hf.EventStream) -> None:
+async def _recovered(stream: hf.events.EventStream) -> None:
     async with asyncio.timeout(30.0):
         async for event in stream:
-            if isinstance(event, hf.Recovered):
+            if isinstance(event, hf.events.Recovered):
                 return
 
 
@@ -370,7 +370,7 @@ async def test_what_cannot_leave_the_process_is_shown_as_text(system: hf.ActorSy
     for isolation in ("task", "process"):
         one = await system.start(hf.child(isolation, hf.start(Holder), isolation=isolation))
         shown = (await system.get_state(one))["file"]
-        assert isinstance(shown, hf.Opaque)
+        assert isinstance(shown, hf.system.Opaque)
         assert "/dev/null" in shown.text
         await system.replace_state(one, functools.partial(plus, 4))  # what cannot be copied stays as it is
         assert await one.ask(Total()) == 4

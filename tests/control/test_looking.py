@@ -87,20 +87,20 @@ async def test_a_trace_tells_turns_and_messages(system: hf.ActorSystem, start_on
         with pytest.raises(No):
             await one.ask(Refuse())
         told = await _until_ended(stream, 2)
-    kinds = [type(event).__name__ for event in told if not isinstance(event, hf.MessageIn)]
+    kinds = [type(event).__name__ for event in told if not isinstance(event, hf.events.MessageIn)]
     assert kinds == ["TurnBegan", "MessageOut", "TurnEnded", "TurnBegan", "TurnEnded"]
-    assert [event.outcome for event in told if isinstance(event, hf.TurnEnded)] == ["done", "refused"]
-    assert [event.to for event in told if isinstance(event, hf.MessageOut)] == ["/app/sink"]
-    assert sum(isinstance(event, hf.MessageIn) for event in told) == 2
+    assert [event.outcome for event in told if isinstance(event, hf.events.TurnEnded)] == ["done", "refused"]
+    assert [event.to for event in told if isinstance(event, hf.events.MessageOut)] == ["/app/sink"]
+    assert sum(isinstance(event, hf.events.MessageIn) for event in told) == 2
     assert all(event.address == one.path for event in told)
 
 
-async def _until_ended(stream: hf.EventStream, turns: int) -> list[Any]:
+async def _until_ended(stream: hf.events.EventStream, turns: int) -> list[Any]:
     told: list[Any] = []
     async with asyncio.timeout(30.0):
         async for event in stream:
             told.append(event)
-            turns -= isinstance(event, hf.TurnEnded)
+            turns -= isinstance(event, hf.events.TurnEnded)
             if not turns:
                 break
     return told
@@ -112,7 +112,7 @@ async def test_a_trace_goes_on_over_a_restart_and_ends_with_the_address(
     one = await start_one(hf.start(Account))
     with await system.trace(one) as stream:
         one.tell(Crash())
-        (began,) = [event for event in await _until_ended(stream, 1) if isinstance(event, hf.TurnEnded)]
+        (began,) = [event for event in await _until_ended(stream, 1) if isinstance(event, hf.events.TurnEnded)]
         assert began.outcome == "crashed: ValueError"
         await one.ask(Total(), timeout=30.0)
         one.tell(Add(1))

@@ -63,8 +63,15 @@ async def test_an_actor_is_moved_there_and_back_with_its_state(
             assert told.startswith(f"{pid} shutdown (moved")
             end.unlink()
         told_of = stream.take()
-    assert [(e.origin, e.to) for e in told_of if isinstance(e, hf.Moved)] == [(here, OTHER[here]), (OTHER[here], here)]
-    assert not [e for e in told_of if isinstance(e, (hf.ChildRestarted, hf.ChildTerminated, hf.ActorStarted))]
+    assert [(e.origin, e.to) for e in told_of if isinstance(e, hf.events.Moved)] == [
+        (here, OTHER[here]),
+        (OTHER[here], here),
+    ]
+    assert not [
+        e
+        for e in told_of
+        if isinstance(e, (hf.events.ChildRestarted, hf.events.ChildTerminated, hf.events.ActorStarted))
+    ]
     assert await one.ask(Add(1)) == 6
     state = await system.get_state(one)
     assert state == {"total": 6, "seen": [5, 1], "starts": [False, True, True] if recovery is None else state["starts"]}
@@ -102,12 +109,12 @@ async def test_children_start_in_the_new_place_when_their_supervisor_is_started_
         one.kill()  # Its supervisor gives up, and is started anew by the root.
         async with asyncio.timeout(30.0):
             async for event in stream:
-                if isinstance(event, hf.ActorStarted) and event.address == "/app/top/one":
+                if isinstance(event, hf.events.ActorStarted) and event.address == "/app/top/one":
                     break
     again = system.ref("/app/top/one", Account)
     assert await again.ask(Add(1), timeout=30.0) == 1
     assert lives_in(system, again) == "process"
-    spec = await supervisor.ask(hf.GetChildSpec("one"))
+    spec = await supervisor.ask(hf.supervision.GetChildSpec("one"))
     assert isinstance(spec, hf.ChildSpec)
     assert spec.isolation == "process"
 
@@ -128,9 +135,9 @@ async def test_limits_are_those_of_the_move(system: hf.ActorSystem) -> None:
     await system.set_isolation(one, "process", limits=hf.Limits(niceness=7))
     own = os.getpriority(os.PRIO_PROCESS, 0)
     assert os.getpriority(os.PRIO_PROCESS, await one.ask(Where())) == min(19, own + 7)
-    root = system.node.root
+    root = system._node.root
     assert root is not None
-    spec = await hf.ActorRef[hf.Supervisor](root).ask(hf.GetChildSpec("one"))
+    spec = await hf.ActorRef[hf.Supervisor](root).ask(hf.supervision.GetChildSpec("one"))
     assert isinstance(spec, hf.ChildSpec)
     assert spec.limits == hf.Limits(niceness=7)
 
@@ -241,7 +248,7 @@ async def test_an_ask_whose_handle_would_be_lost_keeps_the_actor_where_it_is(sys
     one = await system.start(hf.child("one", hf.start(Delayed, True), isolation=here))
     asked = one.ask(Later())
     await one.ask(Where())  # It has begun both.
-    with pytest.raises(hf.CannotMove, match="1 asks wait for replies"):
+    with pytest.raises(hf.errors.CannotMove, match="1 asks wait for replies"):
         await system.set_isolation(one, OTHER[here])
     assert await one.ask(Answer(1)) == 1
     assert await asked == 1
@@ -254,7 +261,7 @@ async def test_background_work_is_waited_for(system: hf.ActorSystem, recovery: A
     one = await system.start(hf.child("one", hf.start(Worker), recovery=recovery, isolation=here))
     one.tell(Work(str(gate)))
     await one.ask(Total())
-    with pytest.raises(hf.CannotMove, match="background work"):
+    with pytest.raises(hf.errors.CannotMove, match="background work"):
         await system.set_isolation(one, OTHER[here], timeout=0.2)
     moving = asyncio.ensure_future(system.set_isolation(one, OTHER[here], timeout=30.0))
     assert await one.ask(Add(1)) == 1  # It goes on meanwhile.
@@ -269,7 +276,7 @@ async def test_a_turn_in_hand_is_waited_for(system: hf.ActorSystem, recovery: An
     one = await system.start(hf.child("one", hf.start(Account), recovery=recovery, isolation=here))
     waiting = one.ask(Wait(str(gate)), timeout=30.0)
     await until_there(tmp_path / "gate.begun")
-    with pytest.raises(hf.CannotMove):
+    with pytest.raises(hf.errors.CannotMove):
         await system.set_isolation(one, OTHER[here], timeout=0.2)
     moving = asyncio.ensure_future(system.set_isolation(one, OTHER[here], timeout=30.0))
     gate.touch()
@@ -282,7 +289,7 @@ async def test_a_new_life_that_does_not_come_up_is_ended(system: hf.ActorSystem,
     ended = tmp_path / "ended"
     recipe = hf.start(Homesick, os.getpid(), str(ended))
     one = await system.start(hf.child("one", recipe, recovery=recovery, isolation="process"))
-    with pytest.raises(hf.CannotMove):
+    with pytest.raises(hf.errors.CannotMove):
         await system.set_isolation(one, "task", timeout=1.0)
     await until_there(ended)
     assert lives_in(system, one) == "process"
@@ -333,14 +340,14 @@ async def test_a_state_larger_than_a_frame_goes_along(system: hf.ActorSystem, re
 async def test_a_state_that_cannot_be_saved_is_refused_by_name(system: hf.ActorSystem) -> None:
     one = await system.start(hf.child("one", hf.start(Holder)))
     assert await one.ask(Add(1)) == 1
-    with pytest.raises(hf.CannotMove, match=r"Holder\.file"):
+    with pytest.raises(hf.errors.CannotMove, match=r"Holder\.file"):
         await system.set_isolation(one, "process")
     assert await one.ask(Add(1)) == 2
     assert lives_in(system, one) == "task"
 
 
 async def test_who_cannot_be_moved_is_told_so(system: hf.ActorSystem) -> None:
-    crew = await system.start(hf.partitions("crew", hf.start(Account), 2))
+    crew = await system.start(hf.supervision.partitions("crew", hf.start(Account), 2))
     spawned = system.spawn(hf.start(Account), "spawned")
     spawner = await system.start(hf.child("spawner", hf.start(Spawns)))
     pool = await system.start(hf.dynamic("pool", template=hf.child("one", hf.start(Account)), isolation="process"))
@@ -350,7 +357,7 @@ async def test_who_cannot_be_moved_is_told_so(system: hf.ActorSystem) -> None:
         (spawned, "nobody restarts it"),
         (spawner, r"children of its own \(own\)"),
     ):
-        with pytest.raises(hf.CannotMove, match=why):
+        with pytest.raises(hf.errors.CannotMove, match=why):
             await system.set_isolation(ref, "process")
     assert await spawner.ask(Add(1)) == 1
 
@@ -361,7 +368,7 @@ async def test_a_class_that_cannot_be_imported_there_stays(system: hf.ActorSyste
 
     one = await system.start(hf.child("one", hf.start(Local)))
     assert await one.ask(Add(1)) == 1
-    with pytest.raises(hf.CannotMove, match="defined in a function"):
+    with pytest.raises(hf.errors.CannotMove, match="defined in a function"):
         await system.set_isolation(one, "process")
     assert await one.ask(Add(1)) == 2
 
@@ -432,4 +439,6 @@ async def test_what_a_replay_has_put_back_waits_until_the_new_life_is_the_one(sy
         await system.set_isolation(one, "task", timeout=30.0)
         assert await asyncio.gather(*asked) == list(range(1, 9))
         assert (await system.get_state(one))["taken"] == list(range(8))
-    assert not [event for event in events.take() if isinstance(event, hf.RecoveryFailed | hf.TrustBreached)]
+    assert not [
+        event for event in events.take() if isinstance(event, hf.events.RecoveryFailed | hf.events.TrustBreached)
+    ]

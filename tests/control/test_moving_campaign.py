@@ -93,7 +93,7 @@ async def test_a_process_killed_at_any_step_of_a_move_costs_nothing(
         struck = strike_at(monkeypatch, step, chance.choice((0, 1, 2, 3, 5, 8, 13)))
         try:
             await system.set_isolation(one, OTHER[place], timeout=10.0)
-        except (hf.CannotMove, hf.AskFailed) as error:
+        except (hf.errors.CannotMove, hf.AskFailed) as error:
             print("not moved:", error)
         monkeypatch.undo()
         await asyncio.gather(*struck)

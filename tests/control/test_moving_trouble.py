@@ -40,7 +40,7 @@ async def test_if_the_new_life_does_not_come_up_the_old_one_goes_on(
     while not moving.done():  # Also while it is at rest.
         asks.append(one.ask(Add(1)))
         await asyncio.sleep(0.0005)
-    with pytest.raises(hf.CannotMove):
+    with pytest.raises(hf.errors.CannotMove):
         await moving
     count = len(asks)
     assert await asyncio.gather(*asks) == list(range(6, 6 + count))
@@ -126,7 +126,7 @@ async def test_an_actor_that_stops_itself_in_the_turn_that_is_waited_for_stops(
     gate.touch()
     async with asyncio.timeout(30.0):
         assert await gone == hf.NORMAL
-    with pytest.raises(hf.CannotMove, match="its life has ended"):
+    with pytest.raises(hf.errors.CannotMove, match="its life has ended"):
         await moving
 
 
@@ -151,7 +151,7 @@ async def test_statistics_and_trace_go_on(system: hf.ActorSystem, here: Any) -> 
         await one.ask(Add(1))
         await system.set_isolation(one, here)
         await one.ask(Add(1))
-        ends = [event for event in stream.take() if isinstance(event, hf.TurnEnded)]
+        ends = [event for event in stream.take() if isinstance(event, hf.events.TurnEnded)]
     assert len(ends) == 3
     counts = await system.statistics(one)
     assert counts is not None
@@ -200,7 +200,7 @@ async def test_an_attempt_right_after_one_that_was_given_up_takes_nothing_of_it(
     if suspended:
         await system.suspend(one)
     for _ in range(first):
-        with pytest.raises(hf.CannotMove, match="the time is over"):
+        with pytest.raises(hf.errors.CannotMove, match="the time is over"):
             await system.set_isolation(one, OTHER[here])
         asks.append(one.ask(Add(10), timeout=30.0))
     await system.set_isolation(one, OTHER[here])
@@ -219,5 +219,5 @@ async def test_who_waits_for_a_move_hears_that_the_system_ends(recovery: Any, tm
         gate.touch()  # The next life does not come up.
         moving = asyncio.ensure_future(system.set_isolation(one, "process", timeout=300.0))
         await asyncio.sleep(0)  # It has begun.
-    with pytest.raises(hf.CannotMove, match="the system ends"):  # Nobody has cancelled us.
+    with pytest.raises(hf.errors.CannotMove, match="the system ends"):  # Nobody has cancelled us.
         await moving

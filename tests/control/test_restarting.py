@@ -23,7 +23,7 @@ class Asker(hf.Actor):
     async def ask(self, message: Asks) -> str:
         try:
             return str(await message.whom.ask(Add(1), timeout=30.0, restarting="fail"))
-        except hf.ActorRestarting as error:
+        except hf.errors.ActorRestarting as error:
             return f"restarting {error.actor}"
 
 
@@ -44,7 +44,7 @@ async def test_an_ask_to_an_actor_that_is_up_is_made(system: hf.ActorSystem, sta
 async def test_an_ask_fails_at_once_between_two_lives(system: hf.ActorSystem, start_one: Starter) -> None:
     one = await start_one(hf.start(Account), backoff=SLOW)
     await crashed(one)
-    with pytest.raises(hf.ActorRestarting, match="/app/one is being restarted"):
+    with pytest.raises(hf.errors.ActorRestarting, match="/app/one is being restarted"):
         await one.ask(Add(1), restarting="fail")
     asker = await system.start(hf.child("asker", hf.start(Asker)))
     assert await asker.ask(Asks(one)) == "restarting /app/one"
@@ -60,7 +60,7 @@ async def test_an_ask_fails_while_the_next_life_comes_up(system: hf.ActorSystem,
     await crashed(one)
     failed = one.ask(Add(1), restarting="fail")
     assert await one.ask(Add(2), timeout=30.0) in (2, 3)
-    with pytest.raises(hf.ActorRestarting):
+    with pytest.raises(hf.errors.ActorRestarting):
         await failed
     assert await one.ask(Add(0), restarting="fail") in (2, 3)
 

@@ -275,7 +275,7 @@ class Hangs(hf.Actor):
 async def main():
     async with hf.ActorSystem("app", log=False) as system:
         system.spawn(hf.start(Hangs)).tell(Go())
-        jobs = hf.Tasks(await system.start(hf.tasks("jobs")))
+        jobs = hf.supervision.Tasks(await system.start(hf.supervision.tasks("jobs")))
         try:
             await jobs.run(threading.Event().wait, timeout=0.1)
         except hf.AskTimeout:

@@ -13,7 +13,7 @@ import pytest
 import holdfast as hf
 
 LIMIT = 0.08
-E = TypeVar("E", bound=hf.Event)
+E = TypeVar("E", bound=hf.events.Event)
 
 
 class Spin(hf.Message):
@@ -63,7 +63,7 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
         yield running
 
 
-async def event(stream: hf.EventStream, kind: type[E]) -> E:
+async def event(stream: hf.events.EventStream, kind: type[E]) -> E:
     async with asyncio.timeout(30.0):
         async for one in stream:
             if isinstance(one, kind):
@@ -76,7 +76,7 @@ async def test_a_turn_that_occupies_the_loop_is_told_of(system: hf.ActorSystem, 
     one = system.spawn(hf.start(Spinner), "one")
     with system.events() as stream:
         one.tell(kind(LIMIT * 4))
-        slow = await event(stream, hf.TurnSlow)
+        slow = await event(stream, hf.events.TurnSlow)
     assert slow.address == "/app/one"
     assert slow.message.endswith(kind.__name__)
     assert LIMIT <= slow.seconds < LIMIT * 40
@@ -86,7 +86,7 @@ async def test_a_loop_that_comes_late_is_told_of(system: hf.ActorSystem) -> None
     with system.events() as stream:
         await asyncio.sleep(0)
         time.sleep(LIMIT * 4)
-        lagged = await event(stream, hf.LoopLagged)
+        lagged = await event(stream, hf.events.LoopLagged)
     assert lagged.address == "app"
     assert lagged.seconds > LIMIT
 
@@ -98,8 +98,8 @@ async def test_turns_that_let_the_loop_go_are_none_of_it(system: hf.ActorSystem)
         await one.ask(Breathe(LIMIT * 5))
         for _ in range(300):
             one.tell(shared)
-        await system.node.settled()
-        assert not [told for told in stream.take() if isinstance(told, hf.TurnSlow)]
+        await system._node.settled()
+        assert not [told for told in stream.take() if isinstance(told, hf.events.TurnSlow)]
 
 
 async def test_nobody_watches_unless_asked_to() -> None:

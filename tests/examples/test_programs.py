@@ -94,7 +94,10 @@ async def test_what_has_no_process_is_not_killed() -> None:
         await run(CASES["planning"].load_or_skip(), kill_at=[1], isolation="task")
 
 
-@pytest.mark.parametrize("name", ["scans", "willow", "particle_filter", "visual_map"])
+WITH_EXAMPLES = [file for file in FOLDER.rglob("*.py") if ">>>" in file.read_text("utf-8")]
+
+
+@pytest.mark.parametrize("name", sorted(".".join(f.relative_to(FOLDER).with_suffix("").parts) for f in WITH_EXAMPLES))
 def test_docstring_examples(name: str) -> None:
     assert doctest.testmod(importlib.import_module(name)).failed == 0
 

@@ -36,19 +36,21 @@ async def work() -> None:
     over = asyncio.Event()
 
     def heard(event: object) -> None:
-        if isinstance(event, hf.LogLine):
+        if isinstance(event, hf.events.LogLine):
             lines.append(event.text)
             if event.text.startswith("got"):
                 over.set()
 
     async with hf.ActorSystem("app", log=False) as system, control_endpoint(system, path):
-        system.node.events.add_sink(heard)
-        child = hf.program([sys.executable, "-I", "-S", "-c", CHILD], id="it", stdin=True, restart="temporary")
+        system._node.events.add_sink(heard)
+        child = hf.supervision.program(
+            [sys.executable, "-I", "-S", "-c", CHILD], id="it", stdin=True, restart="temporary"
+        )
         program = await system.start(child)
         await asyncio.to_thread(len, "")  # Its thread is there.
         wait_for_word()
-        await program.ask(hf.ProgramInput("go\n"), timeout=60.0)
-        await program.ask(hf.ProgramInput(data=b"y" * BYTES, end=True), timeout=60.0)
+        await program.ask(hf.supervision.ProgramInput("go\n"), timeout=60.0)
+        await program.ask(hf.supervision.ProgramInput(data=b"y" * BYTES, end=True), timeout=60.0)
         for _ in range(2):
             print(await asyncio.to_thread(look, path), flush=True)
         await over.wait()

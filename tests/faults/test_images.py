@@ -62,7 +62,7 @@ async def test_nothing_stays_of_a_snapshot_that_cannot_be_written(call: str) -> 
             with system.events() as stream:
                 with pytest.raises(hf.HoldfastError, match="Cannot allocate memory"):
                     await system.checkpoint(ref, timeout=60.0)
-                await event(stream, hf.SnapshotFailed)
+                await event(stream, hf.events.SnapshotFailed)
         finally:
             tracer.terminate()
             tracer.wait()

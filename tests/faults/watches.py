@@ -18,7 +18,7 @@ async def attempt(system: hf.ActorSystem, kind: str, number: int) -> None:
     name = f"{kind}{number}"
     try:
         if kind == "program":
-            await system.start(hf.program(["sleep", "600"], id=name))
+            await system.start(hf.supervision.program(["sleep", "600"], id=name))
         else:
             ledger = await system.start(hf.child(name, hf.start(Ledger), isolation="process"))
             assert await ledger.ask(Enter(number), timeout=60.0) == number

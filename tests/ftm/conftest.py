@@ -11,6 +11,7 @@ import pytest
 import uvloop
 
 import holdfast as hf
+from holdfast.ftm.sec.authority import CertificationAuthority
 
 # The actors of these tests are imported by other processes: by name, so the root has to be on the path.
 ROOT = str(Path(__file__).parents[2])
@@ -28,7 +29,7 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
 @pytest.fixture
 async def secured(system: hf.ActorSystem) -> hf.ActorSystem:
     """A system with a certification authority."""
-    await system.start(hf.child("ca", hf.start(hf.CertificationAuthority)))
+    await system.start(hf.child("ca", hf.start(CertificationAuthority)))
     return system
 
 

@@ -118,11 +118,11 @@ class Driver:
         return f"{ADDRESS}/ftm/{name}"
 
     def protocol(self, name: str) -> hf.ActorRef[Any]:
-        return self.system.node.cell_at(f"{self.path(name)}/protocol").ref
+        return self.system._node.cell_at(f"{self.path(name)}/protocol").ref
 
     def brick(self, name: str, brick: str) -> Any:
         """A brick that lives in this process."""
-        return self.system.node.cell_at(f"{self.path(name)}/{brick}").actor
+        return self.system._node.cell_at(f"{self.path(name)}/{brick}").actor
 
     def server(self, name: str) -> Any:
         """The protected actor of a replica in this process."""
@@ -163,7 +163,7 @@ class Driver:
 
     def feed(self, message: hf.Message[Any], *, is_ask: bool = True, deadline: float = 0.0) -> Feed:
         key = self._id()
-        body = self.system.node.codec.encode(message, ADDRESS)
+        body = self.system._node.codec.encode(message, ADDRESS)
         name = message_name(type(message))
         feed = Feed(key, -1, MESSAGE, name, body, 1000.0 + key, None, is_ask, (), (), deadline)
         self.feeds[key], self.kinds[key] = feed, type(message)
@@ -270,14 +270,14 @@ class Driver:
 
     async def reply(self, key: int) -> Any:
         end = await self.until(key)
-        codec = self.system.node.codec
+        codec = self.system._node.codec
         if end.answer.kind == "reply":
             return codec.decode_reply(self.kinds[key], end.answer.body)
         raise codec.decode_error(end.answer.kind, end.answer.name, end.answer.body)
 
     async def stop_replica(self, name: str) -> None:
         """A replica's process is gone."""
-        cell = self.system.node.cell_at(self.path(name))
+        cell = self.system._node.cell_at(self.path(name))
         gone = cell.ended()
         cell.kill()
         await gone

@@ -288,13 +288,13 @@ def spoil(actor: Any) -> None:
 
 
 def is_ask(actor: Any) -> bool:
-    item = actor.ctx.item
+    item = actor.ctx._item
     return item is not None and not isinstance(item, Envelope) and hasattr(item, "future")
 
 
 def again(actor: Any, item: Any) -> None:
     """The same message once more, as a copy from the same sender would come."""
-    ref = actor.ctx.cell.ref
+    ref = actor.ctx._cell.ref
     if is_ask(actor):
         ref.ask(item, timeout=10.0).add_done_callback(lambda done: done.cancelled() or done.exception())
     else:
@@ -308,7 +308,7 @@ async def late(handler: Any, actor: Any, item: Any) -> Any:
 
 
 def overtaken(actor: Any, item: Any) -> Any:
-    ref, loop = actor.ctx.cell.ref, actor.ctx.cell.node.loop
+    ref, loop = actor.ctx._cell.ref, actor.ctx._cell.node.loop
     if not is_ask(actor):
         loop.call_later(DELAY, ref.tell, item)
         return None
@@ -349,7 +349,7 @@ def altered(item: Any) -> Any:
 
 def forge(actor: Any) -> None:
     """What somebody else would like this actor to believe: in plain words, and as if it were sealed."""
-    ref = actor.ctx.cell.ref
+    ref = actor.ctx._cell.ref
     asked: list[Any] = [Sealed(os.urandom(200)), Sealed(b"")]
     if isinstance(actor, Proxy):
         group = actor._group

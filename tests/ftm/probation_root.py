@@ -20,8 +20,8 @@ async def main(store: str) -> None:
     async with hf.ActorSystem("app", store=store, log=False) as system:
         alice, bob = [await system.start(one) for one in SPECS]
         async with system.transaction(timeout=60) as change:
-            change.attach(alice, PBR())
-            change.transition(bob, LFR())
+            change.protect(alice, PBR())
+            change.protect(bob, LFR())
         await alice.ask(Add(0))
         print("changed", flush=True)
         await asyncio.to_thread(sys.stdin.read)

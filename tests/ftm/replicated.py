@@ -193,8 +193,8 @@ def doubled(system: hf.ActorSystem) -> Any:
     def answer(out: Any) -> Answer | None:
         if out.verb != "ask":
             return None
-        message = system.node.codec.decode(Add, out.body)
-        return Answer(REPLY, "", system.node.codec.encode(2 * message.n, ""))
+        message = system._node.codec.decode(Add, out.body)
+        return Answer(REPLY, "", system._node.codec.encode(2 * message.n, ""))
 
     return answer
 
@@ -226,7 +226,7 @@ async def all_once(driver: Driver, system: hf.ActorSystem, sent: list[int]) -> N
     expected: list[int] = []
     for key in sent:
         end = await driver.until(key)
-        message = system.node.codec.decode(driver.kinds[key], driver.feeds[key].body)
+        message = system._node.codec.decode(driver.kinds[key], driver.feeds[key].body)
         if isinstance(message, Fetch):
             expected += [-message.n, 2 * message.n]
         elif not isinstance(message, Fail):

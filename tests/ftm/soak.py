@@ -13,6 +13,7 @@ from typing import Any
 import holdfast as hf
 from holdfast.ftm.bricks.brick_messages import Done
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpointing
+from holdfast.ftm.sec.authority import CertificationAuthority
 from tests.ftm.accounts import Counter
 from tests.ftm.campaign import Stuck, described, group_of, running, whole
 from tests.ftm.stacks import CA, STACKS
@@ -71,22 +72,22 @@ class Changes:
         ref, group, name = self._ref, group_of(self._ref), self._rng.choice(REPLICATED)
         stack = STACKS[name]("counter")
         if group is None:
-            return {f"attach {name}": lambda change: change.attach(ref, stack)}
+            return {f"attach {name}": lambda change: change.protect(ref, stack)}
         found: Any = ref._cell.host.place
         names = [one.name for one in found.layers]
         choices: dict[str, Any] = {
-            "detach": lambda change: change.detach(ref),
-            "transition": lambda change: change.transition(ref, stack, whole=True),
+            "detach": lambda change: change.protect(ref, None),
+            "transition": lambda change: change.protect(ref, stack),
         }
         if "tr" in names:
-            choices["detach a layer"] = lambda change: change.detach(ref, "tr")
+            choices["detach a layer"] = lambda change: change.protect(ref, [one for one in names if one != "tr"])
         elif names in (["pbr"], ["lfr"], ["sec", "pbr"]):
-            choices["compose"] = lambda change: change.compose(ref, hf.TR())
-            choices["transition of a layer"] = lambda change: change.transition(
-                ref, hf.LFR() if "pbr" in names else PBR()
+            choices["compose"] = lambda change: change.protect(ref, [*names, hf.ftm.TR()])
+            choices["transition of a layer"] = lambda change: change.protect(
+                ref, [*names[:-1], hf.ftm.LFR() if "pbr" in names else PBR()]
             )
         if names in (["pbr"], ["lfr"]):
-            choices["compose outside"] = lambda change: change.compose(ref, hf.SEC(CA), outside=True)
+            choices["compose outside"] = lambda change: change.protect(ref, [hf.ftm.SEC(CA), *names])
         if "pbr" in names:
             new = {"mechanism": "pbr", "role": "primary"}
             choices["update"] = lambda change: change.update(ref, "after", Renewed, **new)
@@ -108,7 +109,7 @@ class Changes:
 async def run(seconds: float, rng: random.Random, *, least: int = 0) -> Found:
     """Soak for so long, and for so many changes."""
     async with running() as system:
-        await system.start(hf.child("ca", hf.start(hf.CertificationAuthority)))
+        await system.start(hf.child("ca", hf.start(CertificationAuthority)))
         load = Plain(30.0, rng)
         ref = await load.start(system, None)
         load.begin()

@@ -8,6 +8,7 @@ from typing import Any
 
 import holdfast as hf
 from holdfast.ftm.model.mechanism import load
+from holdfast.ftm.sec.authority import CertificationAuthority
 from tests.ftm.accounts import Add, Bank, Put, Transfer
 from tests.ftm.store import Cas, Look, Store, Write
 from tests.ftm.versions import OtherCounter, SameCounter
@@ -87,20 +88,20 @@ Make = Callable[[str], tuple[Any, ...]]
 """The layers of a stack for a workload, outermost first."""
 
 STACKS: dict[str, Make] = {
-    "PBR": lambda load: (hf.PBR(),),
-    "LFR": lambda load: (hf.LFR(),),
-    "TR": lambda load: (hf.TR(),),
-    "AD+PBR": lambda load: (hf.AD((RIGHT[load],)), hf.PBR()),
-    "AD+LFR": lambda load: (hf.AD((RIGHT[load],)), hf.LFR()),
-    "RB": lambda load: (hf.RB(alternates=VERSIONS[load][1], test=RIGHT[load]),),
-    "NVP": lambda load: (hf.NVP(VERSIONS[load]),),
-    "TMR": lambda load: (hf.TMR(),),
-    "SEC": lambda load: (hf.SEC(CA),),
-    "SEC+PBR": lambda load: (hf.SEC(CA), hf.PBR()),
-    "PBR+TR": lambda load: (hf.PBR(), hf.TR()),
-    "LFR+TR": lambda load: (hf.LFR(), hf.TR()),
-    "SEC+PBR+TR": lambda load: (hf.SEC(CA), hf.PBR(), hf.TR()),
-    "PBR+own": lambda load: (hf.PBR(), own(load)),
+    "PBR": lambda load: (hf.ftm.PBR(),),
+    "LFR": lambda load: (hf.ftm.LFR(),),
+    "TR": lambda load: (hf.ftm.TR(),),
+    "AD+PBR": lambda load: (hf.ftm.AD((RIGHT[load],)), hf.ftm.PBR()),
+    "AD+LFR": lambda load: (hf.ftm.AD((RIGHT[load],)), hf.ftm.LFR()),
+    "RB": lambda load: (hf.ftm.RB(alternates=VERSIONS[load][1], test=RIGHT[load]),),
+    "NVP": lambda load: (hf.ftm.NVP(VERSIONS[load]),),
+    "TMR": lambda load: (hf.ftm.TMR(),),
+    "SEC": lambda load: (hf.ftm.SEC(CA),),
+    "SEC+PBR": lambda load: (hf.ftm.SEC(CA), hf.ftm.PBR()),
+    "PBR+TR": lambda load: (hf.ftm.PBR(), hf.ftm.TR()),
+    "LFR+TR": lambda load: (hf.ftm.LFR(), hf.ftm.TR()),
+    "SEC+PBR+TR": lambda load: (hf.ftm.SEC(CA), hf.ftm.PBR(), hf.ftm.TR()),
+    "PBR+own": lambda load: (hf.ftm.PBR(), own(load)),
 }
 
 
@@ -113,4 +114,4 @@ def own(workload: str) -> Any:
 async def enrolling(system: hf.ActorSystem, layers: tuple[Any, ...]) -> None:
     """Start the authority, if a layer needs certificates."""
     if any(one.name == "sec" for one in layers):
-        await system.start(hf.child("ca", hf.start(hf.CertificationAuthority)))
+        await system.start(hf.child("ca", hf.start(CertificationAuthority)))

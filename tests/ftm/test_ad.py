@@ -166,7 +166,7 @@ async def test_an_ask_in_a_turn_does_not_overtake_the_outcome_that_the_other_rep
 ) -> None:
     """The turn behind it waits until the home has it, also when the actor went on from the other one's state."""
     accounts = [await system.start(hf.child(name, hf.start(Account, 1000))) for name in ("one", "two")]
-    layers = hf.compose(AD((versions.is_positive,)), PBR(), FAULTY(what="answer", always=True, skip=5))
+    layers = hf.ftm.compose(AD((versions.is_positive,)), PBR(), FAULTY(what="answer", always=True, skip=5))
     bindings: dict[str, str] = dict(zip(("one", "other"), (one.path for one in accounts), strict=True))
     with system.events() as events:
         bank = await system.start(hf.child("bank", hf.start(Bank), mechanism=layers, bindings=bindings))

@@ -64,7 +64,7 @@ class Slow(Counter):
 async def transition(system: hf.ActorSystem, ref: hf.ActorRef[Any], mechanism: Any, seconds: float = 30) -> None:
     several = mechanism if isinstance(mechanism, tuple) else (mechanism,)
     async with system.transaction(timeout=seconds) as change:
-        change.transition(ref, several, whole=True)
+        change.protect(ref, several)
 
 
 async def protected(system: hf.ActorSystem, start: Any = None, mechanism: Any = None, **spec: Any) -> hf.ActorRef[Any]:
@@ -130,28 +130,28 @@ async def test_money_is_moved_once_while_mechanisms_change(system: hf.ActorSyste
     assert (await one.ask(Put(0)), await two.ask(Put(0))) == (1000 - len(tags), 1000 + len(tags))
 
 
-async def test_compose_and_detach_a_layer(system: hf.ActorSystem) -> None:
+async def test_one_layer_comes_and_another_goes(system: hf.ActorSystem) -> None:
     ref = await protected(system)
     load, events = Load(ref), system.events()
     async with system.transaction(timeout=30) as change:
-        change.compose(ref, TR())
+        change.protect(ref, ("pbr", TR()))
     assert stack(ref) == ("pbr", "tr")
     await load.reached(20)
     async with system.transaction(timeout=30) as change:
-        change.detach(ref, "pbr")
+        change.protect(ref, "tr")
     assert stack(ref) == ("tr",)
     assert len(group_of(ref).membership.names) == 1
     await load.reached(20)
     async with system.transaction(timeout=30) as change:
-        change.compose(ref, LFR(), outside=True)
+        change.protect(ref, (LFR(), "tr"))
     assert stack(ref) == ("lfr", "tr")
     await two_again(ref)
     await change.settled()  # A death on probation could be taken for its fault.
     os.kill(pid_of(system, ref, "r1"), signal.SIGKILL)
     await load.reached(20)
     async with system.transaction(timeout=30) as change:
-        change.transition(ref, PBR())  # In the place of the one of its sort.
-    settled = [event for event in events.take() if isinstance(event, hf.MechanismSettled)]
+        change.protect(ref, (PBR(), "tr"))
+    settled = [event for event in events.take() if isinstance(event, hf.events.MechanismSettled)]
     assert stack(ref) == ("pbr", "tr"), settled
     events.close()
     await load.reached(20)
@@ -193,19 +193,16 @@ async def test_what_cannot_be_is_refused_with_its_reason(system: hf.ActorSystem)
     closed = await system.start(hf.child("closed", hf.start(Closed), mechanism=LFR()))
     plain = await system.start(hf.child("plain", hf.start(Counter)))
     cases: list[tuple[str, Any]] = [
-        ("must stand outside of", lambda change: change.compose(ref, TR(), outside=True)),
-        ("keeps replicas already", lambda change: change.compose(ref, LFR())),
-        ("just that already", lambda change: change.transition(ref, PBR())),
-        ("state_access = False", lambda change: change.transition(closed, PBR())),
-        ("state_access = False", lambda change: change.compose(closed, TR())),
-        ("no mechanism yet", lambda change: change.transition(plain, PBR())),
-        ("not attached", lambda change: change.detach(ref, "tr")),
-        ("it is the only one", lambda change: change.detach(ref, "pbr")),
+        ("must stand outside of", lambda change: change.protect(ref, (TR(), "pbr"))),
+        ("keeps replicas already", lambda change: change.protect(ref, ("pbr", LFR()))),
+        ("state_access = False", lambda change: change.protect(closed, PBR())),
+        ("state_access = False", lambda change: change.protect(closed, ("lfr", TR()))),
+        ("no mechanism yet", lambda change: change.update(plain, "after", Noted)),
         ("must be a After", lambda change: change.update(ref, "after", Wrong, role="primary")),
         ("say which role", lambda change: change.update(ref, "after", Noted)),
         ("a brick is one of", lambda change: change.update(ref, "server", Noted)),
-        ("there is no mechanism of that name", lambda change: change.transition(ref, "nothing")),
-        ("cannot be read", lambda change: change.transition(ref, "/nowhere/m.py")),
+        ("there is no mechanism of that name", lambda change: change.protect(ref, "nothing")),
+        ("cannot be read", lambda change: change.protect(ref, "/nowhere/m.py")),
     ]
     before = group_of(ref).adaptation.config
     for reason, wanted in cases:
@@ -219,11 +216,11 @@ async def test_what_cannot_be_is_refused_with_its_reason(system: hf.ActorSystem)
 async def test_a_dry_run_shows_steps_and_bricks(system: hf.ActorSystem) -> None:
     ref = await protected(system)
     async with system.transaction(dry_run=True) as change:
-        change.transition(ref, LFR())
-        change.compose(ref, TR())
+        change.protect(ref, LFR())
+        change.protect(ref, ("lfr", TR()))
     text = change.describe()
-    assert "1. transition of /app/alice to LFR (from PBR to LFR)" in text
-    assert "2. compose /app/alice with TR inside (from LFR to LFR + TR)" in text
+    assert "1. protect /app/alice by LFR" in text
+    assert "2. protect /app/alice by LFR + TR" in text
     assert "- /app/alice/ftm pbr primary after: holdfast.ftm.mechanisms.pbr:Checkpointing" in text
     assert "+ /app/alice/ftm tr single after: holdfast.ftm.mechanisms.tr:Compare" in text
     assert stack(ref) == ("pbr",)
@@ -253,8 +250,7 @@ async def test_what_fails_behind_it_puts_the_old_stack_back(system: hf.ActorSyst
     await load.reached(10)
     with pytest.raises(hf.TransactionFailed):
         async with system.transaction(timeout=30) as change:
-            change.transition(ref, LFR())
-            change.compose(ref, TR())
+            change.protect(ref, (LFR(), TR()))
             change.add("/app", hf.child("bad", hf.start(Failing)))
     assert stack(ref) == ("pbr",)
     await load.reached(10)
@@ -308,21 +304,21 @@ async def test_with_a_store_the_stack_is_there_again(tmp_path: Path) -> None:
         ref = await system.start(spec)
         assert await ref.ask(Add(0)) == 1
         async with system.transaction(timeout=30) as change:
-            change.attach(ref, PBR())
-            change.compose(ref, TR())
+            change.protect(ref, PBR())
+            change.protect(ref, ("pbr", TR()))
         assert await ref.ask(Add(1)) == 2
     async with hf.ActorSystem("app", store=store, log=False) as system:
         ref = await system.start(spec)
         assert stack(ref) == ("pbr", "tr")
         assert await ref.ask(Add(2)) == 3
         async with system.transaction(timeout=30) as change:
-            change.detach(ref)
+            change.protect(ref, None)
     async with hf.ActorSystem("app", store=store, log=False) as system:
         ref = await system.start(spec)
         assert ref._cell.spec.mechanism is None
         assert await ref.ask(Add(3)) == 4
         async with system.transaction(timeout=30) as change:
-            change.attach(ref, PBR())
+            change.protect(ref, PBR())
     async with hf.ActorSystem("app", store=store, log=False) as system:
         ref = await system.start(hf.child("alice", hf.start(Counter), recovery=hf.hybrid(), mechanism=LFR()))
         assert stack(ref) == ("lfr",)

@@ -138,7 +138,7 @@ async def test_each_is_attached_updated_composed_and_detached(office: hf.ActorSy
 async def come_and_go(system: hf.ActorSystem, ref: hf.ActorRef[Any], load: Load, names: Stack, file: Path) -> None:
     await load.reached(3)
     async with system.transaction(timeout=30) as change:
-        change.attach(ref, made(names))
+        change.protect(ref, made(names))
     await load.reached(3)
 
     first = made(names)[0]
@@ -154,14 +154,15 @@ async def come_and_go(system: hf.ActorSystem, ref: hf.ActorRef[Any], load: Load,
 
     inner = next(one for one in ("tr", "pbr") if (*names, one) in STACKS or (one, *names) in STACKS)
     async with system.transaction(timeout=30) as change:
-        change.compose(ref, made((inner,))[0], outside=(*names, inner) not in STACKS)
+        more = made((inner,))[0]
+        change.protect(ref, (*names, more) if (*names, inner) in STACKS else (more, *names))
     await load.reached(3)
     async with system.transaction(timeout=30) as change:
-        change.detach(ref, inner)
+        change.protect(ref, names)
     assert stack(ref) == names
     await load.reached(3)
     async with system.transaction(timeout=30) as change:
-        change.detach(ref)
+        change.protect(ref, None)
 
 
 # -- three replicas ---------------------------------------------------------------------------------------------------
@@ -169,7 +170,7 @@ async def come_and_go(system: hf.ActorSystem, ref: hf.ActorRef[Any], load: Load,
 
 async def test_the_engine_dies_with_three_replicas_and_its_next_life_goes_on(system: hf.ActorSystem) -> None:
     """T38-T41: at each step, while a replica comes in, and while it goes again."""
-    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.PBR()))
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.ftm.PBR()))
     load = Load(ref, clients=2)
     for step, wanted in itertools.product(STEPS, (("tmr",), ("pbr",))):
         await load.reached(3)
@@ -183,7 +184,7 @@ async def test_the_engine_dies_with_three_replicas_and_its_next_life_goes_on(sys
 
 async def test_a_change_with_three_replicas_that_is_given_up_is_undone(system: hf.ActorSystem) -> None:
     """At each step before there is no way back; the engine dies as well, in the middle of undoing it."""
-    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.TMR()))
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.ftm.TMR()))
     load = Load(ref, clients=2)
     for step in STEPS[: STEPS.index("commit")]:
         await load.reached(3)
@@ -234,17 +235,17 @@ import holdfast as hf
 
 async def reconfigure(system):
     for step in (
-        lambda change: change.attach("/app/alice", "pbr"),
-        lambda change: change.compose("/app/alice", "tr"),
+        lambda change: change.protect("/app/alice", "pbr"),
+        lambda change: change.protect("/app/alice", ("pbr", "tr")),
         lambda change: change.update("/app/alice", "after", "newer.py", mechanism="pbr", role="primary"),
-        lambda change: change.detach("/app/alice", "tr"),
+        lambda change: change.protect("/app/alice", "pbr"),
     ):
         async with system.transaction(timeout=30.0) as change:
             step(change)
         status = await system.get_status("/app/alice")
         print(status.state)
     async with system.transaction(timeout=30.0, dry_run=True) as change:
-        change.detach("/app/alice")
+        change.protect("/app/alice", None)
 """
 
 

@@ -189,17 +189,17 @@ async def test_a_root_that_died_in_the_middle_says_so(tmp_path: Path) -> None:
     store = f"sqlite:{tmp_path / 'store.db'}"
     async with hf.ActorSystem("app", store=store, log=False) as system:
         await system.start(hf.child("alice", hf.start(Counter), recovery=hf.hybrid()))
-        system.mechanism_notes.begun("/app/alice", "transition of /app/alice to LFR")
-        system.mechanism_notes.put(
+        system._mechanism_notes.begun("/app/alice", "transition of /app/alice to LFR")
+        system._mechanism_notes.put(
             "/app/alice", None, PBR()
         )  # Not kept: the root dies before the transaction is accepted.
     async with hf.ActorSystem("app", store=store, log=False) as system:
         ref = await system.start(hf.child("alice", hf.start(Counter), recovery=hf.hybrid()))
         assert ref._cell.spec.mechanism is None
-        assert system.homes.notes(UNDER_WAY) == {}
-        system.mechanism_notes.begun("/app/alice", "compose")
+        assert system._homes.notes(UNDER_WAY) == {}
+        system._mechanism_notes.begun("/app/alice", "compose")
         with system.events() as stream:
-            MechanismNotes(system.homes)
+            MechanismNotes(system._homes)
             (event,) = [one for one in stream.take() if isinstance(one, AdaptationUndone)]
         assert (event.address, event.step) == ("/app/alice", "compose")
 

@@ -79,7 +79,7 @@ class Losing(Mechanism):
 
 @pytest.mark.parametrize("below", ["pbr", "lfr"])
 async def test_one_request_is_refused_or_answered_and_leaves_no_trace(system: hf.ActorSystem, below: str) -> None:
-    stack = hf.compose(Guarding(), hf.PBR() if below == "pbr" else hf.LFR())
+    stack = hf.ftm.compose(Guarding(), hf.ftm.PBR() if below == "pbr" else hf.ftm.LFR())
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=stack))
     assert await ref.ask(Add(1)) == 1
     with pytest.raises(TooMuch):
@@ -92,7 +92,7 @@ async def test_one_request_is_refused_or_answered_and_leaves_no_trace(system: hf
 
 @pytest.mark.parametrize("whole", [False, True])
 async def test_a_request_that_a_brick_lets_fall_fails_and_is_told(system: hf.ActorSystem, whole: bool) -> None:
-    stack = hf.compose(Guarding(whole=whole), hf.PBR())
+    stack = hf.ftm.compose(Guarding(whole=whole), hf.ftm.PBR())
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=stack))
     with system.events() as events:
         with pytest.raises(RequestDropped):
@@ -103,12 +103,12 @@ async def test_a_request_that_a_brick_lets_fall_fails_and_is_told(system: hf.Act
     assert await ref.ask(Tags()) == [2]
 
 
-@pytest.mark.parametrize("below", [hf.PBR(), hf.LFR()], ids=["pbr", "lfr"])
+@pytest.mark.parametrize("below", [hf.ftm.PBR(), hf.ftm.LFR()], ids=["pbr", "lfr"])
 @pytest.mark.parametrize("whole", [False, True])
 async def test_an_outcome_that_a_brick_lets_fall_fails_and_may_have_been(
     system: hf.ActorSystem, whole: bool, below: Mechanism
 ) -> None:
-    stack = hf.compose(Losing(whole=whole), below)
+    stack = hf.ftm.compose(Losing(whole=whole), below)
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=stack))
     with pytest.raises(RequestDropped) as dropped:
         await ref.ask(Add(1), timeout=30)

@@ -267,7 +267,7 @@ async def test_work_of_a_turn_that_only_the_backup_has_is_begun_again_or_said_to
         async with asyncio.timeout(20):
             while BROUGHT not in await ref.ask(Tags(), timeout=20.0):
                 await asyncio.sleep(0.005)
-    tags, lost = await ref.ask(Tags()), [one for one in events.take() if isinstance(one, hf.BackgroundWorkLost)]
+    tags, lost = await ref.ask(Tags()), [one for one in events.take() if isinstance(one, hf.events.BackgroundWorkLost)]
     events.close()
     assert tags == ([0, 1, BROUGHT] if recovery is not None else [0, 1])
     assert [one.count for one in lost] == ([] if recovery is not None else [1])
@@ -282,7 +282,7 @@ async def test_what_two_runs_of_a_turn_have_begun_comes_once_however_late_the_se
     for run in (1, 2):
         (tmp_path / f"work{run}").touch()
     recovery = hf.hybrid() if method == "hybrid" else None
-    ref = await system.start(hf.child("alice", hf.start(Runner), mechanism=hf.TR(), recovery=recovery))
+    ref = await system.start(hf.child("alice", hf.start(Runner), mechanism=hf.ftm.TR(), recovery=recovery))
     await ref.ask(Begin(str(tmp_path)))
     for run in (first, 3 - first):
         (tmp_path / f"work{run}").unlink()
@@ -294,7 +294,7 @@ async def test_what_two_runs_of_a_turn_have_begun_comes_once_however_late_the_se
     assert (await ref.ask(Tags())).count(BROUGHT) == 1
 
 
-@pytest.mark.parametrize("mechanism", [PBR(), LFR(), hf.TR(), hf.TMR()], ids=["pbr", "lfr", "tr", "tmr"])
+@pytest.mark.parametrize("mechanism", [PBR(), LFR(), hf.ftm.TR(), hf.ftm.TMR()], ids=["pbr", "lfr", "tr", "tmr"])
 async def test_what_takes_long_counts_though_home_has_forgotten_its_turn(
     system: hf.ActorSystem, mechanism: Any, tmp_path: Path
 ) -> None:
@@ -382,7 +382,7 @@ async def test_work_whose_result_has_come_is_not_begun_again_behind_a_turn_that_
 
 
 @pytest.mark.parametrize("recovery", [hf.hybrid(interval=3600.0), None], ids=["recorded", "plain"])
-@pytest.mark.parametrize("mechanism", [PBR(), hf.TR(), hf.TMR()], ids=["pbr", "tr", "tmr"])
+@pytest.mark.parametrize("mechanism", [PBR(), hf.ftm.TR(), hf.ftm.TMR()], ids=["pbr", "tr", "tmr"])
 async def test_work_goes_on_while_turns_of_a_batch_ask_for_the_first_time(
     system: hf.ActorSystem, mechanism: Any, recovery: hf.Method | None, tmp_path: Path
 ) -> None:
@@ -400,14 +400,14 @@ async def test_work_goes_on_while_turns_of_a_batch_ask_for_the_first_time(
             await asyncio.sleep(0.002)
     assert await ref.ask(Tags()) == [1, 2, BROUGHT]
     assert (await system.get_status(ref)).life == 1
-    assert [event for event in events.take() if isinstance(event, hf.BackgroundWorkLost)] == []
+    assert [event for event in events.take() if isinstance(event, hf.events.BackgroundWorkLost)] == []
 
 
 @pytest.mark.parametrize("name", ["nvp", "tmr"])
 async def test_a_turn_that_does_not_wait_for_what_it_asks_comes_to_the_same_in_each_run(
     system: hf.ActorSystem, name: str
 ) -> None:
-    mechanism = hf.TMR() if name == "tmr" else hf.NVP(versions=(LeavingSecond, LeavingThird))
+    mechanism = hf.ftm.TMR() if name == "tmr" else hf.ftm.NVP(versions=(LeavingSecond, LeavingThird))
     await system.start(hf.child("other", hf.start(Counter)))
     events = system.events()
     ref = await system.start(hf.child("alice", hf.start(Leaving), mechanism=mechanism))
@@ -417,7 +417,7 @@ async def test_a_turn_that_does_not_wait_for_what_it_asks_comes_to_the_same_in_e
             while await ref.ask(Tags()) != count * [BROUGHT]:
                 await asyncio.sleep(0.002)
     assert await system.ref("/app/other", Counter).ask(Tags()) == [0, 0]
-    assert [event for event in events.take() if isinstance(event, (hf.ReplicaLost, hf.Masked))] == []
+    assert [event for event in events.take() if isinstance(event, (hf.events.ReplicaLost, hf.events.Masked))] == []
 
 
 async def test_what_was_said_to_be_lost_does_not_come(system: hf.ActorSystem, tmp_path: Path) -> None:
@@ -438,7 +438,7 @@ async def test_what_was_said_to_be_lost_does_not_come(system: hf.ActorSystem, tm
     assert group.membership.primary is not None
     os.kill(pid_of(system, ref, group.membership.primary), signal.SIGKILL)
     assert await ref.ask(Add(1), timeout=60.0) == 2
-    assert [one.count for one in events.take() if isinstance(one, hf.BackgroundWorkLost)] == [1]
+    assert [one.count for one in events.take() if isinstance(one, hf.events.BackgroundWorkLost)] == [1]
     events.close()
     (tmp_path / "work").unlink()
     async with asyncio.timeout(30):

@@ -81,7 +81,7 @@ async def judged(system: hf.ActorSystem, name: str, bad: Wrong, rng: random.Rand
     try:
         async with asyncio.timeout(300):
             async with system.transaction(timeout=120) as change:
-                change.compose(ref, bad, outside=True)
+                change.protect(ref, (bad, *stack(ref)))
             (outcome,) = await change.settled()
     except hf.TransactionFailed as failed:
         how = f"not undone: {failed}" if failed.kept else how
@@ -143,7 +143,7 @@ async def test_attaching_is_tried_too(system: hf.ActorSystem) -> None:
         await load.reached(10)
         with pytest.raises(hf.TransactionFailed, match=r"exited with code 9|out of memory|has raised this"):
             async with system.transaction(timeout=60) as change:
-                change.attach(ref, (bad, PBR()))
+                change.protect(ref, (bad, PBR()))
     await load.reached(10)
     assert not (await system.protection(ref)).is_protected
     await load.stop()
@@ -160,7 +160,7 @@ async def test_failover_does_not_wait_for_a_change_that_hangs(system: hf.ActorSy
 
     async def changed() -> None:
         async with system.transaction(timeout=60) as change:
-            change.compose(ref, Wrong("hang", "start", "before", "any"), outside=True)
+            change.protect(ref, (Wrong("hang", "start", "before", "any"), *stack(ref)))
 
     changing = asyncio.ensure_future(changed())
     await prepares.wait()
@@ -187,7 +187,7 @@ async def test_a_kill_while_a_change_blocks_the_other_replica_loses_nothing(syst
     host.on_step = lambda step: os.kill(pid, signal.SIGKILL) if step == "prepare" and ref._cell.life == 1 else None
     with pytest.raises(hf.TransactionFailed, match=r"has failed when it prepared it|has ended"):
         async with system.transaction(timeout=60) as change:
-            change.compose(ref, Wrong("hang", "init", "before", "other"), outside=True)
+            change.protect(ref, (Wrong("hang", "init", "before", "other"), *stack(ref)))
     assert await ref.ask(Tags(), timeout=60) == [0, 1, 2, 3, 4]
     assert stack(ref) == ("pbr",)
 
@@ -199,7 +199,7 @@ async def test_the_stack_before_comes_back_to_one_that_leads_while_bricks_keep_w
     load = Load(ref)
     await load.reached(20)
     async with system.transaction(timeout=60) as change:
-        change.compose(ref, Wrong("hang", "peer", "before", "other"), outside=True)
+        change.protect(ref, (Wrong("hang", "peer", "before", "other"), *stack(ref)))
     group, seconds = group_of(ref), 0.2
     async with asyncio.timeout(30):
         while (await group.replicas.ask(group.replicas.backups()[0], Computes(group.switch.turn, seconds), 5.0)).passes:
@@ -223,7 +223,7 @@ async def test_links_that_nobody_certifies_are_refused(system: hf.ActorSystem, a
     await load.reached(10)
     with pytest.raises(hf.TransactionFailed, match=r"no authority lives|has no handler") as failed:
         async with system.transaction(timeout=60) as change:
-            change.compose(ref, hf.SEC(address), outside=True)
+            change.protect(ref, (hf.ftm.SEC(address), *stack(ref)))
     assert not failed.value.kept
     await load.reached(10)
     await load.stop()
@@ -246,7 +246,7 @@ async def test_a_replica_that_waits_for_the_life_that_it_begins_can_be_stopped(s
     await two_again(ref)
     left = next(name for name in group.membership.names if name != group.membership.primary)
     os.kill(pid_of(system, ref, group.membership.primary or ""), signal.SIGKILL)
-    server = system.node.cell_at(f"{ref.path}/ftm/{left}").ref
+    server = system._node.cell_at(f"{ref.path}/ftm/{left}").ref
     async with asyncio.timeout(60):
         while group.membership.leading is None:
             await asyncio.sleep(0.001)
@@ -297,13 +297,13 @@ async def test_a_change_right_after_one_was_taken_back_is_made(system: hf.ActorS
     ref = await system.start(hf.child("one", hf.start(Counter), mechanism=PBR()))
     await two_again(ref)
     async with system.transaction(timeout=120) as change:
-        change.compose(ref, Wrong("exit", "message", "before", "leader"), outside=True)
+        change.protect(ref, (Wrong("exit", "message", "before", "leader"), *stack(ref)))
     answer = ref.ask(Add(1), timeout=120)
     async with asyncio.timeout(120):
         (outcome,) = await change.settled()
     assert not outcome.is_kept
     async with system.transaction(timeout=120) as change:
-        change.transition(ref, LFR())
+        change.protect(ref, LFR())
     assert stack(ref) == ("lfr",)
     assert await answer == 1
 
@@ -323,7 +323,7 @@ async def test_bricks_that_hang_in_a_replica_that_does_not_lead_are_found_withou
         assert await ref.ask(Add(1), timeout=60) == 1
         async with asyncio.timeout(20):
             async for event in events:
-                if isinstance(event, hf.ReplicaLost) and "let nothing pass" in event.why:
+                if isinstance(event, hf.events.ReplicaLost) and "let nothing pass" in event.why:
                     assert event.replica == "r2"
                     break
         assert await ref.ask(Add(2), timeout=60) == 2

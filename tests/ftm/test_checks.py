@@ -32,8 +32,8 @@ CHECKPOINT = "holdfast.ftm.mechanisms.pbr:Checkpoint"
 
 async def said(driver: Any, state: ServerState | StateDelta, *, epoch: int, log: Any = ()) -> int:
     """What the backup answers to this state."""
-    body = driver.system.node.codec.encoder.encode(Checkpoint(state, list(log)))
-    after = driver.system.node.cell_at(driver.path("r2") + "/after").ref
+    body = driver.system._node.codec.encoder.encode(Checkpoint(state, list(log)))
+    after = driver.system._node.cell_at(driver.path("r2") + "/after").ref
     letter = Letter(epoch, 0, CHECKPOINT, body, size=len(body), stream=1, number=1)
     return msgspec.msgpack.decode(await after.ask(letter))
 
@@ -65,7 +65,7 @@ async def test_what_has_changed_since_a_state_that_is_not_here_is_not_taken(syst
     driver = await pair(system)
     assert await driver.ask(Add(1)) == 1
     change = StateDelta(7, 5, None, [b"\x80"], checksum([b"\x80"]), [], [], True)
-    assert await system.node.cell_at(driver.path("r2") + "/state").ref.ask(Apply(change)) == MISFIT
+    assert await system._node.cell_at(driver.path("r2") + "/state").ref.ask(Apply(change)) == MISFIT
     assert driver.standing("r2").server.turn == 1
     await driver.stop_replica("r1")
     await driver.fail_over("r2")
@@ -115,7 +115,7 @@ async def test_a_request_whose_outcome_was_evicted_is_not_handled_again(system: 
 @pytest.mark.parametrize("mechanism", [PBR(), LFR()], ids=lambda one: one.name)
 async def test_a_batch_that_comes_to_proceed_twice_is_computed_once(system: hf.ActorSystem, mechanism: Any) -> None:
     driver = await pair(system, Total, mechanism)
-    proceed = system.node.cell_at(driver.path("r1") + "/proceed").ref
+    proceed = system._node.cell_at(driver.path("r1") + "/proceed").ref
     await system.suspend(proceed)
     (key,) = driver.send(Add(1))
     proceed.tell(Work(driver.epoch, 0, driver.number, [Request("/app/client", 1, driver.feeds[key])]))
@@ -203,7 +203,7 @@ async def test_nobody_speaks_for_a_replica(system: hf.ActorSystem) -> None:
     assert await ref.ask(accounts.Add(0)) == 1
     group = group_of(ref)
     assert group.membership.primary is not None
-    detector, proxy = (system.node.cell_at(f"{ref.path}/ftm/{name}").ref for name in ("detector", "proxy"))
+    detector, proxy = (system._node.cell_at(f"{ref.path}/ftm/{name}").ref for name in ("detector", "proxy"))
     detector.tell(Broken(group.membership.primary, group.replicas.life_of(group.membership.primary), "forged"))
     end = TurnEnd(group.switch.turn + 1, 1, OK, [], Answer(REPLY, "", b"\x63"))
     proxy.tell(Done(group.membership.epoch, group.adaptation.config, -1, [end], False))

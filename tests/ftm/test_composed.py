@@ -69,7 +69,7 @@ async def test_leader_follower_alone_sees_a_value_fault_and_cannot_mask_it(syste
         assert await driver.ask(Add(1)) == 1
         assert await driver.ask(Add(2)) == 3
         assert await driver.ask(Add(3)) == 6
-        await system.node.settled()
+        await system._node.settled()
         told = events.take()
     assert [one.turn for one in told if isinstance(one, Diverged)][:1] == [2 if what == "answer" else 3]
 

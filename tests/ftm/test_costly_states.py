@@ -30,7 +30,7 @@ class Archive(hf.Actor):
         return self.total
 
 
-@pytest.mark.parametrize("stack", [hf.TR(), hf.TMR()], ids=["tr", "tmr"])
+@pytest.mark.parametrize("stack", [hf.ftm.TR(), hf.ftm.TMR()], ids=["tr", "tmr"])
 async def test_it_is_told_once_what_a_large_state_costs(system: hf.ActorSystem, stack: Any) -> None:
     with system.events() as events:
         ref = await system.start(hf.child("archive", hf.start(Archive), mechanism=stack))
@@ -43,7 +43,7 @@ async def test_it_is_told_once_what_a_large_state_costs(system: hf.ActorSystem, 
 
 
 async def test_a_small_state_is_not_worth_a_word(system: hf.ActorSystem) -> None:
-    ref = await system.start(hf.child("archive", hf.start(Archive, 0), mechanism=hf.TR()))
+    ref = await system.start(hf.child("archive", hf.start(Archive, 0), mechanism=hf.ftm.TR()))
     with system.events() as events:
         assert await ref.ask(Add(1)) == 1
         assert not [one for one in events.take() if isinstance(one, ProtectionCostly) and one.size < 10_000]

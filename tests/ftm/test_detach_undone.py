@@ -140,7 +140,7 @@ async def test_the_stack_is_in_force_as_before(
         await load.reached(5)
     with pytest.raises(hf.TransactionFailed, match=why) as failed:
         async with system.transaction(timeout=0.3) as change:
-            change.detach(ref)
+            change.protect(ref, None)
     assert failed.value.kept == ()
     assert names_of(ref) == ["pbr"]
     if not in_turn:

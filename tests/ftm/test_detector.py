@@ -315,7 +315,7 @@ async def test_the_outermost_mechanism_that_says_how_is_heard() -> None:
             ((PBR(), TR()), Detection()),
         ):
             async with system.transaction(timeout=30) as change:
-                change.transition(ref, layers, whole=True)
+                change.protect(ref, layers)
             assert host.group.replicas.detection == said
 
 
@@ -346,17 +346,17 @@ async def test_a_new_replica_is_not_judged_by_an_earlier_one_of_its_name(system:
     assert detector.actor._known[gone, 1] is not before
 
 
-async def changed(system: hf.ActorSystem, ref: hf.ActorRef[Counter], mechanism: hf.Mechanism) -> tuple[str, ...]:
+async def changed(system: hf.ActorSystem, ref: hf.ActorRef[Counter], mechanism: hf.ftm.Mechanism) -> tuple[str, ...]:
     """The replicas that there are with another mechanism, when all are there."""
     async with system.transaction(timeout=120) as change:
-        change.transition(ref, mechanism)
+        change.protect(ref, mechanism)
     await two_again(ref)
     return group_of(ref).membership.names
 
 
 def test_what_is_no_detection_is_refused() -> None:
-    with pytest.raises(hf.MechanismRefused, match="detection must be a Detection"):
-        hf.compose(PBR(detection=0.1))  # type: ignore[arg-type]
+    with pytest.raises(hf.errors.MechanismRefused, match="detection must be a Detection"):
+        hf.ftm.compose(PBR(detection=0.1))  # type: ignore[arg-type]
 
 
 def test_another_interval_is_not_judged_by_the_heartbeats_before() -> None:

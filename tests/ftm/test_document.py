@@ -77,14 +77,14 @@ def test_what_is_chosen() -> None:
 def test_how_replicas_are_watched() -> None:
     table = rows("setting")
     said = {name: None if cells[0] == "none" else float(cells[0]) for name, cells in table.items()}
-    assert said == dataclasses.asdict(hf.Detection())
+    assert said == dataclasses.asdict(hf.ftm.Detection())
 
 
 async def test_the_graph_as_it_is_shown(system: hf.ActorSystem) -> None:
     block = re.search(r"```text\n(/app/bank/alice .*?)```", TEXT, re.S)
     assert block
     said = {line.split()[0] for line in block[1].splitlines()}
-    bank = hf.supervisor("bank", children=[hf.child("alice", hf.start(Counter), mechanism=hf.PBR())])
+    bank = hf.supervisor("bank", children=[hf.child("alice", hf.start(Counter), mechanism=hf.ftm.PBR())])
     await system.start(bank)
     shown = [path for path in system.tree() if path.startswith("/app/bank/alice")]
     second = {path.replace("/r1", "/r2") for path in said if "/r1/" in path}
@@ -105,7 +105,7 @@ async def test_the_graph_as_it_is_shown(system: hf.ActorSystem) -> None:
 
 async def test_the_steps_of_a_failover(system: hf.ActorSystem) -> None:
     """A57-A59, T1."""
-    ref: Any = await system.start(hf.child("c", hf.start(Counter), mechanism=hf.PBR()))
+    ref: Any = await system.start(hf.child("c", hf.start(Counter), mechanism=hf.ftm.PBR()))
     steps: list[str] = []
     ref._cell.host.place.on_step = steps.append
     load = Load(ref)
@@ -123,7 +123,7 @@ async def test_the_mechanism_of_the_example_runs_from_its_file(system: hf.ActorS
     file = tmp_path / "audit.log"
     ref = await system.start(hf.child("c", hf.start(Counter)))
     async with system.transaction() as change:
-        change.attach(ref, (kind(str(file)), hf.PBR()))
+        change.protect(ref, (kind(str(file)), hf.ftm.PBR()))
     clients = Load(ref)
     await clients.reached(50)
     os.kill(system.pid_of(system.ref("/app/c/ftm/r1", hf.Actor)), signal.SIGKILL)
@@ -148,12 +148,12 @@ async def test_the_script_of_the_example_is_applied_from_another_process(
     assert await alice.ask(Add(0)) == 1
     async with control_endpoint(system, tmp_path / "app.sock") as socket:
         command = (sys.executable, "-m", "holdfast.console.cli", "apply", SCRIPT, "--socket", socket)
-        for more, mechanism in (("--dry-run",), None), ((), hf.LFR()):
+        for more, mechanism in (("--dry-run",), None), ((), hf.ftm.LFR()):
             process = await asyncio.create_subprocess_exec(*map(str, (*command, *more)), stdout=subprocess.PIPE)
             output, _ = await process.communicate()
             assert process.returncode == 0
-            assert [line[:12] for line in output.decode().splitlines()[:4]] == [
-                "1. attach PB", "2. compose /", "3. transitio", "4. detach tr",
+            assert [line.partition(" by ")[2] for line in output.decode().splitlines()[:4]] == [
+                "PBR", "PBR + TR", "LFR + TR", "LFR",
             ]  # fmt: skip
             assert alice._cell.spec.mechanism == mechanism
     assert await alice.ask(Add(1)) == 2
@@ -174,7 +174,7 @@ def defined(base: type) -> set[str]:
     }
 
 
-@pytest.mark.parametrize("base", [hf.Event, hf.HoldfastError, hf.Refusal], ids=lambda base: base.__name__)
+@pytest.mark.parametrize("base", [hf.events.Event, hf.HoldfastError, hf.Refusal], ids=lambda base: base.__name__)
 def test_everything_that_can_be_said_is_explained(base: type) -> None:
     assert defined(base)
     missing = {name for name in defined(base) if f"`{name}`" not in TROUBLE}
@@ -188,20 +188,21 @@ def test_each_reason_of_a_rejection_is_explained() -> None:
 
 
 REFUSED: dict[str, Callable[[Any], None]] = {
-    "detach that first": lambda change: change.attach("/app/c", hf.LFR()),
-    "it has no mechanism yet: attach one": lambda change: change.compose("/app/plain", hf.TR()),
-    "not inside": lambda change: change.transition("/app/c", (hf.TR(), hf.PBR())),
-    "keeps replicas already": lambda change: change.compose("/app/c", hf.LFR()),
-    "it stands in the composition twice": lambda change: change.transition("/app/c", (hf.PBR(), hf.TR(), hf.TR())),
-    "a supervisor cannot be protected": lambda change: change.attach("/app/family", hf.PBR()),
-    "there is no mechanism of that name": lambda change: change.transition("/app/c", "none"),
-    "`state_access = False`": lambda change: change.attach("/app/closed", hf.PBR()),
+    "it has no mechanism yet: protect it first": lambda change: change.update("/app/plain", "after", hf.ftm.After),
+    "not inside": lambda change: change.protect("/app/c", (hf.ftm.TR(), hf.ftm.PBR())),
+    "keeps replicas already": lambda change: change.protect("/app/c", ("pbr", hf.ftm.LFR())),
+    "it stands in the composition twice": lambda change: change.protect(
+        "/app/c", (hf.ftm.PBR(), hf.ftm.TR(), hf.ftm.TR())
+    ),
+    "a supervisor cannot be protected": lambda change: change.protect("/app/family", hf.ftm.PBR()),
+    "there is no mechanism of that name": lambda change: change.protect("/app/c", "none"),
+    "`state_access = False`": lambda change: change.protect("/app/closed", hf.ftm.PBR()),
 }
 
 
 async def test_refusals_say_what_the_document_says(system: hf.ActorSystem) -> None:
     """T39, T42."""
-    await system.start(hf.child("c", hf.start(Counter), mechanism=hf.PBR()))
+    await system.start(hf.child("c", hf.start(Counter), mechanism=hf.ftm.PBR()))
     await system.start(hf.child("plain", hf.start(Counter)))
     await system.start(hf.child("closed", hf.start(Closed)))
     await system.start(hf.supervisor("family", children=[]))
@@ -212,7 +213,7 @@ async def test_refusals_say_what_the_document_says(system: hf.ActorSystem) -> No
                 wish(change)
         assert text.strip("`") in str(refused.value)
     with pytest.raises(MechanismRefused, match="state_access = False"):
-        hf.child("x", hf.start(Closed), mechanism=hf.PBR())
+        hf.child("x", hf.start(Closed), mechanism=hf.ftm.PBR())
     assert await system.ref("/app/c", Counter).ask(Add(1)) == 1
 
 

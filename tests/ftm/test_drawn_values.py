@@ -41,13 +41,13 @@ def holds(reply: object) -> bool:
 
 
 STACKS: dict[str, Any] = {
-    "tr": hf.TR(),
-    "pbr_tr": hf.compose(hf.PBR(), hf.TR()),
-    "lfr_tr": hf.compose(hf.LFR(), hf.TR()),
-    "tmr_tr": hf.compose(hf.TMR(), hf.TR()),
-    "tmr": hf.TMR(),
-    "nvp": hf.NVP(versions=(OtherDice, OtherDice)),
-    "ad_lfr": hf.compose(hf.AD(assertions=(holds,)), hf.LFR()),
+    "tr": hf.ftm.TR(),
+    "pbr_tr": hf.ftm.compose(hf.ftm.PBR(), hf.ftm.TR()),
+    "lfr_tr": hf.ftm.compose(hf.ftm.LFR(), hf.ftm.TR()),
+    "tmr_tr": hf.ftm.compose(hf.ftm.TMR(), hf.ftm.TR()),
+    "tmr": hf.ftm.TMR(),
+    "nvp": hf.ftm.NVP(versions=(OtherDice, OtherDice)),
+    "ad_lfr": hf.ftm.compose(hf.ftm.AD(assertions=(holds,)), hf.ftm.LFR()),
 }
 
 

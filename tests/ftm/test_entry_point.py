@@ -55,8 +55,8 @@ async def test_it_is_attached_by_its_name(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter)))
     assert await ref.ask(Add(0)) == 1
     async with system.transaction(timeout=30) as change:
-        change.attach(ref, ("noting", "pbr"))
-        change.compose(ref, "tr")
+        change.protect(ref, ("noting", "pbr"))
+        change.protect(ref, ("noting", "pbr", "tr"))
     layers: Any = ref._cell.spec.mechanism
     assert [layer.name for layer in layers] == ["noting", "pbr", "tr"]
     assert await ref.ask(Add(1)) == 2

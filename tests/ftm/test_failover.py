@@ -469,7 +469,7 @@ async def test_control_reaches_the_replica_that_leads(system: hf.ActorSystem) ->
     ref = await started(system)
     await ref.ask(Add(7))
     assert await system.get_state(ref) == {"total": 1, "tags": [7]}
-    with pytest.raises(hf.ControlFailed, match="detach"):
+    with pytest.raises(hf.errors.ControlFailed, match="detach"):
         await system.replace_state(ref, dict)
     await system.suspend(ref)
     asked = asyncio.ensure_future(ref.ask(Add(8)))
@@ -501,7 +501,7 @@ async def test_without_state_access_a_follower_is_there_before_the_first_request
     assert await ref.ask(Add(2), timeout=60) == 2
 
 
-@pytest.mark.parametrize("mechanism", [hf.PBR(), hf.LFR()], ids=["pbr", "lfr"])
+@pytest.mark.parametrize("mechanism", [hf.ftm.PBR(), hf.ftm.LFR()], ids=["pbr", "lfr"])
 async def test_one_that_comes_back_fresh_leads_on_from_no_state(system: hf.ActorSystem, mechanism: Any) -> None:
     recovery = hf.hybrid(interval=3600.0, on_escalate="fresh")
     spec = hf.child("counter", hf.start(Counter), mechanism=mechanism, recovery=recovery)
@@ -513,7 +513,7 @@ async def test_one_that_comes_back_fresh_leads_on_from_no_state(system: hf.Actor
             os.kill(pid_of(system, ref, name), signal.SIGKILL)
         async with asyncio.timeout(30.0):
             async for one in stream:
-                if isinstance(one, hf.ActorStarted) and one.address == ref.path:
+                if isinstance(one, hf.events.ActorStarted) and one.address == ref.path:
                     break
     again = system.ref(ref.path, Counter)
     assert await again.ask(Add(1), timeout=30.0) == 1

@@ -58,7 +58,7 @@ async def test_background_work_is_begun_again_or_said_to_be_lost(
             await ref.ask(Boom())
     assert await ref.ask(Add(3), timeout=30) == 3
     there.touch()
-    lost = [one for one in events.take() if isinstance(one, hf.BackgroundWorkLost)]
+    lost = [one for one in events.take() if isinstance(one, hf.events.BackgroundWorkLost)]
     if recovery is None:
         assert [one.count for one in lost] == [1]
         assert await ref.ask(Tags()) == [0, 2, 3]
@@ -115,7 +115,7 @@ async def test_nobody_waits_for_the_turn_in_hand_of_a_replica_that_is_broken(
     with system.events() as events:
         answer = ref.ask(Stay(str(tmp_path)), timeout=60)
         await until_there(tmp_path / "begun")
-        system.node.cell_at(f"{ref.path}/ftm/{primary}/before").ref.tell(Break())
+        system._node.cell_at(f"{ref.path}/ftm/{primary}/before").ref.tell(Break())
         assert await answer == 1
         (failover,) = [one for one in events.take() if isinstance(one, FailedOver)]
     assert failover.why == "its before has ended: ValueError: a bug"
@@ -141,7 +141,7 @@ class Friend(hf.Actor):
     async def ring(self, message: Ring) -> str:
         try:
             await self.ctx.find("/app/alice", Counter).ask(Total())
-        except hf.AskDeadlock:
+        except hf.errors.AskDeadlock:
             return "deadlock"
         return "answered"
 

@@ -81,7 +81,7 @@ class Late(Counter):
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
-@pytest.mark.parametrize("mechanism", [hf.PBR, hf.LFR, hf.TMR, hf.TR])
+@pytest.mark.parametrize("mechanism", [hf.ftm.PBR, hf.ftm.LFR, hf.ftm.TMR, hf.ftm.TR])
 async def test_a_stop_that_comes_while_the_next_life_begins_ends_it_when_it_is_up(
     system: hf.ActorSystem, mechanism: Any, tmp_path: Path
 ) -> None:

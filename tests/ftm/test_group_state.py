@@ -565,14 +565,14 @@ def test_who_strays_again_and_again_is_faulty(strayed: list[tuple[str, int, int]
 
 def change(loop: Any, told: list[str] | None = None, **more: Any) -> Reconfiguration:
     said = told if told is not None else []
-    return Reconfiguration("/app/a", 2, (hf.PBR(),), ("r1", "r2"), loop, lambda: said.append("look"), **more)
+    return Reconfiguration("/app/a", 2, (hf.ftm.PBR(),), ("r1", "r2"), loop, lambda: said.append("look"), **more)
 
 
 @given(
     st.lists(st.sampled_from(["r1", "r2", "r3", "r5"]), unique=True, min_size=1),
     st.sampled_from(["r1", "r2", "r3", "r5", None]),
     st.sets(st.sampled_from(["r1", "r2", "r3", "r5"])),
-    st.sampled_from([(hf.TR(),), (hf.PBR(),), (hf.TMR(),)]),
+    st.sampled_from([(hf.ftm.TR(),), (hf.ftm.PBR(),), (hf.ftm.TMR(),)]),
 )
 def test_replicas_are_kept_as_far_as_they_are_needed(
     names: list[str], primary: str | None, members: set[str], layers: tuple[Any, ...]

@@ -22,7 +22,7 @@ from holdfast.diagnosis.repair import (
     RepairAction,
     Repertoire,
     action,
-    compose_mechanism,
+    protect_by,
     restart_child,
 )
 from holdfast.diagnosis.repair.executor import Executor, Result
@@ -68,7 +68,7 @@ class Repair:
         problem = repair_problem(self._domain, nodes=["alice"], bad=["alice"], running=["alice"], facts=facts)
         executor = Executor(
             self,
-            arbiter_of(self._system.node),
+            arbiter_of(self._system._node),
             address=lambda step: ALICE,
             actions=lambda name: self._one,
             is_dangerous=lambda one: False,
@@ -129,7 +129,7 @@ def kill(
 
 
 def holder(system: hf.ActorSystem) -> Hand | None:
-    grant = arbiter_of(system.node).holder(ALICE)
+    grant = arbiter_of(system._node).holder(ALICE)
     return None if grant is None else grant.hand
 
 
@@ -238,7 +238,7 @@ async def test_a_repair_step_that_comes_in_the_middle_of_an_adaptation_is_left_o
     await transition(system, ref, LFR())
     result = await made[0]
     assert result.outcome == SKIPPED
-    assert f"{ALICE} is in the hands of adaptation: transition of {ALICE} to LFR" in result.why
+    assert f"{ALICE} is in the hands of adaptation: protect {ALICE} by LFR" in result.why
     assert (stack(ref), ref._cell.life) == (("lfr",), 1)
     assert holder(system) is None
     await load.stop()
@@ -293,7 +293,7 @@ async def test_what_repair_has_in_hand_is_not_adapted_by_others(system: hf.Actor
 async def test_repair_has_a_mechanism_changed_for_it(system: hf.ActorSystem) -> None:
     """The actor is in its hands, so what is done to it in this step is done by its leave."""
     ref = await protected(system)
-    load, repair = Load(ref), Repair(system, compose_mechanism(system.transaction, "tr", {"alice": ALICE}))
+    load, repair = Load(ref), Repair(system, protect_by(system.transaction, ("pbr", "tr"), {"alice": ALICE}))
     await load.reached(10)
     result = await repair.carry_out()
     assert (result.outcome, result.why) == (DONE, "")
@@ -311,8 +311,7 @@ async def test_a_change_that_failed_gives_the_actor_back(system: hf.ActorSystem)
     ref = await protected(system)
     with pytest.raises(hf.TransactionFailed):  # noqa: PT012
         async with system.transaction(timeout=30) as change:
-            change.transition(ref, LFR())
-            change.compose(ref, "tr")
+            change.protect(ref, (LFR(), "tr"))
             change.add("/app", hf.child("bad", hf.start(Failing)))
     assert stack(ref) == ("pbr",)
     assert holder(system) is None
@@ -329,7 +328,7 @@ async def test_monitoring_waits_while_somebody_else_has_the_actor(system: hf.Act
         resources=Resources(units=2),
     )
     watch = MechanismWatch(ALICE, judge, lambda order: decided.set(), probe=None)
-    grant = arbiter_of(system.node).claim(ALICE, Hand.REPAIR, "it is slow")
+    grant = arbiter_of(system._node).claim(ALICE, Hand.REPAIR, "it is slow")
     with system.events() as events:
         engine = await system.start(hf.child("monitoring", hf.start(MonitoringEngine, watch)))
         engine.tell(Observe("mismatch", 3))
@@ -342,7 +341,7 @@ async def test_monitoring_waits_while_somebody_else_has_the_actor(system: hf.Act
             f"{ALICE} is in the hands of repair: it is slow"
         ]
         assert not decided.is_set()
-        arbiter_of(system.node).release(grant)
+        arbiter_of(system._node).release(grant)
         async with asyncio.timeout(SECONDS):
             await decided.wait()
         seen += events.take()
@@ -360,7 +359,7 @@ async def test_a_supervisor_restart_in_the_middle_of_a_failover_comes_behind_it(
     ]
     await system.start(hf.supervisor("s", children=children, strategy="one_for_all", intensity=100))
     alice, bob = system.ref("/app/s/alice", Counter), system.ref("/app/s/bob", Counter)
-    load, steps, judge = Load(alice), list[str](), arbiter_of(system.node)
+    load, steps, judge = Load(alice), list[str](), arbiter_of(system._node)
     await load.reached(10)
     host: Any = alice._cell.host.place
 
@@ -403,7 +402,7 @@ async def test_what_the_new_primary_knows_and_its_home_does_not_is_not_done_twic
             await above.ask(hf.RestartChild("alice"), SECONDS)
         else:
             async with system.transaction(timeout=SECONDS) as change:
-                change.detach(ref)
+                change.protect(ref, None)
 
     made = at_step(ref, "lead", lambda: asyncio.create_task(leave(), context=contextvars.Context()))
     monkeypatch.setattr(group, "take_done", take_done)
@@ -424,7 +423,7 @@ async def test_what_the_new_primary_knows_and_its_home_does_not_is_not_done_twic
 async def test_a_life_that_ends_in_the_middle_of_a_failover_is_its_supervisors(system: hf.ActorSystem) -> None:
     """The last replica dies too: repair has to wait until the supervisor is done, and may act then."""
     ref = await protected(system, recovery=hf.hybrid(), backoff=hf.Backoff(initial=0.3, maximum=0.3, jitter=0.0))
-    load, judge = Load(ref), arbiter_of(system.node)
+    load, judge = Load(ref), arbiter_of(system._node)
     await load.reached(10)
     backup = other(group_of(ref))
     at_step(ref, "lead", lambda: kill(system, ref, backup))

@@ -44,7 +44,7 @@ class Ticking(hf.Actor):
 @pytest.mark.parametrize("recovery", [None, hf.hybrid(interval=3600.0)], ids=["fresh", "hybrid"])
 async def test_a_timer_of_on_start_is_there_once_after_failovers(recovery: hf.Method | None) -> None:
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
-        spec = hf.child("ticking", hf.start(Ticking), recovery=recovery, mechanism=hf.PBR())
+        spec = hf.child("ticking", hf.start(Ticking), recovery=recovery, mechanism=hf.ftm.PBR())
         ref = await system.start(spec)
         host: Any = ref._cell.host.place
         assert await ref.ask(Count(), timeout=30.0) == 1
@@ -78,7 +78,7 @@ class Holding(Ticking):
 
 async def test_a_handle_of_on_start_is_good_after_a_failover_and_a_restart_of_the_root(tmp_path: Path) -> None:
     store = f"sqlite:{tmp_path / 'app.db'}"
-    spec = hf.child("it", hf.start(Holding), recovery=hf.hybrid(interval=3600.0), mechanism=hf.PBR())
+    spec = hf.child("it", hf.start(Holding), recovery=hf.hybrid(interval=3600.0), mechanism=hf.ftm.PBR())
     async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
         ref = await system.start(spec)
         host: Any = ref._cell.host.place
@@ -127,7 +127,7 @@ class Polite(hf.Actor):
 async def test_what_a_protected_actor_says_when_it_stops_is_heard() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         listener = await system.start(hf.child("listener", hf.start(Listener)))
-        ref = await system.start(hf.child("polite", hf.start(Polite), mechanism=hf.PBR()))
+        ref = await system.start(hf.child("polite", hf.start(Polite), mechanism=hf.ftm.PBR()))
         await system.stop(ref)
         assert await listener.ask(Words()) == ["I go", "I am gone"]
 
@@ -169,11 +169,11 @@ class ReturningThird(Returning):
 
 def who_compares() -> dict[str, Any]:
     return {
-        "tr": hf.TR(),
-        "lfr": hf.LFR(compare_every=0.0),
-        "tmr": hf.TMR(),
-        "nvp": hf.NVP(versions=(ReturningSecond, ReturningThird)),
-        "pbr+tr": hf.compose(hf.PBR(), hf.TR()),
+        "tr": hf.ftm.TR(),
+        "lfr": hf.ftm.LFR(compare_every=0.0),
+        "tmr": hf.ftm.TMR(),
+        "nvp": hf.ftm.NVP(versions=(ReturningSecond, ReturningThird)),
+        "pbr+tr": hf.ftm.compose(hf.ftm.PBR(), hf.ftm.TR()),
     }
 
 
@@ -201,7 +201,7 @@ async def test_a_hook_that_changes_the_state_is_no_difference_and_counts_once_fo
         # The life behind the failed turn has come back too. What its hook has done was saved before the kill, or not.
         assert await ref.ask(Lives(), timeout=25.0) in ([(4, 1), (4, 2)] if fails else [(4, 1)])
         assert (await system.get_status(ref)).life == 2
-        told = hf.Masked, hf.Diverged, StatesDiffer
+        told = hf.events.Masked, hf.events.Diverged, StatesDiffer
         assert [event for event in events.take() if isinstance(event, told)] == []
 
 
@@ -220,7 +220,7 @@ async def test_what_the_hooks_of_the_next_leader_change_is_where_all_runs_of_its
     kind: type[Returning], recovery: hf.Method | None, name: str
 ) -> None:
     """Whoever leads next began a life, or has one: no run is masked, and no ask fails for want of a majority."""
-    mechanism = {**who_compares(), "pbr": hf.PBR()}[name]
+    mechanism = {**who_compares(), "pbr": hf.ftm.PBR()}[name]
     if recovery is None and name in ("tr", "nvp"):
         recovery = hf.hybrid(interval=0.05)  # There is one replica, which is killed: without recovery it begins afresh.
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
@@ -237,7 +237,7 @@ async def test_what_the_hooks_of_the_next_leader_change_is_where_all_runs_of_its
             await two_again(ref)
             for _ in range(3):
                 assert await ref.ask(Count(), timeout=25.0) == next(counts)
-        told = hf.Masked, hf.Diverged, StatesDiffer
+        told = hf.events.Masked, hf.events.Diverged, StatesDiffer
         assert [event for event in events.take() if isinstance(event, told)] == []
 
 
@@ -281,7 +281,7 @@ class Told(Falling):
 @pytest.mark.parametrize("name", ["pbr", "tmr", "pbr+tr"])
 async def test_what_hooks_change_between_two_turns_comes_to_the_other_replica(kind: type[Falling], name: str) -> None:
     """The life of the leader ends without a turn, and its next one begins at the same turn with another state."""
-    mechanism = {**who_compares(), "pbr": hf.PBR()}[name]
+    mechanism = {**who_compares(), "pbr": hf.ftm.PBR()}[name]
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
         ref = await system.start(hf.child("it", hf.start(kind), mechanism=mechanism))
         await two_again(ref)

@@ -116,7 +116,7 @@ async def test_one_that_joins_again_gets_all_and_then_differences(system: hf.Act
 
 async def test_processes_that_are_killed_leave_the_identical_state_to_the_other(system: hf.ActorSystem) -> None:
     start = hf.start(Warehouse, "list", "array", "dict")
-    ref = await system.start(hf.child("alice", start, mechanism=hf.PBR()))
+    ref = await system.start(hf.child("alice", start, mechanism=hf.ftm.PBR()))
     await two_again(ref)
     for at in range(6):
         await ref.ask(Touch(("list", "array", "dict")[at % 3], at))
@@ -226,7 +226,7 @@ async def test_a_turn_that_fails_leaves_the_state_it_found(system: hf.ActorSyste
 
 
 async def test_a_large_state_computed_twice_is_the_same_image_twice(system: hf.ActorSystem) -> None:
-    driver = await pair(system, hf.start(Warehouse, "list", "dict", "array"), hf.PBR(), hf.TR())
+    driver = await pair(system, hf.start(Warehouse, "list", "dict", "array"), hf.ftm.PBR(), hf.ftm.TR())
     with system.events() as events:
         for at in range(4):
             for kind in ("array", "dict", "list"):

@@ -16,17 +16,17 @@ from holdfast.ftm.model.mechanism import COMMON
 from tests.ftm.accounts import Add, Counter, Tags
 
 STACKS = {
-    "PBR": (hf.PBR(),),
-    "LFR": (hf.LFR(),),
-    "PBR over TR": (hf.PBR(), hf.TR()),
-    "LFR over TR": (hf.LFR(), hf.TR()),
+    "PBR": (hf.ftm.PBR(),),
+    "LFR": (hf.ftm.LFR(),),
+    "PBR over TR": (hf.ftm.PBR(), hf.ftm.TR()),
+    "LFR over TR": (hf.ftm.LFR(), hf.ftm.TR()),
 }
 
 
 @pytest.mark.parametrize("name", STACKS)
 async def test_kills_of_the_one_that_leads_lose_and_double_nothing(system: hf.ActorSystem, name: str) -> None:
     """A57-A59."""
-    mechanism: Any = hf.compose(STACKS[name])
+    mechanism: Any = hf.ftm.compose(STACKS[name])
     events = system.events()
     ref = await system.start(hf.child("c", hf.start(Counter), mechanism=mechanism))
     asked: list[asyncio.Future[int]] = []
@@ -59,5 +59,5 @@ class Modules(hf.Actor):
 
 
 async def test_a_replica_has_what_it_may_change_over_to(system: hf.ActorSystem) -> None:
-    ref = await system.start(hf.child("c", hf.start(Modules), mechanism=hf.PBR()))
+    ref = await system.start(hf.child("c", hf.start(Modules), mechanism=hf.ftm.PBR()))
     assert await ref.ask(Known()) == list(COMMON)

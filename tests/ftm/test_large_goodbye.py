@@ -37,7 +37,7 @@ class Store(hf.Actor):
         self.ctx.stop(hf.Shutdown("for a moment"))
 
 
-@pytest.mark.parametrize("mechanism", [hf.PBR, hf.TR])
+@pytest.mark.parametrize("mechanism", [hf.ftm.PBR, hf.ftm.TR])
 async def test_a_large_state_comes_home_when_its_actor_ends_itself(system: hf.ActorSystem, mechanism: Any) -> None:
     spec = hf.child("store", hf.start(Store), mechanism=mechanism(), recovery=hf.hybrid(interval=3600.0))
     ref = await system.start(spec)
@@ -49,4 +49,4 @@ async def test_a_large_state_comes_home_when_its_actor_ends_itself(system: hf.Ac
         await asyncio.gather(*asks)
         assert await ref.ask(Fill(1), timeout=25.0) == LARGE + 1
         told = stream.take()
-    assert any(isinstance(one, hf.SnapshotTaken) and one.size_bytes > LARGE for one in told)
+    assert any(isinstance(one, hf.events.SnapshotTaken) and one.size_bytes > LARGE for one in told)

@@ -71,8 +71,8 @@ async def test_an_ask_that_is_out_is_joined_by_the_next_leader(system: hf.ActorS
 async def test_a_reply_leaves_only_when_the_follower_has_the_request(system: hf.ActorSystem) -> None:
     """A36."""
     driver = await pair(system, Total, LFR())
-    before = system.node.cell_at(driver.path("r2") + "/lfr.before").ref
-    before = system.node.cell_at(driver.path("r2") + "/before").ref
+    before = system._node.cell_at(driver.path("r2") + "/lfr.before").ref
+    before = system._node.cell_at(driver.path("r2") + "/before").ref
     await system.suspend(before)
     (key,) = driver.send(Add(1))
     await asyncio.sleep(0.05)
@@ -108,7 +108,7 @@ async def test_hidden_nondeterminism_is_told_and_the_follower_takes_the_state(sy
 
 async def test_a_follower_that_cannot_take_the_state_ends(system: hf.ActorSystem) -> None:
     driver = await pair(system, Closed, LFR())
-    gone = system.node.cell_at(driver.path("r2")).ended()
+    gone = system._node.cell_at(driver.path("r2")).ended()
     (key,) = driver.send(Guess())
     await driver.reply(key)
     async with asyncio.timeout(5):
@@ -178,7 +178,7 @@ async def test_a_follower_that_has_diverged_does_not_lead(system: hf.ActorSystem
 async def test_what_was_on_its_way_when_a_state_was_taken_is_not_run_on_top_of_it(system: hf.ActorSystem) -> None:
     """Inner layers take a batch a few steps to Proceed; a state that comes meanwhile has its requests in it."""
     driver = await pair(system, Total, LFR(), TR())
-    before = system.node.cell_at(driver.path("r2") + "/tr.before").ref
+    before = system._node.cell_at(driver.path("r2") + "/tr.before").ref
     await system.suspend(before)
     assert await driver.ask(Add(1)) == 1, "the follower has it, though it has not come to its Proceed"
     await driver.join("r2")

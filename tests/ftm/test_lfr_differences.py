@@ -28,7 +28,7 @@ class Watched(Total):
         self.hidden = 0
 
     def wrong(self) -> str:
-        replica = self.ctx.cell.path.split("/")[4]
+        replica = self.ctx._cell.path.split("/")[4]
         self.runs[replica] = self.runs.get(replica, 0) + 1
         return self.flips.pop(replica, "")
 

@@ -52,7 +52,7 @@ async def until_event(events: Any, kind: type[Any]) -> None:
 
 
 async def test_replicas_run_wherever_the_kernel_has_them_run(system: hf.ActorSystem) -> None:
-    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.PBR()))
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.ftm.PBR()))
     await two_again(ref)
     for name in ("r1", "r2"):
         assert os.sched_getaffinity(pid_of(system, ref, name)) == os.sched_getaffinity(0)
@@ -61,18 +61,18 @@ async def test_replicas_run_wherever_the_kernel_has_them_run(system: hf.ActorSys
 async def test_without_state_access_a_follower_that_has_died_is_back_with_the_next_life(
     system: hf.ActorSystem,
 ) -> None:
-    ref = await system.start(hf.child("alice", hf.start(Closed), mechanism=hf.LFR()))
+    ref = await system.start(hf.child("alice", hf.start(Closed), mechanism=hf.ftm.LFR()))
     with system.events() as events:
         assert await ref.ask(Add(1), timeout=60) == 1
         os.kill(pid_of(system, ref, "r2"), signal.SIGKILL)
-        await until_event(events, hf.ReplicaLost)
+        await until_event(events, hf.events.ReplicaLost)
         assert await ref.ask(Add(2), timeout=60) == 2
         os.kill(pid_of(system, ref, "r1"), signal.SIGKILL)
         await until_event(events, TurnsLost)
         assert await ref.ask(Add(3), timeout=60) == 1, "it begins afresh, and not alone"
         assert is_complete(ref)
         os.kill(pid_of(system, ref, "r2"), signal.SIGKILL)
-        await until_event(events, hf.ReplicaLost)
+        await until_event(events, hf.events.ReplicaLost)
     await system.ref("/app", hf.Supervisor).ask(hf.RestartChild("alice", running=True), timeout=60)
     assert is_complete(ref)
     assert await ref.ask(Add(4), timeout=60) == 1
@@ -86,7 +86,7 @@ async def test_the_root_keeps_no_large_state_for_a_stack_on_probation(
     ref = await system.start(hf.child("alice", hf.start(Large, size)))
     assert await ref.ask(Add(1), timeout=60) == 1
     async with system.transaction(timeout=60) as change:
-        change.attach(ref, hf.PBR())
+        change.protect(ref, hf.ftm.PBR())
     await two_again(ref)
     assert await ref.ask(Add(2), timeout=60) == 2
     with system.events() as events:
@@ -98,8 +98,8 @@ async def test_the_root_keeps_no_large_state_for_a_stack_on_probation(
 
 async def test_an_alternate_that_blocks_costs_the_life_and_its_message_is_put_aside(system: hf.ActorSystem) -> None:
     """It is not stopped: its replica is silent, and is ended for that."""
-    quick = hf.Detection(interval=0.02, pause=0.2, hopeless=0.5)
-    blocks = hf.RB(alternates=(Blocks,), test=(is_lucky,), detection=quick)
+    quick = hf.ftm.Detection(interval=0.02, pause=0.2, hopeless=0.5)
+    blocks = hf.ftm.RB(alternates=(Blocks,), test=(is_lucky,), detection=quick)
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=blocks))
     assert await ref.ask(Add(1), timeout=60) == 1
     with pytest.raises(hf.Quarantined):

@@ -32,20 +32,50 @@ class Slow(Counter):
 GATE: list[asyncio.Event] = []
 
 
-def request(node: Any, number: int, message: hf.Message[Any]) -> Request:
+class Trip(hf.Message[None]):
+    """Have the life end outside of any turn, once."""
+
+
+class Pause(hf.Message[None]):
+    """A turn in which that happens: it takes effect behind what the life was given with it."""
+
+
+class Loose(Counter):
+    """Falls between two turns."""
+
+    def on_start(self, restored: bool) -> None: ...
+
+    @hf.on(Trip)
+    def trip(self, message: Trip) -> None:
+        if not GATE[0].is_set():
+            self.ctx.create_task(self._fall())
+
+    async def _fall(self) -> None:
+        await GATE[0].wait()
+        raise RuntimeError("fell")
+
+    @hf.on(Pause)
+    async def pause(self, message: Pause) -> None:
+        GATE[0].set()
+        for _ in range(10):
+            await asyncio.sleep(0)
+
+
+def request_of(node: Any, number: int, message: hf.Message[Any]) -> Request:
     name, body = message_name(type(message)), node.codec.encode(message, "")
     return Request("", 0, Feed(number, -1, MESSAGE, name, body, 0.0, None, True))
 
 
-@pytest.fixture
-async def server(system: hf.ActorSystem) -> Any:
+@pytest.fixture(params=[Slow])
+async def server(system: hf.ActorSystem, request: pytest.FixtureRequest) -> Any:
     """A server as a replica has it, in this process, with a state to begin from."""
+    kind: type[Counter] = request.param
     GATE[:] = [asyncio.Event()]
-    node = system.node
+    node = system._node
     standing = Standing(node.nowhere("/app/x/ftm/r1"), 1, (LFR(),))
     made = standing.server = Server(standing, hf.hybrid())
     cell = node.cell_below(node.root, "x", AddressHost(FED, made, NEAR))
-    cell.spec, cell.extra().start = hf.child("x", hf.start(Slow)), hf.start(Slow)
+    cell.spec, cell.extra().start = hf.child("x", hf.start(kind)), hf.start(kind)
     made.start(cell)
     await made.ensure()
     made.install(made.capture())
@@ -56,7 +86,7 @@ async def server(system: hf.ActorSystem) -> Any:
 
 async def test_a_life_is_begun_once_though_two_want_it(server: Any) -> None:
     node = server.standing.node
-    pending = deque([request(node, 1, Add(1)), request(node, 2, Add(2)), request(node, 3, Add(3))])
+    pending = deque([request_of(node, 1, Add(1)), request_of(node, 2, Add(2)), request_of(node, 3, Add(3))])
     ends: list[TurnEnd] = []
 
     async def handled() -> None:
@@ -80,3 +110,20 @@ async def test_whoever_waits_for_a_life_that_is_dropped_is_told(server: Any) -> 
         await server.drop_life()
         await waits
     assert server.life is None
+
+
+@pytest.mark.parametrize("server", [Loose], indirect=True)
+async def test_what_a_life_has_left_that_ends_between_two_chunks_of_a_part_is_not_lost(
+    server: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rest of the part does not go on from where the part began."""
+    monkeypatch.setattr("holdfast.ftm.replica.protected_actor.PART", 60.0)  # All of it is one part.
+    node, counts = server.standing.node, range(3, 30)
+    messages = [Trip(), Pause(), *(Add(1) for _ in counts)]
+    requests = [request_of(node, number, message) for number, message in enumerate(messages, 1)]
+    assert server.attempts.size < len(requests)
+    await server.ensure()
+    ends = await server._run_all(requests, even_stopping=True)
+    assert GATE[0].is_set()
+    assert [node.codec.decode(int, end.answer.body) for end in ends[2:]] == [*range(1, len(counts) + 1)]
+    assert server.life.cell.actor.total == len(counts)

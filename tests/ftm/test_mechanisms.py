@@ -167,7 +167,7 @@ async def exchange(driver: Driver, *layers: Mechanism, names: tuple[str, ...] = 
 
 def lives(driver: Driver, name: str) -> dict[str, Any]:
     """The bricks of a replica, as objects."""
-    children = driver.system.node.cell_at(driver.path(name)).children or {}
+    children = driver.system._node.cell_at(driver.path(name)).children or {}
     return {key: cell.actor for key, cell in children.items()}
 
 

@@ -162,12 +162,12 @@ async def test_a_difference_is_a_wrong_value_until_it_is_known_to_be_the_applica
 
     async def play(world: World) -> None:
         for turn in range(3):
-            world.system.node.emit(Diverged(at, f"{at}/ftm/r2", 1, turn, "Add", turn))
+            world.system._node.emit(Diverged(at, f"{at}/ftm/r2", 1, turn, "Add", turn))
         await advance(1)
         report = await world.report()
         assert report.application.is_deterministic
         assert "transient_value" in report.faults.classes
-        world.system.node.emit(NondeterminismFound(at, f"{at}/ftm/r2", 1, 3, "Add", 3))
+        world.system._node.emit(NondeterminismFound(at, f"{at}/ftm/r2", 1, 3, "Add", 3))
         await advance(1)
         assert not (await world.report()).application.is_deterministic
 
@@ -375,7 +375,7 @@ async def test_a_change_that_somebody_else_made_counts() -> None:
 
 async def test_a_change_that_somebody_else_made_is_seen_by_its_event() -> None:
     async def play(world: World) -> None:
-        emit = world.system.node.emit
+        emit = world.system._node.emit
         emit(MechanismChanged("/app/bob", ("pbr",), ("lfr",), 2, 0.0))  # Of somebody else.
         await advance(2)
         assert (await world.report()).current == ("pbr",)
@@ -421,7 +421,7 @@ async def test_another_class_at_the_address_is_another_version() -> None:
 async def test_refused_frames_are_signs_but_not_those_of_the_time_before(reason: str, seen: bool) -> None:
     async def play(world: World) -> None:
         for count in range(3):
-            world.system.node.emit(FrameRefused("/app/alice", "/app/alice/ftm/r1", reason, count + 1))
+            world.system._node.emit(FrameRefused("/app/alice", "/app/alice/ftm/r1", reason, count + 1))
         await advance(1.5)
         assert ("forgery" in (await world.report()).faults.classes) is seen
 
@@ -430,7 +430,7 @@ async def test_refused_frames_are_signs_but_not_those_of_the_time_before(reason:
 
 async def test_a_replica_that_is_faulty_again_and_again_is_a_permanent_fault() -> None:
     async def play(world: World) -> None:
-        world.system.node.emit(ReplicaFaulty("/app/alice", "r2", 1, 3))
+        world.system._node.emit(ReplicaFaulty("/app/alice", "r2", 1, 3))
         await advance(1.5)
         assert "permanent_value" in (await world.report()).faults.classes
 

@@ -69,7 +69,7 @@ async def test_finish_takes_a_last_snapshot(system: hf.ActorSystem) -> None:
 async def test_a_reply_leaves_only_when_the_backup_has_its_state(system: hf.ActorSystem) -> None:
     """A34, T4, A52: the backup is stopped in the middle; no reply leaves until it goes on."""
     driver = await pair(system)
-    backup = system.node.cell_at(driver.path("r2") + "/after").ref
+    backup = system._node.cell_at(driver.path("r2") + "/after").ref
     await system.suspend(backup)
     (key,) = driver.send(Add(1))
     await asyncio.sleep(0.05)
@@ -283,9 +283,9 @@ async def test_an_actor_that_stops_itself_says_so_behind_its_turns(system: hf.Ac
 async def test_lower_epochs_and_other_configurations_are_refused(system: hf.ActorSystem) -> None:
     driver = await pair(system)
     await driver.ask(Add(1))
-    after = system.node.cell_at(driver.path("r2") + "/after").ref
+    after = system._node.cell_at(driver.path("r2") + "/after").ref
     state = driver.standing("r2").server.points.point
-    body = system.node.codec.encoder.encode(Checkpoint(state, []))
+    body = system._node.codec.encoder.encode(Checkpoint(state, []))
     name = "holdfast.ftm.mechanisms.pbr:Checkpoint"
     with pytest.raises(StaleLeader):
         await after.ask(Letter(driver.epoch - 1, 0, name, body, size=len(body), stream=1, number=1))
@@ -303,7 +303,7 @@ async def test_an_old_primary_that_wakes_up_changes_nothing(system: hf.ActorSyst
     """T1: it is neither heard by the backup that leads now, nor by the home."""
     driver = await pair(system)
     await driver.ask(Add(1))
-    server = system.node.cell_at(driver.path("r1") + "/proceed").ref
+    server = system._node.cell_at(driver.path("r1") + "/proceed").ref
     await system.suspend(server)
     (key,) = driver.send(Add(2))
     await asyncio.sleep(0.02)
@@ -320,7 +320,7 @@ async def test_an_old_primary_that_wakes_up_changes_nothing(system: hf.ActorSyst
 
 async def test_without_waiting_replies_may_be_ahead_of_the_backup_by_the_window(system: hf.ActorSystem) -> None:
     driver = await pair(system, Total, PBR(acknowledge=False, window=4))
-    backup = system.node.cell_at(driver.path("r2") + "/after").ref
+    backup = system._node.cell_at(driver.path("r2") + "/after").ref
     async with asyncio.timeout(5):
         while driver.standing("r2").server.turn < 0:
             await asyncio.sleep(0.001)
@@ -361,8 +361,8 @@ async def test_a_crash_of_any_brick_is_the_end_of_its_replica(system: hf.ActorSy
     await driver.ask(Add(1))
     for name in ("proceed", "before", "after", "protocol", "state"):
         await driver.add(f"r{name}")
-        cell = system.node.cell_at(driver.path(f"r{name}"))
-        system.node.cell_at(f"{cell.path}/{name}").kill()
+        cell = system._node.cell_at(driver.path(f"r{name}"))
+        system._node.cell_at(f"{cell.path}/{name}").kill()
         await cell.ended()
     assert await driver.ask(Add(2)) == 3
 

@@ -23,7 +23,7 @@ class Unwilling(Total):
 async def test_a_backup_whose_life_cannot_begin_says_so_when_it_is_to_lead(system: hf.ActorSystem) -> None:
     driver = await pair(system, Unwilling)
     await driver.ask(Add(1))
-    gone = system.node.cell_at(driver.path("r2")).ended()
+    gone = system._node.cell_at(driver.path("r2")).ended()
     await driver.stop_replica("r1")
     with pytest.raises((hf.RemoteCrash, hf.ActorStopped, hf.AskFailed)):
         await driver.lead("r2")
@@ -36,7 +36,7 @@ async def test_a_first_state_that_cannot_be_taken_up_ends_the_replica(system: hf
     await first.ask(Add(1))
     exported = await first.protocol("r1").ask(Export(first.epoch))
     await first.add("r3")
-    gone = system.node.cell_at(first.path("r3")).ended()
+    gone = system._node.cell_at(first.path("r3")).ended()
     await first.protocol("r3").ask(Install(first.epoch + 1, exported.turn, exported.data, [], True, []))
     with pytest.raises((hf.RemoteCrash, hf.ActorStopped, hf.AskFailed)):
         await first.lead("r3")

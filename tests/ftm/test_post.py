@@ -42,7 +42,7 @@ async def lose_answer(handler: Handler, actor: Any, item: Any) -> Any:
 
 def double(handler: Handler, actor: Any, item: Any) -> Any:
     """It comes once more."""
-    actor.ctx.cell.ref.ask(item, timeout=10.0).add_done_callback(lambda done: done.cancelled() or done.exception())
+    actor.ctx._cell.ref.ask(item, timeout=10.0).add_done_callback(lambda done: done.cancelled() or done.exception())
     return handler(actor, item)
 
 
@@ -51,11 +51,11 @@ def late(handler: Handler, actor: Any, item: Any) -> Any:
     handle: ReplyHandle[Any] = actor.ctx.reply_handle()
 
     def later() -> None:
-        actor.ctx.cell.ref.ask(item, timeout=10.0).add_done_callback(
+        actor.ctx._cell.ref.ask(item, timeout=10.0).add_done_callback(
             lambda done: None if done.cancelled() or done.exception() else handle.reply(done.result())
         )
 
-    actor.ctx.cell.node.loop.call_later(0.02, later)
+    actor.ctx._cell.node.loop.call_later(0.02, later)
     return handle
 
 

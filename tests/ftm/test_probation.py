@@ -81,7 +81,7 @@ async def test_the_state_survives_bricks_that_end_all_replicas_at_once(system: h
     load = Load(ref)
     await load.reached(20)
     async with system.transaction(timeout=60) as change:
-        change.transition(ref, Doomed(), whole=True)
+        change.protect(ref, Doomed())
     await taken_back(change)
     await load.reached(20)
     await load.stop()
@@ -127,7 +127,7 @@ async def test_the_state_survives_bricks_that_end_both_replicas_under_load(
     load = Load(ref)
     await load.reached(20)
     async with system.transaction(timeout=60) as change:
-        change.compose(ref, Ending(), outside=True)
+        change.protect(ref, (Ending(), *stack(ref)))
     await taken_back(change)
     await load.reached(20)
     await load.stop()
@@ -164,7 +164,7 @@ async def test_a_request_that_is_dropped_is_served_by_the_stack_before(
     load = Load(ref)
     await load.reached(20)
     async with system.transaction(timeout=60) as change:
-        change.compose(ref, Dropping(), outside=True)
+        change.protect(ref, (Dropping(), *stack(ref)))
     outcome = await taken_back(change)
     assert "let a request fall" in outcome.why
     await load.reached(20)
@@ -173,7 +173,7 @@ async def test_a_request_that_is_dropped_is_served_by_the_stack_before(
     assert stack(ref) == (below[0].name,)
 
 
-class Waits(hf.Operation):
+class Waits(hf.system.Operation):
     """A step whose end waits until it is known what comes of the change that another one makes."""
 
     verb = "wait"
@@ -201,13 +201,13 @@ async def test_how_a_change_went_is_told_however_late_one_asks(
         if isinstance(event, MechanismSettled) and not settled.done():
             settled.set_result(None)
 
-    system.node.events.add_sink(seen)
+    system._node.events.add_sink(seen)
     async with system.transaction(timeout=60) as change:
         change.step(Waits(settled))
         if below:
-            change.compose(ref, Dropping(), outside=True)
+            change.protect(ref, (Dropping(), *stack(ref)))
         else:
-            change.attach(ref, Dropping())
+            change.protect(ref, Dropping())
     await taken_back(change)
     await load.reached(20)
     await load.stop()
@@ -228,7 +228,7 @@ async def test_a_brick_that_does_not_return_is_told_in_whatever_role(
     load = Load(ref)
     await load.reached(20)
     async with system.transaction(timeout=60) as change:
-        change.compose(ref, Wrong("hang", "message", part, whose), outside=True)
+        change.protect(ref, (Wrong("hang", "message", part, whose), *stack(ref)))
     outcome = await taken_back(change)
     assert "let nothing pass" in outcome.why
     await load.reached(20)
@@ -242,14 +242,14 @@ async def test_an_actor_whose_attached_mechanism_fails_is_unprotected_again(syst
     load = Load(ref)
     await load.reached(20)
     async with system.transaction(timeout=60) as change:
-        change.attach(ref, (Wrong("exit", "message", "before", "leader"), PBR()))
+        change.protect(ref, (Wrong("exit", "message", "before", "leader"), PBR()))
     outcome = await taken_back(change)
     assert (outcome.before, outcome.layers) == ((), ("wrong", "pbr"))
     assert not (await system.protection(ref)).is_protected
     assert ref._cell.spec.mechanism is None
     await load.reached(20)
     async with system.transaction(timeout=60) as change:
-        change.attach(ref, PBR())
+        change.protect(ref, PBR())
     await load.reached(20)
     await load.stop()
     load.check(await ref.ask(Tags()))
@@ -258,9 +258,9 @@ async def test_an_actor_whose_attached_mechanism_fails_is_unprotected_again(syst
 async def test_detaching_ends_the_probation_of_what_was_attached(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter)))
     async with system.transaction(timeout=60) as attached:
-        attached.attach(ref, PBR())
+        attached.protect(ref, PBR())
     async with system.transaction(timeout=60) as change:
-        change.detach(ref)
+        change.protect(ref, None)
     async with asyncio.timeout(60):
         (outcome,) = await attached.settled()
     assert outcome.is_kept
@@ -276,7 +276,7 @@ async def test_a_stack_is_taken_back_below_a_supervisor_with_a_process_of_its_ow
     load = Load(ref)
     await load.reached(20)
     async with system.transaction(timeout=60) as change:
-        change.compose(ref, bad, outside=True)
+        change.protect(ref, (bad, *stack(ref)))
     await taken_back(change)
     await load.reached(20)
     await load.stop()

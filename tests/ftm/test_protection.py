@@ -23,7 +23,7 @@ from tests.ftm.test_failover import pid_of, two_again
 pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
 
 
-async def whole(system: hf.ActorSystem, ref: hf.ActorRef[Counter], wanted: bool) -> hf.ProtectionStatus:
+async def whole(system: hf.ActorSystem, ref: hf.ActorRef[Counter], wanted: bool) -> hf.ftm.ProtectionStatus:
     """How it is protected when it is whole, or is not."""
     async with asyncio.timeout(30):
         while (found := await system.protection(ref)).is_whole is not wanted:
@@ -68,19 +68,16 @@ async def test_a_kill_of_a_life_that_is_ending_already_is_no_reason_to_end_it_ne
 async def test_a_new_stack_is_on_probation(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=PBR()))
     async with system.transaction(timeout=60) as change:
-        change.transition(ref, LFR())
+        change.protect(ref, LFR())
     found = await system.protection(ref)
     assert (found.stack, found.config, found.is_on_probation) == (("lfr",), 2, True)
 
 
 @pytest.mark.parametrize("mechanism", [LFR(), (LFR(),)], ids=["alone", "tuple of one"])
-async def test_a_tuple_of_one_means_that_one(system: hf.ActorSystem, mechanism: object) -> None:
+async def test_a_tuple_of_one_means_that_one(system: hf.ActorSystem, mechanism: LFR | tuple[LFR]) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=(PBR(), TR())))
     async with system.transaction(timeout=60) as change:
-        change.transition(ref, mechanism)
-    assert (await system.protection(ref)).stack == ("lfr", "tr")
-    async with system.transaction(timeout=60) as change:
-        change.transition(ref, mechanism, whole=True)
+        change.protect(ref, mechanism)
     assert (await system.protection(ref)).stack == ("lfr",)
 
 

@@ -140,12 +140,12 @@ class Sworn(Host):
 
 MECHANISMS: dict[str, Any] = {
     "none": lambda: None,
-    "pbr": hf.PBR,
-    "lfr": hf.LFR,
-    "tr": hf.TR,
-    "tmr": hf.TMR,
-    "tr+pbr": lambda: hf.compose(hf.PBR(), hf.TR()),
-    "tr+lfr": lambda: hf.compose(hf.LFR(), hf.TR()),
+    "pbr": hf.ftm.PBR,
+    "lfr": hf.ftm.LFR,
+    "tr": hf.ftm.TR,
+    "tmr": hf.ftm.TMR,
+    "tr+pbr": lambda: hf.ftm.compose(hf.ftm.PBR(), hf.ftm.TR()),
+    "tr+lfr": lambda: hf.ftm.compose(hf.ftm.LFR(), hf.ftm.TR()),
 }
 
 
@@ -305,7 +305,7 @@ async def test_what_was_put_back_and_raises_fails_once_and_all_behind_it_is_hand
 async def test_what_an_alternate_has_put_back_is_in_no_batch_and_is_handled(system: hf.ActorSystem, more: int) -> None:
     """Also if home sends more while the first of them waits for whom it has asked."""
     other = await system.start(hf.child("other", hf.start(Counter)))
-    blocks = hf.RB(alternates=(Attentive,), test=(is_not_false,))
+    blocks = hf.ftm.RB(alternates=(Attentive,), test=(is_not_false,))
     ref = await system.start(hf.child("host", hf.start(Forgetful), mechanism=blocks))
     guests = [asyncio.ensure_future(ref.ask(Meet(tag, "asks"), timeout=25.0)) for tag in range(1, 9)]
     assert await ref.ask(Welcome(), timeout=25.0)
@@ -320,7 +320,7 @@ async def test_whoever_leads_dies_as_soon_as_it_has_handled_what_home_has_not_he
     system: hf.ActorSystem, spins: int
 ) -> None:
     """The follower has handled all of it. Home asks again in the order in which it was sent, one after the other."""
-    spec = hf.child("host", hf.start(Host), mechanism=hf.LFR(), recovery=hf.hybrid(interval=0.05))
+    spec = hf.child("host", hf.start(Host), mechanism=hf.ftm.LFR(), recovery=hf.hybrid(interval=0.05))
     ref = await system.start(spec)
     await two_again(ref)
     messages = [Meet(1, "says"), Meet(2, "says"), Open("says"), Close(), Meet(3, "says"), Open("says")]
@@ -373,7 +373,7 @@ async def test_the_next_leader_takes_back_in_its_start_and_all_runs_of_what_foll
     assert await asyncio.gather(*guests) == [2, 3, 4]
     assert await ref.ask(Tags(), timeout=IN_TIME) == [100, 1, 2, 3, 101]
     assert await other.ask(Tags()) == [1, 2, 3]
-    assert not [one for one in events.take() if isinstance(one, hf.Masked | hf.Diverged)]
+    assert not [one for one in events.take() if isinstance(one, hf.events.Masked | hf.events.Diverged)]
 
 
 @pytest.mark.parametrize("mechanism", [name for name in MECHANISMS if name != "none"])
@@ -423,12 +423,12 @@ def is_no_error(reply: Any) -> bool:
 
 
 DECIDING: dict[str, Any] = {
-    "rb": lambda: hf.RB(alternates=(Second,), test=(is_no_error,)),
-    "nvp": lambda: hf.NVP(versions=(Second, Third)),
-    "rb+pbr": lambda: hf.compose(hf.PBR(), hf.RB(alternates=(Second,), test=(is_no_error,))),
-    "rb+lfr": lambda: hf.compose(hf.LFR(), hf.RB(alternates=(Second,), test=(is_no_error,))),
-    "nvp+pbr": lambda: hf.compose(hf.PBR(), hf.NVP(versions=(Second, Third))),
-    "nvp+lfr": lambda: hf.compose(hf.LFR(), hf.NVP(versions=(Second, Third))),
+    "rb": lambda: hf.ftm.RB(alternates=(Second,), test=(is_no_error,)),
+    "nvp": lambda: hf.ftm.NVP(versions=(Second, Third)),
+    "rb+pbr": lambda: hf.ftm.compose(hf.ftm.PBR(), hf.ftm.RB(alternates=(Second,), test=(is_no_error,))),
+    "rb+lfr": lambda: hf.ftm.compose(hf.ftm.LFR(), hf.ftm.RB(alternates=(Second,), test=(is_no_error,))),
+    "nvp+pbr": lambda: hf.ftm.compose(hf.ftm.PBR(), hf.ftm.NVP(versions=(Second, Third))),
+    "nvp+lfr": lambda: hf.ftm.compose(hf.ftm.LFR(), hf.ftm.NVP(versions=(Second, Third))),
 }
 
 
@@ -509,8 +509,8 @@ async def test_what_an_alternate_has_put_back_and_no_block_handles_fails_once_an
     system: hf.ActorSystem, waits: bool
 ) -> None:
     await system.start(hf.child("other", hf.start(Counter)))
-    watched = hf.Detection(interval=0.02, watch_turns=0.5)
-    blocks = hf.RB(alternates=(Attending,), test=(is_not_false,), detection=watched)
+    watched = hf.ftm.Detection(interval=0.02, watch_turns=0.5)
+    blocks = hf.ftm.RB(alternates=(Attending,), test=(is_not_false,), detection=watched)
     ref = await system.start(hf.child("host", hf.start(Helpless), mechanism=blocks))
     unwelcome = asyncio.ensure_future(ref.ask(Unwelcome(waits), timeout=25.0))
     guests = [asyncio.ensure_future(ref.ask(Meet(tag, "asks"), timeout=25.0)) for tag in (1, 2)]

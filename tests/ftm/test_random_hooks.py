@@ -183,14 +183,14 @@ class Program:
             await self.ref.ask(message, IN_TIME)
 
 
-def mechanisms() -> dict[str, hf.Mechanism | tuple[hf.Mechanism, ...] | None]:
+def mechanisms() -> dict[str, hf.ftm.Mechanism | tuple[hf.ftm.Mechanism, ...] | None]:
     return {
         "none": None,
-        "pbr": hf.PBR(),
-        "lfr": hf.LFR(compare_every=0.0),
-        "tr": hf.TR(),
-        "tmr": hf.TMR(),
-        "pbr+tr": hf.compose(hf.PBR(), hf.TR()),
+        "pbr": hf.ftm.PBR(),
+        "lfr": hf.ftm.LFR(compare_every=0.0),
+        "tr": hf.ftm.TR(),
+        "tmr": hf.ftm.TMR(),
+        "pbr+tr": hf.ftm.compose(hf.ftm.PBR(), hf.ftm.TR()),
     }
 
 
@@ -245,5 +245,5 @@ async def run_program(name: str, seed: int, *, falls: bool) -> None:
         assert len(tags) == len(set(tags))
         assert FAILED not in tags
         if not falls:  # Else a life ends where it likes, which is what mechanisms that compare do not cover.
-            told = hf.Masked, hf.Diverged, StatesDiffer
+            told = hf.events.Masked, hf.events.Diverged, StatesDiffer
             assert [event for event in events.take() if isinstance(event, told)] == []

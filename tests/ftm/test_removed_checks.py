@@ -12,6 +12,7 @@ JOINING = "tests/ftm/test_pbr_joining.py"
 PBR, LFR, SEC = "tests/ftm/test_pbr.py", "tests/ftm/test_lfr.py", "tests/ftm/test_sec.py"
 SUBTREE, STATE = "tests/ftm/test_subtree.py", "tests/ftm/test_group_state.py"
 PUT_BACK, UNAWAITED = "tests/ftm/test_put_back.py", "tests/ftm/test_unawaited_asks.py"
+SPOILED = "tests/ftm/test_spoiled_states.py"
 RANDOM_HOOKS = "tests/ftm/test_random_hooks.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 CHECKS = {
@@ -119,6 +120,20 @@ CHECKS = {
         "            if False:\n",
         "tests/checkpoint/test_hook_changes.py",
         "test_replicas_that_die_before",
+    ),
+    "what the hooks of a life that has begun alone have left is at home before what stands on it": Check(
+        "ftm/bricks/bricks.py",
+        "            await self._hand_more()  # A snapshot of what its hooks",
+        "            pass  # A snapshot of what its hooks",
+        "tests/checkpoint/test_hook_changes.py",
+        "test_replicas_that_die_before and slow",
+    ),
+    "what hooks have left, and was not saved, is no snapshot": Check(
+        "ftm/replica/actor_state.py",
+        "    is_known = stands and not life.is_touched  #",
+        "    is_known = stands  #",
+        SPOILED,
+        "a_state_that_a_hook_leaves and pbr and all",
     ),
     "no difference leads to what hooks have left": Check(
         "ftm/replica/rewind_points.py",
@@ -731,6 +746,41 @@ CHECKS = {
         "                pass\n            if is_last",
         PUT_BACK,
         "an_alternate_has_put_back",
+    ),
+    "hooks that leave what nobody can save do not end the replica": Check(
+        "ftm/replica/protected_actor.py",
+        "        life.spoiled = error\n        self._stay(life)\n",
+        "        pass\n",
+        SPOILED,
+        "a_state_that_a_hook_leaves and pbr and all",
+    ),
+    "what was not run is not compared": Check(
+        "ftm/bricks/runs.py",
+        "        if life is not None and life.spoiled is not None:\n",
+        "        if False:\n",
+        SPOILED,
+        "a_state_that_a_hook_leaves and tr and all",
+    ),
+    "what the first chunks of a part have left goes with their life, and is run again": Check(
+        "ftm/replica/protected_actor.py",
+        "                if pending and self.life is None and not self._goes_on([], self._rest.missed or ENDED):\n",
+        "                if False:\n",
+        "tests/ftm/test_lives_of_a_replica.py",
+        "between_two_chunks",
+    ),
+    "no turn fails of what `on_start` has left": Check(
+        "ftm/replica/protected_actor.py",
+        "                if self.points.point is None or not has_run:\n",
+        "                if self.points.point is None or not begun:\n",
+        SPOILED,
+        "a_recovery_that_begins and pbr",
+    ),
+    "whoever is asked for a state that nobody can save goes on alone": Check(
+        "ftm/bricks/state_transfer.py",
+        "        except Exception as error:  # What the user's own values and methods raise is no reason",
+        "        except ZeroDivisionError as error:  # What the user's own values and methods raise is no reason",
+        SPOILED,
+        "lfr and Silent",
     ),
     "a message that kills is found out": Check(
         "ftm/group/delivery.py",

@@ -20,9 +20,7 @@ from holdfast.diagnosis.repair import (
     RepairAction,
     Repaired,
     Repairer,
-    attach_mechanism,
-    compose_mechanism,
-    transition_mechanism,
+    protect_by,
 )
 from holdfast.testing import probe
 from tests.ftm.accounts import Add, Counter, Load, Tags
@@ -93,16 +91,16 @@ async def test_a_suspected_value_fault_leads_to_time_redundancy_while_requests_f
 ) -> None:
     """A24, T63: the observer sees wrong values, repair composes TR into the group, and they are masked from then on."""
     noise = tmp_path / "noise"
-    ref = await system.start(hf.child("alice", hf.start(Gauge, str(noise)), mechanism=hf.PBR()))
+    ref = await system.start(hf.child("alice", hf.start(Gauge, str(noise)), mechanism=hf.ftm.PBR()))
     heard = probe(system)
     heard.subscribe(REPAIR)
     load = Load(ref, clients=2)
     await load.reached(LATEST)
-    await system.start(diagnosed(compose_mechanism(system.transaction, "tr", ALICE)))
+    await system.start(diagnosed(protect_by(system.transaction, ("pbr", "tr"), ALICE)))
     await load.reached(LATEST)
     noise.touch()
     begun = await heard.fish(ActionBegan, timeout=60.0)
-    assert str(begun.step) == "compose_tr(alice)"
+    assert str(begun.step) == "protect_pbr_tr(alice)"
     ended: object = await heard.fish(lambda one: isinstance(one, (Repaired, GaveUp)), timeout=60.0)
     assert isinstance(ended, Repaired)
     assert noise.exists()
@@ -119,12 +117,11 @@ async def test_a_suspected_value_fault_leads_to_time_redundancy_while_requests_f
 
 
 async def test_mechanisms_by_name_in_the_repertoire(system: hf.ActorSystem) -> None:
-    """Attach, transition and compose; what cannot be is told with its reason."""
     names: list[Any] = [
-        attach_mechanism(system.transaction, "pbr", ALICE),
-        transition_mechanism(system.transaction, "lfr", ALICE, cost=3),
-        compose_mechanism(system.transaction, hf.TR(), ALICE, outside=True, name="repeat"),
-        attach_mechanism(system.transaction, (hf.PBR(), "tr"), ALICE),
+        protect_by(system.transaction, "pbr", ALICE),
+        protect_by(system.transaction, "lfr", ALICE, cost=3),
+        protect_by(system.transaction, hf.ftm.TR(), ALICE, name="repeat"),
+        protect_by(system.transaction, (hf.ftm.PBR(), "tr"), ALICE),
     ]
-    assert [one.name for one in names] == ["attach_pbr", "transition_lfr", "repeat", "attach_pbr_tr"]
+    assert [one.name for one in names] == ["protect_pbr", "protect_lfr", "repeat", "protect_pbr_tr"]
     assert "total-cost) 3" in names[1].pddl

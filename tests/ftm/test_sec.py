@@ -61,9 +61,9 @@ async def kill_primary(system: hf.ActorSystem, ref: Any) -> None:
 
 STACKS: dict[str, Callable[[], tuple[Any, ...]]] = {
     "SEC": lambda: (SEC(CA),),
-    "SEC over PBR": lambda: (SEC(CA), hf.PBR()),
-    "SEC over LFR": lambda: (SEC(CA), hf.LFR()),
-    "SEC over PBR over TR": lambda: (SEC(CA), hf.PBR(), hf.TR()),
+    "SEC over PBR": lambda: (SEC(CA), hf.ftm.PBR()),
+    "SEC over LFR": lambda: (SEC(CA), hf.ftm.LFR()),
+    "SEC over PBR over TR": lambda: (SEC(CA), hf.ftm.PBR(), hf.ftm.TR()),
     "SEC over TMR": lambda: (SEC(CA), TMR()),
 }
 
@@ -71,7 +71,7 @@ STACKS: dict[str, Callable[[], tuple[Any, ...]]] = {
 @pytest.mark.parametrize("name", STACKS)
 async def test_requests_are_answered_over_it(secured: hf.ActorSystem, name: str) -> None:
     """A73, A74, A66, A71."""
-    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(STACKS[name]())))
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.ftm.compose(STACKS[name]())))
     replies = await asyncio.gather(*[ref.ask(Add(n), timeout=20.0) for n in range(200)])
     assert replies == list(range(1, 201))
     assert group_of(ref).replicas.link is not None
@@ -79,7 +79,7 @@ async def test_requests_are_answered_over_it(secured: hf.ActorSystem, name: str)
 
 @pytest.mark.parametrize("name", [name for name in STACKS if name != "SEC"])
 async def test_kills_of_the_one_that_leads_lose_and_double_nothing(secured: hf.ActorSystem, name: str) -> None:
-    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(STACKS[name]())))
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.ftm.compose(STACKS[name]())))
     asked: list[asyncio.Future[int]] = []
     for round_ in range(3):
         await joined(ref)
@@ -164,7 +164,7 @@ async def test_what_is_altered_or_dropped_on_the_way_is_said_again(
 ) -> None:
     """T47: on all links, both ways; honest requests go on, once each."""
     tap = Tap().on_replicas(monkeypatch)
-    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(STACKS[name]())))
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.ftm.compose(STACKS[name]())))
     await joined(ref)
     tap.on_proxy(ref)
     work, reason = REFUSALS[harm]
@@ -178,7 +178,7 @@ async def test_what_is_altered_or_dropped_on_the_way_is_said_again(
             async with asyncio.timeout(10):
                 places: set[str] = set()
                 while len(places) < 3:
-                    places |= {one.place for one in events.take() if isinstance(one, hf.FrameRefused)}
+                    places |= {one.place for one in events.take() if isinstance(one, hf.events.FrameRefused)}
                     await asyncio.sleep(0.01)
             assert places == {f"/app/c/ftm/{place}" for place in ("proxy", "r1", "r2")}
             assert group_of(ref).replicas.link.rejected[reason] > 0
@@ -186,11 +186,11 @@ async def test_what_is_altered_or_dropped_on_the_way_is_said_again(
 
 async def test_what_is_replayed_is_refused(secured: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch) -> None:
     tap = Tap().on_replicas(monkeypatch)
-    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(SEC(CA), hf.PBR())))
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.ftm.compose(SEC(CA), hf.ftm.PBR())))
     await joined(ref)
     tap.on_proxy(ref)
     assert await ref.ask(Add(0)) == 1
-    node = secured.node
+    node = secured._node
     frames = [(path, message.frame) for path, message in tap.seen if isinstance(message, Sealed)]
     assert {path.rpartition("/ftm/")[2] for path, _ in frames} >= {"proxy", "r1/protocol"}
     for path, frame in frames:
@@ -202,14 +202,14 @@ async def test_what_is_replayed_is_refused(secured: hf.ActorSystem, monkeypatch:
     assert group_of(ref).replicas.link.rejected["replayed"] > 0
 
 
-@pytest.mark.parametrize(("below", "count"), [(hf.PBR(), 2), (TMR(), 3)])
+@pytest.mark.parametrize(("below", "count"), [(hf.ftm.PBR(), 2), (TMR(), 3)])
 async def test_nothing_can_be_read_on_the_way(
     secured: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, below: Any, count: int
 ) -> None:
     """Between proxy and replicas, and from each replica to each other."""
     tap = Tap().on_replicas(monkeypatch)
     plain = await secured.start(hf.child("p", hf.start(Counter), mechanism=below))
-    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(SEC(CA), below)))
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.ftm.compose(SEC(CA), below)))
     await joined(plain, count)
     await joined(ref, count)
     tap.on_proxy(ref)
@@ -242,7 +242,7 @@ async def test_a_client_in_another_process_is_answered_and_the_links_behind_the_
 ) -> None:
     """A66: the link begins where requests enter, at the proxy; it is in the root, to which clients have own pipes."""
     tap = Tap().on_replicas(monkeypatch)
-    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(SEC(CA), hf.PBR())))
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.ftm.compose(SEC(CA), hf.ftm.PBR())))
     await joined(ref)
     tap.on_proxy(ref)
     spec = hf.child("client", hf.start(Client), isolation="process", bindings={"counter": "/app/c"})
@@ -257,9 +257,9 @@ async def test_a_client_in_another_process_is_answered_and_the_links_behind_the_
 
 async def test_what_is_forged_is_refused(secured: hf.ActorSystem) -> None:
     """Plain words, rubbish, and participants that are others."""
-    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(SEC(CA), hf.PBR())))
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.ftm.compose(SEC(CA), hf.ftm.PBR())))
     await joined(ref)
-    group, node = group_of(ref), secured.node
+    group, node = group_of(ref), secured._node
     protocol = node.cell_at("/app/c/ftm/r1/protocol").ref
     with secured.events() as events:
         for order in (
@@ -295,18 +295,18 @@ async def test_what_is_forged_is_refused(secured: hf.ActorSystem) -> None:
         reasons: set[str] = set()
         async with asyncio.timeout(10):
             while reasons < {"plain", "wrong_session", "untrusted", "wrong_peer"}:
-                reasons |= {one.reason for one in events.take() if isinstance(one, hf.FrameRefused)}
+                reasons |= {one.reason for one in events.take() if isinstance(one, hf.events.FrameRefused)}
                 await asyncio.sleep(0.01)
     assert await ref.ask(Add(1)) == 1
     assert (group_of(ref).membership.epoch, ref._cell.life) == (1, 1)
 
 
 async def test_frames_at_a_replica_without_a_secured_link_are_refused_and_harm_nobody(secured: hf.ActorSystem) -> None:
-    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.PBR()))
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.ftm.PBR()))
     await joined(ref)
     lives = dict(group_of(ref).membership.members)
     for name in ("r1", "r2"):
-        protocol = secured.node.cell_at(f"/app/c/ftm/{name}/protocol").ref
+        protocol = secured._node.cell_at(f"/app/c/ftm/{name}/protocol").ref
         for frame in (Greet(b"hello"), Agree(b"hello", b"finish"), Sealed(b"frame")):
             with pytest.raises(Refused, match="closed"):
                 await protocol.ask(frame)
@@ -316,7 +316,7 @@ async def test_frames_at_a_replica_without_a_secured_link_are_refused_and_harm_n
 
 async def test_keys_rotate_sessions_end_and_each_epoch_has_its_own(secured: hf.ActorSystem) -> None:
     sec = SEC(CA, rotate_messages=3, lifetime=0.3)
-    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(sec, hf.PBR())))
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.ftm.compose(sec, hf.ftm.PBR())))
     await joined(ref)
     link, numbers, generations = group_of(ref).replicas.link, set(), set()
     for n in range(150):
@@ -335,7 +335,7 @@ async def test_keys_rotate_sessions_end_and_each_epoch_has_its_own(secured: hf.A
 
 async def test_keys_are_files_of_ours_alone_and_in_no_recipe(secured: hf.ActorSystem) -> None:
     sec = SEC(CA)
-    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(sec, hf.PBR())))
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.ftm.compose(sec, hf.ftm.PBR())))
     await joined(ref)
     folder = Path(sec.folder)
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
@@ -355,7 +355,9 @@ async def test_a_link_among_the_keys_is_refused_and_where_it_leads_nothing_chang
     foreign.write_text("mine")
     root_file(str(keys), CA).symlink_to(foreign)
     with pytest.raises(hf.HoldfastError, match=r"root is not used: .*symbolic links"):
-        await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(SEC(CA, keys=str(keys)), hf.PBR())))
+        await secured.start(
+            hf.child("c", hf.start(Counter), mechanism=hf.ftm.compose(SEC(CA, keys=str(keys)), hf.ftm.PBR()))
+        )
     assert root_file(str(keys), CA).is_symlink()
     assert foreign.read_text() == "mine"
 
@@ -373,7 +375,7 @@ import pathlib, sys
 import holdfast as hf
 from holdfast.ftm.sec.participants import key_file
 from holdfast.ftm.sec.keys import SigningKey
-folder = pathlib.Path(hf.SEC("/app/authority").folder)
+folder = pathlib.Path(hf.ftm.SEC("/app/authority").folder)
 SigningKey.from_file(key_file(str(folder), "/app/c"))
 assert len(list(folder.iterdir())) == 1
 if "foreign" in sys.argv:
@@ -395,7 +397,7 @@ def test_keys_of_killed_processes_are_removed_by_the_next_that_has_some(tmp_path
 import holdfast as hf
 from holdfast.ftm.sec.participants import key_file
 from holdfast.ftm.sec.keys import SigningKey
-sec = hf.SEC("/app/authority")
+sec = hf.ftm.SEC("/app/authority")
 input()
 SigningKey.from_file(key_file(sec.folder, "/app/c"))
 print(sec.folder, flush=True)
@@ -452,12 +454,12 @@ def test_a_directory_that_others_can_enter_is_refused(tmp_path: Path, mode: int)
 async def test_it_stands_outermost(secured: hf.ActorSystem) -> None:
     """A66."""
     with pytest.raises(MechanismRefused, match="outermost"):
-        weave((hf.PBR(), SEC(CA)), leads=True)
+        weave((hf.ftm.PBR(), SEC(CA)), leads=True)
 
 
 async def test_without_its_authority_it_does_not_start(system: hf.ActorSystem) -> None:
     with pytest.raises(hf.StartFailed, match=f"no authority lives at {CA}: start a CertificationAuthority there"):
-        await system.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(SEC(CA), hf.PBR())))
+        await system.start(hf.child("c", hf.start(Counter), mechanism=hf.ftm.compose(SEC(CA), hf.ftm.PBR())))
 
 
 async def test_a_replica_joins_after_the_death_of_an_authority_that_is_saved(
@@ -466,7 +468,7 @@ async def test_a_replica_joins_after_the_death_of_an_authority_that_is_saved(
     """A68: its key is in a file, and what it has issued in a snapshot after each message."""
     start, saved = hf.start(CertificationAuthority, str(tmp_path / "ca.key")), hf.checkpoint_only(every=1)
     authority = await system.start(hf.child("ca", start, recovery=saved))
-    ref = await system.start(hf.child("c", hf.start(Counter), mechanism=(SEC(CA), hf.PBR())))
+    ref = await system.start(hf.child("c", hf.start(Counter), mechanism=(SEC(CA), hf.ftm.PBR())))
     await joined(ref)
     await system.terminate(authority, hf.Crash("ValueError", "boom"))
     await kill_primary(system, ref)
@@ -494,24 +496,24 @@ async def test_attached_composed_and_detached_while_requests_flow(secured: hf.Ac
     load = Load(ref)
     await load.reached(20)
     async with secured.transaction(timeout=30) as change:
-        change.attach(ref, hf.PBR())
+        change.protect(ref, hf.ftm.PBR())
     await load.reached(20)
     async with secured.transaction(timeout=30) as change:
-        change.compose(ref, SEC(CA), outside=True)
+        change.protect(ref, (SEC(CA), "pbr"))
     assert group_of(ref).replicas.link is not None
     await load.reached(20)
     await kill_primary(secured, ref)
     await load.reached(20)
     await joined(ref)
     async with secured.transaction(timeout=30) as change:
-        change.detach(ref, "sec")
+        change.protect(ref, "pbr")
     assert group_of(ref).replicas.link is None
     await load.reached(20)
     async with secured.transaction(timeout=30) as change:
-        change.transition(ref, hf.compose(SEC(CA), hf.PBR()))
+        change.protect(ref, hf.ftm.compose(SEC(CA), hf.ftm.PBR()))
     await load.reached(20)
     async with secured.transaction(timeout=30) as change:
-        change.detach(ref)
+        change.protect(ref, None)
     await load.reached(20)
     await load.stop()
     load.check(await ref.ask(Tags()))
@@ -524,8 +526,8 @@ real = importlib.util.find_spec
 importlib.util.find_spec = lambda name, *more: None if name == "cryptography" else real(name, *more)
 import holdfast as hf
 try:
-    hf.SEC("/app/ca").check(hf.Actor)
-except hf.MechanismRefused as error:
+    hf.ftm.SEC("/app/ca").check(hf.Actor)
+except hf.errors.MechanismRefused as error:
     print(error)
 """
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60).stdout
@@ -534,7 +536,7 @@ except hf.MechanismRefused as error:
 
 async def test_what_comes_twice_is_done_once_in_order(secured: hf.ActorSystem) -> None:
     """A frame whose answer was lost, or that came before another one, is sealed anew and sent again."""
-    sec, node = SEC(CA), secured.node
+    sec, node = SEC(CA), secured._node
     inner = sec.open_link(node, "/app/c", "/app/c/ftm/r1", lambda: 1)
     outer = sec.open_link(node, "/app/c", "/app/c/ftm/proxy", lambda: 1, lambda: ["/app/c/ftm/r1"])
     await outer.ready()

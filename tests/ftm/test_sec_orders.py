@@ -19,7 +19,7 @@ from tests.ftm.test_sec import CA, Tap, every, flip, group_of, joined
 
 
 async def begun(secured: hf.ActorSystem) -> Any:
-    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(hf.SEC(CA), hf.PBR())))
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.ftm.compose(hf.ftm.SEC(CA), hf.ftm.PBR())))
     await joined(ref)
     assert await ref.ask(Add(0)) == 1
     return ref
@@ -51,7 +51,7 @@ async def test_a_change_is_made_though_its_orders_are_held_back_altered_and_repl
     tap.seen.clear()
     tap.strike = strike
     async with secured.transaction(timeout=60) as change:
-        change.transition(ref, hf.compose(hf.SEC(CA), LFR(), hf.TR()))
+        change.protect(ref, hf.ftm.compose(hf.ftm.SEC(CA), LFR(), hf.ftm.TR()))
     tap.strike = lambda path, frame: frame
     assert names(ref) == ["sec", "lfr", "tr"]
     assert {path for path, _ in held} == {"/app/c/ftm/r1/protocol", "/app/c/ftm/r2/protocol"}
@@ -62,7 +62,7 @@ async def test_a_change_is_made_though_its_orders_are_held_back_altered_and_repl
     assert len(again) > len(held)
     for path, frame in again:
         with pytest.raises(Refused, match=r"replayed|wrong_session|forged|stale"):
-            await secured.node.cell_at(path).ref.ask(Sealed(frame))
+            await secured._node.cell_at(path).ref.ask(Sealed(frame))
     assert await ref.ask(Add(1)) == 2
     await joined(ref)
     assert names(ref) == ["sec", "lfr", "tr"]
@@ -75,7 +75,7 @@ async def test_the_order_that_ends_a_link_is_answered_over_it(
     ref = await begun(secured)
     tap.seen.clear()
     async with secured.transaction(timeout=60) as change:
-        change.detach(ref, "sec")
+        change.protect(ref, "pbr")
     assert not [one for _, one in tap.seen if isinstance(one, Commit)]  # Nobody has to ask in plain words.
     assert names(ref) == ["pbr"]
     assert await ref.ask(Add(1)) == 2
@@ -85,7 +85,7 @@ async def test_an_engine_that_dies_before_it_knows_that_the_links_have_ended_lea
     ref = await begun(secured)
     seen = struck(ref, "switch", fails)
     async with secured.transaction(timeout=60) as change:
-        change.detach(ref, "sec")
+        change.protect(ref, "pbr")
     assert seen.count("switch") == 2
     assert names(ref) == ["pbr"]
     assert await ref.ask(Add(1)) == 2
@@ -94,11 +94,11 @@ async def test_an_engine_that_dies_before_it_knows_that_the_links_have_ended_lea
 
 async def test_orders_that_are_forged_change_nothing(secured: hf.ActorSystem) -> None:
     ref = await begun(secured)
-    group, node = group_of(ref), secured.node
+    group, node = group_of(ref), secured._node
     replica, protocol = node.cell_at("/app/c/ftm/r1").ref, node.cell_at("/app/c/ftm/r1/protocol").ref
     bricks = sorted(secured.tree())
     with secured.events() as events:
-        for order in (PrepareStack(99, [hf.PBR().describe()]), Commit(99), Abort(group.adaptation.config)):
+        for order in (PrepareStack(99, [hf.ftm.PBR().describe()]), Commit(99), Abort(group.adaptation.config)):
             with pytest.raises(Refused, match="plain"):
                 await protocol.ask(order)
             with pytest.raises(hf.HoldfastError):
@@ -113,7 +113,7 @@ async def test_orders_that_are_forged_change_nothing(secured: hf.ActorSystem) ->
         places: set[tuple[str, str]] = set()
         async with asyncio.timeout(20):
             while places < {("/app/c/ftm/r1", "plain"), ("/app/c/ftm/proxy", "plain")}:
-                places |= {(one.place, one.reason) for one in events.take() if isinstance(one, hf.FrameRefused)}
+                places |= {(one.place, one.reason) for one in events.take() if isinstance(one, hf.events.FrameRefused)}
                 await asyncio.sleep(0.01)
     assert (
         await protocol.ask(Commit(group.adaptation.config)) == 1

@@ -20,13 +20,13 @@ async def test_a_follower_that_is_wrong_for_good_is_ended_and_the_next_one_joins
     load, seen = Load(ref, clients=2), list[Any]()
     with system.events() as events:
         async with asyncio.timeout(60):
-            while sum(isinstance(one, hf.ReplicaFaulty) for one in seen) < 2:
+            while sum(isinstance(one, hf.events.ReplicaFaulty) for one in seen) < 2:
                 seen += events.take()
                 await asyncio.sleep(0.005)
         await load.reached(20)
     await load.stop()
-    faulty = [one for one in seen if isinstance(one, hf.ReplicaFaulty)]
+    faulty = [one for one in seen if isinstance(one, hf.events.ReplicaFaulty)]
     assert {(one.replica, one.times) for one in faulty} == {("r2", 3)}
-    assert not any(isinstance(one, hf.FailedOver) for one in seen)
+    assert not any(isinstance(one, hf.events.FailedOver) for one in seen)
     assert group_of(ref).membership.primary == "r1"
     load.check(await ref.ask(Tags()))

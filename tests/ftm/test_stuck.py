@@ -34,7 +34,7 @@ class Hanging(Counter):
         return "never"
 
 
-WATCHED = hf.Detection(interval=0.02, watch_turns=1.0)
+WATCHED = hf.ftm.Detection(interval=0.02, watch_turns=1.0)
 
 
 async def begun(system: hf.ActorSystem, mechanism: Any) -> hf.ActorRef[Any]:
@@ -48,14 +48,16 @@ async def test_replicas_that_run_are_watched_as_a_change_of_mechanism_says(
     system: hf.ActorSystem, tmp_path: Path
 ) -> None:
     with system.events() as events:
-        ref = await begun(system, hf.PBR())
+        ref = await begun(system, hf.ftm.PBR())
         async with system.transaction(timeout=30) as change:
-            change.transition(ref, hf.PBR(detection=WATCHED))
+            change.protect(ref, hf.ftm.PBR(detection=WATCHED))
         assert await ref.ask(Hang(str(tmp_path / "first")), timeout=60) == "went on"
-        assert [one.address for one in events.take() if isinstance(one, hf.TurnHung)] == [ref.path]
+        assert [one.address for one in events.take() if isinstance(one, hf.events.TurnHung)] == [ref.path]
 
 
-@pytest.mark.parametrize("mechanism", [hf.PBR(detection=WATCHED), hf.LFR(detection=WATCHED)], ids=["pbr", "lfr"])
+@pytest.mark.parametrize(
+    "mechanism", [hf.ftm.PBR(detection=WATCHED), hf.ftm.LFR(detection=WATCHED)], ids=["pbr", "lfr"]
+)
 async def test_what_hangs_in_one_replica_only_is_answered_by_the_next(
     system: hf.ActorSystem, mechanism: Any, tmp_path: Path
 ) -> None:
@@ -66,14 +68,14 @@ async def test_what_hangs_in_one_replica_only_is_answered_by_the_next(
         assert await hung == "went on"
         assert await asyncio.gather(*behind) == [2, 3]
         told = [one for one in events.take() if isinstance(one, (TurnHung, FailedOver))]
-    if isinstance(mechanism, hf.PBR):  # Of leader and follower, the one that hangs may be the follower.
+    if isinstance(mechanism, hf.ftm.PBR):  # Of leader and follower, the one that hangs may be the follower.
         assert [type(one) for one in told] == [TurnHung, FailedOver]
     assert await ref.ask(Tags()) == [0, 1, 2]
 
 
 @pytest.mark.parametrize(
     "mechanism",
-    [hf.PBR(detection=WATCHED), hf.LFR(detection=WATCHED), hf.TR(detection=WATCHED)],
+    [hf.ftm.PBR(detection=WATCHED), hf.ftm.LFR(detection=WATCHED), hf.ftm.TR(detection=WATCHED)],
     ids=["pbr", "lfr", "tr"],
 )
 async def test_a_message_that_hangs_again_is_put_aside(system: hf.ActorSystem, mechanism: Any) -> None:
@@ -96,4 +98,4 @@ async def test_a_message_that_hangs_again_is_put_aside(system: hf.ActorSystem, m
 
 def test_a_limit_that_is_none_is_refused() -> None:
     with pytest.raises(hf.SpecError, match="watch_turns"):
-        hf.Detection(watch_turns=0)
+        hf.ftm.Detection(watch_turns=0)

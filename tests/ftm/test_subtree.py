@@ -41,7 +41,7 @@ def protected(name: str, recipe: Any = None, **options: Any) -> hf.ChildSpec:
 
 def at(system: hf.ActorSystem, name: str) -> hf.ActorRef[Any]:
     """By address, also while nobody lives there."""
-    return system.node.cell_at(f"/app/bank/{name}").ref
+    return system._node.cell_at(f"/app/bank/{name}").ref
 
 
 def bank_pid(system: hf.ActorSystem) -> int:
@@ -173,7 +173,7 @@ async def test_the_tree_stopped_and_started_again(system: hf.ActorSystem) -> Non
     await root.ask(hf.TerminateChild("bank"))
     await ended(pids)
     assert not [path for path in system.tree() if path.startswith("/app/bank")]
-    with pytest.raises(hf.NoSuchActor):
+    with pytest.raises(hf.errors.NoSuchActor):
         system.ref("/app/bank/alice", Counter)
     await root.ask(hf.RestartChild("bank"), timeout=30.0)
     assert await at(system, "alice").ask(Add(1)) == 2
@@ -195,9 +195,9 @@ async def test_its_supervisor_stops_restarts_and_deletes_it(system: hf.ActorSyst
     assert await at(system, "carol").ask(Add(1)) == 1
     await house.ask(hf.TerminateChild("alice"))
     await house.ask(hf.DeleteChild("alice"))
-    with pytest.raises(hf.NoSuchActor):
+    with pytest.raises(hf.errors.NoSuchActor):
         system.ref("/app/bank/alice", Counter)
-    assert not system.homes.knows("/app/bank/alice")
+    assert not system._homes.knows("/app/bank/alice")
 
 
 class Watch(hf.Message[None]):
@@ -235,7 +235,7 @@ async def test_who_watches_it_hears_of_its_end_and_not_of_a_replica(system: hf.A
     await system.start(bank(protected("alice"), *(watchers if inside else ())))
     for spec in () if inside else watchers:
         await system.start(spec)
-    watcher, linked = (system.node.cell_at(f"{where}/{name}").ref for name in ("watcher", "linked"))
+    watcher, linked = (system._node.cell_at(f"{where}/{name}").ref for name in ("watcher", "linked"))
     alice = at(system, "alice")
     await watcher.ask(Watch("monitor"))
     await linked.ask(Watch("link"))
@@ -278,7 +278,7 @@ async def test_a_child_of_a_dynamic_supervisor(system: hf.ActorSystem) -> None:
     assert await asyncio.gather(*(one.ask(Add(tag)) for tag in range(6))) == [1, 2, 3, 4, 5, 6]
     with pytest.raises(hf.TransactionRefused, match="no recipe here has its spec"):
         async with system.transaction() as change:
-            change.transition(one, "lfr")
+            change.protect(one, "lfr")
 
 
 class Never(Counter):

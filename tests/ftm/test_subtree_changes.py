@@ -38,12 +38,11 @@ async def test_its_mechanism_is_changed_under_load(system: hf.ActorSystem) -> No
     load = Load(alice)
     await load.reached(20)
     async with system.transaction(timeout=30) as change:
-        change.transition(alice, LFR())
+        change.protect(alice, LFR())
     assert names_of(alice) == ["lfr"]
     await load.reached(20)
     async with system.transaction(timeout=30) as change:
-        change.compose(alice, TR())
-        change.transition(alice, PBR())
+        change.protect(alice, (PBR(), TR()))
     assert names_of(alice) == ["pbr", "tr"]
     await load.reached(20)
     await two_again(alice)
@@ -58,7 +57,7 @@ async def test_the_new_stack_holds_over_restarts_of_the_child_and_of_the_subtree
     await system.start(bank())
     ref = at(system, "inner/deep")
     async with system.transaction(timeout=30) as change:
-        change.transition(ref, (LFR(), TR()))
+        change.protect(ref, (LFR(), TR()))
     await system.terminate(ref)  # Its supervisor, in the process, starts it again.
     assert await ref.ask(Add(0), timeout=30.0) == 1
     assert names_of(ref) == ["lfr", "tr"]
@@ -76,23 +75,23 @@ async def test_a_dry_run_says_what_would_be_and_an_undone_one_leaves_it(system: 
     await system.start(bank(protected("alice")))
     alice = at(system, "alice")
     async with system.transaction(dry_run=True) as change:
-        change.transition(alice, LFR())
+        change.protect(alice, LFR())
     assert change.describe().splitlines()[:3] == [
-        "1. transition of /app/bank/alice to LFR (from PBR to LFR)",
+        "1. protect /app/bank/alice by LFR",
         "- /app/bank/alice: Counter, permanent, task, protected by PBR",
         "+ /app/bank/alice: Counter, permanent, task, protected by LFR",
     ]
     with pytest.raises(hf.TransactionFailed):
         async with system.transaction(timeout=30) as change:
-            change.transition(alice, LFR())
+            change.protect(alice, LFR())
             change.add("/app/bank", hf.child("bad", hf.start(Bad)))
     assert names_of(alice) == ["pbr"]
     await system.terminate(alice)
     assert await alice.ask(Add(0), timeout=30.0) == 1
     assert names_of(alice) == ["pbr"]
-    with pytest.raises(hf.TransactionRefused, match="has just that already"):
-        async with system.transaction() as change:
-            change.transition(alice, PBR())
+    async with system.transaction() as change:
+        change.protect(alice, PBR())  # It has just that already.
+    assert names_of(alice) == ["pbr"]
 
 
 def recorded(name: str = "alice", **options: Any) -> hf.ChildSpec:
@@ -101,12 +100,12 @@ def recorded(name: str = "alice", **options: Any) -> hf.ChildSpec:
 
 async def attach(system: hf.ActorSystem, ref: hf.ActorRef[Any], mechanism: Any = None) -> None:
     async with system.transaction(timeout=30) as change:
-        change.attach(ref, mechanism or PBR())
+        change.protect(ref, mechanism or PBR())
 
 
 async def detach(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
     async with system.transaction(timeout=30) as change:
-        change.detach(ref)
+        change.protect(ref, None)
 
 
 async def test_attached_and_detached_under_load_nothing_is_lost(system: hf.ActorSystem) -> None:
@@ -192,8 +191,8 @@ async def test_undone_with_its_transaction_it_lives_as_before(system: hf.ActorSy
         await load.reached(10)
     with pytest.raises(hf.TransactionFailed):
         async with system.transaction(timeout=30) as change:
-            change.attach(alice, LFR())
-            change.detach(bob)
+            change.protect(alice, LFR())
+            change.protect(bob, None)
             change.add("/app/bank", hf.child("bad", hf.start(Bad)))
     assert isinstance(alice._cell.host.place, SlotPlace)
     assert names_of(bob) == ["pbr"]
@@ -244,11 +243,11 @@ async def test_a_turn_that_does_not_end_rolls_it_back(system: hf.ActorSystem, tm
         async with system.transaction(timeout=seconds) as collected:
             match verb:
                 case "attach":
-                    collected.attach(alice, PBR())
+                    collected.protect(alice, PBR())
                 case "detach":
-                    collected.detach(alice)
+                    collected.protect(alice, None)
                 case _:
-                    collected.transition(alice, LFR())
+                    collected.protect(alice, LFR())
 
     with pytest.raises(hf.TransactionFailed):
         await change(1.0)
@@ -266,7 +265,7 @@ async def test_the_engine_dies_at_each_step_and_its_next_life_goes_on(system: hf
     await load.reached(5)
     seen = struck(alice, step, fails)
     async with system.transaction(timeout=30) as change:
-        change.transition(alice, LFR())
+        change.protect(alice, LFR())
     assert step in seen
     assert names_of(alice) == ["lfr"]
     await two_again(alice)
@@ -283,7 +282,7 @@ async def test_a_change_that_its_process_does_not_survive_is_made_of_the_next_li
     pid = bank_pid(system)
     struck(alice, "prepare", lambda: os.kill(pid, signal.SIGKILL))
     async with system.transaction(timeout=30) as change:
-        change.transition(alice, LFR())
+        change.protect(alice, LFR())
     assert await alice.ask(Add(1), timeout=30.0) == 2
     assert names_of(alice) == ["lfr"]
     assert bank_pid(system) != pid
@@ -297,15 +296,15 @@ async def test_with_a_store_the_stack_is_there_again(tmp_path: Path) -> None:
         alice, deep = at(system, "alice"), at(system, "inner/deep")
         assert [await alice.ask(Add(0)), await deep.ask(Add(0))] == [1, 1]
         async with system.transaction(timeout=30) as change:
-            change.attach(alice, PBR())
-            change.compose(deep, TR())
+            change.protect(alice, PBR())
+            change.protect(deep, ("pbr", TR()))
     async with hf.ActorSystem("app", store=store, log=False) as system:
         await system.start(spec)
         alice, deep = at(system, "alice"), at(system, "inner/deep")
         assert (names_of(alice), names_of(deep)) == (["pbr"], ["pbr", "tr"])
         assert [await alice.ask(Add(1)), await deep.ask(Add(1))] == [2, 2]
         async with system.transaction(timeout=30) as change:
-            change.detach(alice)
+            change.protect(alice, None)
     async with hf.ActorSystem("app", store=store, log=False) as system:
         await system.start(spec)
         assert isinstance(at(system, "alice")._cell.host.place, SlotPlace)

@@ -46,7 +46,7 @@ async def together(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
 
 WAYS = {"replicas": (attach, detach), "process": (apart, together)}
 BOTH_WAYS = pytest.mark.parametrize("way", list(WAYS))
-REFUSED = (hf.TransactionFailed, hf.TransactionRefused, hf.CannotMove)
+REFUSED = (hf.TransactionFailed, hf.TransactionRefused, hf.errors.CannotMove)
 
 
 def is_out(system: hf.ActorSystem, ref: hf.ActorRef[Any], way: str) -> bool:
@@ -108,7 +108,7 @@ async def test_there_and_back_under_load_nothing_is_lost(system: hf.ActorSystem,
             await two_again(alice)
         await home(system, alice)
         assert isinstance(alice._cell.host, OutsideHost)
-        assert system.homes.at(alice.path) is None
+        assert system._homes.at(alice.path) is None
     await load.reached(30)
     said = await talking.stop()
     await load.stop()
@@ -125,7 +125,7 @@ def is_to_rest(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> bool:
     """Whether whoever lives there has been told to come to rest."""
     if isinstance(ref._cell.host.place, GroupPlace):
         return group_of(ref).delivery.is_stopping
-    top = system.node.cell_at("/app/bank").host.place
+    top = system._node.cell_at("/app/bank").host.place
     assert isinstance(top, SubtreePlace)
     move = system._moves._under_way.get(ref._cell)
     return top.at(ref.path).arriving is not None or (move is not None and hasattr(move.leaving, "taken"))
@@ -211,7 +211,7 @@ async def test_a_message_that_cannot_leave_the_process_is_refused_and_all_others
         await attach(system, alice)
         assert await sibling.ask(Outcome(), timeout=30.0) == ["BadMessage", "int"]
         assert await alice.ask(Tags()) == [0, 1]
-        letters = [one for one in events.take() if isinstance(one, hf.DeadLetter)]
+        letters = [one for one in events.take() if isinstance(one, hf.events.DeadLetter)]
     assert [one.address for one in letters] == [alice.path]
     assert "a value of type object cannot be sent" in letters[0].why
 
@@ -527,8 +527,8 @@ async def test_undone_with_its_transaction_it_lives_as_before(system: hf.ActorSy
         await load.reached(10)
     with pytest.raises(hf.TransactionFailed):
         async with system.transaction(timeout=30) as change:
-            change.attach(alice, LFR())
-            change.detach(bob)
+            change.protect(alice, LFR())
+            change.protect(bob, None)
             change.add("/app/bank", hf.child("bad", hf.start(Bad)))
     assert isinstance(alice._cell.host, OutsideHost)
     assert names_of(bob) == ["pbr"]
@@ -551,9 +551,9 @@ async def test_a_turn_that_does_not_end_rolls_it_back(system: hf.ActorSystem, tm
         async with system.transaction(timeout=seconds) as collected:
             match verb:
                 case "attach":
-                    collected.attach(alice, PBR())
+                    collected.protect(alice, PBR())
                 case "detach":
-                    collected.detach(alice)
+                    collected.protect(alice, None)
                 case _:
                     collected.isolation(alice, "process" if verb == "apart" else "task")
 

@@ -183,10 +183,10 @@ async def test_a_spec_with_mechanisms_that_do_not_go_together_is_refused() -> No
     """As a transaction would: it is not started at all."""
     async with hf.ActorSystem("app", log=False) as system:
         for layers, why in (
-            ((hf.TR(), hf.PBR()), "must stand outside of tr"),
-            ((hf.PBR(), hf.TMR()), "keeps replicas already"),
-            ((layer_of("ad"), hf.TMR()), "it wants 3 replicas, and ad outside of it 2"),
-            ((hf.PBR(), hf.TR(), layer_of("nvp")), "both of repetition"),
+            ((hf.ftm.TR(), hf.ftm.PBR()), "must stand outside of tr"),
+            ((hf.ftm.PBR(), hf.ftm.TMR()), "keeps replicas already"),
+            ((layer_of("ad"), hf.ftm.TMR()), "it wants 3 replicas, and ad outside of it 2"),
+            ((hf.ftm.PBR(), hf.ftm.TR(), layer_of("nvp")), "both of repetition"),
         ):
             with pytest.raises(hf.HoldfastError, match=why):
                 await system.start(hf.child("alice", hf.start(Counter), mechanism=layers))

@@ -32,7 +32,7 @@ async def trio(system: hf.ActorSystem, *inner: Any, kind: Any = Total) -> Any:
 async def ended(driver: Any, name: str) -> None:
     """Wait until a replica has ended by itself; the driver does not start it again."""
     async with asyncio.timeout(5):
-        while (cell := driver.system.node.find(driver.path(name))) is not None and cell.state == "running":
+        while (cell := driver.system._node.find(driver.path(name))) is not None and cell.state == "running":
             await asyncio.sleep(0.001)
 
 
@@ -106,7 +106,7 @@ class Gated(Total):
 
     @hf.on(Fetch)
     async def fetch(self, message: Fetch) -> Any:
-        reached = self.gates.pop(self.ctx.cell.path.split("/")[4], None)
+        reached = self.gates.pop(self.ctx._cell.path.split("/")[4], None)
         if reached is not None:
             reached.set_result(None)
             await asyncio.Event().wait()
@@ -120,7 +120,7 @@ async def test_a_replica_that_is_stopped_while_it_computes_has_no_vote(system: h
     with system.events() as events:
         (key,) = driver.send(Fetch(2))
         await reached
-        system.node.cell_at(driver.path("r2")).request_stop(hf.SHUTDOWN)  # As when one of its bricks has crashed.
+        system._node.cell_at(driver.path("r2")).request_stop(hf.SHUTDOWN)  # As when one of its bricks has crashed.
         assert await driver.reply(key) == 2
         assert [one for one in events.take() if isinstance(one, Outvoted | Masked)] == []
     assert await driver.ask(Add(5)) == 7
@@ -129,7 +129,7 @@ async def test_a_replica_that_is_stopped_while_it_computes_has_no_vote(system: h
 async def test_nothing_leaves_before_all_that_are_up_have_it(system: hf.ActorSystem) -> None:
     """Whoever leads next has what was answered."""
     driver = await trio(system)
-    before = system.node.cell_at(driver.path("r3") + "/before").ref
+    before = system._node.cell_at(driver.path("r3") + "/before").ref
     await system.suspend(before)
     (key,) = driver.send(Add(1))
     await asyncio.sleep(0.05)

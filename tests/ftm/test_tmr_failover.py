@@ -81,7 +81,7 @@ async def trio_of(system: hf.ActorSystem, kind: Any = Total) -> Any:
 
 async def test_what_only_the_next_leader_knows_leaves_when_the_third_one_has_it_too(system: hf.ActorSystem) -> None:
     driver = await trio_of(system)
-    before = system.node.cell_at(driver.path("r3") + "/before").ref
+    before = system._node.cell_at(driver.path("r3") + "/before").ref
     await system.suspend(before)
     turn = driver.standing("r2").server.turn
     (key,) = driver.send(Add(1))
@@ -108,7 +108,7 @@ async def test_what_a_joiner_computes_while_it_takes_a_state_is_not_overwritten_
     driver = await trio_of(system)
     for n in range(handled):
         await driver.ask(Add(n))
-    proceed = system.node.cell_at(driver.path("r3") + "/proceed").ref
+    proceed = system._node.cell_at(driver.path("r3") + "/proceed").ref
     await system.suspend(proceed)
     joining = asyncio.create_task(driver.join("r3"))
     async with asyncio.timeout(30):
@@ -130,7 +130,7 @@ class Curious(Total):
 
     @hf.on(Fetch)
     async def fetch(self, message: Fetch) -> Any:
-        if "/r3/" in self.ctx.cell.path:
+        if "/r3/" in self.ctx._cell.path:
             await self.other.ask(Add(0))
         return await super().fetch(message)
 

@@ -113,7 +113,7 @@ async def test_below_passive_replication_the_backup_gets_what_was_agreed_on(syst
     await driver.fail_over("r2")
     assert await driver.ask(Add(4)) == 9
     assert await driver.ask(Read()) == [2, 3, 4]
-    names = {cell.name for cell in (system.node.cell_at(driver.path("r2")).children or {}).values()}
+    names = {cell.name for cell in (system._node.cell_at(driver.path("r2")).children or {}).values()}
     assert names >= {"protocol", "before", "tr.protocol", "tr.before", "proceed", "tr.after", "server", "state"}
 
 
@@ -157,7 +157,7 @@ async def test_what_was_begun_in_time_is_not_dropped_by_the_other_runs(system: h
     """The second run begins when the deadline is over; that is no difference between the runs."""
     driver = await pair(system, Slow, TR(), others=())
     with system.events() as events:
-        (key,) = driver.send(Add(1), deadline=system.node.loop.time() + 0.5)
+        (key,) = driver.send(Add(1), deadline=system._node.loop.time() + 0.5)
         assert await driver.reply(key) == 1
         assert not [one for one in events.take() if isinstance(one, Masked)]
     assert await driver.ask(Read()) == [1]

@@ -78,7 +78,7 @@ NVP_OF_WALKERS = NVP(versions=(WalkerSecond, Walker))
 def only_waited_for(driver: Any) -> None:
     """Nobody answers what nobody waits for."""
     answer = driver.outside
-    driver.outside = lambda out: None if driver.system.node.codec.decode(Add, out.body).n < 0 else answer(out)
+    driver.outside = lambda out: None if driver.system._node.codec.decode(Add, out.body).n < 0 else answer(out)
 
 
 @pytest.mark.parametrize("mechanism", [PBR(), LFR(), TMR()], ids=["pbr", "lfr", "tmr"])
@@ -117,7 +117,7 @@ async def test_its_turn_comes_to_the_same_in_each_run(
         assert await driver.ask(Say(1)) == 1
         assert await driver.ask(Walk(count)) == 1 + count
         assert await driver.ask(Add(1)) >= 2
-        masked = [one for one in events.take() if isinstance(one, (hf.Masked, hf.ReplicaLost))]
+        masked = [one for one in events.take() if isinstance(one, (hf.events.Masked, hf.events.ReplicaLost))]
     assert masked == []
     assert len(driver.released) == 2 + count
 
@@ -127,7 +127,7 @@ async def test_a_version_that_asks_something_else_is_outvoted_at_once(system: hf
     only_waited_for(driver)
     with system.events() as events:
         assert await driver.ask(Walk(0)) == 0
-        assert [one for one in events.take() if isinstance(one, hf.Masked)] != []
+        assert [one for one in events.take() if isinstance(one, hf.events.Masked)] != []
 
 
 async def test_a_turn_that_fails_behind_it_fails_alike_in_each_run(system: hf.ActorSystem) -> None:
@@ -141,7 +141,7 @@ async def test_a_turn_that_fails_behind_it_fails_alike_in_each_run(system: hf.Ac
 async def test_where_a_turn_stood_when_it_raised_is_no_difference(system: hf.ActorSystem) -> None:
     """The follower has the outcome of the ask before it has the request: its turn does not wait for it."""
     driver = await pair(system, Walker, LFR())
-    before = system.node.cell_at(driver.path("r2") + "/before").ref
+    before = system._node.cell_at(driver.path("r2") + "/before").ref
     with system.events() as events:
         await system.suspend(before)
         (key,) = driver.send(Stumble(3))

@@ -43,9 +43,9 @@ class Slow(hf.Actor):
 
 PLACES: dict[str, dict[str, Any]] = {
     "process": {"isolation": "process"},
-    "pbr": {"mechanism": hf.PBR()},
-    "lfr": {"mechanism": hf.LFR()},
-    "recorded_pbr": {"mechanism": hf.PBR(), "recovery": hf.hybrid()},
+    "pbr": {"mechanism": hf.ftm.PBR()},
+    "lfr": {"mechanism": hf.ftm.LFR()},
+    "recorded_pbr": {"mechanism": hf.ftm.PBR(), "recovery": hf.hybrid()},
 }
 
 

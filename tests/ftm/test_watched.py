@@ -52,9 +52,9 @@ async def test_what_is_decided_is_done_to_what_the_spec_says(system: hf.ActorSys
         monitor = await engine(system, watch)
         monitor.tell(Observe("mismatch", 3))
         assert (await done(events)).current == ("pbr", "tr")
-    assert stack(ref) == (PBR(window=3), hf.TR())  # What it had keeps its settings.
+    assert stack(ref) == (PBR(window=3), hf.ftm.TR())  # What it had keeps its settings.
     async with system.transaction(timeout=30) as change:
-        change.transition(ref, (LFR(), hf.TR()))
+        change.protect(ref, (LFR(), hf.ftm.TR()))
     async with asyncio.timeout(30):
         while (await monitor.ask(Report())).current != ("lfr", "tr"):
             await asyncio.sleep(0.01)
@@ -90,7 +90,7 @@ async def test_what_is_moved_to_another_supervisor_is_watched_there(system: hf.A
                 await asyncio.sleep(0.01)
         async with system.transaction(timeout=30) as change:
             change.add("/app/here", hf.child("alice", hf.start(Counter)))
-            change.transition(ref, LFR())
+            change.protect(ref, LFR())
         async with asyncio.timeout(30):
             while (await monitor.ask(Report())).current != ("lfr",):
                 await asyncio.sleep(0.01)
@@ -102,7 +102,7 @@ async def test_what_is_moved_to_another_supervisor_is_watched_there(system: hf.A
 
 async def test_what_mechanisms_bring_along_counts(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter)))
-    asserting = hf.AD(assertions=(is_positive,))
+    asserting = hf.ftm.AD(assertions=(is_positive,))
     watch = watch_of(system, ref, CRASHES, mechanisms=(asserting, "pbr", LFR), known={"rate": 7.0})
     assert watch.judge.application == Application.of(Counter, assertions=1, rate=7.0)
     with pytest.raises(MechanismRefused, match="no mechanism of that name"):

@@ -16,7 +16,7 @@ PLACES = ["task", "process", "replicas"]
 
 def traveller(kind: str, place: str) -> hf.ChildSpec:
     more: dict[str, Any] = {} if KINDS[kind] is None else {"recovery": KINDS[kind]}
-    more |= {"mechanism": hf.PBR()} if place == "replicas" else {"isolation": place}
+    more |= {"mechanism": hf.ftm.PBR()} if place == "replicas" else {"isolation": place}
     return hf.child("one", hf.start(Traveller), mailbox=hf.bounded(100_000), **more)
 
 

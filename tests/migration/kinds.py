@@ -39,13 +39,13 @@ class Own(hf.Supervisor):
 
 SPECS: dict[str, Any] = {
     "own": lambda isolation: hf.child("team", hf.start(Own, 10), isolation=isolation),
-    "pool": lambda isolation: over(hf.pool("below", leaf(None), 2, intensity=99), isolation),
-    "partitions": lambda isolation: hf.partitions("team", leaf(None), 3, intensity=99, isolation=isolation),
+    "pool": lambda isolation: over(hf.supervision.pool("below", leaf(None), 2, intensity=99), isolation),
+    "partitions": lambda isolation: hf.supervision.partitions("team", leaf(None), 3, intensity=99, isolation=isolation),
     "template": lambda isolation: hf.dynamic(
         "team", template=leaf(None), journal=True, intensity=99, isolation=isolation
     ),
     "journal": lambda isolation: over(hf.dynamic("below", journal=True, intensity=99), isolation),
-    "jobs": lambda isolation: hf.tasks("team", isolation=isolation, intensity=99),
+    "jobs": lambda isolation: hf.supervision.tasks("team", isolation=isolation, intensity=99),
     "stopped": lambda isolation: over(
         hf.supervisor("below", children=[leaf("one"), leaf("no", autostart=False), leaf("two")], intensity=99),
         isolation,
@@ -95,7 +95,7 @@ async def is_as_before(system: hf.ActorSystem, at: str, homes: tuple[str, ...], 
     try:
         async with asyncio.timeout(IN_TIME):
             while last != before:
-                with contextlib.suppress(hf.NoSuchActor, hf.ActorStopped, hf.AskFailed, AssertionError):
+                with contextlib.suppress(hf.errors.NoSuchActor, hf.ActorStopped, hf.AskFailed, AssertionError):
                     last = await shape(system, at, homes)
                 await asyncio.sleep(0.005)
     except TimeoutError:
@@ -111,7 +111,9 @@ class Clients:
         self._pumps = [] if kind == "pool" else [Pump(ref) for ref in self.refs.values()]
         self._spread: set[int] = set()  # what the pool has answered
         self._sent, self._is_over = 0, False
-        self._pool = hf.pool_of(system, f"{team_of(system).path}/below", Traveller) if kind == "pool" else None
+        self._pool = (
+            hf.supervision.pool_of(system, f"{team_of(system).path}/below", Traveller) if kind == "pool" else None
+        )
         self._task = asyncio.create_task(self._spread_all())
 
     async def _spread_all(self) -> None:

@@ -42,7 +42,7 @@ def supervisors(kind: str, at: str, isolation: Any) -> list[hf.ChildSpec]:
     ]
 
 
-async def move(system: hf.ActorSystem, ref: Any, to: str, *then: hf.Operation) -> None:
+async def move(system: hf.ActorSystem, ref: Any, to: str, *then: hf.system.Operation) -> None:
     async with system.transaction(timeout=IN_TIME) as change:
         change.move(ref, f"/app/{to}")
         for step in then:
@@ -110,10 +110,10 @@ async def test_a_process_that_is_killed_at_any_instant_loses_nothing(
     await pump.reached(10)
     moving = asyncio.ensure_future(move(system, ref, new))
     rng = random.Random(seed)
-    struck = system.node.loop.time() + rng.random() * 0.3
-    while not moving.done() and system.node.loop.time() < struck:
+    struck = system._node.loop.time() + rng.random() * 0.3
+    while not moving.done() and system._node.loop.time() < struck:
         await asyncio.sleep(0)
-    with contextlib.suppress(hf.NoSuchActor, ProcessLookupError):  # It lives nowhere just now.
+    with contextlib.suppress(hf.errors.NoSuchActor, ProcessLookupError):  # It lives nowhere just now.
         pid = (
             rng.choice(processes(system, ref)) if victim == "own" else pid_of(system, {"old": old, "new": new}[victim])
         )
@@ -283,7 +283,7 @@ async def test_what_its_old_supervisor_says_before_it_has_heard_is_void(
         assert (await one.ask(Seen(), IN_TIME))["added"] == [5]
         holder = busy.ref("/app/far/holder", Holder)
         assert (await holder.ask(Reach("/app/far/one"), IN_TIME))["added"] == [5]
-        assert not [event for event in events.take() if isinstance(event, hf.TrustBreached)]
+        assert not [event for event in events.take() if isinstance(event, hf.events.TrustBreached)]
     assert (one.path, busy.pid_of(one)) == ("/app/near/one", own)
     assert [info.id for info in await busy.ref("/app/far", hf.Supervisor).ask(hf.WhichChildren())] == ["holder"]
     await busy.stop(one)
@@ -330,7 +330,7 @@ async def test_a_supervisor_within_a_process_comes_back_with_who_has_come_and_wi
         async with asyncio.timeout(IN_TIME):
             while True:
                 await asyncio.sleep(0.005)
-                with contextlib.suppress(hf.NoSuchActor, hf.ActorStopped, hf.AskFailed):
+                with contextlib.suppress(hf.errors.NoSuchActor, hf.ActorStopped, hf.AskFailed):
                     told = await system.ref(f"/app/far/{name}", hf.Supervisor).ask(hf.WhichChildren(), IN_TIME)
                     if [info.id for info in told] == below:
                         break
@@ -348,7 +348,7 @@ async def test_a_process_that_is_started_anew_knows_where_they_are_who_have_left
     async with asyncio.timeout(IN_TIME):
         while not seen:
             await asyncio.sleep(0.005)
-            with contextlib.suppress(hf.NoSuchActor, hf.ActorStopped, hf.AskFailed):
+            with contextlib.suppress(hf.errors.NoSuchActor, hf.ActorStopped, hf.AskFailed):
                 seen = await busy.ref("/app/far/holder", Holder).ask(Reach("/app/far/one"), IN_TIME)
     assert seen["added"] == [4]
 
@@ -493,13 +493,13 @@ class Forge(hf.Message[bool]):
 class Speaker(hf.Actor):
     @hf.on(Speak)
     def speak(self, message: Speak) -> int:
-        names = self.ctx.cell.node.ports.uplink.connection.names
+        names = self.ctx._cell.node.ports.uplink.connection.names
         self.ctx.find(message.to, Traveller).tell(Add(1))
         return int(names.to_wire(self.ctx.path))
 
     @hf.on(Forge)
     def forge(self, message: Forge) -> bool:
-        connection = self.ctx.cell.node.ports.uplink.connection
+        connection = self.ctx._cell.node.ports.uplink.connection
         name, to = connection.names.to_wire(message_name(Add)), connection.names.to_wire(message.to)
         connection.send(frames.Tell(to, name, msgspec.Raw(msgspec.msgpack.encode([1])), 0, message.sender))
         return True
@@ -518,7 +518,7 @@ async def test_a_process_does_not_speak_for_an_actor_that_has_left_it(system: hf
     await move(system, one, "near")
     with system.events() as events:
         evil.tell(Forge(other.path, senders[-1]))
-        breach = await next_event(events, hf.TrustBreached)
+        breach = await next_event(events, hf.events.TrustBreached)
     assert breach.address == "/app/far"
     assert len((await other.ask(Seen(), IN_TIME))["added"]) == 4
 

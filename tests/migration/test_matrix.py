@@ -101,7 +101,7 @@ class Walk:
             self._kill_replica()
         try:
             await taking
-        except (hf.CannotMove, hf.TransactionFailed):
+        except (hf.errors.CannotMove, hf.TransactionFailed):
             assert fault != "none"
             await take(self._system, self.ref, step)
         self._faults.give_up = False
@@ -136,7 +136,7 @@ class Walk:
     def _kill(self) -> None:
         try:
             pid = self._system.pid_of(self.ref)
-        except hf.NoSuchActor:
+        except hf.errors.NoSuchActor:
             return  # It lives nowhere just now.
         if pid != os.getpid():
             os.kill(pid, signal.SIGKILL)

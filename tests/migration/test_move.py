@@ -119,12 +119,12 @@ async def test_a_move_that_is_given_up_or_fails_at_any_step_leaves_the_life_wher
     async def fails() -> None:
         await plain()
         if how == "error":
-            raise hf.CannotMove(ref.path, "it fails")
+            raise hf.errors.CannotMove(ref.path, "it fails")
         move.give_up("it is given up")
 
     monkeypatch.setattr(side, step, fails)
     asked = ref.ask(Add(10))
-    with pytest.raises(hf.CannotMove, match="it fails" if how == "error" else "it is given up"):
+    with pytest.raises(hf.errors.CannotMove, match="it fails" if how == "error" else "it is given up"):
         await move.run()
     assert did[-2:] == ["discard", "resume"]
     assert "retire" not in did

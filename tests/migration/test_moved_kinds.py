@@ -63,13 +63,13 @@ async def test_who_is_killed_at_any_instant_loses_nothing(
     await clients.reached(5)
     moving = asyncio.ensure_future(move(system, new, way=way))
     rng = random.Random(seed)
-    struck = system.node.loop.time() + rng.random() * 0.4
-    while not moving.done() and system.node.loop.time() < struck:
+    struck = system._node.loop.time() + rng.random() * 0.4
+    while not moving.done() and system._node.loop.time() < struck:
         await asyncio.sleep(0)
     tops = [path for path in system.tree() if path.endswith("/team")]
     struck_at = {"own": rng.choice(list(clients.refs.values())).path, "team": rng.choice([*tops, f"/app/{old}/team"])}
     struck_at |= {"old": f"/app/{old}", "new": f"/app/{new}"}
-    with contextlib.suppress(hf.NoSuchActor, ProcessLookupError):  # It lives nowhere just now.
+    with contextlib.suppress(hf.errors.NoSuchActor, ProcessLookupError):  # It lives nowhere just now.
         pid = rng.choice(processes(system, system.ref(struck_at[victim], hf.Actor)))
         if pid != os.getpid():  # Else asks of those below fail while it is restarted, as in any restart.
             os.kill(pid, signal.SIGKILL)
@@ -193,7 +193,7 @@ async def test_what_was_noted_is_true_when_a_move_was_given_up(system: hf.ActorS
     old, new = WAYS[way]
     await plant_kind(system, kind, way, old, new)
     if kind == "pool":
-        await system.ref(f"/app/{old}/team/below", hf.Supervisor).ask(hf.ResizePool(3), IN_TIME)
+        await system.ref(f"/app/{old}/team/below", hf.Supervisor).ask(hf.supervision.ResizePool(3), IN_TIME)
     before, names = await shape(system, old, (old, new)), leaves(system)
     for name in names:
         assert await system.ref(f"/app/{old}/team/{name}", Traveller).ask(Add(3), IN_TIME) == 3
@@ -261,7 +261,7 @@ async def test_a_suspended_one_stays_suspended(system: hf.ActorSystem, way: str)
     team, one = team_of(system), system.ref(f"/app/{old}/team/inner/one", Traveller)
     for to in (new, old, new):
         await system.suspend(team)
-        waiting = team.ask(hf.CountChildren(), IN_TIME)
+        waiting = team.ask(hf.supervision.CountChildren(), IN_TIME)
         async with asyncio.timeout(IN_TIME):
             await move(system, to, way=way)
         assert await one.ask(Add(1), IN_TIME) > 0
@@ -316,14 +316,14 @@ async def nap(seconds: float) -> float:
 @pytest.mark.parametrize("way", ["near to far", "to a process"])
 async def test_jobs_that_run_are_waited_for(system: hf.ActorSystem, way: str) -> None:
     old, new = WAYS[way]
-    await plant(system, old, hf.tasks("team"), old, new)
+    await plant(system, old, hf.supervision.tasks("team"), old, new)
     team: Any = team_of(system)
-    jobs, end = hf.Tasks(team), asyncio.Event()
+    jobs, end = hf.supervision.Tasks(team), asyncio.Event()
     job = jobs.start(end.wait)
     await asyncio.wait_for(started(system, 1), IN_TIME)
 
     async def end_soon(system: hf.ActorSystem) -> None:
-        system.node.loop.call_later(0.3, end.set)
+        system._node.loop.call_later(0.3, end.set)
 
     await move(system, new, Stumble(end_soon), way=way)
     assert job.is_done
@@ -341,9 +341,9 @@ async def started(system: hf.ActorSystem, count: int) -> None:
 async def test_jobs_begin_again_when_a_move_was_given_up(system: hf.ActorSystem, way: str) -> None:
     """Those that were asked for meanwhile have waited."""
     old, new = WAYS[way]
-    await plant(system, old, hf.tasks("team"), old, new)
+    await plant(system, old, hf.supervision.tasks("team"), old, new)
     team: Any = team_of(system)
-    jobs = hf.Tasks(team)
+    jobs = hf.supervision.Tasks(team)
     long = jobs.start(nap, 3600.0)
     await asyncio.wait_for(started(system, 1), IN_TIME)
 
@@ -364,21 +364,21 @@ async def test_jobs_begin_again_when_a_move_was_given_up(system: hf.ActorSystem,
 async def test_a_pool_that_has_grown_keeps_its_size_and_begins_with_the_first(system: hf.ActorSystem, way: str) -> None:
     old, new = WAYS[way]
     worker = hf.child(None, hf.start(Traveller))
-    pool = hf.pool("below", worker, 2, intensity=99)
+    pool = hf.supervision.pool("below", worker, 2, intensity=99)
     await plant(system, old, hf.supervisor("team", children=[pool], isolation=isolation_for(way)), old, new)
-    assert await system.ref(f"/app/{old}/team/below", hf.Supervisor).ask(hf.ResizePool(4), IN_TIME) == 2
+    assert await system.ref(f"/app/{old}/team/below", hf.Supervisor).ask(hf.supervision.ResizePool(4), IN_TIME) == 2
     await move(system, new, way=way)
     supervisor = system.ref(f"/app/{new}/team/below", hf.Supervisor)
-    told = await supervisor.ask(hf.PoolInfo(), IN_TIME)
+    told = await supervisor.ask(hf.supervision.PoolInfo(), IN_TIME)
     assert (told.size, told.up) == (4, 4)
-    router = hf.pool_of(system, f"/app/{new}/team/below", Traveller)
+    router = hf.supervision.pool_of(system, f"/app/{new}/team/below", Traveller)
     for _ in range(8):
         await router.ask(Add(1), IN_TIME)
     seen = [(await system.ref(f"{supervisor.path}/{n}", Traveller).ask(Seen(), IN_TIME))["added"] for n in range(4)]
     assert seen == [[1, 1]] * 4
-    assert await supervisor.ask(hf.ResizePool(3), IN_TIME) == 4
+    assert await supervisor.ask(hf.supervision.ResizePool(3), IN_TIME) == 4
     await system.ref(f"/app/{new}/team", hf.Supervisor).ask(hf.RestartChild("below", running=True), IN_TIME)
-    assert (await supervisor.ask(hf.PoolInfo(), IN_TIME)).size == 2
+    assert (await supervisor.ask(hf.supervision.PoolInfo(), IN_TIME)).size == 2
 
 
 @pytest.mark.parametrize("way", list(WAYS))
@@ -386,13 +386,15 @@ async def test_partitions_route_as_before(system: hf.ActorSystem, way: str) -> N
     old, new = WAYS[way]
     await plant_kind(system, "partitions", way, old, new)
     team = team_of(system)
-    assert await team.ask(hf.ResizePartitions(2), IN_TIME) == 3
+    assert await team.ask(hf.supervision.ResizePartitions(2), IN_TIME) == 3
     for to in (new, old, new):
-        first = [(await team.ask(hf.Route(key), IN_TIME)).path.rpartition("/")[2] for key in range(6)]
+        first = [(await team.ask(hf.supervision.Route(key), IN_TIME)).path.rpartition("/")[2] for key in range(6)]
         await move(system, to, way=way)
-        assert await team.ask(hf.CountPartitions(), IN_TIME) == 2
-        assert [(await team.ask(hf.Route(key), IN_TIME)).path.rpartition("/")[2] for key in range(6)] == first
-    assert await team.ask(hf.ResizePartitions(3), IN_TIME) == 2
+        assert await team.ask(hf.supervision.CountPartitions(), IN_TIME) == 2
+        assert [
+            (await team.ask(hf.supervision.Route(key), IN_TIME)).path.rpartition("/")[2] for key in range(6)
+        ] == first
+    assert await team.ask(hf.supervision.ResizePartitions(3), IN_TIME) == 2
     assert dict(await below(system, team.path)) == dict.fromkeys("012", "running")
 
 
@@ -434,12 +436,12 @@ class Patient(hf.Supervisor):
 @pytest.mark.parametrize("way", list(WAYS))
 async def test_what_it_has_put_aside_goes_along(system: hf.ActorSystem, way: str) -> None:
     old, new = WAYS[way]
-    flags = hf.Flags(intensity=9)
+    flags = hf.supervision.Flags(intensity=9)
     spec = hf.child("team", hf.start(Patient, flags, (leaf("one"),)), isolation=isolation_for(way))
     await plant(system, old, spec, old, new)
     team = system.ref(f"/app/{old}/team", Patient)
     waiting = [team.ask(Add(number), IN_TIME) for number in range(3)]
-    assert (await team.ask(hf.CountChildren(), IN_TIME)).active == 1
+    assert (await team.ask(hf.supervision.CountChildren(), IN_TIME)).active == 1
     await move(system, new, way=way)
     assert await team.ask(Visits(), IN_TIME) == 0
     assert await asyncio.gather(*waiting) == [0, 1, 2]
@@ -483,6 +485,6 @@ async def test_who_was_stopped_by_order_is_known_as_such(system: hf.ActorSystem,
     await team_of(system).ask(hf.TerminateChild("two"), IN_TIME)
     await move(system, new, way=way)
     assert await below(system, f"/app/{new}/team") == [("one", "running"), ("two", "stopped")]
-    with pytest.raises(hf.ChildParked):
+    with pytest.raises(hf.errors.ChildParked):
         await team_of(system).ask(hf.RestartChild("two", unless_parked=True), IN_TIME)
     assert await team_of(system).ask(hf.RestartChild("two"), IN_TIME) is not None

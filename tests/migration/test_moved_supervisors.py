@@ -48,7 +48,7 @@ async def is_whole(system: hf.ActorSystem, at: str, homes: tuple[str, ...]) -> N
     """All of it is there and nothing of it elsewhere, in the end."""
     async with asyncio.timeout(IN_TIME):
         while True:
-            with contextlib.suppress(hf.NoSuchActor, hf.ActorStopped, hf.AskFailed):
+            with contextlib.suppress(hf.errors.NoSuchActor, hf.ActorStopped, hf.AskFailed):
                 told = {name: await below(system, f"/app/{name}") for name in homes}
                 if told == {name: [("team", "running")] if name == at else [] for name in homes}:
                     inner = await below(system, f"/app/{at}/team/inner")
@@ -108,12 +108,12 @@ async def test_who_is_killed_at_any_instant_loses_nothing(
         await pump.reached(5)
     moving = asyncio.ensure_future(move(system, new, way=way))
     rng = random.Random(seed)
-    struck = system.node.loop.time() + rng.random() * 0.4
-    while not moving.done() and system.node.loop.time() < struck:
+    struck = system._node.loop.time() + rng.random() * 0.4
+    while not moving.done() and system._node.loop.time() < struck:
         await asyncio.sleep(0)
     paths = [path for path in system.tree() if path.endswith("/team")]
     struck_at = {"own": rng.choice(refs).path, "team": rng.choice(paths), "old": f"/app/{old}", "new": f"/app/{new}"}
-    with contextlib.suppress(hf.NoSuchActor, ProcessLookupError):  # It lives nowhere just now.
+    with contextlib.suppress(hf.errors.NoSuchActor, ProcessLookupError):  # It lives nowhere just now.
         ref = system.ref(struck_at[victim], hf.Actor)
         pid = rng.choice(processes(system, ref))
         if pid != os.getpid():  # Else asks of those below fail while it is restarted, as in any restart.
@@ -249,7 +249,7 @@ class Friend(hf.Actor):
     @hf.on(Ask)
     async def count(self, message: Ask) -> int:
         refs = (self.kept, self.ctx.find(message.path, hf.Supervisor), self.bound)
-        counts = [await ref.ask(hf.CountChildren(), IN_TIME) for ref in refs]
+        counts = [await ref.ask(hf.supervision.CountChildren(), IN_TIME) for ref in refs]
         return min(one.active for one in counts)
 
     @hf.on(Heard, readonly=True)
@@ -294,7 +294,7 @@ async def test_who_is_tied_to_it_is_tied_to_the_one_that_takes_its_place(
         assert await friend.ask(Heard(), IN_TIME) == []
     await system.stop(supervisor)
     await hears(friend, ["down", "exit"])  # Once each.
-    with pytest.raises(hf.NoSuchActor):
+    with pytest.raises(hf.errors.NoSuchActor):
         system.whereis("the team")
 
 
@@ -319,7 +319,7 @@ async def test_restarts_before_the_move_count_behind_it(system: hf.ActorSystem, 
     await fall()
     with system.events() as events:
         one.kill()
-        event = await next_event(events, hf.SupervisorGaveUp)
+        event = await next_event(events, hf.events.SupervisorGaveUp)
     assert event.address == f"/app/{new}/team"
     await is_whole(system, new, (old, new))
 
@@ -395,11 +395,11 @@ async def test_what_cannot_begin_anew_is_refused_before_anything_is_done(system:
     with pytest.raises(hf.TransactionRefused, match=why):
         async with system.transaction(timeout=IN_TIME) as change:
             change.move("/app/near/deep", "/app/far")
-    with pytest.raises(hf.CannotMove, match=why):
+    with pytest.raises(hf.errors.CannotMove, match=why):
         await system.set_isolation(system.ref("/app/near/deep", hf.Supervisor), "process")
-    with pytest.raises(hf.CannotMove, match="its supervisor lives in another process"):
+    with pytest.raises(hf.errors.CannotMove, match="its supervisor lives in another process"):
         await system.set_isolation(system.ref("/app/far/inner", hf.Supervisor), "process")
-    with pytest.raises(hf.CannotMove, match="nobody supervises it"):
+    with pytest.raises(hf.errors.CannotMove, match="nobody supervises it"):
         await system.set_isolation(system.ref("/app", hf.Supervisor), "process")
     await system.set_isolation(system.ref("/app/far", hf.Supervisor), "process")  # It has one.
     assert system.tree() == before
@@ -409,11 +409,11 @@ async def test_steps_about_one_that_begins_anew(system: hf.ActorSystem) -> None:
     """What is refused in the same transaction, and what goes along."""
     await plant(system, "near", team("plain", "task"), "near", "far", "other")
 
-    def twice(change: hf.Change) -> None:
+    def twice(change: hf.system.Change) -> None:
         change.move("/app/near/team", "/app/far")
         change.move("/app/far/team", "/app/other")
 
-    def smaller(change: hf.Change) -> None:
+    def smaller(change: hf.system.Change) -> None:
         change.remove("/app/near/team/zero")
         change.move("/app/near/team", "/app/far")
 
@@ -481,9 +481,9 @@ async def test_who_has_left_the_address_is_found_by_it_when_nobody_stays_there(s
     await move(system, "far")
     with pytest.raises(hf.TransactionFailed):
         await move(system, "near", Stumble())
-    assert await system.ref("/app/near/team", hf.Supervisor).ask(hf.CountChildren(), IN_TIME) == await team_of(
-        system
-    ).ask(hf.CountChildren(), IN_TIME)
+    assert await system.ref("/app/near/team", hf.Supervisor).ask(
+        hf.supervision.CountChildren(), IN_TIME
+    ) == await team_of(system).ask(hf.supervision.CountChildren(), IN_TIME)
     assert await system.ref("/app/near/team/one", Traveller).ask(Add(1), IN_TIME) == 1
 
 
@@ -495,7 +495,7 @@ async def test_what_waits_for_it_is_answered_by_the_one_that_takes_its_place(sys
 
     async def ask() -> None:
         while not is_over:
-            answers.append((await supervisor.ask(hf.CountChildren(), IN_TIME)).specs)
+            answers.append((await supervisor.ask(hf.supervision.CountChildren(), IN_TIME)).specs)
 
     asking = asyncio.create_task(ask())
     for to in (new, old) * 2:
@@ -536,7 +536,9 @@ async def test_its_old_life_ends_and_tells_nobody_else(system: hf.ActorSystem, w
         async with asyncio.timeout(IN_TIME):
             while file.read_text().splitlines() != expected:
                 await asyncio.sleep(0.005)
-        told = [event for event in events.take() if isinstance(event, (hf.ChildTerminated, hf.ChildRestarted))]
+        told = [
+            event for event in events.take() if isinstance(event, (hf.events.ChildTerminated, hf.events.ChildRestarted))
+        ]
     assert told == []
 
 
@@ -588,7 +590,7 @@ async def test_who_falls_when_its_supervisor_has_stood_down_is_restarted(system:
     await is_whole(system, new, (old, new))
 
 
-class Strike(hf.Operation):
+class Strike(hf.system.Operation):
     """Kills the process of a supervisor at the commit."""
 
     verb = "strike"

@@ -49,7 +49,7 @@ async def exists(file: str) -> None:
             await asyncio.sleep(0.005)
 
 
-CHANGES: dict[str, Callable[[hf.Change, Any], None]] = {
+CHANGES: dict[str, Callable[[hf.system.Change, Any], None]] = {
     "isolation": lambda change, ref: change.isolation(ref, "process"),
     "protect": lambda change, ref: change.protect(ref, PBR()),
     "lodging": lambda change, ref: change.move(ref, "/app/far"),
@@ -88,7 +88,7 @@ async def test_a_move_waits_for_another_one_no_longer_than_its_time_limit(
     moved = asyncio.ensure_future(system.set_isolation(ref, "process", timeout=IN_TIME))
     await exists(f"{tmp_path}/no.met")
     async with asyncio.timeout(20.0):
-        with pytest.raises(hf.CannotMove, match=r"another change of it is not over within 0\.2 s"):
+        with pytest.raises(hf.errors.CannotMove, match=r"another change of it is not over within 0\.2 s"):
             await system.set_isolation(ref, "task", timeout=0.2)
     (tmp_path / "no").unlink()
     await moved
@@ -142,7 +142,9 @@ async def test_who_crashes_again_and_again_is_named_with_the_number_of_its_ends(
     with pytest.raises(hf.TransactionFailed, match=r"not within 1 s.*/app/near/one: its life has ended [0-9]+ times"):
         async with system.transaction(timeout=1.0) as change:
             CHANGES[about](change, ref)
-    with pytest.raises(hf.CannotMove, match=r"/app/near/one.*its life has ended [0-9]+ times.*mend what ends it"):
+    with pytest.raises(
+        hf.errors.CannotMove, match=r"/app/near/one.*its life has ended [0-9]+ times.*mend what ends it"
+    ):
         await system.set_isolation(ref, "process", timeout=0.5)
 
 
@@ -160,7 +162,7 @@ class Hanging(Reluctant):
         return self.total
 
 
-def hang(ref: hf.ActorRef[Any], file: Path, *, fails: bool) -> hf.Operation:
+def hang(ref: hf.ActorRef[Any], file: Path, *, fails: bool) -> hf.system.Operation:
     """A step behind the one that has lent it a process: its next turn hangs."""
 
     async def do(system: hf.ActorSystem) -> None:
@@ -191,7 +193,7 @@ async def test_the_process_that_it_is_lent_keeps_a_transaction_no_longer_than_it
             except hf.TransactionFailed as failed:
                 told = failed.kept
             else:
-                told = (await next_event(events, hf.TransactionCommitted)).problems
+                told = (await next_event(events, hf.events.TransactionCommitted)).problems
     assert "one cannot be moved: " in "".join(told)
     own = system.pid_of(ref)
     assert own not in (os.getpid(), pid_of(system, "far"))
@@ -251,12 +253,12 @@ async def test_a_mechanism_that_gives_way_while_somebody_detaches_it_is_gone_onc
     ref = await supervised(system, child(hf.start(Traveller), kind), old)
     assert await ref.ask(Add(1), IN_TIME) == 1
     async with system.transaction(timeout=IN_TIME) as change:
-        change.attach(ref, PBR())
+        change.protect(ref, PBR())
     gives_way = system._moves.unprotect(ref._cell, IN_TIME)
 
     async def detach() -> None:
         async with system.transaction(timeout=IN_TIME) as change:
-            change.detach(ref)
+            change.protect(ref, None)
 
     await asyncio.gather(detach(), gives_way)
     assert await ref.ask(Add(1), IN_TIME) == 2

@@ -87,7 +87,7 @@ async def test_a_move_that_fails_in_the_new_life_breaks_no_promise(system: hf.Ac
     ref = await system.start(hf.child("one", hf.start(Choosy, os.getpid()), isolation=place))
     promised = ref.ask(Later(), IN_TIME)
     await ref.ask(Avoid(other))
-    with pytest.raises(hf.CannotMove, match="not here"):
+    with pytest.raises(hf.errors.CannotMove, match="not here"):
         await system.set_isolation(ref, other)
     assert not promised.done()
     assert await ref.ask(Give(9))

@@ -141,7 +141,7 @@ def tree(place: str, kind: str) -> hf.ChildSpec:
     if place in ("a process", OWN_BELOW):
         where["isolation"] = "process"
     if place == "replicas":
-        where["mechanism"] = hf.PBR()
+        where["mechanism"] = hf.ftm.PBR()
     if KINDS[kind] is not None:
         where["recovery"] = KINDS[kind]
     one = hf.child("one", hf.start(Traveller), **where)
@@ -165,10 +165,10 @@ async def take(system: hf.ActorSystem, ref: hf.ActorRef[Any], step: str) -> None
             await system.set_isolation(ref, step, timeout=60.0)
         case "protect":
             async with system.transaction(timeout=60.0) as change:
-                change.protect(ref, hf.PBR())
+                change.protect(ref, hf.ftm.PBR())
         case "unprotect":
             async with system.transaction(timeout=60.0) as change:
-                change.detach(ref)
+                change.protect(ref, None)
         case "move":
             async with system.transaction(timeout=60.0) as change:
                 change.move(ref, "/app/here" if ref.path.startswith("/app/there/") else "/app/there")

@@ -32,14 +32,14 @@ def isolation_for(way: str) -> Any:
     return "process" if way in ("with its process", "to a task") else "task"
 
 
-async def move(system: hf.ActorSystem, to: str, *then: hf.Operation, way: str = "") -> None:
+async def move(system: hf.ActorSystem, to: str, *then: hf.system.Operation, way: str = "") -> None:
     async with system.transaction(timeout=IN_TIME) as change:
         put(system, change, to, way)
         for step in then:
             change.step(step)
 
 
-def put(system: hf.ActorSystem, change: hf.Change, to: str, way: str) -> None:
+def put(system: hf.ActorSystem, change: hf.system.Change, to: str, way: str) -> None:
     """Have it be below that supervisor, or live elsewhere where it is."""
     ref = team_of(system)
     if way in IN_PLACE:

@@ -107,7 +107,7 @@ class Family:
     async def rest(self) -> str:
         """Until nothing happens any more; what was started and stopped meanwhile."""
         for _ in range(10):
-            await self.system.node.settled()
+            await self.system._node.settled()
         return self.plan.take()
 
     async def after(self, name: str, message: hf.Message[Any]) -> str:

@@ -75,7 +75,7 @@ async def main(store: str, life: str, place: Any) -> None:
                 await asker.send(AskIt(busy.path))
                 while not marker.exists() or not (await system.get_status(busy)).queued >= 2:
                     await asyncio.sleep(0)
-                await system.homes.settled()
+                await system._homes.settled()
                 os.kill(os.getpid(), signal.SIGKILL)
             outcome = await asker.ask(Outcome(), timeout=60.0)
             told = [
@@ -83,7 +83,7 @@ async def main(store: str, life: str, place: Any) -> None:
                 for event in events.take()
                 if isinstance(event, DeadLetter)
             ]
-        print(json.dumps([outcome, sorted(told), system.homes.known("/app/many")]))
+        print(json.dumps([outcome, sorted(told), system._homes.known("/app/many")]))
 
 
 if __name__ == "__main__":

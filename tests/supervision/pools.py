@@ -97,14 +97,14 @@ class Worker(hf.Actor):
     async def via(self, message: Via) -> str:
         if not message.again:
             return self.name
-        pool = hf.pool_of(self.ctx.cell, "/app/w", Worker)
+        pool = hf.supervision.pool_of(self.ctx, "/app/w", Worker)
         return f"{self.name} {await pool.ask(Via(message.again - 1))}"
 
 
 class Other(hf.Actor):
     @hf.on(Who)
     async def who(self, message: Who) -> str:
-        pool = hf.pool_of(self.ctx.cell, "/app/w", Worker)
+        pool = hf.supervision.pool_of(self.ctx, "/app/w", Worker)
         pool.tell(Note("hello"))
         return await pool.ask(Who())
 
@@ -114,8 +114,8 @@ async def begin(
 ) -> tuple[hf.ActorRef[Any], hf.ActorRef[Worker]]:
     """The pool's supervisor, and the pool."""
     options.setdefault("intensity", 99)
-    top = await system.start(hf.pool("w", worker or hf.start(Worker), size, **options))
-    return top, hf.pool_of(system, "/app/w", Worker)
+    top = await system.start(hf.supervision.pool("w", worker or hf.start(Worker), size, **options))
+    return top, hf.supervision.pool_of(system, "/app/w", Worker)
 
 
 def one(system: hf.ActorSystem, number: int) -> hf.ActorRef[Worker]:
@@ -130,5 +130,5 @@ async def settled(system: hf.ActorSystem) -> None:
     """Until nothing happens any more; turns may wait (which `node.settled` would wait for): all is in this process."""
     for _ in range(20):
         await asyncio.sleep(0)
-        while system.node.awake:
+        while system._node.awake:
             await asyncio.sleep(0)

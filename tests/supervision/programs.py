@@ -32,15 +32,15 @@ time.sleep(99)
 
 
 def sh(script: str, **options: Any) -> hf.ChildSpec:
-    return hf.program(["sh", "-c", script], id=options.pop("id", "it"), **options)
+    return hf.supervision.program(["sh", "-c", script], id=options.pop("id", "it"), **options)
 
 
 def python(script: str, **options: Any) -> hf.ChildSpec:
-    return hf.program([*PYTHON, script], id=options.pop("id", "it"), **options)
+    return hf.supervision.program([*PYTHON, script], id=options.pop("id", "it"), **options)
 
 
-async def info(system: hf.ActorSystem, path: str = "/app/it") -> hf.ProgramStatus:
-    return await system.ref(path, hf.Program).ask(hf.ProgramInfo(), 30)
+async def info(system: hf.ActorSystem, path: str = "/app/it") -> hf.supervision.ProgramStatus:
+    return await system.ref(path, hf.supervision.Program).ask(hf.supervision.ProgramInfo(), 30)
 
 
 async def refused(system: hf.ActorSystem, spec: hf.ChildSpec) -> str:
@@ -74,5 +74,5 @@ async def family(system: hf.ActorSystem, spec: hf.ChildSpec) -> tuple[int, list[
     """Start a FAMILY: its pid, and those of its descendants."""
     with system.events() as events:
         await system.start(spec)
-        pids = [int((await next_event(events, hf.LogLine)).text) for _ in range(2)]
+        pids = [int((await next_event(events, hf.events.LogLine)).text) for _ in range(2)]
     return (await info(system)).pid, pids

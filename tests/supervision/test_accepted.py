@@ -50,7 +50,7 @@ async def keeper(system: hf.ActorSystem, path: str) -> hf.ActorRef[Keeper]:
         while True:
             try:
                 return system.ref(path, Keeper)
-            except hf.NoSuchActor:
+            except hf.errors.NoSuchActor:
                 await asyncio.sleep(0)
 
 
@@ -58,7 +58,7 @@ async def restart(system: hf.ActorSystem, supervisor: hf.ActorRef[hf.Supervisor]
     with system.events() as events:
         supervisor.kill()
         async for event in events:
-            if isinstance(event, hf.ChildRestarted) and event.address == supervisor.path:
+            if isinstance(event, hf.events.ChildRestarted) and event.address == supervisor.path:
                 return
 
 
@@ -67,7 +67,7 @@ async def test_the_workers_that_a_pool_was_given_come_back_with_what_they_have_a
     tmp_path: Path, how: str
 ) -> None:
     paths = [f"/app/w/{number}" for number in range(4)]
-    spec = hf.pool("w", WORKER, 2, intensity=9)
+    spec = hf.supervision.pool("w", WORKER, 2, intensity=9)
     store = f"sqlite:{tmp_path / 'app.db'}"
 
     async def all_taken(system: hf.ActorSystem) -> list[list[int]]:
@@ -76,19 +76,19 @@ async def test_the_workers_that_a_pool_was_given_come_back_with_what_they_have_a
     expected = [[place * 10 + n for n in range(3)] for place in range(4)]
     async with hf.ActorSystem("app", log=False, store=store) as system:
         pool = await system.start(spec)
-        assert await pool.ask(hf.ResizePool(4), 60) == 2
+        assert await pool.ask(hf.supervision.ResizePool(4), 60) == 2
         await fill(system, paths)
         if how == "supervisor":
             await restart(system, pool)
-            assert (await pool.ask(hf.PoolInfo(), 60)).size == 4
+            assert (await pool.ask(hf.supervision.PoolInfo(), 60)).size == 4
             assert await all_taken(system) == expected
     async with hf.ActorSystem("app", log=False, store=store) as system:
         pool = await system.start(spec)
-        assert (await pool.ask(hf.PoolInfo(), 60)).size == 4
+        assert (await pool.ask(hf.supervision.PoolInfo(), 60)).size == 4
         assert await all_taken(system) == expected
-        await pool.ask(hf.ResizePool(1), 60)
+        await pool.ask(hf.supervision.ResizePool(1), 60)
         await restart(system, pool)
-        assert (await pool.ask(hf.PoolInfo(), 60)).size == 2, "those that were let go do not come back"
+        assert (await pool.ask(hf.supervision.PoolInfo(), 60)).size == 2, "those that were let go do not come back"
 
 
 @pytest.mark.parametrize("journal", [False, True])
@@ -101,7 +101,7 @@ async def test_what_waits_at_a_made_up_address_is_told_if_nobody_comes_back_ther
         with system.events() as events:
             await restart(system, supervisor)
             await supervisor.ask(hf.WhichChildren(), 60)
-            dead = [(one.address, one.message) for one in events.take() if isinstance(one, hf.DeadLetter)]
+            dead = [(one.address, one.message) for one in events.take() if isinstance(one, hf.events.DeadLetter)]
         assert dead == ([] if journal else [(made_up, Item(n)) for n in range(3)])
         if not journal:
             await supervisor.ask(hf.StartChild(id="given"), 60)
@@ -146,12 +146,12 @@ async def test_nothing_stays_of_a_made_up_child_that_has_ended_but_what_it_said(
             while len(taken := await given.ask(Taken(), 60)) < 3:
                 await asyncio.sleep(0)
         assert sorted(taken) == [0, 1, 2]
-        await system.homes.settled()
-        assert system.homes.known("/app/d") == [given.path]
-        with pytest.raises(hf.NoSuchActor):
+        await system._homes.settled()
+        assert system._homes.known("/app/d") == [given.path]
+        with pytest.raises(hf.errors.NoSuchActor):
             system.ref(made_up[0].path, Leaver)
     async with hf.ActorSystem("app", log=False, store=store) as system:
-        assert system.homes.known("/app/d") == [given.path]
+        assert system._homes.known("/app/d") == [given.path]
 
 
 async def test_a_process_takes_more_recorded_children_in_its_life_than_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

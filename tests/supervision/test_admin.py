@@ -90,7 +90,7 @@ async def test_a_child_can_be_started_stopped_started_again_stopped_and_forgotte
         assert await ref.ask(Life()) == 1
         await top.ask(TerminateChild("x"))
         assert await states(top) == {"x": "stopped"}
-        with pytest.raises(hf.NoSuchActor):
+        with pytest.raises(hf.errors.NoSuchActor):
             system.ref("/app/top/x", Kid)
         again = await top.ask(RestartChild("x"))
         assert await again.ask(Life()) == 1
@@ -213,7 +213,7 @@ async def test_deleting_a_child_that_its_group_left_stopped_frees_its_address() 
         ref = system.ref("/app/top/c", Kid)
         switch.is_broken = True
         system.ref("/app/top/a", Kid).tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
         assert await states(top) == {"a": "running", "b": "restarting", "c": "stopped"}
         waiting = ref.ask(Life())
         await top.ask(DeleteChild("c"))
@@ -267,7 +267,7 @@ async def test_the_supervisor_answers_while_children_back_off() -> None:
         top = await begin(system, kid("x", backoff=slow), kid("y", backoff=slow), intensity=9)
         for name in "xy":
             system.ref(f"/app/top/{name}", Kid).tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
         assert await states(top) == {"x": "restarting", "y": "restarting"}
         with pytest.raises(AlreadyPresent):
             await top.ask(StartChild(kid("x")))
@@ -287,28 +287,32 @@ async def test_counts_are_of_specs_and_of_who_runs() -> None:
     """otp.md 1.9: supervisors and workers count whether they run or not."""
     async with hf.ActorSystem(log=False) as system:
         top = await begin(system, kid("a"), kid("b"), hf.supervisor("c"), hf.dynamic("d"))
-        assert await top.ask(hf.CountChildren()) == hf.ChildCounts(specs=4, active=4, supervisors=2, workers=2)
+        assert await top.ask(hf.supervision.CountChildren()) == hf.supervision.ChildCounts(
+            specs=4, active=4, supervisors=2, workers=2
+        )
         for name in "bc":
             await top.ask(TerminateChild(name))
-        assert await top.ask(hf.CountChildren()) == hf.ChildCounts(specs=4, active=2, supervisors=2, workers=2)
+        assert await top.ask(hf.supervision.CountChildren()) == hf.supervision.ChildCounts(
+            specs=4, active=2, supervisors=2, workers=2
+        )
 
 
 async def test_a_spec_comes_back_with_its_defaults() -> None:
     async with hf.ActorSystem(log=False) as system:
         spec = kid("a", restart="transient")
         top = await begin(system, spec)
-        told = await top.ask(hf.GetChildSpec("a"))
+        told = await top.ask(hf.supervision.GetChildSpec("a"))
         assert told == spec
         assert (told.restart, told.shutdown, told.is_supervisor) == ("transient", 5.0, False)
         with pytest.raises(NoSuchChild):
-            await top.ask(hf.GetChildSpec("b"))
+            await top.ask(hf.supervision.GetChildSpec("b"))
 
 
 async def test_a_name_taken_by_somebody_else_is_told_as_it_is() -> None:
     """otp.md 1.9: a clash outside the supervisor's own list is passed through."""
     async with hf.ActorSystem(log=False) as system:
         system.spawn(hf.start(Kid), "x")
-        with pytest.raises(hf.NameTaken, match="/app/x"):
+        with pytest.raises(hf.errors.NameTaken, match="/app/x"):
             await system.start(kid("x"))
         assert [info.id for info in await system._root_ref().ask(WhichChildren())] == []
 

@@ -160,7 +160,7 @@ def _counts(judge: Arbiter, grant: Grant) -> bool:
 
 async def test_a_system_has_one_arbiter() -> None:
     async with hf.ActorSystem("t", log=False) as system:
-        assert arbiter_of(system.node) is arbiter_of(system.node)
+        assert arbiter_of(system._node) is arbiter_of(system._node)
 
 
 @pytest.mark.asyncio(loop_factories=["virtual"])
@@ -169,7 +169,7 @@ async def test_a_supervisor_that_restarts_a_child_has_it() -> None:
         backoff = hf.Backoff(initial=10.0, maximum=10.0, jitter=0.0)
         spec = hf.supervisor("s", children=[hf.child("w", hf.start(Worker), backoff=backoff)])
         await system.start(spec)
-        judge = arbiter_of(system.node)
+        judge = arbiter_of(system._node)
         system.ref("/t/s/w", Worker).tell(Boom())
         await asyncio.sleep(1.0)
         for address in ("/t/s/w", "/t/s", "/t"):
@@ -183,7 +183,7 @@ async def test_a_supervisor_that_restarts_a_child_has_it() -> None:
 async def test_repair_loses_an_actor_that_crashes_in_its_hands() -> None:
     async with hf.ActorSystem("t", log=False) as system:
         await system.start(hf.supervisor("s", intensity=3, children=[hf.child("w", hf.start(Worker))]))
-        judge = arbiter_of(system.node)
+        judge = arbiter_of(system._node)
         lost = asyncio.get_running_loop().create_future()
         grant = judge.claim("/t/s/w", REPAIR, "slow", lost=lost.set_result)
         system.ref("/t/s/w", Worker).tell(Boom())
@@ -196,7 +196,7 @@ async def test_repair_loses_an_actor_that_crashes_in_its_hands() -> None:
 async def test_what_repair_has_a_supervisor_do_does_not_take_it_away() -> None:
     async with hf.ActorSystem("t", log=False) as system:
         await system.start(hf.supervisor("s", children=[hf.child("w", hf.start(Worker))]))
-        judge, keeper = arbiter_of(system.node), system.ref("/t/s", hf.Supervisor)
+        judge, keeper = arbiter_of(system._node), system.ref("/t/s", hf.Supervisor)
         grant = judge.claim("/t/s/w", REPAIR, "slow")
         await keeper.ask(hf.TerminateChild("w"))
         await keeper.ask(hf.RestartChild("w"))

@@ -63,7 +63,7 @@ async def tree(system: hf.ActorSystem, isolation: Any = "task", gate: Gate | Non
 async def asked(system: hf.ActorSystem, path: str, before: Any) -> str:
     """Whom the actor there is bound to, when another one lives there than `before`."""
     async with asyncio.timeout(IN_TIME):
-        while (cell := system.node.find(path)) in (None, before) or cell.state != "running":
+        while (cell := system._node.find(path)) in (None, before) or cell.state != "running":
             await asyncio.sleep(0)
         return await hf.ActorRef[Idle](cell).ask(Where(), IN_TIME)
 
@@ -84,46 +84,49 @@ def told(events: Any, kind: type[Any]) -> list[Any]:
 async def test_two_that_are_killed_at_once_come_back_with_one_restart_each(isolation: Any, first: str) -> None:
     async with hf.ActorSystem("app", log=False, intensity=2, period=60.0) as system:
         await tree(system, isolation)
-        before = system.node.find("/app/here/one")
+        before = system._node.find("/app/here/one")
         with system.events() as events:
             system.ref("/app/here" if first == "here" else "/app/there", hf.Actor).kill()
             system.ref("/app/there" if first == "here" else "/app/here", hf.Actor).kill()
             assert await asked(system, "/app/here/one", before) == "/app/there/two"
             seen = list[Any]()
             async with asyncio.timeout(IN_TIME):
-                while len([event for event in seen if isinstance(event, hf.ChildRestarted)]) < 2:
+                while len([event for event in seen if isinstance(event, hf.events.ChildRestarted)]) < 2:
                     seen += events.take()
                     await asyncio.sleep(0)
-        assert {event.address for event in seen if isinstance(event, hf.ChildRestarted)} == {"/app/here", "/app/there"}
-        assert not [event for event in seen if isinstance(event, hf.ChildStartFailed)]
+        assert {event.address for event in seen if isinstance(event, hf.events.ChildRestarted)} == {
+            "/app/here",
+            "/app/there",
+        }
+        assert not [event for event in seen if isinstance(event, hf.events.ChildStartFailed)]
 
 
 async def test_it_waits_for_somebody_in_a_process_that_begins() -> None:
     async with hf.ActorSystem("app", log=False, intensity=2, period=60.0) as system:
         await tree(system, "process")
-        before, there = system.node.find("/app/here/one"), system.ref("/app/there", hf.Supervisor)
+        before, there = system._node.find("/app/here/one"), system.ref("/app/there", hf.Supervisor)
         with system.events() as events:
             os.kill(system.pid_of(there), signal.SIGKILL)
             async with asyncio.timeout(IN_TIME):
-                while system.node.find("/app/there/two") is not None:
+                while system._node.find("/app/there/two") is not None:
                     await asyncio.sleep(0)
             system.ref("/app/here", hf.Actor).kill()
             assert await asked(system, "/app/here/one", before) == "/app/there/two"
-            assert not told(events, hf.ChildStartFailed)
+            assert not told(events, hf.events.ChildStartFailed)
 
 
 async def test_whoever_waits_holds_up_nobody_and_answers() -> None:
     gate = Gate()
     async with hf.ActorSystem("app", log=False, intensity=2, period=60.0) as system:
         await tree(system, gate=gate)
-        before = system.node.find("/app/here/one")
+        before = system._node.find("/app/here/one")
         here, there = system.ref("/app/here", hf.Supervisor), system.ref("/app/there", hf.Supervisor)
         there.kill()
         async with asyncio.timeout(IN_TIME):
             while gate.came < 2:
                 await asyncio.sleep(0)
             here.kill()
-            while system.node.find("/app/here/one") is not None or here._cell.actor is None:
+            while system._node.find("/app/here/one") is not None or here._cell.actor is None:
                 await asyncio.sleep(0)
         (info,) = await here.ask(WhichChildren(), IN_TIME)
         assert (info.id, info.state) == ("one", "starting")
@@ -141,7 +144,7 @@ async def test_one_that_waits_can_be_stopped_and_its_supervisor_too() -> None:
             while gate.came < 2:
                 await asyncio.sleep(0)
             here.kill()
-            while system.node.find("/app/here/one") is not None or here._cell.actor is None:
+            while system._node.find("/app/here/one") is not None or here._cell.actor is None:
                 await asyncio.sleep(0)
             (info,) = await here.ask(WhichChildren(), IN_TIME)
             assert info.state == "starting"
@@ -149,9 +152,9 @@ async def test_one_that_waits_can_be_stopped_and_its_supervisor_too() -> None:
             await system.stop(here)
         gate.opened.set()
         async with asyncio.timeout(IN_TIME):
-            while (cell := system.node.find("/app/there/two")) is None or cell.state != "running":
+            while (cell := system._node.find("/app/there/two")) is None or cell.state != "running":
                 await asyncio.sleep(0)
-        assert system.node.find("/app/here") is None
+        assert system._node.find("/app/here") is None
 
 
 async def test_it_waits_no_longer_than_its_start_may_take() -> None:
@@ -168,7 +171,7 @@ async def test_it_waits_no_longer_than_its_start_may_take() -> None:
                     await asyncio.sleep(0)
                 system.ref("/app/here", hf.Actor).kill()
                 while not failed:
-                    failed += told(events, hf.ChildStartFailed)
+                    failed += told(events, hf.events.ChildStartFailed)
                     await asyncio.sleep(0)
             assert failed[0].address == "/app/here/one"
             assert "/app/there/two, to which it is bound, was not there within 0.1 s" in failed[0].reason
@@ -194,10 +197,10 @@ async def test_two_that_wait_for_each_other_are_told_and_counted() -> None:
             there.kill()
             seen = list[Any]()
             async with asyncio.timeout(IN_TIME):
-                while not [event for event in seen if isinstance(event, hf.SupervisorGaveUp)]:
+                while not [event for event in seen if isinstance(event, hf.events.SupervisorGaveUp)]:
                     seen += events.take()
                     await asyncio.sleep(0)
-        reasons = [event.reason for event in seen if isinstance(event, hf.ChildStartFailed)]
+        reasons = [event.reason for event in seen if isinstance(event, hf.events.ChildStartFailed)]
         circles = [reason for reason in reasons if "before another one" in str(reason)]
         assert circles
         for said in ("/app/top/here/one waits for /app/top/there/b", "/app/top/there/two waits for /app/top/here/a"):

@@ -128,7 +128,7 @@ async def test_siblings_and_the_supervisor_are_served_while_a_child_waits() -> N
         fragile, sound = (system.ref(f"/app/clinic/{name}", Fragile) for name in ("fragile", "sound"))
         fragile.tell(Boom())
         waiting = fragile.ask(Born())
-        await system.node.settled()
+        await system._node.settled()
         assert await sound.ask(Born()) == 0.0
         assert asyncio.get_running_loop().time() == 0.0
         assert not waiting.done()

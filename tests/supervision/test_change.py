@@ -33,7 +33,7 @@ async def test_new_flags_hold_at_once() -> None:
     plan = Plan()
     async with hf.ActorSystem(log=False) as system:
         family = await Family.start(system, plan, *(kid(plan, name) for name in "abc"), intensity=0)
-        await family.top.ask(hf.ChangeSupervisor(hf.Flags("one_for_all", 5, 10.0)))
+        await family.top.ask(hf.supervision.ChangeSupervisor(hf.supervision.Flags("one_for_all", 5, 10.0)))
         assert await family.after("b", Boom()) == "-b -c -a +a +b +c"
 
 
@@ -41,9 +41,9 @@ async def test_a_known_child_gets_its_new_spec_and_goes_on() -> None:
     async with hf.ActorSystem(log=False) as system:
         top = await system.start(hf.supervisor("top", children=[named("a", "old")]))
         ref = system.ref("/app/top/a", Named)
-        await top.ask(hf.ChangeSupervisor(children=[named("a", "new", restart="transient", shutdown=1.0)]))
+        await top.ask(hf.supervision.ChangeSupervisor(children=[named("a", "new", restart="transient", shutdown=1.0)]))
         assert await ref.ask(Name()) == "old", "it was not touched"
-        spec = await top.ask(hf.GetChildSpec("a"))
+        spec = await top.ask(hf.supervision.GetChildSpec("a"))
         assert (spec.restart, spec.shutdown) == ("transient", 1.0)
         ref.tell(Boom())
         assert await ref.ask(Name()) == "new", "its next life is the new one"
@@ -53,7 +53,7 @@ async def test_a_new_child_is_added_and_not_started_and_a_missing_one_stays_behi
     plan = Plan()
     async with hf.ActorSystem(log=False) as system:
         family = await Family.start(system, plan, *(kid(plan, name) for name in "abc"), strategy="rest_for_one")
-        await family.top.ask(hf.ChangeSupervisor(children=[kid(plan, name) for name in "cxa"]))
+        await family.top.ask(hf.supervision.ChangeSupervisor(children=[kid(plan, name) for name in "cxa"]))
         assert plan.take() == ""
         assert list((await family.states()).items()) == [
             ("c", "running"),
@@ -69,19 +69,27 @@ async def test_a_new_child_is_added_and_not_started_and_a_missing_one_stays_behi
         assert plan.take() == "-b -a -x -c"
 
 
-INVALID: list[Callable[[Plan], hf.ChangeSupervisor]] = [
-    lambda plan: hf.ChangeSupervisor("one_for_all"),
-    lambda plan: hf.ChangeSupervisor(hf.Flags("one_for_all"), "abc"),
-    lambda plan: hf.ChangeSupervisor(hf.Flags("one_for_all"), [kid(plan, "a"), kid(plan, "a")]),
-    lambda plan: hf.ChangeSupervisor(hf.Flags("one_for_all"), [kid(plan, "a", restart="transient", significant=True)]),
-    lambda plan: hf.ChangeSupervisor(hf.Flags("one_for_all"), [kid(plan, None)]),
-    lambda plan: hf.ChangeSupervisor(hf.Flags("one_for_all"), [kid(plan, "a", mailbox=hf.bounded(5))]),
-    lambda plan: hf.ChangeSupervisor(hf.Flags("one_for_all"), [kid(plan, "x"), kid(plan, "a", recovery=hf.fresh())]),
+INVALID: list[Callable[[Plan], hf.supervision.ChangeSupervisor]] = [
+    lambda plan: hf.supervision.ChangeSupervisor("one_for_all"),
+    lambda plan: hf.supervision.ChangeSupervisor(hf.supervision.Flags("one_for_all"), "abc"),
+    lambda plan: hf.supervision.ChangeSupervisor(hf.supervision.Flags("one_for_all"), [kid(plan, "a"), kid(plan, "a")]),
+    lambda plan: hf.supervision.ChangeSupervisor(
+        hf.supervision.Flags("one_for_all"), [kid(plan, "a", restart="transient", significant=True)]
+    ),
+    lambda plan: hf.supervision.ChangeSupervisor(hf.supervision.Flags("one_for_all"), [kid(plan, None)]),
+    lambda plan: hf.supervision.ChangeSupervisor(
+        hf.supervision.Flags("one_for_all"), [kid(plan, "a", mailbox=hf.bounded(5))]
+    ),
+    lambda plan: hf.supervision.ChangeSupervisor(
+        hf.supervision.Flags("one_for_all"), [kid(plan, "x"), kid(plan, "a", recovery=hf.fresh())]
+    ),
 ]
 
 
 @pytest.mark.parametrize("change", INVALID)
-async def test_if_anything_is_invalid_nothing_changes(change: Callable[[Plan], hf.ChangeSupervisor]) -> None:
+async def test_if_anything_is_invalid_nothing_changes(
+    change: Callable[[Plan], hf.supervision.ChangeSupervisor],
+) -> None:
     plan = Plan()
     async with hf.ActorSystem(log=False) as system:
         family = await Family.start(system, plan, kid(plan, "a"), kid(plan, "b"))
@@ -95,7 +103,7 @@ async def test_what_belongs_to_the_address_can_be_changed_when_the_child_is_stop
     async with hf.ActorSystem(log=False) as system:
         family = await Family.start(system, plan, kid(plan, "a"))
         await family.top.ask(hf.TerminateChild("a"))
-        await family.top.ask(hf.ChangeSupervisor(children=[kid(plan, "a", mailbox=hf.bounded(5))]))
+        await family.top.ask(hf.supervision.ChangeSupervisor(children=[kid(plan, "a", mailbox=hf.bounded(5))]))
         ref = await family.top.ask(hf.RestartChild("a"))
         assert ref._cell.more.bound is not None
 
@@ -130,7 +138,7 @@ async def test_init_gives_the_children_and_is_asked_at_each_start() -> None:
     async with hf.ActorSystem(log=False) as system:
         bank = await system.start(hf.child("bank", hf.start(Bank, 2)))
         assert [info.id for info in await bank.ask(hf.WhichChildren())] == ["branch0", "branch1"]
-        spec = await system._root_ref().ask(hf.GetChildSpec("bank"))
+        spec = await system._root_ref().ask(hf.supervision.GetChildSpec("bank"))
         assert (spec.is_supervisor, spec.shutdown) == (True, "infinity")
         bank.kill()
         assert [info.id for info in await bank.ask(hf.WhichChildren())] == ["branch0", "branch1"]
@@ -141,7 +149,7 @@ async def test_a_change_without_anything_asks_init_anew() -> None:
     async with hf.ActorSystem(log=False) as system:
         bank = await system.start(hf.child("bank", hf.start(Bank, 2)))
         Bank.answer = lambda branches: hf.Plan([named("branch1", "new"), named("extra", "x")], strategy="one_for_one")
-        await bank.ask(hf.ChangeSupervisor())
+        await bank.ask(hf.supervision.ChangeSupervisor())
         assert [(info.id, info.state) for info in await bank.ask(hf.WhichChildren())] == [
             ("branch1", "running"),
             ("extra", "stopped"),
@@ -168,9 +176,9 @@ async def test_init_that_has_no_answer_changes_nothing(answer: Any, error: type[
         bank = await system.start(hf.child("bank", hf.start(Bank, 2)))
         Bank.answer = answer
         if error is None:
-            await bank.ask(hf.ChangeSupervisor())
+            await bank.ask(hf.supervision.ChangeSupervisor())
         else:
-            assert isinstance(await refused(bank.ask(hf.ChangeSupervisor())), error)
+            assert isinstance(await refused(bank.ask(hf.supervision.ChangeSupervisor())), error)
         assert bank._cell.life == 1
         assert len(await bank.ask(hf.WhichChildren())) == 2
 
@@ -188,7 +196,9 @@ async def test_init_that_has_no_answer_at_a_start_fails_it(answer: Any, text: st
 async def test_a_supervisor_in_a_process_can_be_changed_too() -> None:
     async with hf.ActorSystem(log=False) as system:
         top = await system.start(hf.supervisor("top", children=[named("a", "old")], isolation="process"))
-        await top.ask(hf.ChangeSupervisor(hf.Flags(intensity=5), [named("a", "new"), named("b", "b")]))
+        await top.ask(
+            hf.supervision.ChangeSupervisor(hf.supervision.Flags(intensity=5), [named("a", "new"), named("b", "b")])
+        )
         assert [(info.id, info.state) for info in await top.ask(hf.WhichChildren())] == [
             ("a", "running"),
             ("b", "stopped"),
@@ -196,10 +206,10 @@ async def test_a_supervisor_in_a_process_can_be_changed_too() -> None:
         b = await top.ask(hf.RestartChild("b"))
         c = await top.ask(hf.StartChild(named("c", "c")))
         assert (await b.ask(Name()), await c.ask(Name())) == ("b", "c")
-        await top.ask(hf.ChangeSupervisor(children=[named("p", "p", isolation="process")]))
+        await top.ask(hf.supervision.ChangeSupervisor(children=[named("p", "p", isolation="process")]))
         p = await top.ask(hf.RestartChild("p"))
         assert await p.ask(Name()) == "p"
         assert system.pid_of(p) != system.pid_of(top)
         far = hf.supervisor("far", children=[], isolation="process")
-        error = await refused(top.ask(hf.ChangeSupervisor(children=[far])))
+        error = await refused(top.ask(hf.supervision.ChangeSupervisor(children=[far])))
         assert "cannot hold another supervisor" in str(error)

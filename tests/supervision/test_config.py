@@ -97,7 +97,7 @@ async def test_a_tree_from_a_file_is_the_tree_from_code(tmp_path: Path) -> None:
             hf.child("safe", start, recovery=hf.hybrid(interval=9.0)),
             hf.supervisor("inner", intensity=7, children=[hf.child("deep", start)]),
             hf.dynamic("pool", max_children=1, template=hf.child(None, start, restart="temporary")),
-            hf.partitions("shards", hf.start(Counter, 1000), 3),
+            hf.supervision.partitions("shards", hf.start(Counter, 1000), 3),
         ],
     )
     async with hf.ActorSystem(log=False) as system:
@@ -105,7 +105,7 @@ async def test_a_tree_from_a_file_is_the_tree_from_code(tmp_path: Path) -> None:
         assert await system.ref("/app/top/alice", Counter).ask(Ask()) == 105
         assert await system.ref("/app/top/inner/deep", Counter).ask(Ask()) == 1
         assert await system.ref("/app/top/shards/2", Counter).ask(Ask()) == 1001
-        pool = system.ref("/app/top/pool", hf.DynamicSupervisor)
+        pool = system.ref("/app/top/pool", hf.supervision.DynamicSupervisor)
         assert await (await pool.ask(hf.StartChild(args=(7,)))).ask(Ask()) == 8
 
 
@@ -140,7 +140,7 @@ GOOD: dict[str, Any] = {
         (("children", 0, "recovery"), {"interval": 1.0}, r"tree\.children\[0\]\.recovery\.use: must be a name"),
         (("children", 0, "mechanism"), {"window": 3}, r"tree\.children\[0\]\.mechanism\.use: must be a name"),
         (("children", 0, "mechanism"), [{"use": "holdfast:hybrid"}], r"tree\.children\[0\]: .*mechanism must be one"),
-        (("children", 0, "mechanism"), [{"use": "holdfast:PBR", "windw": 3}], r"mechanism\[0\]: .*'windw'"),
+        (("children", 0, "mechanism"), [{"use": "holdfast.ftm:PBR", "windw": 3}], r"mechanism\[0\]: .*'windw'"),
         (("children", 0, "mechanism"), "pbr", r"tree\.children\[0\]\.mechanism: must be a list"),
         (("children", 0, "significant"), True, r"tree\.children\[0\]: child 'a': a permanent child cannot be"),
         (("children", 1, "name"), None, r"tree\.children\[1\]: "),
@@ -150,33 +150,33 @@ GOOD: dict[str, Any] = {
 )
 def test_errors_say_where(place: tuple[Any, ...], value: Any, error: str) -> None:
     mapping = copy.deepcopy(GOOD)
-    assert hf.tree_from(mapping).id == "top"
+    assert hf.supervision.tree_from(mapping).id == "top"
     at: Any = mapping
     for step in place[:-1]:
         at = at[step]
     at[place[-1]] = value
     with pytest.raises(hf.SpecError, match=error):
-        hf.tree_from(mapping)
+        hf.supervision.tree_from(mapping)
 
 
 def test_mechanisms_are_tables_too() -> None:
-    one = {"id": "one", "start": COUNTER, "mechanism": {"use": "holdfast:PBR", "window": 3}}
-    two = {"id": "two", "start": COUNTER, "mechanism": [{"use": "holdfast:LFR"}, {"use": "holdfast:TR"}]}
+    one = {"id": "one", "start": COUNTER, "mechanism": {"use": "holdfast.ftm:PBR", "window": 3}}
+    two = {"id": "two", "start": COUNTER, "mechanism": [{"use": "holdfast.ftm:LFR"}, {"use": "holdfast.ftm:TR"}]}
     children = [
-        hf.child("one", hf.start(Counter), mechanism=hf.PBR(window=3)),
-        hf.child("two", hf.start(Counter), mechanism=(hf.LFR(), hf.TR())),
+        hf.child("one", hf.start(Counter), mechanism=hf.ftm.PBR(window=3)),
+        hf.child("two", hf.start(Counter), mechanism=(hf.ftm.LFR(), hf.ftm.TR())),
     ]
-    assert hf.tree_from({"name": "top", "children": [one, two]}) == hf.supervisor("top", children=children)
+    assert hf.supervision.tree_from({"name": "top", "children": [one, two]}) == hf.supervisor("top", children=children)
 
 
 def test_the_top_is_a_supervisor_and_what_is_given_stays_as_it_is() -> None:
     with pytest.raises(hf.SpecError, match="the top must be a supervisor"):
-        hf.tree_from({"id": "a", "start": COUNTER})
+        hf.supervision.tree_from({"id": "a", "start": COUNTER})
     with pytest.raises(hf.SpecError, match="a supervisor name and children"):
-        hf.tree_from({"children": []})
+        hf.supervision.tree_from({"children": []})
     mapping = {"name": "top", "kind": "dynamic", "template": {"start": COUNTER}}
     before = copy.deepcopy(mapping)
-    hf.tree_from(mapping)
+    hf.supervision.tree_from(mapping)
     assert mapping == before
 
 

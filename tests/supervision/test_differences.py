@@ -88,8 +88,8 @@ async def _(system: hf.ActorSystem) -> None:
 async def _(system: hf.ActorSystem) -> None:
     top = await system.start(hf.supervisor("top", children=[hf.child("a", hf.start(Lingers))]))
     first = top.ask(hf.TerminateChild("a"))
-    assert isinstance(await refused(top.ask(hf.RestartChild("a"))), hf.ChildBusy)
-    assert isinstance(await refused(top.ask(hf.DeleteChild("a"))), hf.ChildBusy)
+    assert isinstance(await refused(top.ask(hf.RestartChild("a"))), hf.errors.ChildBusy)
+    assert isinstance(await refused(top.ask(hf.DeleteChild("a"))), hf.errors.ChildBusy)
     await top.ask(hf.TerminateChild("a"))
     assert first.done()
     assert asyncio.get_running_loop().time() == 2.0
@@ -114,7 +114,7 @@ async def _(system: hf.ActorSystem) -> None:
     told: list[str] = []
     top = await system.start(hf.supervisor("top", restart="temporary", children=[hf.child("a", hf.start(Notes, told))]))
     top.kill()
-    await system.node.settled()
+    await system._node.settled()
     assert (system.tree(), told) == (["/app"], [])
 
 
@@ -130,8 +130,8 @@ async def _(system: hf.ActorSystem) -> None:
     with system.events() as events:
         ref = await system.start(hf.child("a", hf.start(Fails)))
         ref.tell(Boom())
-        await system.node.settled()
-        (restarted,) = [event for event in events.take() if isinstance(event, hf.ChildRestarted)]
+        await system._node.settled()
+        (restarted,) = [event for event in events.take() if isinstance(event, hf.events.ChildRestarted)]
     assert str(restarted.reason) == "ValueError: boom"
 
 
@@ -152,7 +152,7 @@ async def _(system: hf.ActorSystem) -> None:
     ref = await top.ask(hf.StartChild(kid(plan, "a")))
     ref.tell(Boom())
     ref.tell(Boom())
-    await system.node.settled()
+    await system._node.settled()
     assert system.tree() == ["/app"]
 
 
@@ -195,7 +195,7 @@ async def _(system: hf.ActorSystem) -> None:
     watcher = system.spawn(hf.start(Watches, target.path))
     await watcher.ask(Watch())
     target.kill()
-    await system.node.settled()
+    await system._node.settled()
     assert await watcher.ask(Told()) == ["/app/target"]
 
 
@@ -214,7 +214,7 @@ async def _(system: hf.ActorSystem) -> None:
     top = await system.start(
         hf.supervisor("top", isolation="process", children=[hf.child("a", hf.start(Lingers, 0.0))])
     )
-    assert not isinstance(await top.ask(hf.GetChildSpec("a"), 60.0), hf.ChildSpec)
+    assert not isinstance(await top.ask(hf.supervision.GetChildSpec("a"), 60.0), hf.ChildSpec)
 
 
 @entry("siblings while a `rest_for_one` retry waits for its back-off")

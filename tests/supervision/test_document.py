@@ -98,7 +98,7 @@ async def answer(supervisor: hf.ActorRef[Any], call: hf.Message[Any]) -> str:
 
 
 def call_of(name: str, plan: Plan) -> hf.Message[Any]:
-    kind: Any = getattr(hf, name)
+    kind: Any = getattr(hf, name, None) or getattr(hf.supervision, name)
     return hf.StartChild(kid(plan, "a")) if kind is hf.StartChild else cast("hf.Message[Any]", kind("a"))
 
 
@@ -191,8 +191,8 @@ async def test_whom_on_stop_is_called_for(how: str, _column: str, expected: str)
                 peer.kill()
             else:
                 ref.tell(Leave() if "ctx" in how else Boom())
-        await system.node.settled()
-        await system.node.settled()
+        await system._node.settled()
+        await system._node.settled()
         assert "/app/a" not in system.tree()
         assert bool(told) is (expected == "called")
 

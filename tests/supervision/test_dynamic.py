@@ -31,7 +31,9 @@ class Adder(hf.Actor):
         raise ValueError("boom")
 
 
-async def begin(system: hf.ActorSystem, *, intensity: int = 9, **options: Any) -> hf.ActorRef[hf.DynamicSupervisor]:
+async def begin(
+    system: hf.ActorSystem, *, intensity: int = 9, **options: Any
+) -> hf.ActorRef[hf.supervision.DynamicSupervisor]:
     return await system.start(hf.dynamic("top", intensity=intensity, **options))
 
 
@@ -46,7 +48,7 @@ async def test_it_starts_empty_and_takes_specs_and_bare_starts() -> None:
         refs = (given, made_up, nameless, by_id)
         assert [ref.path for ref in refs] == [f"/app/top/{name}" for name in ("given", "adder-1", "adder-2", "four")]
         assert [await ref.ask(Sum()) for ref in refs] == [1, 2, 3, 4]
-        assert await top.ask(hf.CountChildren()) == hf.ChildCounts(4, 4, 0, 4)
+        assert await top.ask(hf.supervision.CountChildren()) == hf.supervision.ChildCounts(4, 4, 0, 4)
 
 
 async def test_an_id_that_lives_is_refused_with_its_ref_and_free_again_when_it_has_ended() -> None:
@@ -55,7 +57,7 @@ async def test_an_id_that_lives_is_refused_with_its_ref_and_free_again_when_it_h
         top = await begin(system)
         family = Family(system, plan)
         ref = await top.ask(hf.StartChild(kid(plan, "a", restart="transient")))
-        assert await refused(top.ask(hf.StartChild(kid(plan, "a")))) == hf.AlreadyStarted("a", ref)
+        assert await refused(top.ask(hf.StartChild(kid(plan, "a")))) == hf.errors.AlreadyStarted("a", ref)
         await family.after("a", Leave())
         assert await top.ask(hf.StartChild(kid(plan, "a"))) == ref
 
@@ -102,7 +104,7 @@ async def test_no_more_than_max_children(most: int) -> None:
     async with hf.ActorSystem(log=False) as system:
         top = await begin(system, max_children=most)
         refs = [await top.ask(hf.StartChild(hf.start(Adder))) for _ in range(most)]
-        assert await refused(top.ask(hf.StartChild(hf.start(Adder)))) == hf.MaxChildren(most)
+        assert await refused(top.ask(hf.StartChild(hf.start(Adder)))) == hf.errors.MaxChildren(most)
         if refs:
             await top.ask(hf.TerminateChild("adder-1"))
             await top.ask(hf.StartChild(hf.start(Adder)))
@@ -117,8 +119,8 @@ async def test_children_that_are_being_restarted_count() -> None:
         await top.ask(hf.StartChild(kid(plan, "a", backoff=SLOW)))
         await family.after("a", Boom())
         assert await family.states() == {"a": "restarting"}
-        assert await refused(top.ask(hf.StartChild(hf.start(Adder)))) == hf.MaxChildren(1)
-        assert isinstance(await refused(top.ask(hf.StartChild(kid(plan, "a")))), hf.AlreadyStarted)
+        assert await refused(top.ask(hf.StartChild(hf.start(Adder)))) == hf.errors.MaxChildren(1)
+        assert isinstance(await refused(top.ask(hf.StartChild(kid(plan, "a")))), hf.errors.AlreadyStarted)
         await top.ask(hf.TerminateChild("a"))  # Which cancels the restart.
         await top.ask(hf.StartChild(hf.start(Adder), id="b"))
         await asyncio.sleep(1000.0)
@@ -130,8 +132,8 @@ async def test_a_changed_max_children_holds_and_those_who_live_stay() -> None:
         top = await begin(system)
         for _ in range(3):
             await top.ask(hf.StartChild(hf.start(Adder)))
-        await top.ask(hf.ChangeSupervisor(hf.Flags(max_children=1)))
-        assert await refused(top.ask(hf.StartChild(hf.start(Adder)))) == hf.MaxChildren(1)
+        await top.ask(hf.supervision.ChangeSupervisor(hf.supervision.Flags(max_children=1)))
+        assert await refused(top.ask(hf.StartChild(hf.start(Adder)))) == hf.errors.MaxChildren(1)
         assert len(await top.ask(hf.WhichChildren())) == 3
 
 
@@ -155,10 +157,10 @@ async def test_terminate_forgets_and_a_second_time_there_is_nobody() -> None:
         ref = await top.ask(hf.StartChild(hf.start(Adder)))
         calls: list[hf.Message[Any]] = [hf.RestartChild("adder-1"), hf.DeleteChild("adder-1")]
         for call in calls:
-            assert isinstance(await refused(top.ask(call)), hf.NotSupported)
+            assert isinstance(await refused(top.ask(call)), hf.errors.NotSupported)
         await top.ask(hf.TerminateChild("adder-1"))
         for call in [hf.TerminateChild("adder-1"), *calls]:
-            assert await refused(top.ask(call)) == hf.NoSuchChild("adder-1")
+            assert await refused(top.ask(call)) == hf.errors.NoSuchChild("adder-1")
         with pytest.raises(hf.ActorStopped):
             await ref.ask(Sum())
 
@@ -185,9 +187,9 @@ async def test_what_does_not_go_with_dynamic_children_is_refused() -> None:
         for call in (
             hf.StartChild(significant),
             hf.StartChild(args=(1,)),
-            hf.ChangeSupervisor(hf.Flags(auto_shutdown="any_significant")),
-            hf.ChangeSupervisor(hf.Flags(strategy="one_for_all")),
-            hf.ChangeSupervisor(children=[hf.child("a", hf.start(Adder)), hf.child("b", hf.start(Adder))]),
+            hf.supervision.ChangeSupervisor(hf.supervision.Flags(auto_shutdown="any_significant")),
+            hf.supervision.ChangeSupervisor(hf.supervision.Flags(strategy="one_for_all")),
+            hf.supervision.ChangeSupervisor(children=[hf.child("a", hf.start(Adder)), hf.child("b", hf.start(Adder))]),
         ):
             assert isinstance(await refused(top.ask(call)), hf.SpecError)
         assert await top.ask(hf.StartChild(hf.start(Adder))) is not None
@@ -211,7 +213,7 @@ async def test_all_children_are_stopped_at_once() -> None:
             await top.ask(hf.StartChild(spec))
         with system.events() as events:
             await system.stop(top)
-            errors = [event for event in events.take() if isinstance(event, hf.ShutdownError)]
+            errors = [event for event in events.take() if isinstance(event, hf.events.ShutdownError)]
         assert asyncio.get_running_loop().time() == 4.5
         assert [(error.address[-1], str(error.reason)) for error in errors] == [("3", "killed"), ("4", "killed")]
         assert system.tree() == ["/app"]
@@ -242,8 +244,8 @@ async def test_a_template_takes_the_rest_of_the_arguments() -> None:
         assert [await ref.ask(Sum()) for ref in refs] == [103, 200, 105]
         refs[0].tell(Boom())
         assert await refs[0].ask(Sum()) == 103, "restarted with the arguments it was started with"
-        assert (await top.ask(hf.GetChildSpec("five"))).restart == "transient"
-        assert await refused(top.ask(hf.StartChild())) == hf.MaxChildren(3)
+        assert (await top.ask(hf.supervision.GetChildSpec("five"))).restart == "transient"
+        assert await refused(top.ask(hf.StartChild())) == hf.errors.MaxChildren(3)
 
 
 async def test_a_template_with_an_id_names_its_children_by_it() -> None:
@@ -265,13 +267,13 @@ async def test_a_changed_template_is_for_those_to_come() -> None:
     async with hf.ActorSystem(log=False) as system:
         top = await begin(system, template=hf.child(None, hf.start(Adder, 1)))
         old = await top.ask(hf.StartChild())
-        await top.ask(hf.ChangeSupervisor(children=[hf.child(None, hf.start(Adder, 2))]))
+        await top.ask(hf.supervision.ChangeSupervisor(children=[hf.child(None, hf.start(Adder, 2))]))
         new = await top.ask(hf.StartChild())
         old.tell(Boom())
         assert (await old.ask(Sum()), await new.ask(Sum())) == (1, 2)
 
 
-class Pool(hf.DynamicSupervisor):
+class Pool(hf.supervision.DynamicSupervisor):
     """A dynamic supervisor as a class."""
 
     def __init__(self, most: int) -> None:
@@ -285,7 +287,7 @@ async def test_a_derived_class_says_it_in_init() -> None:
     async with hf.ActorSystem(log=False) as system:
         pool = await system.start(hf.child("pool", hf.start(Pool, 1)))
         assert await (await pool.ask(hf.StartChild())).ask(Sum()) == 7
-        assert await refused(pool.ask(hf.StartChild())) == hf.MaxChildren(1)
+        assert await refused(pool.ask(hf.StartChild())) == hf.errors.MaxChildren(1)
 
 
 # -- processes ------------------------------------------------------------------------------------------------------
@@ -302,12 +304,12 @@ async def test_children_in_processes_and_a_whole_pool_in_a_process() -> None:
         second = await remote.ask(hf.StartChild(hf.start(Adder, 5)))
         assert (await first.ask(Sum()), await second.ask(Sum())) == (4, 5)
         assert system.pid_of(first) == system.pid_of(remote)
-        assert await refused(remote.ask(hf.StartChild(hf.start(Adder)))) == hf.MaxChildren(2)
+        assert await refused(remote.ask(hf.StartChild(hf.start(Adder)))) == hf.errors.MaxChildren(2)
         far = hf.supervisor("far", children=[], isolation="process")
         error = await refused(remote.ask(hf.StartChild(far)))
         assert "cannot hold another supervisor" in str(error)
         again = await refused(remote.ask(hf.StartChild(hf.child("first", hf.start(Adder)))))
-        assert again == hf.AlreadyStarted("first", first)
+        assert again == hf.errors.AlreadyStarted("first", first)
 
 
 class Hire(hf.Message[str]):

@@ -68,7 +68,7 @@ async def restarted(system: hf.ActorSystem) -> None:
     with system.events() as stream:
         system.ref("/app/school", hf.Supervisor).kill()
         async for one in stream:
-            if isinstance(one, hf.ChildRestarted):
+            if isinstance(one, hf.events.ChildRestarted):
                 break
     await until(lambda: "/app/school" in system.tree() and up(system))
 
@@ -163,7 +163,7 @@ async def test_nothing_stays_of_one_with_a_made_up_id_that_has_ended_for_good(
         assert await two.ask(Seen()) == ["nobody of nowhere", "secret"]
         await top.ask(hf.TerminateChild(one.path.rpartition("/")[2]))
         await system.stop(three)
-        await until(lambda: system.homes.known("/app/school") == [two.path])
+        await until(lambda: system._homes.known("/app/school") == [two.path])
         await restarted(system)
         assert [f"/app/school/{name}" for name in await ids(system)] == [two.path]
         new = await top.ask(how[0])
@@ -175,13 +175,13 @@ async def test_what_was_recorded_of_one_that_has_ended_can_be_erased(store: str 
         top = await system.start(school(PUPIL, isolation=isolation))
         bob = await top.ask(hf.StartChild(args=("Bob",), id="bob"))
         await bob.ask(Note("secret"))
-        with pytest.raises(hf.NotSupported):
+        with pytest.raises(hf.errors.NotSupported):
             await top.ask(hf.DeleteChild("bob"))
         await top.ask(hf.TerminateChild("bob"))
-        with pytest.raises(hf.NoSuchChild):
+        with pytest.raises(hf.errors.NoSuchChild):
             await top.ask(hf.DeleteChild("bob", erase=False))
         await top.ask(hf.DeleteChild("bob"))
-        with pytest.raises(hf.NoSuchChild):
+        with pytest.raises(hf.errors.NoSuchChild):
             await top.ask(hf.DeleteChild("bob"))
         await restarted(system)
         again = await top.ask(hf.StartChild(args=("Bob",), id="bob"))
@@ -202,18 +202,18 @@ async def test_what_the_store_refuses_to_forget_is_an_error_and_can_be_forgotten
             await pupil.ask(Note("secret"))
         await top.ask(hf.TerminateChild("bob"))
         with monkeypatch.context() as broken, system.events() as events:
-            broken.setattr(system.homes.journal, "erase", refuse)
+            broken.setattr(system._homes.journal, "erase", refuse)
             with pytest.raises(hf.HoldfastError, match="the disk is gone"):
                 await top.ask(hf.DeleteChild("bob"))
             with pytest.raises(hf.HoldfastError, match="the disk is gone"):
                 await top.ask(hf.StartChild(args=("Bob",), id="bob", fresh=True))
             await top.ask(hf.TerminateChild(made_up.path.rpartition("/")[2]))  # It is over, whatever the store says.
-            refused: hf.StoreRefused = await event(events, hf.StoreRefused)
+            refused: hf.events.StoreRefused = await event(events, hf.events.StoreRefused)
         assert (refused.address, refused.reason) == (made_up.path, "the disk is gone")
-        assert set(system.homes.known("/app/school")) == {bob.path, made_up.path}
+        assert set(system._homes.known("/app/school")) == {bob.path, made_up.path}
         await top.ask(hf.DeleteChild("bob"))
         await restarted(system)
-        await until(lambda: not system.homes.known("/app/school"))
+        await until(lambda: not system._homes.known("/app/school"))
 
 
 async def test_a_start_that_fails_or_is_refused_leaves_nothing_in_the_journal(
@@ -227,12 +227,12 @@ async def test_a_start_that_fails_or_is_refused_leaves_nothing_in_the_journal(
             await top.ask(hf.StartChild(hf.child("bad", hf.start(Shy, str(blocked), "fail"))))
         assert await top.ask(hf.StartChild(hf.child("shy", hf.start(Shy, str(blocked), "ignore")))) is None
         await top.ask(hf.StartChild(hf.child("good", hf.start(Pupil, "Ann"))))
-        with pytest.raises(hf.MaxChildren):
+        with pytest.raises(hf.errors.MaxChildren):
             await top.ask(hf.StartChild(hf.child("more", hf.start(Pupil, "Bob"))))
         blocked.unlink()
         await restarted(system)
         assert await ids(system) == ["good"]
-        assert list(system.node.ports.keeper.notes("child ")) == ["child /app/school/good"]
+        assert list(system._node.ports.keeper.notes("child ")) == ["child /app/school/good"]
 
 
 async def test_one_that_fails_to_come_back_is_tried_again_and_does_not_keep_the_others_away(

@@ -15,10 +15,10 @@ class Idle(hf.Actor):
     pass
 
 
-async def gave_up(stream: hf.EventStream) -> hf.SupervisorGaveUp:
+async def gave_up(stream: hf.events.EventStream) -> hf.events.SupervisorGaveUp:
     async with asyncio.timeout(60.0):
         async for event in stream:
-            if isinstance(event, hf.SupervisorGaveUp):
+            if isinstance(event, hf.events.SupervisorGaveUp):
                 return event
     raise AssertionError("it has not given up")
 

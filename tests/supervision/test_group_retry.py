@@ -53,7 +53,7 @@ async def test_between_the_attempts_the_earlier_run_and_the_later_do_not(strateg
         plan.todo["c"] = ["fail"]
         assert await family.after("a", Boom()) == f"{first} !c"
         assert await family.states() == {"a": "running", "b": "running", "c": "restarting", "d": "stopped"}
-        counts = await family.top.ask(hf.CountChildren())
+        counts = await family.top.ask(hf.supervision.CountChildren())
         assert (counts.specs, counts.active, counts.workers) == (4, 2, 4)
         assert asyncio.get_running_loop().time() == 0.0
         await asyncio.sleep(100.0)
@@ -70,7 +70,7 @@ async def test_every_attempt_of_a_group_counts(strategy: str, intensity: int) ->
             family = await family_of(system, plan, strategy, intensity=intensity, restart="temporary")
             plan.todo["b"] = ["fail"] * 100
             told = await family.after("a", Boom())
-            gave_up = [event.child for event in events.take() if isinstance(event, hf.SupervisorGaveUp)]
+            gave_up = [event.child for event in events.take() if isinstance(event, hf.events.SupervisorGaveUp)]
         assert told.count("!b") == intensity
         assert gave_up == ["b"]
         assert not family.is_alive
@@ -112,7 +112,7 @@ async def test_the_supervisor_answers_while_a_member_starts_and_later_ones_wait(
         family = await slow_family(system, plan)
         assert await family.states() == {"a": "running", "b": "restarting", "c": "restarting", "d": "restarting"}
         for call in (hf.RestartChild("c"), hf.DeleteChild("b")):
-            assert await refused(family.top.ask(call)) == hf.ChildBusy(call.id, "restarting")
+            assert await refused(family.top.ask(call)) == hf.errors.ChildBusy(call.id, "restarting")
         assert asyncio.get_running_loop().time() == 1.0
         await asyncio.sleep(20.0)
         assert plan.take() == "+b +c +d"

@@ -24,10 +24,10 @@ async def test_at_the_first_start_the_spec_is_kept_unless_it_is_temporary(
         family = Family(system, plan)
         assert plan.log[:3] == ["+a", "?b", "+c"]
         assert (await family.states()).get("b") == ("stopped" if known else None)
-        counts = await top.ask(hf.CountChildren())
+        counts = await top.ask(hf.supervision.CountChildren())
         assert (counts.specs, counts.active, counts.workers) == (3 if known else 2, 2, 3 if known else 2)
         assert "/app/top/b" not in system.tree()
-        assert not [event for event in told if isinstance(event, (hf.ActorCrashed, hf.ChildStartFailed))]
+        assert not [event for event in told if isinstance(event, (hf.events.ActorCrashed, hf.events.ChildStartFailed))]
 
 
 @LATE
@@ -106,7 +106,7 @@ async def test_a_start_by_the_system_answers_none_and_a_spawn_says_so() -> None:
     plan.todo["a"] = ["ignore", "ignore"]
     async with hf.ActorSystem(log=False) as system:
         assert await system.start(kid(plan, "a", restart="temporary")) is None
-        with pytest.raises(hf.StartIgnored, match="/app/a does not want to be started: not needed here"):
+        with pytest.raises(hf.errors.StartIgnored, match="/app/a does not want to be started: not needed here"):
             system.spawn(hf.start(Kid, plan), "a")
         assert system.tree() == ["/app"]
 
@@ -147,7 +147,7 @@ async def test_it_works_alike_in_a_process_of_its_own(where: str) -> None:
             assert [(info.id, info.state) for info in await top.ask(hf.WhichChildren())] == [("picky", "stopped")]
             assert await top.ask(hf.RestartChild("picky")) is None
             told = events.take()
-        assert not [event for event in told if isinstance(event, (hf.ActorCrashed, hf.ChildStartFailed))]
+        assert not [event for event in told if isinstance(event, (hf.events.ActorCrashed, hf.events.ChildStartFailed))]
         assert system._workers.processes() == {}
 
 

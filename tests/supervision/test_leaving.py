@@ -22,10 +22,10 @@ PLACES: dict[str, dict[str, Any]] = {
 }
 
 
-async def crashed(events: hf.EventStream, path: str, error: str) -> None:
+async def crashed(events: hf.events.EventStream, path: str, error: str) -> None:
     """Wait until it is told that the life at an address has crashed with this."""
     async for event in events:
-        if isinstance(event, hf.ActorCrashed) and event.address == path and error in str(event.reason):
+        if isinstance(event, hf.events.ActorCrashed) and event.address == path and error in str(event.reason):
             return
 
 

@@ -303,13 +303,13 @@ class Step:
         """New flags, until the supervisor is itself restarted; those that do not fit its children are refused."""
         owner = self.owner
         strategy, auto = STRATEGIES[self.number % 3], AUTO[self.number % 2]
-        flags = hf.Flags(strategy, self.number % 4, PERIOD, auto)
+        flags = hf.supervision.Flags(strategy, self.number % 4, PERIOD, auto)
         if auto == "never" and any(one.significant for one in owner.children):
             with contextlib.suppress(hf.SpecError):
-                await self.supervisor.ask(hf.ChangeSupervisor(flags))
+                await self.supervisor.ask(hf.supervision.ChangeSupervisor(flags))
                 raise AssertionError("it was taken")
         else:
-            await self.supervisor.ask(hf.ChangeSupervisor(flags))
+            await self.supervisor.ask(hf.supervision.ChangeSupervisor(flags))
             owner.strategy, owner.intensity, owner.auto = strategy, self.number % 4, auto
 
     async def change(self, one: One) -> None:
@@ -319,8 +319,10 @@ class Step:
         if one.significant and restart == "permanent":
             return
         one.shape = dataclasses.replace(one.shape, restart=restart)
-        spec = await self.supervisor.ask(hf.GetChildSpec(one.id))
-        await self.supervisor.ask(hf.ChangeSupervisor(children=[dataclasses.replace(spec, restart=restart)]))
+        spec = await self.supervisor.ask(hf.supervision.GetChildSpec(one.id))
+        await self.supervisor.ask(
+            hf.supervision.ChangeSupervisor(children=[dataclasses.replace(spec, restart=restart)])
+        )
         owner.children.remove(one)
         owner.children.insert(0, one)
 
@@ -347,7 +349,7 @@ class Step:
 async def rest(system: hf.ActorSystem) -> None:
     """Until nothing happens any more; a start that has ended may yet be told of in the next tick."""
     for _ in range(30):
-        await system.node.settled()
+        await system._node.settled()
 
 
 async def compare(system: hf.ActorSystem, group: Group) -> None:
@@ -359,7 +361,9 @@ async def compare(system: hf.ActorSystem, group: Group) -> None:
     active = sum(one.is_up for one in group.children)
     nested = sum(one.below is not None or bool(one.shape.below) for one in group.children)
     total = len(group.children)
-    assert await supervisor.ask(hf.CountChildren()) == hf.ChildCounts(total, active, nested, total - nested)
+    assert await supervisor.ask(hf.supervision.CountChildren()) == hf.supervision.ChildCounts(
+        total, active, nested, total - nested
+    )
     for one in group.children:
         path = f"{group.path}/{one.id}"
         assert (path in system.tree()) == one.is_up

@@ -51,7 +51,7 @@ async def shutdown_errors(spec: hf.ChildSpec, work: Work, *, by: str = "call") -
                 await top.ask(hf.TerminateChild("x"), timeout=1000.0)
             else:
                 await system.stop(top)
-            return [str(event.reason) for event in events.take() if isinstance(event, hf.ShutdownError)]
+            return [str(event.reason) for event in events.take() if isinstance(event, hf.events.ShutdownError)]
 
 
 BY = pytest.mark.parametrize("by", ["call", "end"])
@@ -97,7 +97,7 @@ async def test_another_clean_reason_is_reported_of_permanent_children_only(
         await asyncio.sleep(1.0)  # It is on its way out: its `on_stop` takes ten seconds.
         with system.events() as events:
             await top.ask(hf.TerminateChild("x"), timeout=100.0)
-            told = [str(event.reason) for event in events.take() if isinstance(event, hf.ShutdownError)]
+            told = [str(event.reason) for event in events.take() if isinstance(event, hf.events.ShutdownError)]
         assert told == reported
 
 
@@ -127,7 +127,7 @@ async def test_a_child_that_dies_while_a_sibling_is_being_stopped_is_no_trouble(
             family.ref("a").tell(Boom())
             await stopping
             told = events.take()
-        assert not [event for event in told if isinstance(event, (hf.ChildRestarted, hf.ShutdownError))]
+        assert not [event for event in told if isinstance(event, (hf.events.ChildRestarted, hf.events.ShutdownError))]
         assert system.tree() == ["/app"]
 
 
@@ -164,7 +164,9 @@ async def test_a_failing_start_rolls_back_in_reverse_with_each_childs_own_shutdo
         with system.events() as events, pytest.raises(hf.StartFailed, match="/app/top/d could not be started"):
             await system.start(hf.supervisor("top", children=children))
         assert plan.take() == "+a +b +c !d -c -a"
-        failed = [(event.address, event.reason) for event in events.take() if isinstance(event, hf.ChildStartFailed)]
+        failed = [
+            (event.address, event.reason) for event in events.take() if isinstance(event, hf.events.ChildStartFailed)
+        ]
         assert failed[0] == ("/app/top/d", "OSError: not there yet")
 
 
@@ -206,14 +208,14 @@ async def test_a_supervisor_ends_with_its_parent(message: hf.Message[Any]) -> No
         await system.start(hf.supervisor("top"))
         parent = system.spawn(hf.start(Stranger, plan), "parent")
         parent.tell(Work())
-        await system.node.settled()
+        await system._node.settled()
         assert plan.take() == "+a +b"
         if isinstance(message, Leave):
             parent.tell(message)
         else:
             parent.stop()
         for _ in range(10):
-            await system.node.settled()
+            await system._node.settled()
         assert plan.take() == "-b -a"
         assert system.tree() == ["/app", "/app/top"]
 
@@ -240,7 +242,7 @@ async def test_which_ends_are_reported(restart: Any, reason: hf.ExitReason) -> N
         family = await Family.start(system, plan, kid(plan, "a", restart=restart))
         with system.events() as events:
             await family.after("a", Leave(reason))
-            told = [event.reason for event in events.take() if isinstance(event, hf.ChildTerminated)]
+            told = [event.reason for event in events.take() if isinstance(event, hf.events.ChildTerminated)]
         assert told == ([reason] if restart == "permanent" or not reason.is_clean else [])
 
 
@@ -262,7 +264,7 @@ async def test_an_end_is_told_that_comes_while_its_supervisor_stops(restart: Any
                 await asyncio.sleep(1.0)
                 system.ref("/app/top/a", Kid).kill()
                 await stopping
-            told = [event for event in events.take() if isinstance(event, hf.ChildTerminated)]
+            told = [event for event in events.take() if isinstance(event, hf.events.ChildTerminated)]
         assert [(event.address, event.reason) for event in told] == [("/app/top/a", hf.KILLED)]
 
 
@@ -276,7 +278,7 @@ async def test_so_is_one_that_comes_while_its_group_is_restarted() -> None:
             await asyncio.sleep(1.0)
             family.ref("a").kill()
             await asyncio.sleep(10.0)
-            told = [event for event in events.take() if isinstance(event, hf.ChildTerminated)]
+            told = [event for event in events.take() if isinstance(event, hf.events.ChildTerminated)]
         assert [event.address for event in told] == ["/app/top/b", "/app/top/a"]
         assert plan.take() == "-b +a +b"
 

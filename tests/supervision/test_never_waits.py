@@ -78,7 +78,7 @@ async def test_an_end_that_hangs_is_told_with_its_stacks_and_made(what: str) -> 
                 await system.shutdown()
             else:
                 await system.stop(top if what == "it" else system.ref("/app/above", hf.Supervisor))
-            (told,) = [event for event in events.take() if isinstance(event, hf.StopOverdue)]
+            (told,) = [event for event in events.take() if isinstance(event, hf.events.StopOverdue)]
         assert loop.time() - before == pytest.approx(9.0, abs=0.5)
         assert (told.address, told.seconds) == ("/app/above/top", 9.0)
         assert "/app/above/top (running) has been in the turn of Block" in told.stacks
@@ -97,7 +97,7 @@ async def test_a_leaf_that_may_take_for_ever_is_waited_for() -> None:
         await system.start(hf.supervisor("above", children=[hf.supervisor("top", children=children)]))
         with system.events() as events:
             await system.shutdown()
-            assert not [event for event in events.take() if isinstance(event, hf.StopOverdue)]
+            assert not [event for event in events.take() if isinstance(event, hf.events.StopOverdue)]
     assert asyncio.get_running_loop().time() == pytest.approx(10_000.0)
 
 
@@ -120,5 +120,7 @@ async def test_a_supervisor_has_the_time_of_all_its_children(dynamic: bool) -> N
             top = await system.start(hf.supervisor("top", children=specs))
         with system.events() as events:
             await system.stop(top)
-            assert not [event for event in events.take() if isinstance(event, (hf.StopOverdue, hf.ShutdownError))]
+            assert not [
+                event for event in events.take() if isinstance(event, (hf.events.StopOverdue, hf.events.ShutdownError))
+            ]
     assert asyncio.get_running_loop().time() == pytest.approx(7.9 if dynamic else 39.5)

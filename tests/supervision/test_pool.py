@@ -66,8 +66,8 @@ async def test_least_loaded_passes_over_who_is_at_work_or_has_a_queue() -> None:
 async def test_least_loaded_knows_the_load_of_processes() -> None:
     async with hf.ActorSystem(log=False) as system:
         worker = hf.child(None, hf.start(Sleeper), isolation="process")
-        await system.start(hf.pool("w", worker, 2, routing="least_loaded"))
-        pool = hf.pool_of(system, "/app/w", Sleeper)
+        await system.start(hf.supervision.pool("w", worker, 2, routing="least_loaded"))
+        pool = hf.supervision.pool_of(system, "/app/w", Sleeper)
         busy = await pool.ask(Who())
         number = busy.split()[0]
         held = system.ref(f"/app/w/{number}", Sleeper).ask(Hold(), 30)
@@ -99,21 +99,23 @@ async def test_hash_keeps_a_key_with_its_worker(key: Any) -> None:
         for number in range(20):
             name = f"key-{number}"
             for _ in range(2):
-                assert await pool.ask(Job(name)) == str(hf.partition_of(name, 3))
+                assert await pool.ask(Job(name)) == str(hf.supervision.partition_of(name, 3))
 
 
 async def test_a_message_without_its_key_is_refused_and_ends_nobody() -> None:
     async with hf.ActorSystem(log=False) as system:
         _, pool = await begin(system, routing="hash", key="key")
-        with pytest.raises(hf.NoRoute, match=r"AttributeError.*'key'"):
+        with pytest.raises(hf.errors.NoRoute, match=r"AttributeError.*'key'"):
             await pool.ask(Who())
         with system.events() as events:
             pool.tell(Note())
             await settled(system)
-            assert [event.address for event in events.take() if isinstance(event, hf.DeadLetter)] == ["/app/w/router"]
-        with pytest.raises(hf.NoRoute):
+            assert [event.address for event in events.take() if isinstance(event, hf.events.DeadLetter)] == [
+                "/app/w/router"
+            ]
+        with pytest.raises(hf.errors.NoRoute):
             await pool.ask(Job(object()))  # type: ignore[arg-type]
-        assert await pool.ask(Job("x")) == str(hf.partition_of("x", 3))
+        assert await pool.ask(Job("x")) == str(hf.supervision.partition_of("x", 3))
         assert pool._cell.life == 1
 
 
@@ -125,7 +127,7 @@ async def test_broadcast_tells_all_and_refuses_to_ask() -> None:
         await settled(system)
         for number in range(3):
             assert await one(system, number).ask(Notes()) == ["a", "b"]
-        with pytest.raises(hf.NotSupported, match="a broadcast has no single reply"):
+        with pytest.raises(hf.errors.NotSupported, match="a broadcast has no single reply"):
             await pool.ask(Job())
 
 
@@ -150,13 +152,13 @@ async def test_messages_of_other_classes_are_refused_at_the_call() -> None:
 async def test_a_pool_is_found_by_the_class_of_its_workers() -> None:
     async with hf.ActorSystem(log=False) as system:
         await begin(system)
-        with pytest.raises(hf.WrongActor, match=r"a pool of .*Worker, not a pool of .*Other"):
-            hf.pool_of(system, "/app/w", Other)
+        with pytest.raises(hf.errors.WrongActor, match=r"a pool of .*Worker, not a pool of .*Other"):
+            hf.supervision.pool_of(system, "/app/w", Other)
         await system.start(hf.supervisor("top"))
-        with pytest.raises(hf.WrongActor, match="PoolSupervisor"):
-            hf.pool_of(system, "/app/top", Worker)
-        with pytest.raises(hf.NoSuchActor):
-            hf.pool_of(system, "/app/none", Worker)
+        with pytest.raises(hf.errors.WrongActor, match="PoolSupervisor"):
+            hf.supervision.pool_of(system, "/app/top", Worker)
+        with pytest.raises(hf.errors.NoSuchActor):
+            hf.supervision.pool_of(system, "/app/none", Worker)
 
 
 @pytest.mark.asyncio(loop_factories=["virtual"])
@@ -212,7 +214,9 @@ async def test_or_it_is_waited_for(options: dict[str, Any]) -> None:
         began = asyncio.get_running_loop().time()
         asks = [pool.ask(Job(f"key-{number}"), 60) for number in range(6)]
         told = " ".join(await asyncio.gather(*asks))
-        expected = [hf.partition_of(f"key-{number}", 3) if "key" in options else number % 3 for number in range(6)]
+        expected = [
+            hf.supervision.partition_of(f"key-{number}", 3) if "key" in options else number % 3 for number in range(6)
+        ]
         assert told == " ".join(map(str, expected))
         assert asyncio.get_running_loop().time() - began >= 5
 
@@ -228,7 +232,7 @@ async def test_while_nobody_is_up_messages_wait_in_their_order() -> None:
         pool.tell(Note("a"))
         pool.tell(Note("b"))
         await settled(system)
-        status = await top.ask(hf.PoolInfo())
+        status = await top.ask(hf.supervision.PoolInfo())
         assert (status.size, status.up, status.leaving, status.waiting) == (1, 0, 0, 3)
         with pytest.raises(hf.MailboxFull):
             pool.tell(Note("too many"))
@@ -239,7 +243,7 @@ async def test_while_nobody_is_up_messages_wait_in_their_order() -> None:
         pool.tell(Note("c"))
         await settled(system)
         assert await pool.ask(Notes()) == ["a", "b", "c"]
-        status = await top.ask(hf.PoolInfo())
+        status = await top.ask(hf.supervision.PoolInfo())
         assert (status.up, status.waiting) == (1, 0)
 
 
@@ -267,7 +271,7 @@ async def test_nothing_is_lost_or_doubled_or_left_while_workers_crash() -> None:
             answered += len(await asyncio.gather(*asks))
         assert answered == 2000
         await settled(system)
-        assert (await top.ask(hf.PoolInfo())).up == 3
+        assert (await top.ask(hf.supervision.PoolInfo())).up == 3
 
 
 async def test_a_router_that_crashes_is_restarted_and_keeps_its_queue() -> None:
@@ -316,7 +320,7 @@ async def test_full_workers_are_passed_over_and_then_the_router_waits_for_room()
         await settled(system)
         assert not full.done()
         assert not direct.done()
-        assert (await top.ask(hf.PoolInfo())).waiting == 4
+        assert (await top.ask(hf.supervision.PoolInfo())).waiting == 4
         gate.event.set()
         await asyncio.wait_for(asyncio.gather(full, direct), 10)
         await settled(system)

@@ -40,7 +40,7 @@ def ends() -> Iterator[Ends]:
 async def test_its_output_is_logged_under_the_path_of_its_actor(system: hf.ActorSystem) -> None:
     with system.events() as events:
         await system.start(sh("echo one; echo 'zwei, ü'; echo no >&2; exec sleep 99"))
-        lines = [await next_event(events, hf.LogLine) for _ in range(3)]
+        lines = [await next_event(events, hf.events.LogLine) for _ in range(3)]
     assert {line.address for line in lines} == {"/app/it"}
     assert [line.text for line in lines if line.stream == "stdout"] == ["one", "zwei, ü"]
     assert [line.text for line in lines if line.stream == "stderr"] == ["no"]
@@ -67,9 +67,11 @@ async def test_megabytes_of_output_arrive_whole_and_in_order(system: hf.ActorSys
     count = 200_000
     with system.events() as events:
         texts: list[str] = []
-        system.node.events.add_sink(lambda event: texts.append(event.text) if isinstance(event, hf.LogLine) else None)
+        system._node.events.add_sink(
+            lambda event: texts.append(event.text) if isinstance(event, hf.events.LogLine) else None
+        )
         await system.start(python(f"for n in range({count}): print(n, 'x' * 20)", restart="temporary"))
-        await next_event(events, hf.ProcessDied)
+        await next_event(events, hf.events.ProcessDied)
     assert texts == [f"{number} {'x' * 20}" for number in range(count)]
 
 
@@ -77,11 +79,11 @@ async def test_output_that_is_no_text_or_has_no_end(system: hf.ActorSystem) -> N
     script = r"import os; os.write(1, b'\xff\xfe gr\xc3\xbcn\n\x00' + b'y' * 3_000_000); os.write(2, b'half')"
     texts: dict[str, list[str]] = {"stdout": [], "stderr": []}
     with system.events() as events:
-        system.node.events.add_sink(
-            lambda event: texts[event.stream].append(event.text) if isinstance(event, hf.LogLine) else None
+        system._node.events.add_sink(
+            lambda event: texts[event.stream].append(event.text) if isinstance(event, hf.events.LogLine) else None
         )
         await system.start(python(script, restart="temporary"))
-        assert (await next_event(events, hf.ProcessDied)).reason == hf.NORMAL
+        assert (await next_event(events, hf.events.ProcessDied)).reason == hf.NORMAL
     assert texts["stdout"][0] == "\ufffd\ufffd grün"
     assert "".join(texts["stdout"][1:]) == "\x00" + "y" * 3_000_000
     assert texts["stderr"] == ["half"]
@@ -117,7 +119,7 @@ async def test_a_sign_that_is_cut_in_a_very_long_line_is_found(system: hf.ActorS
             spec = python(textwrap.dedent(script).format(path=path, end=end), id=name, ready="LISTENING", cwd=folder)
             with system.events() as events:
                 starting = asyncio.ensure_future(system.start(spec))
-                line = await next_event(events, hf.LogLine)
+                line = await next_event(events, hf.events.LogLine)
                 assert line.text.endswith("LISTEN")
                 Path(folder, f"{name}-go").touch()
                 await asyncio.wait_for(starting, 60)
@@ -208,7 +210,7 @@ async def test_one_that_is_not_ready_in_time_is_ended(system: hf.ActorSystem, en
         starting = asyncio.ensure_future(
             refused(system, python(STUBBORN, ready="never", ready_timeout=0.3, shutdown=0.2))
         )
-        ends.add((await next_event(events, hf.ProcessStarted)).pid)
+        ends.add((await next_event(events, hf.events.ProcessStarted)).pid)
         told = await starting
     await ends.all()
     assert "it was not ready after 0.3 s; its last lines:\nup" in told
@@ -225,11 +227,11 @@ async def test_a_sign_that_cannot_be_looked_for_is_a_failed_start(system: hf.Act
 
 async def test_what_cannot_be_run_says_why(system: hf.ActorSystem, tmp_path: Path) -> None:
     asked: list[int] = []
-    none = hf.program(["no-such-program", "x"], stop=asked.append)
+    none = hf.supervision.program(["no-such-program", "x"], stop=asked.append)
     assert "no-such-program: No such file or directory: no-such-program" in await refused(system, none)
     assert asked == [], "whoever stops it is not given the pid of a program that never ran"
     (tmp_path / "data").write_text("no program")
-    assert "Permission denied" in await refused(system, hf.program([str(tmp_path / "data")]))
+    assert "Permission denied" in await refused(system, hf.supervision.program([str(tmp_path / "data")]))
     assert f"No such file or directory: {tmp_path}/none" in await refused(system, sh("true", cwd=tmp_path / "none"))
 
 
@@ -248,13 +250,13 @@ async def test_environment_and_directory(
 
 async def test_it_reads_what_it_is_told(system: hf.ActorSystem) -> None:
     with system.events() as events:
-        ref = await system.start(hf.program(["cat"], stdin=True, restart="transient"))
-        ref.tell(hf.ProgramInput("grün\n"))
-        ref.tell(hf.ProgramInput(data=b"two\n"))
-        assert [(await next_event(events, hf.LogLine)).text for _ in range(2)] == ["grün", "two"]
-        await ref.ask(hf.ProgramInput("last", end=True))
-        assert (await next_event(events, hf.LogLine)).text == "last"
-        assert (await next_event(events, hf.ProcessDied)).reason == hf.NORMAL
+        ref = await system.start(hf.supervision.program(["cat"], stdin=True, restart="transient"))
+        ref.tell(hf.supervision.ProgramInput("grün\n"))
+        ref.tell(hf.supervision.ProgramInput(data=b"two\n"))
+        assert [(await next_event(events, hf.events.LogLine)).text for _ in range(2)] == ["grün", "two"]
+        await ref.ask(hf.supervision.ProgramInput("last", end=True))
+        assert (await next_event(events, hf.events.LogLine)).text == "last"
+        assert (await next_event(events, hf.events.ProcessDied)).reason == hf.NORMAL
 
 
 async def test_megabytes_of_input_arrive_whole(system: hf.ActorSystem) -> None:
@@ -265,16 +267,16 @@ async def test_megabytes_of_input_arrive_whole(system: hf.ActorSystem) -> None:
             data = bytes([number]) * 50_000
             while True:
                 try:
-                    await ref.ask(hf.ProgramInput(data=data, end=number == 199))
-                except hf.InputRefused:  # It does not read yet.
+                    await ref.ask(hf.supervision.ProgramInput(data=data, end=number == 199))
+                except hf.errors.InputRefused:  # It does not read yet.
                     await asyncio.sleep(0.005)
                 else:
                     break
             sent += len(data)
-        assert (await next_event(events, hf.LogLine)).text.strip() == str(sent)
+        assert (await next_event(events, hf.events.LogLine)).text.strip() == str(sent)
 
 
-async def feed(ref: hf.ActorRef[hf.Program], message: hf.ProgramInput) -> None:
+async def feed(ref: hf.ActorRef[hf.supervision.Program], message: hf.supervision.ProgramInput) -> None:
     """The first ones may still be taken, by the pipe."""
     for _ in range(3):
         await ref.ask(message)
@@ -284,17 +286,17 @@ async def test_input_that_cannot_be_had_is_refused(system: hf.ActorSystem) -> No
     for options, why in (({}, "program(..., stdin=True)"), ({"stdin": True}, "it does not read: ")):
         name = f"it-{len(options)}"
         ref = await system.start(sh("exec sleep 99", id=name, **options))
-        with pytest.raises(hf.InputRefused, match=re.escape(why)):
-            await feed(ref, hf.ProgramInput(data=b"x" * 1_000_000))
+        with pytest.raises(hf.errors.InputRefused, match=re.escape(why)):
+            await feed(ref, hf.supervision.ProgramInput(data=b"x" * 1_000_000))
     ref = await system.start(sh("exec <&-; echo closed; exec sleep 99", id="closed", stdin=True, ready="closed"))
-    with pytest.raises(hf.InputRefused, match="its standard input is closed"):
-        await feed(ref, hf.ProgramInput("x"))
+    with pytest.raises(hf.errors.InputRefused, match="its standard input is closed"):
+        await feed(ref, hf.supervision.ProgramInput("x"))
 
 
 async def test_without_input_it_finds_the_end_at_once(system: hf.ActorSystem) -> None:
     with system.events() as events:
         await system.start(sh("cat; echo end", restart="temporary"))
-        assert (await next_event(events, hf.LogLine)).text == "end"
+        assert (await next_event(events, hf.events.LogLine)).text == "end"
 
 
 # -- specs ---------------------------------------------------------------------------------------------------------
@@ -335,9 +337,9 @@ BAD: list[tuple[Any, dict[str, Any], str]] = [
 @pytest.mark.parametrize(("command", "options", "problem"), BAD)
 def test_a_bad_argument_is_refused_when_the_spec_is_built(command: Any, options: dict[str, Any], problem: str) -> None:
     with pytest.raises(hf.SpecError, match=problem):
-        hf.program(command, **options)
+        hf.supervision.program(command, **options)
 
 
 def test_a_pattern_keeps_its_flags_whatever_stands_in_it() -> None:
     for pattern in (re.compile("(?i)up", re.M), "(?i)up", re.compile("up", re.X | re.A)):
-        assert hf.program(["x"], ready=pattern).id == "x"
+        assert hf.supervision.program(["x"], ready=pattern).id == "x"

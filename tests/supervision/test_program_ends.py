@@ -56,15 +56,15 @@ async def test_its_end_is_an_exit_reason_and_restarts_by_type(
     script = f"if mkdir {tmp_path}/first 2>&-; then {script}; fi; exec sleep 99"
     with system.events() as events:
         await system.start(sh(script, restart=restart))
-        assert (await next_event(events, hf.ProcessDied)).reason == reason
+        assert (await next_event(events, hf.events.ProcessDied)).reason == reason
         again = restart == "permanent" or (restart == "transient" and not reason.is_clean)
         if again:
-            assert (await next_event(events, hf.ChildRestarted)).reason == reason
-            pid = (await next_event(events, hf.ProcessStarted)).pid
+            assert (await next_event(events, hf.events.ChildRestarted)).reason == reason
+            pid = (await next_event(events, hf.events.ProcessStarted)).pid
             assert (await info(system)).pid == pid
         else:
             await until(lambda: "/app/it" not in system.tree())
-            assert not [event for event in events.take() if isinstance(event, hf.ProcessStarted)]
+            assert not [event for event in events.take() if isinstance(event, hf.events.ProcessStarted)]
 
 
 async def test_rules_decide_by_the_way_it_ends(system: hf.ActorSystem) -> None:
@@ -74,9 +74,9 @@ async def test_rules_decide_by_the_way_it_ends(system: hf.ActorSystem) -> None:
         with system.events() as events:
             spec = sh(f"sleep 0.05; exit {code}", id=name, rules=rules, backoff=hf.Backoff(0.05, 0.05))
             await system.start(spec)
-            assert (await next_event(events, hf.ProcessDied)).reason == hf.Exited(code)
+            assert (await next_event(events, hf.events.ProcessDied)).reason == hf.Exited(code)
             if stays:
-                await next_event(events, hf.ProcessStarted)
+                await next_event(events, hf.events.ProcessStarted)
             else:
                 await until(lambda: f"/app/{name}" not in system.tree())  # noqa: B023
 
@@ -87,14 +87,14 @@ async def test_a_kill_from_outside_is_seen_at_once(system: hf.ActorSystem) -> No
         with system.events() as events:
             before = (await info(system)).pid
             os.kill(before, signal.SIGKILL)
-            assert (await next_event(events, hf.ProcessDied)).reason == hf.Signal(9)
-            assert (await next_event(events, hf.ProcessStarted)).pid == (await info(system)).pid != before
+            assert (await next_event(events, hf.events.ProcessDied)).reason == hf.Signal(9)
+            assert (await next_event(events, hf.events.ProcessStarted)).pid == (await info(system)).pid != before
 
 
 async def test_a_supervisor_gives_up_on_one_that_ends_again_and_again(system: hf.ActorSystem) -> None:
     with system.events() as events:
         await system.start(hf.supervisor("top", intensity=2, restart="temporary", children=[sh("exit 1")]))
-        gave_up = await next_event(events, hf.SupervisorGaveUp)
+        gave_up = await next_event(events, hf.events.SupervisorGaveUp)
     assert (gave_up.address, gave_up.reason) == ("/app/top", hf.Exited(1))
 
 
@@ -103,9 +103,9 @@ async def test_limits_are_those_of_the_program(system: hf.ActorSystem) -> None:
     with system.events() as events:
         limits = hf.Limits(memory_bytes=100_000_000, watch_interval=0.05, open_files=32)
         await system.start(python(hungry, limits=limits, restart="temporary"))
-        assert isinstance((await next_event(events, hf.ProcessDied)).reason, hf.OutOfMemory)
+        assert isinstance((await next_event(events, hf.events.ProcessDied)).reason, hf.OutOfMemory)
         await system.start(sh("ulimit -n; exec sleep 99", id="files", limits=limits))
-        assert (await next_event(events, hf.LogLine)).text == "32"
+        assert (await next_event(events, hf.events.LogLine)).text == "32"
 
 
 # -- stopping ------------------------------------------------------------------------------------------------------
@@ -125,7 +125,7 @@ async def said_at_its_end(system: hf.ActorSystem, **options: Any) -> str:
     ref = await system.start(python(textwrap.dedent(script), ready="up", **options))
     with system.events() as events:
         await system.stop(ref)
-        return " ".join(event.text for event in events.take() if isinstance(event, hf.LogLine))
+        return " ".join(event.text for event in events.take() if isinstance(event, hf.events.LogLine))
 
 
 async def interrupt(pid: int) -> None:
@@ -163,7 +163,7 @@ async def test_one_that_ignores_sigterm_is_killed_when_its_time_is_over(system: 
     with system.events() as events:
         await system.stop(ref)
         took = asyncio.get_running_loop().time() - began
-        reasons = [event.reason for event in events.take() if isinstance(event, hf.ProcessDied)]
+        reasons = [event.reason for event in events.take() if isinstance(event, hf.events.ProcessDied)]
     assert reasons == [hf.Signal(9)]
     assert 0.3 <= took < 60
     await ends.all()
@@ -173,7 +173,7 @@ async def test_one_that_ignores_sigterm_is_killed_when_its_time_is_over(system: 
 async def test_nothing_of_it_is_left_when_the_stop_returns(system: hf.ActorSystem, shutdown: Any) -> None:
     pid, descendants = await family(system, python(FAMILY, shutdown=shutdown))
     keeper = keeper_of(pid)
-    await system.stop(system.ref("/app/it", hf.Program))
+    await system.stop(system.ref("/app/it", hf.supervision.Program))
     assert not [one for one in (pid, keeper.pid, *descendants) if psutil.pid_exists(one)]
 
 
@@ -181,9 +181,9 @@ async def test_its_descendants_end_with_it_before_it_is_started_anew(system: hf.
     pid, descendants = await family(system, python(FAMILY))
     with system.events() as events:
         os.kill(pid, signal.SIGKILL)
-        await next_event(events, hf.ProcessDied)
+        await next_event(events, hf.events.ProcessDied)
         assert not [one for one in (pid, *descendants) if psutil.pid_exists(one)]
-        await next_event(events, hf.ProcessStarted)
+        await next_event(events, hf.events.ProcessStarted)
 
 
 @pytest.mark.parametrize("script", [STUBBORN, FAMILY])
@@ -196,7 +196,7 @@ async def test_the_next_one_begins_when_the_last_one_of_a_killed_actor_is_gone(
         below = before.children(recursive=True)
         with system.events() as events:
             ref.kill()
-            after = (await next_event(events, hf.ProcessStarted)).pid
+            after = (await next_event(events, hf.events.ProcessStarted)).pid
         assert after != before.pid
         assert not [one for one in (before, *below) if one.is_running()]
 
@@ -209,22 +209,22 @@ async def test_however_long_that_takes(system: hf.ActorSystem) -> None:
     with system.events() as events:
         try:
             ref.kill()
-            await next_event(events, hf.ActorStarted)
+            await next_event(events, hf.events.ActorStarted)
             for _ in range(10):
                 await asyncio.sleep(0)
             assert own_children() == [keeper], "nothing else is started"
         finally:
             keeper.resume()
-        assert (await next_event(events, hf.ProcessDied)).pid == before
-        assert (await next_event(events, hf.ProcessStarted)).pid == (await info(system)).pid
+        assert (await next_event(events, hf.events.ProcessDied)).pid == before
+        assert (await next_event(events, hf.events.ProcessStarted)).pid == (await info(system)).pid
 
 
 async def test_a_stop_while_it_starts_ends_it(system: hf.ActorSystem, ends: Ends) -> None:
     with system.events() as events:
         starting = asyncio.ensure_future(system.start(sh("exec sleep 99", ready="never", shutdown="brutal_kill")))
-        pid = (await next_event(events, hf.ProcessStarted)).pid
+        pid = (await next_event(events, hf.events.ProcessStarted)).pid
         ends.add(pid)
-        system.ref("/app/it", hf.Program).kill()
+        system.ref("/app/it", hf.supervision.Program).kill()
         with pytest.raises(hf.StartFailed):
             await starting
     await ends.all()
@@ -234,13 +234,13 @@ async def test_a_keeper_that_is_killed_takes_its_program_with_it(system: hf.Acto
     script = "sleep 98 & echo $!; exec sleep 99"
     with system.events() as events:
         await system.start(sh(script))
-        below = int((await next_event(events, hf.LogLine)).text)
+        below = int((await next_event(events, hf.events.LogLine)).text)
         pid = (await info(system)).pid
         ends.add(pid, below)
         keeper_of(pid).kill()
-        assert (await next_event(events, hf.ProcessDied)).reason == hf.Signal(9)
+        assert (await next_event(events, hf.events.ProcessDied)).reason == hf.Signal(9)
         await ends.all()
-        assert (await next_event(events, hf.ProcessStarted)).pid == (await info(system)).pid
+        assert (await next_event(events, hf.events.ProcessStarted)).pid == (await info(system)).pid
 
 
 OTHER_USER = """
@@ -256,13 +256,13 @@ async def main():
         def tell(event):
             if type(event).__name__ in ("HookFailed", "ChildStartFailed", "ProcessDied"):
                 print(event.reason, flush=True)
-            if isinstance(event, hf.ProcessDied):
+            if isinstance(event, hf.events.ProcessDied):
                 ended.set()
 
-        system.node.events.add_sink(tell)
-        spec = hf.program([sys.executable, "-c", BECOME], id="it", ready="up", shutdown=1.0)
+        system._node.events.add_sink(tell)
+        spec = hf.supervision.program([sys.executable, "-c", BECOME], id="it", ready="up", shutdown=1.0)
         ref = await system.start(spec)
-        print((await ref.ask(hf.ProgramInfo())).pid, flush=True)
+        print((await ref.ask(hf.supervision.ProgramInfo())).pid, flush=True)
         if {kills}:
             ref.kill()  # The next life does not begin, and so ends the tree.
         else:
@@ -305,15 +305,15 @@ import holdfast as hf
 
 async def main():
     async with hf.ActorSystem("app", log=False) as system:
-        spec = hf.program([sys.executable, "-I", "-S", "-c", {family!r}], id="it")
+        spec = hf.supervision.program([sys.executable, "-I", "-S", "-c", {family!r}], id="it")
         if {apart}:
             spec = hf.supervisor("top", children=[spec], isolation="process")
         with system.events() as events:
             ref = await system.start(spec)
             async for event in events:
-                if isinstance(event, hf.LogLine):
+                if isinstance(event, hf.events.LogLine):
                     print(event.text, flush=True)
-                elif isinstance(event, hf.ProcessStarted):
+                elif isinstance(event, hf.events.ProcessStarted):
                     print(event.pid, flush=True)
 
 if __name__ == "__main__":
@@ -345,7 +345,7 @@ async def test_no_descriptor_task_or_zombie_is_left_by_many_lives(system: hf.Act
                 os.kill((await info(system)).pid, signal.SIGKILL)
             else:
                 ref.kill()
-            await next_event(events, hf.ProcessStarted)
+            await next_event(events, hf.events.ProcessStarted)
     await info(system)
     assert len(os.listdir("/proc/self/fd")) == files
     assert len(asyncio.all_tasks()) <= tasks + 1
@@ -372,11 +372,11 @@ async def test_the_same_below_a_supervisor_with_a_process_of_its_own(
         status = await info(system, path)
         assert status.lines == ["none none none"], "it is given the environment of a program that knows nothing of us"
         assert keeper_of(status.pid).ppid() == system.pid_of(system.ref("/app/top", hf.Supervisor))
-        await system.ref(path, hf.Program).ask(hf.ProgramInput("and this\n", end=True))
-        assert (await next_event(events, hf.LogLine, lambda line: line.text == "and this")).address == path
-        died = await next_event(events, hf.ProcessDied)
+        await system.ref(path, hf.supervision.Program).ask(hf.supervision.ProgramInput("and this\n", end=True))
+        assert (await next_event(events, hf.events.LogLine, lambda line: line.text == "and this")).address == path
+        died = await next_event(events, hf.events.ProcessDied)
         assert (died.address, died.reason) == (path, hf.Exited(5))
-        assert (await next_event(events, hf.ProcessStarted)).pid == (await info(system, path)).pid
+        assert (await next_event(events, hf.events.ProcessStarted)).pid == (await info(system, path)).pid
 
 
 async def test_it_ends_with_the_process_of_its_supervisor(system: hf.ActorSystem, ends: Ends) -> None:
@@ -389,7 +389,7 @@ async def test_it_ends_with_the_process_of_its_supervisor(system: hf.ActorSystem
     os.kill(system.pid_of(top), signal.SIGKILL)
     await ends.all()
     with system.events() as events:
-        started = await next_event(events, hf.ProcessStarted, lambda event: event.address == path)
+        started = await next_event(events, hf.events.ProcessStarted, lambda event: event.address == path)
     assert started.pid == (await info(system, path)).pid != status.pid
 
 

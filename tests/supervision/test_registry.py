@@ -11,7 +11,7 @@ from holdfast.testing import idle
 from tests.supervision.family import Boom, Leave, refused
 
 virtual = pytest.mark.asyncio(loop_factories=["virtual"])
-Names = hf.Registry[Any, Any]
+Names = hf.supervision.Registry[Any, Any]
 
 
 class Do(hf.Message[Any]):
@@ -60,7 +60,7 @@ class Holder(hf.Actor):
 
 
 async def open_names(system: hf.ActorSystem, **options: Any) -> Names:
-    return hf.Registry(await system.start(hf.registry("names", **options)))
+    return hf.supervision.Registry(await system.start(hf.supervision.registry("names", **options)))
 
 
 def by(holder: hf.ActorRef[Holder], work: Callable[[], Awaitable[Any]]) -> asyncio.Future[Any]:
@@ -75,10 +75,12 @@ async def test_unique_keys_have_one_holder_with_a_value() -> None:
         names = await open_names(system)
         one, other = (system.spawn(hf.start(Holder), name) for name in ("one", "other"))
         await by(one, lambda: names.register("hello", {"a": 1}))
-        assert await names.lookup("hello") == [hf.RegistryEntry("hello", one, {"a": 1})]
+        assert await names.lookup("hello") == [hf.supervision.RegistryEntry("hello", one, {"a": 1})]
         assert await names.whereis("hello") == one
         for asker in (one, other):
-            assert await refused(by(asker, lambda: names.register("hello", 2))) == hf.AlreadyRegistered("hello", one)
+            assert await refused(by(asker, lambda: names.register("hello", 2))) == hf.errors.AlreadyRegistered(
+                "hello", one
+            )
         await by(other, lambda: names.register("world", 2))
         assert await by(other, lambda: names.keys()) == ["world"]
         assert (await names.keys(one), await names.keys(other)) == (["hello"], ["world"])
@@ -120,7 +122,7 @@ async def test_who_is_no_actor_holds_nothing() -> None:
         calls: list[Awaitable[Any]] = [names.register("k", 1), names.unregister("k"), names.keys()]
         calls += [names.update_value("k", lambda value: value), names.unregister_match("k", bool)]
         for call in calls:
-            assert isinstance(await refused(call), hf.NotAnActor)
+            assert isinstance(await refused(call), hf.errors.NotAnActor)
         assert await names.count() == 0
 
 
@@ -169,7 +171,9 @@ async def test_duplicate_keys_have_many_entries_also_of_one_holder() -> None:
         assert await names.values("k") == [1, 3]
         assert await by(one, lambda: names.unregister("k")) == 1
         assert await names.values("k") == [3]
-        assert isinstance(await refused(by(other, lambda: names.update_value("k", lambda value: 9))), hf.NotUnique)
+        assert isinstance(
+            await refused(by(other, lambda: names.update_value("k", lambda value: 9))), hf.errors.NotUnique
+        )
 
 
 async def test_dispatch_tells_every_holder_once_per_entry() -> None:
@@ -192,12 +196,12 @@ async def test_dispatch_calls_a_function_with_the_entries_in_the_caller() -> Non
         await by(holder, lambda: names.register("k", 5))
         seen: list[Any] = []
 
-        async def later(entries: list[hf.RegistryEntry[Any, Any]]) -> None:
+        async def later(entries: list[hf.supervision.RegistryEntry[Any, Any]]) -> None:
             seen.extend(entries)
 
         assert await names.dispatch("k", later) == 1
         assert await names.dispatch("nobody", later) == 0
-        assert seen == [hf.RegistryEntry("k", holder, 5)]
+        assert seen == [hf.supervision.RegistryEntry("k", holder, 5)]
         with pytest.raises(ZeroDivisionError):
             await names.dispatch("k", lambda entries: 1 // 0)  # type: ignore[arg-type, return-value]
         assert await names.count() == 1
@@ -282,7 +286,7 @@ class Locker(hf.Actor):
 
     @hf.on(Grab)
     async def grab(self, message: Grab) -> None:
-        names = hf.Registry[str, int](self.ctx.find(message.path, hf.RegistryActor))
+        names = hf.supervision.Registry[str, int](self.ctx.find(message.path, hf.supervision.RegistryActor))
         async with names.lock("k"):
             await names.register("locked", 1)
             await asyncio.get_running_loop().create_future()
@@ -326,12 +330,12 @@ class Listener(hf.Actor):
     def __init__(self) -> None:
         self.heard: asyncio.Queue[str] = asyncio.Queue()
 
-    @hf.on(hf.KeyRegistered)
-    def registered(self, message: hf.KeyRegistered) -> None:
+    @hf.on(hf.supervision.KeyRegistered)
+    def registered(self, message: hf.supervision.KeyRegistered) -> None:
         self.heard.put_nowait(f"+{message.key} {message.value} {message.holder.path[5:]}")
 
-    @hf.on(hf.KeyFreed)
-    def freed(self, message: hf.KeyFreed) -> None:
+    @hf.on(hf.supervision.KeyFreed)
+    def freed(self, message: hf.supervision.KeyFreed) -> None:
         self.heard.put_nowait(f"-{message.key} {message.holder.path[5:]}{' ended' if message.ended else ''}")
 
     @hf.on(Next)
@@ -356,7 +360,7 @@ async def test_listeners_hear_of_every_key_by_name_or_address() -> None:
         await by(one, lambda: names.unregister("k"))
         await by(one, lambda: names.unregister("k"))
         await by(other, lambda: names.register(("l", 1), 3))
-        assert isinstance(await refused(by(one, lambda: names.register(("l", 1), 4))), hf.AlreadyRegistered)
+        assert isinstance(await refused(by(one, lambda: names.register(("l", 1), 4))), hf.errors.AlreadyRegistered)
         other.kill()
         for listener in listeners:
             heard = [await listener.ask(Next()) for _ in range(4)]
@@ -387,7 +391,7 @@ async def test_metadata_belongs_to_the_registry() -> None:
 )
 def test_a_wrong_option_is_named(options: dict[str, Any], problem: str) -> None:
     with pytest.raises(hf.SpecError, match=f"registry 'names': {problem}"):
-        hf.registry("names", **options)
+        hf.supervision.registry("names", **options)
 
 
 async def test_who_asks_a_registry_that_is_gone_hears_so() -> None:
@@ -396,5 +400,5 @@ async def test_who_asks_a_registry_that_is_gone_hears_so() -> None:
         await system.stop(names.ref)
         for call in (names.lookup("k"), names.count(), names.meta("a"), names.lock("k").__aenter__()):
             assert isinstance(await refused(call), hf.ActorStopped)
-        with pytest.raises(hf.NoSuchActor):
-            system.ref("/app/names", hf.RegistryActor)
+        with pytest.raises(hf.errors.NoSuchActor):
+            system.ref("/app/names", hf.supervision.RegistryActor)

@@ -108,8 +108,8 @@ class Recorded(hf.Actor):
         self.n = 0
 
     @property
-    def _names(self) -> hf.Registry[str, int]:
-        return hf.Registry(self.ctx.find(self.path, hf.RegistryActor))
+    def _names(self) -> hf.supervision.Registry[str, int]:
+        return hf.supervision.Registry(self.ctx.find(self.path, hf.supervision.RegistryActor))
 
     @hf.on(Note)
     async def note(self, message: Note) -> None:
@@ -157,7 +157,7 @@ async def test_a_restarted_registry_has_lost_nothing_but_the_dead() -> None:
         again.kill()  # Restarted, but it is another life that never registered.
         assert [entry.holder for entry in await names.select(lambda entry: True)] == [living]
         assert (await names.meta("since"), names.ref._cell.life) == (2, 2)
-        assert await refused(by(living, lambda: names.register(living.path))) == hf.AlreadyRegistered(
+        assert await refused(by(living, lambda: names.register(living.path))) == hf.errors.AlreadyRegistered(
             living.path, living
         )
         heard = [await listener.ask(Next()) for _ in range(5)]
@@ -197,10 +197,10 @@ async def test_a_registry_that_is_given_up_is_empty_when_it_comes_again() -> Non
         spec = hf.supervisor(
             "top",
             strategy="rest_for_one",
-            children=[hf.registry("names"), hf.child("h", hf.start(Finder, "/app/top/names"))],
+            children=[hf.supervision.registry("names"), hf.child("h", hf.start(Finder, "/app/top/names"))],
         )
         await system.start(spec)
-        names = hf.Registry[str, int](system.ref("/app/top/names", hf.RegistryActor))
+        names = hf.supervision.Registry[str, int](system.ref("/app/top/names", hf.supervision.RegistryActor))
         stranger = system.spawn(hf.start(Holder))
         await by(stranger, lambda: names.register("stranger", 1))
         top = system.ref("/app/top", hf.Supervisor)
@@ -208,7 +208,7 @@ async def test_a_registry_that_is_given_up_is_empty_when_it_comes_again() -> Non
         await idle(system)
         holder = system.ref("/app/top/h", Finder)
         assert await holder.ask(Kept()) == []
-        again = hf.Registry[str, int](system.ref("/app/top/names", hf.RegistryActor))
+        again = hf.supervision.Registry[str, int](system.ref("/app/top/names", hf.supervision.RegistryActor))
         assert [(entry.key, entry.holder) for entry in await again.select(lambda entry: True)] == [("finder", holder)]
         again.ref.kill()
         await idle(system)
@@ -219,7 +219,7 @@ class Finder(Holder):
     """Finds the registry by its address."""
 
     def __init__(self, path: str, key: str = "finder") -> None:
-        super().__init__(hf.Registry(self.ctx.find(path, hf.RegistryActor)), key)
+        super().__init__(hf.supervision.Registry(self.ctx.find(path, hf.supervision.RegistryActor)), key)
 
 
 # -- processes ------------------------------------------------------------------------------------------------------
@@ -235,7 +235,7 @@ class Far(hf.Actor):
 
     @hf.on(Act)
     async def act(self, message: Act) -> str:
-        names = hf.Registry[Any, Any](self.ctx.find(message.path, hf.RegistryActor))
+        names = hf.supervision.Registry[Any, Any](self.ctx.find(message.path, hf.supervision.RegistryActor))
         key = ("far", self.ctx.path)
         match message.what:
             case "register":
@@ -247,7 +247,7 @@ class Far(hf.Actor):
             case "taken":
                 try:
                     await names.register("near", 1)
-                except hf.AlreadyRegistered as no:
+                except hf.errors.AlreadyRegistered as no:
                     return f"{no.key} is {no.holder.path}"
             case _:
                 return repr((await names.keys(), await names.select(lambda entry: entry.key == "near")))
@@ -275,7 +275,7 @@ async def test_actors_in_other_processes_hold_keys_like_any_other(where: str) ->
 
         await act("register")
         key = ("far", "/app/top/far")
-        assert await names.lookup(key) == [hf.RegistryEntry(key, far, {"n": [1]})]
+        assert await names.lookup(key) == [hf.supervision.RegistryEntry(key, far, {"n": [1]})]
         assert await act("update") == "({'n': [1, 2]}, {'n': [1]})"
         assert await act("look") == f"[({key}, '/app/top/far', {{'n': [1, 2]}})]"
         assert await act("taken") == "near is /app/near"
@@ -292,9 +292,9 @@ async def test_actors_in_other_processes_hold_keys_like_any_other(where: str) ->
 
 async def test_a_registry_inside_a_process_serves_those_outside() -> None:
     async with hf.ActorSystem(log=False) as system:
-        children = [hf.registry("names"), hf.child("in", hf.start(Far))]
+        children = [hf.supervision.registry("names"), hf.child("in", hf.start(Far))]
         await system.start(hf.supervisor("top", children=children, isolation="process"))
-        names = hf.Registry[Any, Any](system.ref("/app/top/names", hf.RegistryActor))
+        names = hf.supervision.Registry[Any, Any](system.ref("/app/top/names", hf.supervision.RegistryActor))
         inner, outer = system.ref("/app/top/in", Far), system.spawn(hf.start(Holder), "outer")
         await inner.ask(Act(names.ref.path, "register"))
         await by(outer, lambda: names.register("o", 1))

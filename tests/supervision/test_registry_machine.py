@@ -29,7 +29,9 @@ class RegistryMachine(RuleBasedStateMachine):
     async def _begin(self, keys: Any) -> None:
         self.system = await hf.ActorSystem(log=False, intensity=999).__aenter__()
         self.system._body = None  # It is left in another task than it was entered in.
-        self.names: hf.Registry[Any, int] = hf.Registry(await self.system.start(hf.registry("names", keys=keys)))
+        self.names: hf.supervision.Registry[Any, int] = hf.supervision.Registry(
+            await self.system.start(hf.supervision.registry("names", keys=keys))
+        )
         self.holders = {name: await self.system.start(hf.child(name, hf.start(Holder))) for name in "abc"}
 
     def teardown(self) -> None:
@@ -49,8 +51,8 @@ class RegistryMachine(RuleBasedStateMachine):
         has_it = [name for k, name, _ in self.model if k == known]
         try:
             self.by(holder, lambda: self.names.register(key, value))
-        except hf.AlreadyRegistered as no:
-            refusal: hf.AlreadyRegistered | None = no
+        except hf.errors.AlreadyRegistered as no:
+            refusal: hf.errors.AlreadyRegistered | None = no
         else:
             refusal = None
             self.model.append((known, holder, value))

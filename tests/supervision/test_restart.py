@@ -122,9 +122,9 @@ async def test_refs_stay_good_over_restarts_of_the_supervisor_too() -> None:
         await system.start(hf.supervisor("top", intensity=0, children=[fragile(plan)]))
         ref = system.ref("/app/top/fragile", Fragile)
         ref.tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
         while plan.starts < 2:
-            await system.node.settled()
+            await system._node.settled()
         assert await ref.ask(Note(1)) == 1  # a new child of a new supervisor, at the same address
 
 
@@ -190,7 +190,7 @@ async def test_every_attempt_counts_and_endless_failure_ends(where: Where) -> No
                 await ref.ask(Note())
             assert [event.address for event in events.take() if isinstance(event, SupervisorGaveUp)] == ["/app/top"]
         assert plan.starts == 1 + 2
-        await system.node.settled()
+        await system._node.settled()
         assert top.path not in system.tree()
 
 
@@ -199,11 +199,11 @@ async def test_the_supervisor_answers_between_two_attempts() -> None:
     plan = Plan()
     async with hf.ActorSystem(log=False) as system:
         top = await system.start(hf.supervisor("top", intensity=100, children=[fragile(plan)]))
-        outside, asked = contextvars.copy_context(), list[asyncio.Future[list[hf.ChildInfo]]]()
+        outside, asked = contextvars.copy_context(), list[asyncio.Future[list[hf.supervision.ChildInfo]]]()
         plan.before_failure = lambda: asked.append(outside.run(top.ask, WhichChildren()))
         plan.failures = 3
         system.ref("/app/top/fragile", Fragile).tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
         assert [[info.state for info in await answer] for answer in asked] == [["restarting"]] * 3
         assert await states(system) == {"fragile": "running"}
 
@@ -218,7 +218,7 @@ async def test_one_for_all_starts_everything_again_after_a_failed_attempt() -> N
         log.clear()
         plans["b"].failures = 1
         system.ref("/app/top/a", Telling).tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
         assert " ".join(log) == "-a -c -b +a -a +a +b +c"
         assert await states(system) == dict.fromkeys("abc", "running")
 
@@ -233,7 +233,7 @@ async def test_rest_for_one_goes_on_at_the_child_that_failed() -> None:
         log.clear()
         plans["b"].failures = 1
         system.ref("/app/top/a", Telling).tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
         assert " ".join(log) == "-a -c -b +a +b +c"
 
 
@@ -390,7 +390,7 @@ async def test_the_product_of_the_intensities_is_what_the_root_bears() -> None:
             for crashes in range(1, 4):
                 ref.tell(Boom())
                 while plan.starts == crashes:
-                    await system.node.settled()
+                    await system._node.settled()
                 assert await ref.ask(Note()) in (1, 2)
             ref.tell(Boom())
             await asyncio.Event().wait()
@@ -407,7 +407,7 @@ async def test_a_retry_is_void_after_terminate_child() -> None:
     async with hf.ActorSystem(log=False) as system:
         top = await system.start(hf.supervisor("top", children=[fragile(plan, backoff=slow)]))
         system.ref("/app/top/fragile", Fragile).tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
         assert await states(system) == {"fragile": "restarting"}
         await top.ask(TerminateChild("fragile"))
         assert await states(system) == {"fragile": "stopped"}
@@ -444,7 +444,7 @@ async def test_queued_asks_fail_when_the_child_they_wait_for_is_terminated() -> 
         ref = system.ref("/app/top/fragile", Fragile)
         ref.tell(Boom())
         waiting = ref.ask(Note(), timeout=60.0)
-        await system.node.settled()
+        await system._node.settled()
         await top.ask(TerminateChild("fragile"))
         with pytest.raises(hf.ActorStopped, match="the message was not handled"):
             await waiting

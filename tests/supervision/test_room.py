@@ -112,8 +112,8 @@ class Echo(Writer, Listener):
 async def test_a_pool_of_bounded_workers_loses_nothing(isolation: Any, recovery: Any) -> None:
     async with hf.ActorSystem("app", log=False) as system:
         worker = hf.child(None, hf.start(Reader), isolation=isolation, recovery=recovery, mailbox=hf.bounded(2))
-        await system.start(hf.pool("w", worker, 2, mailbox=hf.bounded(2)))
-        pool = hf.pool_of(system, "/app/w", Reader)
+        await system.start(hf.supervision.pool("w", worker, 2, mailbox=hf.bounded(2)))
+        pool = hf.supervision.pool_of(system, "/app/w", Reader)
         for n in range(40):
             await asyncio.wait_for(pool.send(Item(n)), 60)
         taken: list[int] = []
@@ -126,7 +126,7 @@ async def test_a_pool_of_bounded_workers_loses_nothing(isolation: Any, recovery:
 async def test_a_pool_in_a_process_of_its_own_loses_nothing_whose_homes_are_at_the_root() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         worker = hf.child(None, hf.start(Reader), recovery=hf.hybrid(), mailbox=hf.bounded(2))
-        pool = hf.pool("w", worker, 2, mailbox=hf.bounded(2))
+        pool = hf.supervision.pool("w", worker, 2, mailbox=hf.bounded(2))
         await system.start(hf.supervisor("apart", children=[pool], isolation="process"))
         router = system.ref("/app/apart/w/router", hf.Actor)
         workers = [system.ref(f"/app/apart/w/{at}", Reader) for at in (0, 1)]
@@ -134,7 +134,7 @@ async def test_a_pool_in_a_process_of_its_own_loses_nothing_whose_homes_are_at_t
             await system.suspend(one)
         sends = [asyncio.ensure_future(router.send(Item(n))) for n in range(60)]
         for _ in range(20):
-            await system.ref("/app/apart/w", hf.PoolSupervisor).ask(hf.PoolInfo(), 60)
+            await system.ref("/app/apart/w", hf.supervision.PoolSupervisor).ask(hf.supervision.PoolInfo(), 60)
         assert sum(send.done() for send in sends) < 20, "2 wait at each of three, 2 are on the way to each worker"
         assert system.dead_letters == 0
         for one in workers:
@@ -151,8 +151,8 @@ async def test_a_pool_in_a_process_of_its_own_loses_nothing_whose_homes_are_at_t
 async def test_least_loaded_knows_who_has_messages(isolation: Any, recovery: Any, mailbox: Any) -> None:
     async with hf.ActorSystem("app", log=False) as system:
         worker = hf.child(None, hf.start(Reader), isolation=isolation, recovery=recovery, mailbox=mailbox)
-        await system.start(hf.pool("w", worker, 2, routing="least_loaded"))
-        pool = hf.pool_of(system, "/app/w", Reader)
+        await system.start(hf.supervision.pool("w", worker, 2, routing="least_loaded"))
+        pool = hf.supervision.pool_of(system, "/app/w", Reader)
         for busy in ("0", "1"):
             one = system.ref(f"/app/w/{busy}", Reader)
             await system.suspend(one)
@@ -220,7 +220,7 @@ async def test_one_full_subscriber_holds_back_the_publisher_and_no_other_subscri
             published = (await system.start(spec)).ask(Publish(1, 2), 60)
         while await other.ask(Taken(), 60) != [1]:
             assert not published.done(), "the others are full"
-        system.node.topics.unsubscribe(TOPIC, leaving._cell)
+        system._node.topics.unsubscribe(TOPIC, leaving._cell)
         for reader in (leaving, full):
             assert not published.done(), "it waits for who is full"
             await system.resume(reader)
@@ -248,7 +248,7 @@ async def test_who_is_full_of_its_own_messages_does_not_wait_for_itself(
             ref = system.ref("/app/echo" if below is None else "/app/below/echo", Echo)
             assert await ref.ask(Publish(0, 9), 60) == 9
             taken = [*await ref.ask(Taken(), 60)]
-            lost = [event.message.n for event in events.take() if isinstance(event, hf.DeadLetter)]
+            lost = [event.message.n for event in events.take() if isinstance(event, hf.events.DeadLetter)]
             assert taken + lost == list(range(9))
             assert bool(lost) == (recovery is None), "a recorded actor has room for what it says itself"
             assert await other.ask(Taken(), 60) == list(range(9))
@@ -329,7 +329,7 @@ async def test_what_a_full_mailbox_refuses_is_told_as_the_message_it_was(
             else:
                 await told
                 async for event in events:
-                    if isinstance(event, hf.DeadLetter):
+                    if isinstance(event, hf.events.DeadLetter):
                         assert (event.address, event.message) == ("/app/full", Item(5))
                         assert "is full" in event.why
                         break

@@ -106,7 +106,7 @@ async def test_escalation_hands_the_reason_up_where_rules_can_meet_it() -> None:
         with system.events() as events:
             system.ref("/app/top/inner/leaf", Kid).tell(Boom())
             assert await family.rest() == "-leaf -b +leaf +b"
-            restarted = [event for event in events.take() if isinstance(event, hf.ChildRestarted)]
+            restarted = [event for event in events.take() if isinstance(event, hf.events.ChildRestarted)]
         assert [(event.address, str(event.reason)) for event in restarted] == [("/app/top/inner", "ValueError: boom")]
 
 

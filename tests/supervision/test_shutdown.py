@@ -200,7 +200,7 @@ async def test_a_supervisor_that_is_killed_takes_its_children_with_it_without_ho
         top = hf.supervisor("top", restart="temporary", children=[worker(log, id="a"), worker(log, id="b")])
         ref = await system.start(top)
         ref.kill()
-        await system.node.settled()
+        await system._node.settled()
         assert system.tree() == ["/app"]
     assert log == []
 
@@ -211,7 +211,7 @@ async def test_on_stop_hears_the_reason_an_actor_gave_itself(reason: hf.ExitReas
     async with hf.ActorSystem(log=False) as system:
         ref = await system.start(worker(log, restart="temporary"))
         ref.tell(Quit(reason))
-        await system.node.settled()
+        await system._node.settled()
         assert log == [f"worker stops: {reason}", "worker has stopped"]
 
 
@@ -220,7 +220,7 @@ async def test_on_stop_hears_of_a_crash() -> None:
     async with hf.ActorSystem(log=False) as system:
         ref = await system.start(worker(log, restart="temporary"))
         ref.tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
         assert log == ["worker stops: ValueError: boom", "worker has stopped"]
 
 

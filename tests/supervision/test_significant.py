@@ -46,16 +46,16 @@ async def test_the_same_holds_for_children_that_are_added() -> None:
 
 async def test_check_children_checks_what_it_is_told() -> None:
     child = significant(Plan(), "a")
-    hf.check_children([child])
-    hf.check_children([child], "all_significant")
+    hf.supervision.check_children([child])
+    hf.supervision.check_children([child], "all_significant")
     with pytest.raises(hf.SpecError, match="significant, but"):
-        hf.check_children([child], "never")
+        hf.supervision.check_children([child], "never")
     with pytest.raises(hf.SpecError, match="two children have the id 'a'"):
-        hf.check_children([child, child])
+        hf.supervision.check_children([child, child])
     with pytest.raises(hf.SpecError, match="children must be a list"):
-        hf.check_children(7)  # type: ignore[arg-type]
+        hf.supervision.check_children(7)  # type: ignore[arg-type]
     with pytest.raises(hf.SpecError, match="auto_shutdown must be one of"):
-        hf.check_children([], "sometimes")  # type: ignore[arg-type]
+        hf.supervision.check_children([], "sometimes")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("value", ["sometimes", None, True])
@@ -95,7 +95,7 @@ async def test_an_end_by_itself_without_a_restart_is_a_trigger(
                 restart="temporary",
             )
             told = await family.after("b", message)
-            auto_shutdowns = [event.child for event in events.take() if isinstance(event, hf.AutoShutdown)]
+            auto_shutdowns = [event.child for event in events.take() if isinstance(event, hf.events.AutoShutdown)]
         assert family.is_alive is not ends
         assert told == ("-b -c -a" if ends else "-b +b")
         assert auto_shutdowns == (["b"] if ends else [])
@@ -210,6 +210,6 @@ async def test_changing_auto_shutdown_holds_for_the_children_there_are() -> None
         family = await Family.start(
             system, plan, significant(plan, "a"), significant(plan, "b"), auto_shutdown=ALL, restart="temporary"
         )
-        await family.top.ask(hf.ChangeSupervisor(hf.Flags(auto_shutdown="any_significant")))
+        await family.top.ask(hf.supervision.ChangeSupervisor(hf.supervision.Flags(auto_shutdown="any_significant")))
         await family.after("a", Leave())
         assert not family.is_alive

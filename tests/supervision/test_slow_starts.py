@@ -108,8 +108,8 @@ async def test_a_supervisor_answers_while_a_child_starts(how: str) -> None:
         above = system.ref(path, hf.Supervisor)
         other = await above.ask(hf.StartChild(hf.child("other", hf.start(hf.Actor))))
         assert other.path == f"{path}/other"
-        assert isinstance(await refused(above.ask(hf.StartChild(slow(gate)))), hf.AlreadyPresent)
-        assert isinstance(await refused(above.ask(hf.RestartChild("slow"))), hf.ChildBusy)
+        assert isinstance(await refused(above.ask(hf.StartChild(slow(gate)))), hf.errors.AlreadyPresent)
+        assert isinstance(await refused(above.ask(hf.RestartChild("slow"))), hf.errors.ChildBusy)
         assert not start.done()
         gate.set()
         assert (await start).path in (f"{path}/slow", "/app/top")
@@ -150,7 +150,7 @@ async def test_a_supervisor_escalates_while_a_child_starts(how: str) -> None:
         with system.events() as events:
             system.ref("/app/top/first", hf.Actor).kill()
             error = await refused(start)
-            gave_up = [one for one in events.take() if isinstance(one, hf.SupervisorGaveUp)]
+            gave_up = [one for one in events.take() if isinstance(one, hf.events.SupervisorGaveUp)]
         assert isinstance(error, hf.AskFailed if how == "StartChild" else hf.StartFailed)
         assert [one.address for one in gave_up] == ["/app/top"]
         if how == "StartChild":
@@ -312,8 +312,8 @@ async def test_a_restart_that_takes_too_long_is_tried_again_and_counts() -> None
             await asyncio.sleep(50.0)
             told = events.take()
         assert await states(system, "/app/top") == {"a": "running"}
-        assert [event.attempt for event in told if isinstance(event, hf.ChildRestarted)] == [1, 2, 3]
-        assert sum(isinstance(event, hf.ChildStartFailed) for event in told) == 2
+        assert [event.attempt for event in told if isinstance(event, hf.events.ChildRestarted)] == [1, 2, 3]
+        assert sum(isinstance(event, hf.events.ChildStartFailed) for event in told) == 2
 
 
 @virtual
@@ -372,7 +372,7 @@ async def test_a_replay_is_limited_by_its_progress(hangs: bool) -> None:
                 await asyncio.sleep(0.1)
             while (await states(system, ref.path))["a"] != "running":
                 await asyncio.sleep(0.1)
-            failed = [event.reason for event in events.take() if isinstance(event, hf.ChildStartFailed)]
+            failed = [event.reason for event in events.take() if isinstance(event, hf.events.ChildStartFailed)]
         assert failed == (["it came no step further within 20 s (start_timeout)"] if hangs else [])
 
 
@@ -390,7 +390,7 @@ async def test_the_pauses_of_a_paced_replay_are_not_counted() -> None:
             await asyncio.sleep(1000.0)
             told = events.take()
         assert await states(system, "/app/top") == {"a": "running"}
-        assert not [event for event in told if isinstance(event, hf.ChildStartFailed)]
+        assert not [event for event in told if isinstance(event, hf.events.ChildStartFailed)]
 
 
 # -- it blocks ------------------------------------------------------------------------------------------------------

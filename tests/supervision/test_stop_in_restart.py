@@ -40,7 +40,7 @@ async def test_a_child_that_is_stopped_stays_so_whenever_its_group_is_restarted(
             children = [hf.child(one, hf.start(kind)) for one, kind in names.items()]
             top = await system.start(hf.supervisor("top", strategy=strategy, intensity=99, children=children))
             crashing = "a" if name != "a" else "late"
-            found = system.node.find(f"/app/top/{name}")
+            found = system._node.find(f"/app/top/{name}")
             assert found is not None
             if first == "crash":
                 system.ref(f"/app/top/{crashing}", hf.Actor).tell(Boom())
@@ -53,4 +53,4 @@ async def test_a_child_that_is_stopped_stays_so_whenever_its_group_is_restarted(
                 await stopping
             await asyncio.sleep(1.0)
             assert [info.id for info in await top.ask(hf.WhichChildren())] == [one for one in names if one != name]
-            assert system.node.find(f"/app/top/{name}") is None
+            assert system._node.find(f"/app/top/{name}") is None

@@ -69,7 +69,7 @@ class Family:
         """What was started and stopped because of a message to one child."""
         self.log.clear()
         self.ref(name).tell(message)
-        await self.system.node.settled()
+        await self.system._node.settled()
         return " ".join(self.log)
 
     async def after_kill(self, *names: str) -> str:
@@ -77,7 +77,7 @@ class Family:
         self.log.clear()
         for name in names:
             self.ref(name).kill()
-        await self.system.node.settled()
+        await self.system._node.settled()
         return " ".join(self.log)
 
     async def states(self) -> dict[str, str]:

@@ -47,7 +47,7 @@ async def test_a_job_in_a_process_of_its_own() -> None:
         assert isinstance(crash, hf.RemoteCrash)
         assert (crash.type_name, crash.text) == ("ValueError", "far")
         assert await refused(jobs.run(refuse, isolation="process")) == Short(by=3)
-        assert isinstance(await refused(jobs.run(say_nothing, isolation="process")), hf.BadMessage)
+        assert isinstance(await refused(jobs.run(say_nothing, isolation="process")), hf.errors.BadMessage)
         assert isinstance(await refused(jobs.run(die, 3, isolation="process")), hf.AskFailed)
         assert await jobs.children() == []
 
@@ -86,10 +86,10 @@ class Far(hf.Actor):
     async def ask(self, message: Ask) -> str:
         there = "nothing"
         try:
-            await hf.Tasks(message.at).run(pid_later)  # type: ignore[arg-type]
+            await hf.supervision.Tasks(message.at).run(pid_later)  # type: ignore[arg-type]
         except hf.SpecError as error:
             there = str(error)
-        own = hf.Tasks(self.ctx.spawn(hf.tasks("jobs").start, "jobs"))
+        own = hf.supervision.Tasks(self.ctx.spawn(hf.supervision.tasks("jobs").start, "jobs"))
         same = await own.run(pid_later) == os.getpid()
         return f"{same} {there}"
 

@@ -41,8 +41,8 @@ class Load:
         return n
 
 
-async def values(results: AsyncIterator[hf.Ok[Any, Any] | hf.Failed[Any]]) -> list[Any]:
-    return [result.value if isinstance(result, hf.Ok) else str(result.error) async for result in results]
+async def values(results: AsyncIterator[hf.supervision.Ok[Any, Any] | hf.supervision.Failed[Any]]) -> list[Any]:
+    return [result.value if isinstance(result, hf.supervision.Ok) else str(result.error) async for result in results]
 
 
 @virtual
@@ -72,8 +72,13 @@ async def test_each_result_says_what_it_was_given_and_failures_stop_nothing() ->
     async with opened() as (_, jobs):
         results = [result async for result in jobs.stream(Load().fail_odd, range(4), max_concurrency=2)]
         assert [result.item for result in results] == [0, 1, 2, 3]
-        assert [type(result) for result in results] == [hf.Ok, hf.Failed, hf.Ok, hf.Failed]
-        assert [str(result.error) for result in results if isinstance(result, hf.Failed)] == [
+        assert [type(result) for result in results] == [
+            hf.supervision.Ok,
+            hf.supervision.Failed,
+            hf.supervision.Ok,
+            hf.supervision.Failed,
+        ]
+        assert [str(result.error) for result in results if isinstance(result, hf.supervision.Failed)] == [
             "ValueError: 1 is odd",
             "ValueError: 3 is odd",
         ]
@@ -109,7 +114,7 @@ async def test_the_source_is_pulled_only_as_fast_as_results_are_taken(kind: str)
         taken = 0
         async with contextlib.aclosing(jobs.stream(add, source, max_concurrency=3)) as results:
             async for result in results:
-                assert result == hf.Ok(taken, taken + 1)
+                assert result == hf.supervision.Ok(taken, taken + 1)
                 taken += 1
                 await idle(system)
                 assert pulled <= taken + 3
@@ -191,7 +196,7 @@ async def test_a_stream_wider_than_the_supervisor_allows_is_refused() -> None:
     async with opened(max_children=2) as (_, jobs):
         gate = Gate()
         error = await refused(values(jobs.stream(gate, [1, 2, 3], max_concurrency=3)))
-        assert error == hf.MaxChildren(2)
+        assert error == hf.errors.MaxChildren(2)
         assert await jobs.children() == []
         assert await values(jobs.stream(add, range(9), max_concurrency=2)) == list(range(1, 10))
 

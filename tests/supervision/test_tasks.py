@@ -27,8 +27,8 @@ class Caller(hf.Actor):
     async def do(self, message: Do) -> Any:
         return await message.work()
 
-    @hf.on(hf.KeyFreed)
-    def unused(self, message: hf.KeyFreed) -> None: ...
+    @hf.on(hf.supervision.KeyFreed)
+    def unused(self, message: hf.supervision.KeyFreed) -> None: ...
 
 
 class Short(hf.Refusal):
@@ -54,9 +54,9 @@ class Gate:
 
 
 @asynccontextmanager
-async def opened(**options: Any) -> AsyncGenerator[tuple[hf.ActorSystem, hf.Tasks], None]:
+async def opened(**options: Any) -> AsyncGenerator[tuple[hf.ActorSystem, hf.supervision.Tasks], None]:
     async with hf.ActorSystem(log=False, intensity=9) as system:
-        yield system, hf.Tasks(await system.start(hf.tasks("jobs", **options)))
+        yield system, hf.supervision.Tasks(await system.start(hf.supervision.tasks("jobs", **options)))
 
 
 async def add(a: int, b: int = 1) -> int:
@@ -94,7 +94,7 @@ async def test_a_plain_function_may_block_and_sees_its_own_actor() -> None:
         caller = system.spawn(hf.start(Caller), "caller")
 
         def block() -> int:
-            caller.tell(hf.KeyFreed(caller, "k", caller, False))
+            caller.tell(hf.supervision.KeyFreed(caller, "k", caller, False))
             return threading.get_ident()
 
         assert await jobs.run(block) != threading.get_ident()
@@ -204,9 +204,9 @@ async def test_jobs_are_children_named_by_their_function() -> None:
             ("Gate-3", "running"),
         ]
         assert [ref.path for ref in await jobs.children()] == [*(job.path for job in started), spawned.path]
-        assert await jobs.ref.ask(hf.CountChildren()) == hf.ChildCounts(3, 3, 0, 3)
+        assert await jobs.ref.ask(hf.supervision.CountChildren()) == hf.supervision.ChildCounts(3, 3, 0, 3)
         gate.open.set()
-        assert [await job.outcome() for job in started] == [hf.Ok(None, None)] * 2
+        assert [await job.outcome() for job in started] == [hf.supervision.Ok(None, None)] * 2
 
 
 async def test_no_more_than_max_children_and_a_place_is_free_when_run_returns() -> None:
@@ -216,7 +216,7 @@ async def test_no_more_than_max_children_and_a_place_is_free_when_run_returns() 
         await gate.begun.wait()
         refusals = [jobs.run(add, 1), jobs.spawn(add, 1), jobs.stream(add, [1]).__anext__()]
         for call in refusals:
-            assert await refused(call) == hf.MaxChildren(1)
+            assert await refused(call) == hf.errors.MaxChildren(1)
         gate.open.set()
         await job
         for n in range(20):
@@ -270,14 +270,14 @@ async def test_a_started_job_is_awaited_as_often_as_one_likes() -> None:
         await gate.begun.wait()
         waiting.cancel()
         gate.open.set()
-        assert [await job, await job, await job.outcome()] == [7, 7, hf.Ok(None, 7)]
+        assert [await job, await job, await job.outcome()] == [7, 7, hf.supervision.Ok(None, 7)]
         assert (job.is_done, gate.log) == (True, []), "the cancelled wait did not end it"
         outcome = await failing.outcome()
-        assert isinstance(outcome, hf.Failed)
+        assert isinstance(outcome, hf.supervision.Failed)
         assert str(outcome.error) == "ValueError: no"
 
 
-async def _await(job: hf.Job[Any]) -> Any:
+async def _await(job: hf.supervision.Job[Any]) -> Any:
     return await job
 
 
@@ -294,7 +294,7 @@ async def test_shutdown_is_a_ladder() -> None:
         for job, shutdown in zip(handles, (5.0, 3.0, "brutal_kill"), strict=True):
             begun = loop.time()
             outcome = await job.stop(shutdown)  # type: ignore[arg-type]
-            assert isinstance(outcome, hf.Failed)
+            assert isinstance(outcome, hf.supervision.Failed)
             assert isinstance(outcome.error, hf.AskFailed)
             times.append(loop.time() - begun)
             reasons.append(outcome.error.reason)
@@ -306,7 +306,7 @@ async def test_stopping_a_job_that_is_over_gives_its_result() -> None:
     async with opened() as (_, jobs):
         job = jobs.start(add, 1)
         await job
-        assert await job.stop() == hf.Ok(None, 2)
+        assert await job.stop() == hf.supervision.Ok(None, 2)
         job.cancel()
         job.kill()
         assert await job == 2
@@ -329,8 +329,8 @@ async def test_outcomes_of_many() -> None:
         gate = Gate()
         many = [jobs.start(add, 1), jobs.start(fail, "no"), jobs.start(gate)]
         first, second, third = await jobs.outcomes(many, 2.0)
-        assert (first, third) == (hf.Ok(None, 2), None)
-        assert isinstance(second, hf.Failed)
+        assert (first, third) == (hf.supervision.Ok(None, 2), None)
+        assert isinstance(second, hf.supervision.Failed)
         assert (await jobs.outcomes([]), not many[2].is_done) == ([], True)
         assert (await jobs.outcomes(many, 1.0, on_timeout="kill_task"))[2] is None
         assert isinstance(await refused(many[2]), hf.AskFailed)
@@ -455,7 +455,7 @@ async def test_what_cannot_be_a_job_is_refused_by_name() -> None:
         with pytest.raises(hf.SpecError, match="max_concurrency must be"):
             jobs.stream(add, [1], max_concurrency=0)
     with pytest.raises(hf.SpecError, match="tasks 'jobs': max_children"):
-        hf.tasks("jobs", max_children=-1)
+        hf.supervision.tasks("jobs", max_children=-1)
 
 
 async def test_results_have_the_functions_type() -> None:
@@ -463,10 +463,10 @@ async def test_results_have_the_functions_type() -> None:
     async with opened() as (_, jobs):
         assert_type(await jobs.run(add, 1), int)
         assert_type(await jobs.run(add_slowly, 1, 2, timeout=9.0), int)
-        assert_type(jobs.start(refuse), hf.Job[int])
+        assert_type(jobs.start(refuse), hf.supervision.Job[int])
         async for result in jobs.stream(str, [1]):
-            assert_type(result, hf.Ok[int, str] | hf.Failed[int])
-            assert result == hf.Ok(1, "1")
+            assert_type(result, hf.supervision.Ok[int, str] | hf.supervision.Failed[int])
+            assert result == hf.supervision.Ok(1, "1")
 
 
 # -- what would end the program -------------------------------------------------------------------------------------
@@ -486,7 +486,7 @@ def leave_it_from_a_thread(how: str) -> None:
 @pytest.mark.parametrize("isolation", ["task", "process"])
 async def test_a_job_that_would_end_the_program_ends_itself(how: str, job: Any, isolation: Any) -> None:
     async with hf.ActorSystem(log=False) as system:
-        jobs = hf.Tasks(await system.start(hf.tasks("jobs")))
+        jobs = hf.supervision.Tasks(await system.start(hf.supervision.tasks("jobs")))
         with pytest.raises(hf.RemoteCrash, match=how):
             await jobs.run(job, how, isolation=isolation)
         task = asyncio.current_task()
@@ -506,7 +506,7 @@ async def test_so_does_background_work_of_an_actor(how: str) -> None:
         ref = await system.start(hf.child("works", hf.start(Works)))
         with system.events() as events:
             ref.tell(Begin())
-            while not (told := [event for event in events.take() if isinstance(event, hf.ActorCrashed)]):
+            while not (told := [event for event in events.take() if isinstance(event, hf.events.ActorCrashed)]):
                 await asyncio.sleep(0)
         assert [how in str(event.reason) for event in told] == [True]
         assert await ref.ask(Do(functools.partial(asyncio.sleep, 0, "again"))) == "again"

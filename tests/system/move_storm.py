@@ -227,7 +227,7 @@ class Storm:
     def _seconds(self) -> float:
         return self.chance.choice((2.0, 10.0))
 
-    async def _change(self, collect: Callable[[hf.Change], None], seconds: float) -> None:
+    async def _change(self, collect: Callable[[hf.system.Change], None], seconds: float) -> None:
         async with self._system.transaction(timeout=seconds) as change:
             collect(change)
 
@@ -252,13 +252,13 @@ class Storm:
         await self._change(lambda change: change.protect(book.ref, mechanism), self._seconds)
 
     async def detach(self, book: Known) -> None:
-        await self._change(lambda change: change.detach(book.ref), self._seconds)
+        await self._change(lambda change: change.protect(book.ref, None), self._seconds)
 
     async def give_up(self, book: Known) -> None:
         """A transaction that has hardly any time."""
         to = self.chance.choice([*SUPERVISORS])
         isolation: Any = self.chance.choice(("task", "process"))
-        collect: Callable[[hf.Change], None] = self.chance.choice(
+        collect: Callable[[hf.system.Change], None] = self.chance.choice(
             (
                 lambda change: change.move(book.ref, f"/app/{to}"),
                 lambda change: change.move(self.team, f"/app/{to}"),
@@ -276,7 +276,7 @@ class Storm:
     async def suspend(self, book: Known) -> None:
         await self._system.suspend(book.ref)
         await asyncio.sleep(self.chance.choice((0.0, 0.01, 0.1)))
-        with contextlib.suppress(hf.NotSuspended):
+        with contextlib.suppress(hf.errors.NotSuspended):
             await self._system.resume(book.ref)
 
     async def crash(self, book: Known) -> None:

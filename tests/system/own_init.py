@@ -45,7 +45,7 @@ class Owner(hf.Actor):
     def kill(self, message: Kill) -> str:
         try:
             self.port.kill()
-        except hf.NotGranted as error:
+        except hf.errors.NotGranted as error:
             return str(error)
         return ""
 
@@ -75,6 +75,6 @@ def options(kind: str) -> dict[str, Any]:
     known: dict[str, dict[str, Any]] = {
         "plain": {},
         "recorded": {"recovery": hf.hybrid(interval=3600.0)},
-        "protected": {"mechanism": hf.PBR()},
+        "protected": {"mechanism": hf.ftm.PBR()},
     }
     return known[kind]

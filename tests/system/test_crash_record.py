@@ -45,7 +45,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "process": {"isolation": "process"},
     "recorded task": {"recovery": hf.hybrid()},
     "recorded process": {"isolation": "process", "recovery": hf.hybrid()},
-    "replica": {"mechanism": hf.PBR()},
+    "replica": {"mechanism": hf.ftm.PBR()},
 }
 
 

@@ -2,6 +2,8 @@
 
 import asyncio
 import logging
+import subprocess
+import sys
 from collections.abc import Iterator, MutableMapping
 from typing import Any
 
@@ -80,7 +82,7 @@ async def test_each_crash_has_one_record_and_it_counts_the_restarts(records: lis
         fragile = system.ref("/app/top/x", Fragile)
         for _ in range(2):
             fragile.tell(Boom())
-            await system.node.settled()
+            await system._node.settled()
     crashes = of(records, "actor crashed")
     assert [(crash["restarts"], crash["allowed"]) for crash in crashes] == [(0, 1), (1, 1)]
     assert ["exception" in record for record in records] == [True, True, False]
@@ -90,7 +92,7 @@ async def test_each_crash_has_one_record_and_it_counts_the_restarts(records: lis
 async def test_a_crash_that_no_supervisor_sees_is_logged_all_the_same(records: list[Record]) -> None:
     async with hf.ActorSystem() as system:
         system.spawn(hf.start(Fragile), "alone").tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
         await asyncio.sleep(2.0)  # of the virtual clock
         (crash,) = records
     assert (crash["event"], crash["address"]) == ("actor crashed", "/app/alone")
@@ -155,12 +157,39 @@ async def test_standard_logging_gets_the_record_where_structlog_is_not_set_up(st
     assert vars(record)["holdfast"]["restarts"] == 0
 
 
+async def test_a_program_that_has_set_up_nothing_gets_its_log_on_stderr() -> None:
+    program = """
+import asyncio, holdfast as hf
+
+class Boom(hf.Message): ...
+
+class Fragile(hf.Actor):
+    @hf.on(Boom)
+    def boom(self, message): raise ValueError("boom")
+
+async def main():
+    async with hf.ActorSystem("app") as system:
+        ref = await system.start(hf.child("one", hf.start(Fragile)))
+        with system.events() as events:
+            ref.tell(Boom())
+            async for event in events:
+                if isinstance(event, hf.events.ChildRestarted): break
+    print("done")
+
+asyncio.run(main())
+"""
+    argv = [sys.executable, "-c", program]
+    done = subprocess.run(argv, check=False, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (0, "done\n")
+    assert "actor crashed" in done.stderr
+
+
 async def test_standard_logging_decides_which_levels_are_seen(standard: FromStandard) -> None:
     logging.getLogger("holdfast").setLevel(logging.CRITICAL)
     try:
         async with hf.ActorSystem() as system:
             system.spawn(hf.start(Fragile), "fragile").tell(Boom())
-            await system.node.settled()
+            await system._node.settled()
     finally:
         logging.getLogger("holdfast").setLevel(logging.NOTSET)
     assert standard.records == []
@@ -171,7 +200,7 @@ async def test_a_supervisor_that_gives_up_is_logged_as_an_error(records: list[Re
         top = hf.supervisor("top", intensity=0, restart="temporary", children=[hf.child("x", hf.start(Fragile))])
         await system.start(top)
         system.ref("/app/top/x", Fragile).tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
     (gave_up,) = of(records, "supervisor gave up")
     assert (gave_up["log_level"], gave_up["address"], gave_up["child"]) == ("error", "/app/top", "x")
 
@@ -212,12 +241,12 @@ async def test_a_flood_of_one_kind_hides_no_other(records: list[Record]) -> None
         for _ in range(100):
             gone.tell(Boom())
         system.spawn(hf.start(Fragile), "late").tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
     assert [crash["address"] for crash in of(records, "actor crashed")] == ["/app/late"]
 
 
 async def test_log_false_is_silent(records: list[Record]) -> None:
     async with hf.ActorSystem(log=False) as system:
         system.spawn(hf.start(Fragile)).tell(Boom())
-        await system.node.settled()
+        await system._node.settled()
     assert records == []

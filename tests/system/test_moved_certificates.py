@@ -13,7 +13,7 @@ import pytest
 import holdfast as hf
 from holdfast.ftm.bricks.sealed_frames import Greet, Refused, Sealed
 from holdfast.ftm.mechanisms.sec import SEC
-from holdfast.ftm.sec.authority import Enrol, GetCertificate, GetRevocations, GetRoot, Revoke
+from holdfast.ftm.sec.authority import CertificationAuthority, Enrol, GetCertificate, GetRevocations, GetRoot, Revoke
 from holdfast.ftm.sec.certificates import Trust, about, make_request
 from holdfast.ftm.sec.handshake import Participant
 from holdfast.ftm.sec.keys import SigningKey
@@ -45,8 +45,8 @@ CA = "/app/ca"
 PARTS = ("proxy", "r1", "r2")
 
 
-def authority(system: hf.ActorSystem) -> hf.ActorRef[hf.CertificationAuthority]:
-    return system.ref(CA, hf.CertificationAuthority)
+def authority(system: hf.ActorSystem) -> hf.ActorRef[CertificationAuthority]:
+    return system.ref(CA, CertificationAuthority)
 
 
 async def certificates(system: hf.ActorSystem, address: str) -> dict[str, bytes]:
@@ -67,7 +67,7 @@ async def party(system: hf.ActorSystem, path: str, certificate: bytes) -> Partic
 
 async def greeted(system: hf.ActorSystem, of: Participant, at: str) -> str:
     """Why a greeting is refused; "" if it is not."""
-    ref = system.node.cell_at(f"{at}/protocol").ref
+    ref = system._node.cell_at(f"{at}/protocol").ref
     try:
         await ref.ask(Greet(of.begin(at).hello), IN_TIME)
     except Refused as no:
@@ -116,7 +116,7 @@ async def test_an_old_certificate_opens_nothing_any_more(part: str) -> None:
         await moved(system)
         assert await one.ask(Add(), IN_TIME) == 1
         assert await greeted(system, mallory, f"{THERE}/ftm/r1") == "revoked"
-        child = hf.child("one", hf.start(Resident), mechanism=(SEC(CA), hf.PBR()))
+        child = hf.child("one", hf.start(Resident), mechanism=(SEC(CA), hf.ftm.PBR()))
         async with system.transaction(timeout=IN_TIME) as change:
             change.add("/app/here", child)
         other = system.ref("/app/here/one", Resident)
@@ -165,7 +165,7 @@ async def test_what_was_sealed_before_the_move_is_refused_behind_it(monkeypatch:
         for path in (f"{THERE}/ftm/r1", f"{THERE}/ftm/r2"):
             for frame in recorded:
                 with pytest.raises(Refused, match=r"wrong_session|stale|plain"):
-                    await system.node.cell_at(f"{path}/protocol").ref.ask(Sealed(frame), IN_TIME)
+                    await system._node.cell_at(f"{path}/protocol").ref.ask(Sealed(frame), IN_TIME)
         assert (await one.ask(Told(), IN_TIME))["count"] == 2
 
 
@@ -189,7 +189,7 @@ async def test_what_was_certified_for_a_move_that_is_given_up_is_revoked() -> No
 
 async def test_two_that_exchange_their_addresses_are_certified_anew() -> None:
     async with program("SEC+PBR", "plain") as system:
-        child = hf.child("one", hf.start(Resident), mechanism=(SEC(CA), hf.PBR()))
+        child = hf.child("one", hf.start(Resident), mechanism=(SEC(CA), hf.ftm.PBR()))
         async with system.transaction(timeout=IN_TIME) as change:
             change.add("/app/there", child)
         one, other = resident(system), resident(system, THERE)
@@ -211,7 +211,7 @@ async def test_two_that_exchange_their_addresses_are_certified_anew() -> None:
         assert [await ref.ask(Me(), IN_TIME) for ref in (one, other)] == [HERE, THERE]
         await exchanged()
         trust = Trust(await authority(system).ask(GetRoot(), IN_TIME))
-        trust.take_list(await authority(system).ask(GetRevocations(), IN_TIME), system.node.loop.time())
+        trust.take_list(await authority(system).ask(GetRevocations(), IN_TIME), system._node.loop.time())
         for certified in before:
             assert all(trust.is_revoked(about(one)[0]) for one in certified.values())
         for address in (HERE, THERE):
@@ -228,8 +228,8 @@ async def test_a_name_that_belongs_to_another_key_keeps_it_where_it_is(taken: st
     keys = tmp_path / "keys"
     keys.mkdir(mode=0o700)
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
-        await system.start(hf.child("ca", hf.start(hf.CertificationAuthority)))
-        stack = (SEC(CA, keys=str(keys)), hf.PBR())
+        await system.start(hf.child("ca", hf.start(CertificationAuthority)))
+        stack = (SEC(CA, keys=str(keys)), hf.ftm.PBR())
         await system.start(hf.supervisor("here", children=[hf.child("one", hf.start(Resident), mechanism=stack)]))
         await system.start(hf.supervisor("there"))
         one = resident(system)
@@ -278,11 +278,11 @@ async def test_an_authority_that_is_gone_keeps_it_where_it_is() -> None:
 
 
 async def test_an_authority_that_dies_at_the_commit_revokes_in_its_next_life(tmp_path: Path) -> None:
-    start = hf.start(hf.CertificationAuthority, str(tmp_path / "ca.key"))
+    start = hf.start(CertificationAuthority, str(tmp_path / "ca.key"))
     ca = hf.child("ca", start, recovery=hf.checkpoint_only(every=1))
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
         await system.start(ca)
-        stack = (SEC(CA), hf.PBR())
+        stack = (SEC(CA), hf.ftm.PBR())
         await system.start(hf.supervisor("here", children=[hf.child("one", hf.start(Resident), mechanism=stack)]))
         await system.start(hf.supervisor("there"))
         one = resident(system)

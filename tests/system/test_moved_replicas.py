@@ -22,6 +22,7 @@ from holdfast.ftm.bricks.bricks import Before
 from holdfast.ftm.events import ReplicaLost
 from holdfast.ftm.group import probation
 from holdfast.ftm.model.mechanism import Mechanism, Role
+from holdfast.ftm.sec.authority import CertificationAuthority
 from tests.ftm.bad_bricks import Wrong
 from tests.system.test_moved_ties import Heard, Party, Tie, hears_once
 from tests.system.test_transaction_commit import Die
@@ -118,7 +119,7 @@ class Resident(hf.Actor):
             file.with_suffix(".begun").touch()
             while file.exists():
                 time.sleep(0.001)
-            self.ctx.cell.node.emit(ProtectionCostly(self.ctx.path, "", 1.0, 1))
+            self.ctx._cell.node.emit(ProtectionCostly(self.ctx.path, "", 1.0, 1))
 
         look()
         return True
@@ -148,11 +149,11 @@ def is_counted(reply: Any) -> bool:
 
 
 STACKS: dict[str, Any] = {
-    "PBR": hf.PBR(),
-    "LFR": hf.LFR(),
-    "LFR+TR": (hf.LFR(), hf.TR()),
-    "A&D": (hf.AD(assertions=(is_counted,)), hf.LFR()),
-    "SEC+PBR": (hf.SEC("/app/ca"), hf.PBR()),
+    "PBR": hf.ftm.PBR(),
+    "LFR": hf.ftm.LFR(),
+    "LFR+TR": (hf.ftm.LFR(), hf.ftm.TR()),
+    "A&D": (hf.ftm.AD(assertions=(is_counted,)), hf.ftm.LFR()),
+    "SEC+PBR": (hf.ftm.SEC("/app/ca"), hf.ftm.PBR()),
 }
 
 
@@ -186,7 +187,7 @@ STACK = pytest.mark.parametrize("stack", list(STACKS))
 KIND = pytest.mark.parametrize("kind", list(KINDS))
 THERE_IN = pytest.mark.parametrize("there", ["task", "process"])
 HERE, THERE = "/app/here/one", "/app/there/one"
-TROUBLE = (hf.Diverged, hf.FailedOver, ReplicaLost, StatesDiffer, hf.TrustBreached)
+TROUBLE = (hf.events.Diverged, hf.events.FailedOver, ReplicaLost, StatesDiffer, hf.events.TrustBreached)
 
 
 @asynccontextmanager
@@ -197,7 +198,7 @@ async def program(
     kept: dict[str, Any] = {} if store is None else {"store": f"sqlite:{store}", "durability": "os"}
     async with hf.ActorSystem("app", log=False, intensity=1000, **kept) as system:
         mechanism = None if stack is None else STACKS[stack]
-        await system.start(hf.child("ca", hf.start(hf.CertificationAuthority)))
+        await system.start(hf.child("ca", hf.start(CertificationAuthority)))
         one = hf.child("one", hf.start(Resident), mechanism=mechanism, recovery=KINDS[kind])
         await system.start(hf.supervisor("here", intensity=1000, children=[one]))
         await system.start(hf.supervisor("there", isolation=there, intensity=1000, children=[]))
@@ -311,11 +312,11 @@ async def test_it_is_taken_out_of_its_replicas_behind_the_move_and_protected_aga
         assert await one.ask(Add(), IN_TIME) == 1
         await moved(system)
         async with system.transaction(timeout=IN_TIME) as change:
-            change.detach(one)
+            change.protect(one, None)
         assert await one.ask(Add(), IN_TIME) == 2
         await system.set_isolation(one, "process", timeout=IN_TIME)
         async with system.transaction(timeout=IN_TIME) as change:
-            change.protect(one, hf.LFR())
+            change.protect(one, hf.ftm.LFR())
         await moved(system, "/app/here", THERE)  # It is on probation.
         await fail_over(one)
         assert await one.ask(Add(), IN_TIME) == 3
@@ -340,7 +341,7 @@ async def test_who_comes_to_live_at_the_old_address_is_not_taken_for_it(stack: s
                 await asyncio.sleep(0.01)
         assert await system.get_state(system.ref(HERE, hf.Actor)) == {"count": 50}
         async with system.transaction(timeout=IN_TIME) as change:
-            change.protect(system.ref(HERE, hf.Actor), hf.PBR())
+            change.protect(system.ref(HERE, hf.Actor), hf.ftm.PBR())
         await whole(system.ref(HERE, hf.Actor))
         assert await one.ask(Add(), IN_TIME) == 4
 
@@ -388,7 +389,7 @@ async def test_a_follower_that_is_behind_runs_what_was_handled_as_it_was(tmp_pat
 async def test_a_follower_whose_bricks_are_behind_runs_what_was_handled_as_it_was(tmp_path: Path) -> None:
     file = tmp_path / "busy"
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
-        child = hf.child("one", hf.start(Resident), mechanism=(Late(str(file)), hf.LFR()))
+        child = hf.child("one", hf.start(Resident), mechanism=(Late(str(file)), hf.ftm.LFR()))
         await system.start(hf.supervisor("here", children=[child], intensity=1000))
         await system.start(hf.supervisor("there"))
         one = resident(system)
@@ -410,7 +411,7 @@ async def test_a_follower_whose_bricks_are_behind_runs_what_was_handled_as_it_wa
 @pytest.mark.parametrize("stack", ["LFR", "SEC+PBR"])
 async def test_two_that_are_protected_exchange_their_addresses(stack: str, kind: str) -> None:
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
-        await system.start(hf.child("ca", hf.start(hf.CertificationAuthority)))
+        await system.start(hf.child("ca", hf.start(CertificationAuthority)))
         for above in ("here", "there"):
             child = hf.child("one", hf.start(Resident), mechanism=STACKS[stack], recovery=KINDS[kind])
             await system.start(hf.supervisor(above, children=[child], intensity=1000))
@@ -474,7 +475,7 @@ async def test_it_comes_back_with_its_new_supervisor(supervisor: Any) -> None:
         if supervisor is hf.supervisor:
             system.ref("/app/aside", hf.Actor).kill()
             async with asyncio.timeout(IN_TIME):
-                while (found := system.node.find("/app/aside/one")) is None or found is one._cell:
+                while (found := system._node.find("/app/aside/one")) is None or found is one._cell:
                     await asyncio.sleep(0.005)
             one = resident(system, "/app/aside/one")
             assert await one.ask(Add(), IN_TIME) == 4
@@ -484,7 +485,7 @@ async def test_it_comes_back_with_its_new_supervisor(supervisor: Any) -> None:
 @pytest.mark.parametrize("stack", ["PBR", "SEC+PBR"])
 async def test_a_supervisor_is_moved_with_those_that_are_protected_below_it(stack: str) -> None:
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
-        await system.start(hf.child("ca", hf.start(hf.CertificationAuthority)))
+        await system.start(hf.child("ca", hf.start(CertificationAuthority)))
         children = [hf.child(name, hf.start(Resident), mechanism=STACKS[stack]) for name in ("one", "two")]
         await system.start(hf.supervisor("here", children=[hf.supervisor("team", children=children, intensity=99)]))
         await system.start(hf.supervisor("there"))
@@ -506,7 +507,7 @@ async def test_a_supervisor_is_moved_with_those_that_are_protected_below_it(stac
 async def test_ties_follow_it(who: str, verb: str, kind: str) -> None:
     """Whoever is protected is moved, when it is tied."""
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
-        protected: dict[str, Any] = {"mechanism": hf.PBR(), "recovery": KINDS[kind]}
+        protected: dict[str, Any] = {"mechanism": hf.ftm.PBR(), "recovery": KINDS[kind]}
         children = [
             hf.child(name, hf.start(Party), **(protected if who in (name, "both") else {}))
             for name in ("watcher", "target")
@@ -529,7 +530,7 @@ async def test_ties_follow_it(who: str, verb: str, kind: str) -> None:
         await hears_once(one, "exit" if verb == "link" else "down")
 
 
-class Refuse(hf.Operation):
+class Refuse(hf.system.Operation):
     """A step that is never ready, and then has failed."""
 
     verb = "refuse"
@@ -540,7 +541,7 @@ class Refuse(hf.Operation):
     async def check(self, system: hf.ActorSystem, draft: Any) -> None: ...
 
     async def prepare(self, system: hf.ActorSystem) -> None:
-        raise hf.ControlFailed("/app", "refuse", "on purpose")
+        raise hf.errors.ControlFailed("/app", "refuse", "on purpose")
 
 
 @STACK
@@ -578,7 +579,7 @@ async def test_a_mechanism_that_fails_behind_the_move_gives_way_there(there: Any
         assert await one.ask(Add(), IN_TIME) == 1
         bad = Wrong("exit", "message", "before", "leader")
         async with system.transaction(timeout=IN_TIME) as change:
-            change.protect(one, (bad, hf.PBR()))
+            change.protect(one, (bad, hf.ftm.PBR()))
         await moved(system)
         stream = asyncio.gather(*(one.ask(Add(), IN_TIME) for _ in range(20)))
         async with asyncio.timeout(IN_TIME):
@@ -600,14 +601,14 @@ async def test_the_next_root_has_the_mechanism_that_it_was_given_at_its_new_addr
     async with program(stack, "recorded", tmp_path / "store") as system:
         one = resident(system)
         async with system.transaction(timeout=IN_TIME) as change:
-            change.protect(one, hf.LFR())
+            change.protect(one, hf.ftm.LFR())
         await moved(system)
         async with asyncio.timeout(IN_TIME):
             await change.settled()
         assert await one.ask(Add(), IN_TIME) == 1
     async with program(stack, "recorded", tmp_path / "store") as system:
         one = resident(system, THERE)
-        assert one._cell.spec.mechanism == hf.LFR()
+        assert one._cell.spec.mechanism == hf.ftm.LFR()
         await fail_over(one)
         assert await one.ask(Add(), IN_TIME) == 2
 
@@ -641,7 +642,7 @@ async def test_a_replica_that_is_killed_at_any_instant_of_the_move_loses_nothing
         assert (told["count"], changes(told["at"])) == (count, [HERE, THERE])
 
 
-class Strike(hf.Operation):
+class Strike(hf.system.Operation):
     """A step at which something is done, when all before it are ready or in force."""
 
     verb = "strike"
@@ -687,7 +688,7 @@ async def test_what_a_replica_says_before_it_has_heard_of_its_address_is_meant_s
             file.unlink()
             assert await one.ask(Add(), IN_TIME) == 1
             seen = events.take()
-            assert not [event for event in seen if isinstance(event, (hf.TrustBreached, hf.DeadLetter))]
+            assert not [event for event in seen if isinstance(event, (hf.events.TrustBreached, hf.events.DeadLetter))]
             assert [event.address for event in seen if isinstance(event, ProtectionCostly)] == [THERE]
         assert pids(one) == before
 
@@ -728,7 +729,7 @@ async def killed(store: str, when: str, how: str) -> None:
         one = resident(system)
         if how == "on trial":
             async with system.transaction(timeout=IN_TIME) as change:
-                change.protect(one, hf.LFR())
+                change.protect(one, hf.ftm.LFR())
         assert await one.ask(Add(7), IN_TIME) == 7
         async with system.transaction(timeout=IN_TIME) as change:
             if when == "finish":

@@ -148,7 +148,7 @@ class Client(hf.Actor):
 async def test_who_is_bound_to_it_reaches_it_also_when_somebody_else_has_its_address(place: str) -> None:
     options: dict[str, Any] = PLACES.get(place, {})
     if "replicas" in place:
-        options = {"mechanism": hf.PBR(), "recovery": hf.hybrid() if "recorded" in place else None}
+        options = {"mechanism": hf.ftm.PBR(), "recovery": hf.hybrid() if "recorded" in place else None}
     client = hf.child("client", hf.start(Client), bindings={"other": "/app/here/named"}, **options)
     async with hf.ActorSystem("app", log=False) as system:
         await system.start(hf.supervisor("here", children=[hf.child("named", hf.start(Named, "first"))]))
@@ -295,5 +295,5 @@ async def answered(system: hf.ActorSystem, path: str, message: hf.Message[str]) 
         while True:
             try:
                 return await system.ref(path, hf.Actor).ask(message, IN_TIME)
-            except (hf.NoSuchActor, hf.ActorStopped, hf.AskFailed):
+            except (hf.errors.NoSuchActor, hf.ActorStopped, hf.AskFailed):
                 await asyncio.sleep(0.005)

@@ -97,7 +97,7 @@ async def test_what_is_known_is_what_is_in_force_after_a_restart(system: hf.Acto
     assert await is_held(system, "/app/other")
     with system.events() as events:
         os.kill(system.pid_of(system.ref(TOP, Top)), signal.SIGKILL)  # `init` is asked again.
-        await next_event(events, hf.ActorStarted, lambda event: event.address == TOP)
+        await next_event(events, hf.events.ActorStarted, lambda event: event.address == TOP)
     now = await system.ref(WHO, Owner).ask(Where(), timeout=SECONDS)
     assert now == ("/app/other" if kind == "protected" else "/app/first")  # The root binds replicas.
     assert await is_held(system, now)
@@ -116,8 +116,8 @@ async def test_it_grants_nothing_but_what_the_root_binds(system: hf.ActorSystem,
         assert "may not order /app/first" in await who.ask(Kill(), timeout=SECONDS)
         await bind(system, who, "/app/other")
         assert await who.ask(Kill(), timeout=SECONDS) == ""
-        assert (await next_event(events, hf.ChildTerminated)).address == "/app/other"
-        assert hf.TrustBreached not in [type(event) for event in events.take()]
+        assert (await next_event(events, hf.events.ChildTerminated)).address == "/app/other"
+        assert hf.events.TrustBreached not in [type(event) for event in events.take()]
 
 
 async def test_of_a_grandchild(system: hf.ActorSystem) -> None:
@@ -146,4 +146,4 @@ async def test_who_is_added_by_a_change_is_granted_what_it_is_bound_to(system: h
         change.add(top, hf.supervisor("inner", children=below))
     with system.events() as events:
         assert await system.ref(f"{TOP}/inner/who", Owner).ask(Kill(), timeout=SECONDS) == ""
-        assert (await next_event(events, hf.ChildTerminated)).address == "/app/other"
+        assert (await next_event(events, hf.events.ChildTerminated)).address == "/app/other"

@@ -150,7 +150,7 @@ async def test_what_is_recorded_of_it_comes_back_at_its_new_address(tmp_path: Pa
         assert await one.ask(Add(1), IN_TIME) == 9
         assert await system.get_state(one) == {"count": 9, "other": "", "ends": [], "drawn": drawn}
     async with program(tmp_path / "store", isolation) as system:
-        assert system.node.find("/app/there/one") is not None
+        assert system._node.find("/app/there/one") is not None
         assert await ref(system, "/app/there/one").ask(Add(1)) == 10
         assert await ref(system, "/app/here/one").ask(Add(1)) == 11  # Who knows only its old address finds it.
 
@@ -197,7 +197,7 @@ async def test_who_comes_to_live_at_an_address_that_was_left_has_a_journal_of_it
 async def test_two_exchange_their_addresses(tmp_path: Path) -> None:
     for _ in range(2):
         async with program(tmp_path / "store") as system:
-            if system.node.find("/app/there/one") is None:
+            if system._node.find("/app/there/one") is None:
                 async with system.transaction(timeout=IN_TIME) as change:
                     change.add("/app/there", friend("one"))
                 await ref(system, "/app/here/one").ask(Add(1))
@@ -359,9 +359,9 @@ async def test_it_has_moved_though_the_store_has_refused_to_note_it(
             raise hf.HoldfastError("the disk is gone")
 
         with monkeypatch.context() as broken, system.events() as events:
-            broken.setattr(system.homes.addresses, "moved", refuse)
+            broken.setattr(system._homes.addresses, "moved", refuse)
             await moved(system)
-            (event,) = (event for event in events.take() if isinstance(event, hf.TransactionCommitted))
+            (event,) = (event for event in events.take() if isinstance(event, hf.events.TransactionCommitted))
         assert "the disk is gone" in event.problems[0]
         assert await one.ask(Add(1)) == 8
         one.kill()
@@ -406,7 +406,7 @@ async def test_what_a_process_says_before_it_has_heard_of_its_address_is_meant_s
             (watch,) = other._cell.extra().ties.monitors
             assert watch.watcher is one._cell
             assert list(other._cell.extra().ties.links) == [one._cell]
-            assert not [event for event in events.take() if isinstance(event, hf.TrustBreached)]
+            assert not [event for event in events.take() if isinstance(event, hf.events.TrustBreached)]
         assert system.pid_of(one) == process
         assert await one.ask(Add(1)) == 1
 

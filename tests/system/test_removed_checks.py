@@ -25,14 +25,14 @@ JOURNALS = "tests/supervision/test_dynamic_journal.py"
 CHECKS = {
     "the states are in the store together": Check(
         "system/transaction/transaction.py",
-        "            with self._system.homes.journal.together():\n",
+        "            with self._system._homes.journal.together():\n",
         "            if True:\n",
         COMMIT,
         "test_a_root_that_is_killed and commit and task",
     ),
     "the specification is in the store with the states": Check(
         "system/transaction/transaction.py",
-        "        system.specifications.changed(*self._draft.below_root(), mechanisms)\n",
+        "        system._specifications.changed(*self._draft.below_root(), mechanisms)\n",
         "        pass\n",
         KEPT,
         "test_a_root_that_is_killed and finish",
@@ -242,14 +242,14 @@ CHECKS = {
     ),
     "a supervisor that has lost a child says so": Check(
         "supervision/supervisor.py",
-        "        return one.cell is not None and one.cell.parent is not self.ctx.cell\n",
+        "        return one.cell is not None and one.cell.parent is not self.ctx._cell\n",
         "        return False\n",
         FAR,
         "test_what_its_old_supervisor_says",
     ),
     "a supervisor does not stop who was given to another": Check(
         "supervision/supervisor.py",
-        "            if child.parent is self.ctx.cell:  # Else",
+        "            if child.parent is self.ctx._cell:  # Else",
         "            if True:  # Else",
         FAR,
         "test_a_supervisor_that_stops",
@@ -312,7 +312,7 @@ CHECKS = {
     ),
     "a binding follows the actor and not its address": Check(
         "system/transaction/arrangement.py",
-        "            settle_bindings(system.node.root)\n",
+        "            settle_bindings(system._node.root)\n",
         "            pass\n",
         COMMIT,
         "test_who_was_bound_to_a_life_that_is_over",
@@ -347,7 +347,7 @@ CHECKS = {
     ),
     "processes are told where those are that they are bound to": Check(
         "system/transaction/arrangement.py",
-        "            tell_bindings(system.node.root, {new: old for old, new in now.items()})\n",
+        "            tell_bindings(system._node.root, {new: old for old, new in now.items()})\n",
         "            pass\n",
         TIES,
         "test_who_is_bound_to_it",
@@ -361,7 +361,7 @@ CHECKS = {
     ),
     "the mechanism of an actor is noted where it is now": Check(
         "system/transaction/arrangement.py",
-        "            system.mechanism_notes.moved(now)\n",
+        "            system._mechanism_notes.moved(now)\n",
         "",
         REPLICAS,
         "test_a_root_that_is_killed and trial and finish",
@@ -664,7 +664,7 @@ CHECKS = {
     ),
     "an address that was left leads to who has left it when a candidate has gone from there": Check(
         "system/transaction/succession.py",
-        "        system.homes.addresses.put_back(self._forwarded or {})\n",
+        "        system._homes.addresses.put_back(self._forwarded or {})\n",
         "        pass\n",
         SUPERVISORS,
         "test_who_has_left_the_address",
@@ -699,7 +699,7 @@ CHECKS = {
     ),
     "who waits for a restart is not waited for": Check(
         "supervision/supervisor.py",
-        "                self.ctx.cell.push(Retry(one, one.retry, one.due))\n",
+        "                self.ctx._cell.push(Retry(one, one.retry, one.due))\n",
         "                pass\n",
         KINDS,
         "test_who_waits_for_a_restart",
@@ -797,8 +797,8 @@ CHECKS = {
     ),
     "a link through a ref from before is one with who is there now": Check(
         "actors/kernel/context.py",
-        "links.link(self.cell, other._cell.living)",
-        "links.link(self.cell, other._cell)",
+        "links.link(self._cell, other._cell.living)",
+        "links.link(self._cell, other._cell)",
         SUPERVISORS,
         "test_a_ref_from_before",
     ),

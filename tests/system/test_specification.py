@@ -47,7 +47,7 @@ async def program(store: Path, *, fresh: bool = False, first: Any = None) -> Asy
 def shape(system: hf.ActorSystem) -> dict[str, Any]:
     """The specification, as it is lived."""
     found: dict[str, Any] = {}
-    root = system.node.root
+    root = system._node.root
     assert root is not None
     waiting = [root]
     while waiting:
@@ -64,7 +64,7 @@ def shape(system: hf.ActorSystem) -> dict[str, Any]:
     return found
 
 
-def much(change: hf.Change) -> None:
+def much(change: hf.system.Change) -> None:
     change.add("/app/left", hf.supervisor("sub", children=[counter("x")]))
     change.move("/app/left/a", "/app/left/sub")
     change.move("/app/left/b", "/app/right")
@@ -81,12 +81,12 @@ def much(change: hf.Change) -> None:
     change.intensity("/app", 88, 8.0)
 
 
-def move(change: hf.Change) -> None:
+def move(change: hf.system.Change) -> None:
     change.move("/app/left/a", "/app/right")
     change.reorder("/app/right", ["a"])  # It has to be there before the client that is bound to it.
 
 
-CHANGES: dict[str, Callable[[hf.Change], object]] = {
+CHANGES: dict[str, Callable[[hf.system.Change], object]] = {
     "add": lambda change: change.add("/app/left", counter("x")),
     "remove": lambda change: change.remove("/app/left/b"),
     "move": lambda change: move(change),
@@ -155,7 +155,7 @@ async def test_what_is_taken_back_leaves_no_trace(tmp_path: Path) -> None:
             async with system.transaction(timeout=IN_TIME) as change:
                 much(change)
                 change.step(Stumble())
-        assert system.specifications._kept == {}
+        assert system._specifications._kept == {}
     async with program(tmp_path / "store") as system:
         assert shape(system) == before
 
@@ -174,11 +174,11 @@ async def test_a_program_that_says_something_else_is_newer(tmp_path: Path) -> No
             await system.start(right())
             top = await system.start(counter("top", 100))  # It was there already, as the transaction said.
             assert await top.ask(Add(1)) == 101
-        assert system.node.find("/app/left/x") is None
+        assert system._node.find("/app/left/x") is None
         actor: Any = ref(system, "/app/right")._cell.actor
         assert actor._flags.strategy == "one_for_all"
     async with program(tmp_path / "store", first=left(strategy="rest_for_one")) as system:
-        assert system.node.find("/app/left/x") is None
+        assert system._node.find("/app/left/x") is None
 
 
 @pytest.mark.parametrize("what", ["move", "add", "rise"])
@@ -221,11 +221,11 @@ async def test_a_class_that_is_gone_is_named(tmp_path: Path, monkeypatch: pytest
     monkeypatch.undo()
     monkeypatch.delattr("tests.system.trees.Counter")
     async with hf.ActorSystem("app", store=f"sqlite:{tmp_path / 'store'}", log=False) as system:
-        assert system.node.find("/app/top") is None
+        assert system._node.find("/app/top") is None
     monkeypatch.undo()
     async with program(tmp_path / "store") as system:
         assert await ref(system, "/app/top").ask(Add(1)) == 1
-        assert system.node.find("/app/left/x") is not None
+        assert system._node.find("/app/left/x") is not None
 
 
 async def test_a_start_that_fails_forgets_nothing(tmp_path: Path) -> None:
@@ -245,7 +245,7 @@ async def test_in_one_life_of_the_root_the_program_is_taken_at_its_word(tmp_path
             change.add("/app/left", counter("x"))
         await system.stop(ref(system, "/app/left"))
         await system.start(left())
-        assert system.node.find("/app/left/x") is None
+        assert system._node.find("/app/left/x") is None
 
 
 async def test_what_cannot_be_stored_is_told_and_the_next_root_begins_as_the_program_says(tmp_path: Path) -> None:
@@ -260,8 +260,8 @@ async def test_what_cannot_be_stored_is_told_and_the_next_root_begins_as_the_pro
         assert told.address == "/app/left"
         assert told.why
     async with program(tmp_path / "store") as system:
-        assert system.node.find("/app/left/x") is None
-        assert system.node.find("/app/left/y") is None
+        assert system._node.find("/app/left/x") is None
+        assert system._node.find("/app/left/y") is None
 
 
 async def test_who_is_bound_to_the_program_comes_back_behind_it(tmp_path: Path) -> None:
@@ -276,15 +276,15 @@ async def test_who_is_bound_to_the_program_comes_back_behind_it(tmp_path: Path) 
 async def test_mechanisms_and_specifications_are_kept_side_by_side(tmp_path: Path) -> None:
     async with program(tmp_path / "store") as system:
         async with system.transaction(timeout=60) as change:
-            change.attach("/app/left/r", PBR())
+            change.protect("/app/left/r", PBR())
             change.add("/app/left", counter("x", recovery=RECORDED, mechanism=TR()))
         async with system.transaction(timeout=60) as change:
             change.reorder("/app/left", ["x", "r"])
-            change.detach("/app/left/x")
+            change.protect("/app/left/x", None)
         for event in await change.settled():
             assert event.is_kept
         assert await ref(system, "/app/left/r").ask(Add(5)) == 5
-        notes = system.mechanism_notes.declared()
+        notes = system._mechanism_notes.declared()
         assert notes["/app/left/r"] is None
     for _ in range(2):
         async with program(tmp_path / "store") as system:
@@ -302,13 +302,13 @@ async def test_what_cannot_be_noted_stops_neither_the_transaction_nor_the_store(
         with monkeypatch.context() as broken, system.events() as events:
 
             def fail() -> Any:
-                raise hf.MechanismRefused("/app/left/r", "there is none of that name")
+                raise hf.errors.MechanismRefused("/app/left/r", "there is none of that name")
 
-            broken.setattr(system.mechanism_notes, "declared", fail)
+            broken.setattr(system._mechanism_notes, "declared", fail)
             async with system.transaction(timeout=IN_TIME) as change:
                 change.remove("/app/left/c")
                 change.replace_state("/app/left/r", taken)
-            (event,) = (one for one in events.take() if isinstance(one, hf.TransactionCommitted))
+            (event,) = (one for one in events.take() if isinstance(one, hf.events.TransactionCommitted))
         assert len(event.problems) == 1
         assert "there is none of that name" in event.problems[0]
         async with system.transaction(timeout=IN_TIME) as change:
@@ -359,7 +359,7 @@ async def on_trial(store: str) -> None:
     """The root is killed before it is known whether a mechanism stays."""
     async with program(Path(store)) as system:
         async with system.transaction(timeout=60) as change:
-            change.attach("/app/left/r", PBR())
+            change.protect("/app/left/r", PBR())
             change.add("/app/left", counter("x"))
         os.kill(os.getpid(), signal.SIGKILL)
 
@@ -422,10 +422,10 @@ def above(path: str, **options: Any) -> hf.ChildSpec:
 
 async def restarted(system: hf.ActorSystem, path: str, below: str) -> hf.ActorRef[Client]:
     """The supervisor at an address has been restarted: one of those below it in its next life."""
-    before = system.node.find(below)
+    before = system._node.find(below)
     system.ref(path, hf.Actor).kill()
     async with asyncio.timeout(IN_TIME):
-        while (cell := system.node.find(below)) in (None, before) or cell.state != "running":
+        while (cell := system._node.find(below)) in (None, before) or cell.state != "running":
             await asyncio.sleep(0.002)
     return hf.ActorRef(cell)
 
@@ -443,7 +443,7 @@ async def test_a_binding_that_a_transaction_has_made_outlives_the_supervisor(kin
         client = await restarted(system, "/app/above", "/app/above/client")
         assert await client.ask(Where(), IN_TIME) == to
         async with asyncio.timeout(IN_TIME):
-            while (cell := system.node.find(to)) is None or cell.state != "running":
+            while (cell := system._node.find(to)) is None or cell.state != "running":
                 await asyncio.sleep(0.002)
         bound = client._cell.extra().bindings["peer"].ref
         assert isinstance(await bound.ask(Add(1), IN_TIME), int)
@@ -529,11 +529,11 @@ async def test_two_that_transactions_have_bound_to_each_other_come_back() -> Non
         async with system.transaction(timeout=IN_TIME) as change:
             change.bind(here, "peer", there)
             change.bind(there, "peer", here)
-        before = [system.node.find(path) for path in (here, there)]
+        before = [system._node.find(path) for path in (here, there)]
         for path in ("/app/here", "/app/there"):
             system.ref(path, hf.Actor).kill()
         async with asyncio.timeout(IN_TIME):
-            while any((cell := system.node.find(path)) in (None, *before) for path in (here, there)):
+            while any((cell := system._node.find(path)) in (None, *before) for path in (here, there)):
                 await asyncio.sleep(0.002)
         assert cell is not None
         for path, to in ((here, there), (there, here)):
@@ -580,7 +580,7 @@ async def test_the_program_has_the_last_word_on_the_flags_of_the_root(tmp_path: 
                 async with system.transaction(timeout=IN_TIME) as change:
                     change.intensity("/app", 77, 7.0)
                     change.reorder("/app", ["c", "a"])
-            root: Any = system.node.root
+            root: Any = system._node.root
             names = [name for name in root.actor._children if name in "abc"]
             return root.actor._flags.intensity, names, superseded
 
@@ -595,7 +595,7 @@ async def test_the_order_of_the_root_is_that_of_the_last_transaction_without_tho
     tmp_path: Path,
 ) -> None:
     def order(system: hf.ActorSystem) -> list[str]:
-        root: Any = system.node.root
+        root: Any = system._node.root
         listed = [name for name in root.actor._children if name not in ("left", "right")]
         assert [name for name in root.children if name in listed] == listed
         return listed
@@ -609,6 +609,6 @@ async def test_the_order_of_the_root_is_that_of_the_last_transaction_without_tho
             change.remove("/app/y")
         assert order(system) == ["z", "x"]
     async with program(tmp_path / "store") as system:
-        root: Any = system.node.root
+        root: Any = system._node.root
         assert list(root.actor._children)[-4:] == ["z", "x", "right", "left"]
         assert order(system) == ["z", "x"]

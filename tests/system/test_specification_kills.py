@@ -40,7 +40,7 @@ async def program(store: str) -> AsyncGenerator[hf.ActorSystem]:
 
 def lines(system: hf.ActorSystem) -> list[str]:
     """The tree in words: who is where, in which order, of which class, by which flags and bound to whom."""
-    return ours(Draft(system.node, Arrangement(), 10.0).lines())
+    return ours(Draft(system._node, Arrangement(), 10.0).lines())
 
 
 def ours(tree: list[str]) -> list[str]:
@@ -48,7 +48,7 @@ def ours(tree: list[str]) -> list[str]:
     return [line for line in tree if line.startswith(TOPS)]
 
 
-def draw(dice: random.Random, change: hf.Change, tree: list[str], number: int) -> None:
+def draw(dice: random.Random, change: hf.system.Change, tree: list[str], number: int) -> None:
     """One random step."""
     paths = [line.partition(":")[0] for line in tree]
     supervisors = [
@@ -96,7 +96,7 @@ async def changing(store: str, log: str, seed: int) -> None:
                 steps = [dice.randrange(2**32) for _ in range(dice.randrange(1, 4))]
                 tree = lines(system)
 
-                def collect(change: hf.Change, steps: list[int] = steps, tree: list[str] = tree) -> None:
+                def collect(change: hf.system.Change, steps: list[int] = steps, tree: list[str] = tree) -> None:
                     for at, one in enumerate(steps):
                         draw(random.Random(one), change, tree, number * 10 + at)  # noqa: B023
 

@@ -92,7 +92,7 @@ async def test_systems_live_side_by_side_and_do_not_see_each_other() -> None:
         mine = left.spawn(hf.start(Kid), "kid")
         yours = right.spawn(hf.start(Kid), "kid")
         assert (mine.path, yours.path) == ("/left/kid", "/right/kid")
-        with pytest.raises(hf.NoSuchActor):
+        with pytest.raises(hf.errors.NoSuchActor):
             left.ref("/right/kid", Kid)
         left.register("name", mine)
         right.register("name", yours)
@@ -242,14 +242,14 @@ async def test_an_id_in_use_is_refused() -> None:
         await system.start(hf.child("kid", hf.start(Kid)))
         with pytest.raises(AlreadyStarted):
             await system.start(hf.child("kid", hf.start(Kid)))
-        with pytest.raises(hf.NameTaken, match="/app/kid exists already"):
+        with pytest.raises(hf.errors.NameTaken, match="/app/kid exists already"):
             system.spawn(hf.start(Kid), "kid")
 
 
 async def test_a_name_taken_by_a_spawned_actor_is_no_crash_of_the_root() -> None:
     async with hf.ActorSystem("app", intensity=0, log=False) as system:
         ref = system.spawn(hf.start(Kid), "kid")
-        with pytest.raises(hf.NameTaken, match="/app/kid exists already"):
+        with pytest.raises(hf.errors.NameTaken, match="/app/kid exists already"):
             await system.start(hf.child("kid", hf.start(Kid)))
         assert await ref.ask(Life()) == 1
         await system.stop(ref)
@@ -283,10 +283,11 @@ async def test_a_ref_says_who_lives_there_or_that_nobody_does() -> None:
         await system.start(hf.supervisor("top", children=[hf.child("kid", hf.start(Kid))]))
         assert system.ref("/app/top/kid", Kid) == system.ref("/app/top/kid", hf.Actor)
         for path in ("/app/top/nobody", "/app/nobody/kid", "/other/top/kid", "/appendix", "kid", ""):
-            with pytest.raises(hf.NoSuchActor) as nobody:
+            with pytest.raises(hf.errors.NoSuchActor) as nobody:
                 system.ref(path, Kid)
             assert nobody.value.actor == path
-        with pytest.raises(hf.WrongActor, match=r"/app/top/kid is a .*Kid, not a .*Listener"):
+        assert system.ref("/app/top/kid") == system.ref("/app/top/kid", hf.Actor)
+        with pytest.raises(hf.errors.WrongActor, match=r"/app/top/kid is a .*Kid, not a .*Listener"):
             system.ref("/app/top/kid", Listener)
 
 
@@ -305,15 +306,15 @@ async def test_names_find_actors_and_are_free_when_those_have_stopped() -> None:
         system.register("boss", one)
         system.register("boss", one)
         assert system.whereis("boss") == one
-        with pytest.raises(hf.NameTaken):
+        with pytest.raises(hf.errors.NameTaken):
             system.register("boss", other)
         await system.stop(one)
-        with pytest.raises(hf.NoSuchActor):
+        with pytest.raises(hf.errors.NoSuchActor):
             system.whereis("boss")
         system.register("boss", other)
         system.unregister("boss")
         system.unregister("boss")
-        with pytest.raises(hf.NoSuchActor):
+        with pytest.raises(hf.errors.NoSuchActor):
             system.whereis("boss")
         with pytest.raises(hf.ActorStopped):
             system.register("ghost", one)
@@ -339,7 +340,7 @@ async def test_a_subscription_ends_with_the_actor_and_begins_anew_with_its_next_
         await system.publish("/scan", Scan(1))
         assert await kept.ask(Seen()) == [1]
         kept.kill()
-        await system.node.settled()
+        await system._node.settled()
         await system.publish("/scan", Scan(2))
         assert await kept.ask(Seen()) == [2]
         assert system.dead_letters == 0
@@ -350,7 +351,7 @@ async def test_publishing_waits_for_room_at_a_bounded_subscriber() -> None:
         listener = system.spawn(hf.start(Listener), mailbox=hf.bounded(1))
         for number in range(5):
             await system.publish("/scan", Scan(number))
-        await system.node.settled()
+        await system._node.settled()
         reply = listener.ask(Seen())
         assert await reply == [0, 1, 2, 3, 4]
 

@@ -79,7 +79,7 @@ async def in_thread(call: Callable[[], Any]) -> Any:
 async def test_a_tell_from_another_thread_is_refused_whole(system: hf.ActorSystem, way: str) -> None:
     book = await system.start(hf.child("book", hf.start(Notebook), **WAYS[way]))
     for _ in range(2):  # Room is left after a refusal, too.
-        with pytest.raises(hf.WrongThread, match=r"from_thread\(\)"):
+        with pytest.raises(hf.errors.WrongThread, match=r"from_thread\(\)"):
             await in_thread(lambda: book.tell(Note(1, 1)))
     book.tell(Note(0, 0))
     assert await book.ask(Noted()) == [(0, 0)]
@@ -89,9 +89,9 @@ async def test_a_tell_from_another_thread_is_refused_whole(system: hf.ActorSyste
 async def test_other_calls_are_refused_too(system: hf.ActorSystem, call: str) -> None:
     book = await system.start(hf.child("book", hf.start(Notebook)))
     calls: dict[str, Callable[[], object]] = {"ask": lambda: book.ask(Noted()), "stop": book.stop, "kill": book.kill}
-    with pytest.raises(hf.WrongThread, match="/app/book"):
+    with pytest.raises(hf.errors.WrongThread, match="/app/book"):
         await in_thread(calls[call])
-    with pytest.raises(hf.WrongThread, match="/app/book"):
+    with pytest.raises(hf.errors.WrongThread, match="/app/book"):
         await in_thread(lambda: asyncio.run(book.send(Note(1, 1))))
     assert await book.ask(Noted()) == []
 
@@ -185,7 +185,7 @@ def name_of(call: Callable[[], Any]) -> str:
     return "nothing"
 
 
-Calls = Callable[[hf.ThreadPortal, "hf.ActorRef[Any]"], Any]
+Calls = Callable[[hf.system.ThreadPortal, "hf.ActorRef[Any]"], Any]
 
 CALLS: dict[str, Calls] = {
     "tell": lambda portal, ref: portal.tell(ref, Note(0, 0)),
@@ -238,7 +238,7 @@ async def test_who_calls_while_the_system_ends_hears_of_it() -> None:
 @pytest.mark.parametrize("call", CALLS)
 async def test_who_calls_after_the_system_is_refused(call: str) -> None:
     """Whether its event loop goes on, or is closed: also by the thread that ran it."""
-    found: list[tuple[hf.ThreadPortal, hf.ActorRef[Any]]] = []
+    found: list[tuple[hf.system.ThreadPortal, hf.ActorRef[Any]]] = []
 
     async def main() -> str:
         async with hf.ActorSystem("inner", log=False) as inner:
@@ -258,7 +258,7 @@ async def test_who_calls_after_the_system_is_refused(call: str) -> None:
 async def test_what_a_closed_loop_never_did_is_not_waited_for(call: str) -> None:
     """It was handed over when the loop had taken its last step."""
     ended = asyncio.new_event_loop()
-    found: list[tuple[hf.ThreadPortal, hf.ActorRef[Any]]] = []
+    found: list[tuple[hf.system.ThreadPortal, hf.ActorRef[Any]]] = []
 
     async def main() -> None:
         async with hf.ActorSystem("inner", log=False) as inner:

@@ -25,7 +25,7 @@ from tests.system.trees import (
 # A refused or failed transaction ends with its block, which collects several steps.
 # ruff: noqa: PT012
 
-Steps = Callable[[hf.Change], object]
+Steps = Callable[[hf.system.Change], object]
 
 
 def tenfold(state: dict[str, Any]) -> dict[str, Any]:
@@ -138,8 +138,8 @@ async def test_a_removed_child_has_ended_and_is_forgotten(system: hf.ActorSystem
         change.remove(b)
     with pytest.raises(hf.ActorStopped):
         await b.ask(Add())
-    with pytest.raises(hf.NoSuchChild):
-        await ref(system, "/app/left").ask(hf.GetChildSpec("b"))
+    with pytest.raises(hf.errors.NoSuchChild):
+        await ref(system, "/app/left").ask(hf.supervision.GetChildSpec("b"))
 
 
 async def test_what_is_removed_cannot_be_used_by_later_steps(system: hf.ActorSystem) -> None:
@@ -188,8 +188,8 @@ async def test_a_moved_child_is_restarted_by_its_new_supervisor(system: hf.Actor
     with system.events() as stream:
         a.tell(Boom())
         assert await a.ask(Life()) == 2
-        await system.node.settled()
-        restarted = {event.address for event in stream.take() if isinstance(event, hf.ChildRestarted)}
+        await system._node.settled()
+        restarted = {event.address for event in stream.take() if isinstance(event, hf.events.ChildRestarted)}
     assert restarted == {"/app/right/a"}
     assert await ref(system, "/app/right/d").ask(Life()) == 2  # `right` is one_for_all.
     assert await b.ask(Life()) == 1
@@ -288,7 +288,7 @@ async def test_the_tree_keeps_its_new_shape_when_a_supervisor_is_restarted(syste
     left.kill()
     right.kill()
     for _ in range(10):
-        await system.node.settled()
+        await system._node.settled()
     assert [info.id for info in await left.ask(hf.WhichChildren())] == ["g", "a"]
     assert [info.id for info in await right.ask(hf.WhichChildren())] == ["d", "e", "client", "c"]
     assert await ref(system, "/app/left/g").ask(Add()) == 6
@@ -352,7 +352,7 @@ async def test_one_inside_another_is_refused(system: hf.ActorSystem) -> None:
             async with system.transaction():
                 pass
         change.unregister("first")
-    assert "first" not in system.node.names
+    assert "first" not in system._node.names
     async with system.transaction(dry_run=True):  # The refused one has left nothing behind.
         pass
 
@@ -388,7 +388,7 @@ async def test_one_that_takes_too_long_is_rolled_back(system: hf.ActorSystem) ->
             change.strategy("/app/left", "one_for_all")
             change.add("/app/left", hf.child("slow", hf.start(Slow)))
     assert picture(system) == before
-    assert await ref(system, "/app/left").ask(hf.CountChildren()) == hf.ChildCounts(3, 3, 0, 3)
+    assert await ref(system, "/app/left").ask(hf.supervision.CountChildren()) == hf.supervision.ChildCounts(3, 3, 0, 3)
 
 
 @pytest.mark.asyncio(loop_factories=["virtual"])
@@ -417,7 +417,7 @@ async def test_a_child_that_waits_for_its_restart_is_moved_when_it_is_up(system:
     top = ref(system, "/app/left")
     g = await top.ask(hf.StartChild(counter("g", backoff=hf.Backoff(initial=2.0, jitter=0.0))))
     g.tell(Boom())
-    await system.node.settled()
+    await system._node.settled()
     async with system.transaction() as change:
         change.move(g, "/app/right")
     assert (g.path, await g.ask(Life())) == ("/app/right/g", 2)
@@ -463,13 +463,13 @@ async def test_events_tell_of_it(system: hf.ActorSystem) -> None:
             async with system.transaction() as change:
                 change.unregister("second")
                 change.step(Stumble())
-        kinds = (hf.TransactionBegan, hf.TransactionCommitted, hf.TransactionRolledBack)
+        kinds = (hf.events.TransactionBegan, hf.events.TransactionCommitted, hf.events.TransactionRolledBack)
         told = [event for event in stream.take() if isinstance(event, kinds)]
     began, committed, began_again, back = told
-    assert isinstance(began, hf.TransactionBegan)
-    assert isinstance(committed, hf.TransactionCommitted)
-    assert isinstance(began_again, hf.TransactionBegan)
-    assert isinstance(back, hf.TransactionRolledBack)
+    assert isinstance(began, hf.events.TransactionBegan)
+    assert isinstance(committed, hf.events.TransactionCommitted)
+    assert isinstance(began_again, hf.events.TransactionBegan)
+    assert isinstance(back, hf.events.TransactionRolledBack)
     assert (began.steps, committed.problems) == (("unregister first",), ())
     assert (back.step, back.reason) == ("stumble over a stone", "there was a stone")
     assert back.steps == ("unregister second", "stumble over a stone")
@@ -488,4 +488,4 @@ async def test_what_cannot_be_undone_is_told(system: hf.ActorSystem) -> None:
             change.step(Stuck(nothing))
             change.step(Stumble())
     assert failed.value.undone == ("stumble over a stone", "unregister first")
-    assert "first" in system.node.names
+    assert "first" in system._node.names

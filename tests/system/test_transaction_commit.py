@@ -51,7 +51,7 @@ async def crashed(system: hf.ActorSystem, path: str) -> None:
     before.kill()
     async with asyncio.timeout(IN_TIME):
         while True:
-            cell = system.node.find(path)
+            cell = system._node.find(path)
             if cell is not None and (cell is not before or cell.life != life) and cell.host.is_up(cell):
                 return
             await asyncio.sleep(0)
@@ -190,7 +190,7 @@ def missing(state: dict[str, Any]) -> dict[str, Any]:
 # -- what restarts meanwhile ------------------------------------------------------------------------------------------
 
 RESTARTED = ["/app/left", "/app/right"]
-SHAPES: dict[str, Callable[[hf.Change], object]] = {
+SHAPES: dict[str, Callable[[hf.system.Change], object]] = {
     "add": lambda change: change.add("/app/left", counter("g")),
     "add subtree": lambda change: change.add("/app/left", hf.supervisor("g", children=[counter("h")])),
     "remove": lambda change: change.remove("/app/left/b"),
@@ -211,41 +211,41 @@ SHAPES: dict[str, Callable[[hf.Change], object]] = {
 }
 
 
-def move_and_add(change: hf.Change) -> None:
+def move_and_add(change: hf.system.Change) -> None:
     change.move("/app/left/b", "/app/right")
     change.add("/app/right", counter("g"))
     change.reorder("/app/right", ["g", "d"])
     change.move("/app/left/a", "/app/right")
 
 
-def replace(change: hf.Change, above: str, name: str, other: str) -> None:
+def replace(change: hf.system.Change, above: str, name: str, other: str) -> None:
     change.move(f"{above}/{name}", other)
     change.add(above, counter(name, 100))
 
 
-def move_and_start(change: hf.Change) -> None:
+def move_and_start(change: hf.system.Change) -> None:
     change.move("/app/right/e", "/app/left")
     change.start("/app/left", "e")
 
 
-def move_and_stop(change: hf.Change) -> None:
+def move_and_stop(change: hf.system.Change) -> None:
     change.move("/app/left/b", "/app/right")
     change.stop("/app/right/b")
 
 
-def swap(change: hf.Change) -> None:
+def swap(change: hf.system.Change) -> None:
     change.add("/app/right", hf.supervisor("way", children=[counter("b", 100)]))
     change.move("/app/left/b", "/app/right")
     change.move("/app/right/way/b", "/app/left")
 
 
-def move_to_new(change: hf.Change) -> None:
+def move_to_new(change: hf.system.Change) -> None:
     change.add("/app/right", hf.supervisor("new"))
     change.move("/app/left/b", "/app/right/new")
     change.add("/app/right/new", counter("g"))
 
 
-def there_and_back(change: hf.Change) -> None:
+def there_and_back(change: hf.system.Change) -> None:
     change.move("/app/left/b", "/app/right")
     change.move("/app/right/b", "/app/left")
 
@@ -461,7 +461,7 @@ async def test_who_was_bound_to_a_life_that_is_over_stays_with_the_actor_and_not
         change.add("/app/left", counter("a", 100))
         change.register("third", before)
     assert await client.ask(Where()) == "/app/pool/a"
-    assert system.node.names["third"].path == "/app/pool/a"
+    assert system._node.names["third"].path == "/app/pool/a"
 
 
 async def test_an_address_that_somebody_else_has_leads_to_nobody_else_while_that_one_is_restarted(
@@ -475,7 +475,7 @@ async def test_an_address_that_somebody_else_has_leads_to_nobody_else_while_that
     left = ref(system, "/app/left")._cell
     left.kill()
     seen: set[int | None] = set()
-    while (found := system.node.find("/app/left/a")) is None or found.state != "running" or not seen - {None}:
+    while (found := system._node.find("/app/left/a")) is None or found.state != "running" or not seen - {None}:
         seen.add(None if found is None else found.parent is not None and id(found.parent))
         await asyncio.sleep(0)
     assert seen <= {None, id(left)}
@@ -518,7 +518,7 @@ async def test_a_request_that_waited_in_the_queue_of_a_restarted_supervisor_leav
     if is_given_up:
         assert isinstance(failed, pytest.ExceptionInfo)
         assert failed.value.kept == ()
-        assert system.node.find(path) is None
+        assert system._node.find(path) is None
         assert [info.id for info in await ref(system, "/app/left").ask(hf.WhichChildren())] == ["a", "b", "c"]
     else:
         assert await ref(system, path).ask(Add(1)) == 1
@@ -546,7 +546,7 @@ async def test_a_tree_that_could_not_be_started_again_is_refused(system: hf.Acto
     assert await ref(system, "/app/top/user").ask(Where()) == "/app/top/first"
 
 
-OWN: list[Callable[[hf.Change], object]] = [
+OWN: list[Callable[[hf.system.Change], object]] = [
     lambda change: change.add("/app/recovery", counter("x")),
     lambda change: change.move("/app/left/a", "/app/recovery"),
     lambda change: change.remove("/app/recovery"),
@@ -556,7 +556,7 @@ OWN: list[Callable[[hf.Change], object]] = [
 
 @pytest.mark.parametrize("step", OWN)
 async def test_what_belongs_to_the_system_itself_is_not_changed(
-    system: hf.ActorSystem, step: Callable[[hf.Change], object]
+    system: hf.ActorSystem, step: Callable[[hf.system.Change], object]
 ) -> None:
     await system.start(counter("recorded", recovery=hf.hybrid(interval=60.0)))
     with pytest.raises(hf.TransactionRefused, match="a part of the system itself"):
@@ -595,7 +595,7 @@ async def test_a_busy_actor_is_stopped_however_long_it_takes(system: hf.ActorSys
         with system.events() as stream:
             async with asyncio.timeout(IN_TIME):
                 async for event in stream:
-                    if isinstance(event, hf.TransactionBegan):
+                    if isinstance(event, hf.events.TransactionBegan):
                         break
         task.cancel()
     worker.may_end.set()
@@ -668,12 +668,12 @@ async def test_names_are_in_force_as_the_last_step_says(system: hf.ActorSystem) 
         change.register("second", a)
         change.register("third", d)
         change.unregister("third")
-    assert {name: cell.path for name, cell in system.node.names.items()} == {"first": b.path, "second": a.path}
+    assert {name: cell.path for name, cell in system._node.names.items()} == {"first": b.path, "second": a.path}
     async with system.transaction(timeout=IN_TIME) as change:
         change.unbind("/app/right/client", "peer")
         change.stop(a)
         change.register("second", d)
-    assert {name: cell.path for name, cell in system.node.names.items()} == {"first": b.path, "second": d.path}
+    assert {name: cell.path for name, cell in system._node.names.items()} == {"first": b.path, "second": d.path}
     assert d._cell.extra().belongings.names == ["second"]
 
 
@@ -714,7 +714,7 @@ async def test_who_was_stopped_by_a_message_and_came_back_with_its_supervisor_is
 async def test_a_binding_in_a_process_is_changed_by_the_commit_alone(
     system: hf.ActorSystem, one: hf.ActorRef[Any]
 ) -> None:
-    await system.node.settled()
+    await system._node.settled()
     before = picture(system)
     with pytest.raises(hf.TransactionFailed):
         async with system.transaction(timeout=IN_TIME) as change:
@@ -742,7 +742,7 @@ async def test_a_binding_of_a_spec_follows_an_actor_and_not_its_old_address(syst
         assert await ref(system, path).ask(Where()) == "/app/pool/a"
 
 
-class Killed(hf.Operation):
+class Killed(hf.system.Operation):
     """A step at whose commit the process of an actor is killed, which the root hears of later."""
 
     verb = "kill"
@@ -772,14 +772,14 @@ async def test_a_process_that_dies_at_the_commit_loses_nothing_of_it(system: hf.
             for step in steps:
                 step()
         assert (await a.ask(Add(0)), await b.ask(Add(0))) == (400, 600)
-        (told,) = [event for event in stream.take() if isinstance(event, hf.TransactionCommitted)]
+        (told,) = [event for event in stream.take() if isinstance(event, hf.events.TransactionCommitted)]
     assert told.problems == ()
 
 
 # -- the root ends ----------------------------------------------------------------------------------------------------
 
 
-class Die(hf.Operation):
+class Die(hf.system.Operation):
     """A step at which the program is killed, before the commit or in the middle of it."""
 
     verb = "die"

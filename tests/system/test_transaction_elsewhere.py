@@ -54,7 +54,7 @@ async def shape(system: hf.ActorSystem) -> object:
 async def test_a_supervisor_in_another_process_is_changed_by_its_admin_messages(
     system: hf.ActorSystem, verb: str
 ) -> None:
-    def collect(change: hf.Change) -> None:
+    def collect(change: hf.system.Change) -> None:
         match verb:
             case "add":
                 change.register("new", change.add("/app/far", counter("c", 5)))
@@ -149,8 +149,8 @@ async def test_a_recorded_sender_recovers_although_its_receiver_has_moved(system
         sender.kill()
         assert await sender.ask(Poke(plain)) == 6
         kinds = [type(event) for event in stream.take()]
-    assert hf.RecoveryFailed not in kinds
-    assert hf.Recovered in kinds
+    assert hf.events.RecoveryFailed not in kinds
+    assert hf.events.Recovered in kinds
 
 
 async def test_a_process_is_told_where_the_actor_lives_now_that_it_is_bound_to(system: hf.ActorSystem) -> None:

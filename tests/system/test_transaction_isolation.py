@@ -75,7 +75,7 @@ async def test_who_cannot_live_there_undoes_the_steps_before(
         async with system.transaction() as change:
             change.isolation(one, "process")
             change.isolation(parent, "process")
-    assert isinstance(failed.value.__cause__, hf.CannotMove)
+    assert isinstance(failed.value.__cause__, hf.errors.CannotMove)
     assert system.pid_of(one) == os.getpid()
     assert await one.ask(Add(0)) == 5
 

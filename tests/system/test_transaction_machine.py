@@ -65,7 +65,7 @@ async def possible(system: hf.ActorSystem, steps: list[Step]) -> list[Step]:
     return good
 
 
-def collect(change: hf.Change, steps: list[Step]) -> None:
+def collect(change: hf.system.Change, steps: list[Step]) -> None:
     for verb, args in steps:
         getattr(change, verb)(*args)
 

@@ -92,7 +92,7 @@ def spec_of(node: Node, peer: str | None) -> hf.ChildSpec[Any]:
     )
 
 
-class Act(hf.Operation):
+class Act(hf.system.Operation):
     """A step of the tests: it does `work` where others prepare, and is told of the commit.
 
     Its methods have the names of both ways to carry out a transaction: as steps that are done and undone (`do`, `undo`,

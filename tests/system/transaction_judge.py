@@ -188,7 +188,7 @@ class Judge:
             found.append(
                 f"order: the children of {path} are {[name for name, _ in told]}, not {[n for n, _ in wanted]}"
             )
-        cell = system.node.find(path)
+        cell = system._node.find(path)
         actor = cell.actor if cell is not None else None
         if not isinstance(actor, Supervisor):
             return [*found, f"between two lives: {path}"]
@@ -230,7 +230,7 @@ class Judge:
         for name in NAMES:
             try:
                 path: str | None = system.whereis(name).path
-            except hf.NoSuchActor:
+            except hf.errors.NoSuchActor:
                 path = None
             holder = spec.holder(name)
             wanted = spec.path(holder.who) if holder is not None else None
@@ -247,7 +247,7 @@ class Judge:
             ref = system.ref(spec.path(node.who), hf.Actor)
             status = await system.get_status(ref)
             node.is_suspended = status.state == "suspended"
-            node.names = {name for name in node.names if name in system.node.names}
+            node.names = {name for name in node.names if name in system._node.names}
             if status.bindings.get("peer") != (None if node.peer is None else spec.path(node.peer)):
                 node.peer = node.spec_peer  # It cannot be seen otherwise who is meant if that one is suspended.
             if not node.is_suspended and not node.is_recorded:

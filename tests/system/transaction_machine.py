@@ -199,7 +199,7 @@ class Machine:
             self.judge.fault(f"late: transaction {number} took {loop.time() - begun:g} s of {script.timeout:g}")
         return bool(commits)
 
-    def _collect(self, change: hf.Change, script: Script, steps: list[Step]) -> None:
+    def _collect(self, change: hf.system.Change, script: Script, steps: list[Step]) -> None:
         draft = self.spec.copy()
         for draw in script.draws:
             if draw.verb in ("fail", "hang", "pause"):
@@ -315,7 +315,7 @@ class Machine:
             ref.kill()
 
 
-def collect(change: hf.Change, step: Step, draft: Spec, target: Callable[[int], Any]) -> None:
+def collect(change: hf.system.Change, step: Step, draft: Spec, target: Callable[[int], Any]) -> None:
     """Have the transaction do a step."""
     args = step.args
     match step.verb:

@@ -73,7 +73,7 @@ async def forever() -> None:
     await asyncio.get_running_loop().create_future()
 
 
-class Stumble(hf.Operation):
+class Stumble(hf.system.Operation):
     """A step that passes its check and then fails, or does what a test wants in the middle."""
 
     verb = "stumble over"
@@ -119,7 +119,7 @@ def ref(system: hf.ActorSystem, path: str) -> hf.ActorRef[Any]:
 
 def picture(system: hf.ActorSystem) -> dict[str, Any]:
     """All there is to be seen of a tree."""
-    node = system.node
+    node = system._node
     assert node.root is not None
     cells = dict(everything(node.root))
     return {

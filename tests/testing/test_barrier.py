@@ -169,7 +169,7 @@ async def test_back_off_and_intensity_window_pass_without_sleeping(
     with actor_system.events() as events:
         counter.tell(Add(-1))
         await advance(2400.0)
-        assert any(isinstance(event, hf.SupervisorGaveUp) for event in events.take()) is gives_up
+        assert any(isinstance(event, hf.events.SupervisorGaveUp) for event in events.take()) is gives_up
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop", "asyncio"])

@@ -301,4 +301,4 @@ async def test_an_actor_of_another_process_is_refused_by_name(guarded: bool, pro
 async def test_a_program_is_refused_by_name(probe: Probe) -> None:
     async with hf.ActorSystem("far", log=False) as system:
         with pytest.raises(hf.HoldfastError, match="cannot run under the virtual clock"):
-            await system.start(hf.program(["sleep", "60"]))
+            await system.start(hf.supervision.program(["sleep", "60"]))

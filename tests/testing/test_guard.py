@@ -289,9 +289,9 @@ class Reader(hf.Actor):
 
 async def test_wrong(actor_system):
     reader = actor_system.spawn(hf.start(Reader), "reader")
-    with pytest.raises(hf.BadMessage, match=r"Expected `list`, got `tuple` - at `rows\\['a'\\]`"):
+    with pytest.raises(hf.errors.BadMessage, match=r"Expected `list`, got `tuple` - at `rows\\['a'\\]`"):
         reader.tell(Rows({"a": (1, 2)}))
-    with pytest.raises(hf.BadMessage, match=r"Expected `int`, got `str` - at `items\\[1\\]`"):
+    with pytest.raises(hf.errors.BadMessage, match=r"Expected `int`, got `str` - at `items\\[1\\]`"):
         reader.tell(Local(Odd(), [1, "2"]))
 
 async def test_right(actor_system):

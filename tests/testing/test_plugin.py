@@ -60,7 +60,7 @@ def test_a_crash_that_nobody_expected_fails_the_test(suite) -> None:
 async def test_crashes(actor_system):
     counter = actor_system.spawn(hf.start(Counter), "counter")
     counter.tell(Add(-1))
-    await actor_system.node.settled()
+    await actor_system._node.settled()
 """)
     result.assert_outcomes(passed=1, errors=1)
     result.stdout.fnmatch_lines(["*/app/counter (life 1) crashed in Add(n=-1): ValueError: negative*"])
@@ -71,7 +71,7 @@ def test_what_is_expected_passes_and_is_counted(suite) -> None:
 async def crash(system):
     counter = system.spawn(hf.start(Counter), "counter")
     counter.tell(Add(-1))
-    await system.node.settled()
+    await system._node.settled()
     counter.tell(Add(1))
 
 async def test_any(actor_system):
@@ -96,7 +96,7 @@ def test_the_configuration_can_expect_for_all_tests(suite) -> None:
         """
 async def test_crashes(actor_system):
     actor_system.spawn(hf.start(Counter)).tell(Add(-1))
-    await actor_system.node.settled()
+    await actor_system._node.settled()
 """,
         holdfast_expect="crashes",
     )
@@ -133,7 +133,7 @@ async def test_does_not_wait(actor_system):
     ],
 )
 def test_a_leak_fails_the_test(suite, leak: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("holdfast.testing.guard.leaks.SHORT_GRACE", 0.1)
+    monkeypatch.setattr("holdfast.testing.guard.process_leaks.SHORT_GRACE", 0.1)
     result = suite(f"""
 kept = []
 
@@ -171,7 +171,7 @@ def pytest_configure(config):
 from conftest import REAL, exchanged
 
 async def test_guarded(actor_system):
-    with pytest.raises(hf.BadMessage):
+    with pytest.raises(hf.errors.BadMessage):
         actor_system.spawn(hf.start(Counter)).tell(Add("one"))
 
 async def test_plain():
@@ -203,7 +203,7 @@ async def test_told_to_end(actor_system, kept):
     kept[-1].terminate()
 
 async def test_own(actor_system, kept, monkeypatch):
-    monkeypatch.setattr("holdfast.testing.guard.leaks.SHORT_GRACE", 0.0)
+    monkeypatch.setattr("holdfast.testing.guard.process_leaks.SHORT_GRACE", 0.0)
     program = "import sys; sys.stdin.read()"
     kept.append(subprocess.Popen([sys.executable, "-c", program, boot.__file__], stdin=subprocess.PIPE))
     asyncio.get_running_loop().call_later(0.0, kept[-1].stdin.close)
@@ -235,7 +235,7 @@ async def test_two(actor_systems):
 
 def test_ended():
     assert [system.tree() for system in running] == [["/one"], ["/other"]]
-    assert all(system.node.root.is_dead for system in running)
+    assert all(system._node.root.is_dead for system in running)
 
 running = []
 """)
@@ -265,7 +265,7 @@ async def test_mutates(actor_system):
     message = Many([1])
     for kind in (Reader, Counter):
         actor_system.spawn(hf.start(kind), kind.__name__).tell(message)
-    await actor_system.node.settled()
+    await actor_system._node.settled()
 """)
     result.assert_outcomes(passed=1, errors=1)
     result.stdout.fnmatch_lines(["*from the test to /app/Counter: sent Many(items=[[]1])*"])
@@ -283,7 +283,7 @@ async def test_mutates(actor_system):
     items = [1]
     reader.tell(Many(items))
     items.clear()
-    await actor_system.node.settled()
+    await actor_system._node.settled()
 
 @pytest.mark.holdfast(sends=True)
 async def test_may(actor_system):
@@ -291,7 +291,7 @@ async def test_may(actor_system):
     items = [1]
     reader.tell(Many(items))
     items.clear()
-    await actor_system.node.settled()
+    await actor_system._node.settled()
 """)
     result.assert_outcomes(passed=2, errors=1)
     result.stdout.fnmatch_lines(["*sent Many(items=[[]1]), after its turn it was Many(items=[[]])*"])
@@ -302,8 +302,8 @@ def test_a_message_of_the_wrong_types_is_refused_where_it_is_sent(suite) -> None
 @pytest.mark.parametrize("way", ["tell", "ask", "send", "publish"])
 async def test_sends(actor_system, way):
     counter = actor_system.spawn(hf.start(Counter), "counter")
-    actor_system.node.topics.subscribe("/adds", counter._cell)
-    with pytest.raises(hf.BadMessage, match="Expected `int`, got `str`"):
+    actor_system._node.topics.subscribe("/adds", counter._cell)
+    with pytest.raises(hf.errors.BadMessage, match="Expected `int`, got `str`"):
         if way == "publish":
             await actor_system.publish("/adds", Add("5"))
         elif way == "send":
@@ -460,7 +460,7 @@ from holdfast.testing import simulate
 
 async def crash(system):
     system.spawn(hf.start(Counter), "counter").tell(Add(-1))
-    await system.node.settled()
+    await system._node.settled()
 
 @simulate(seeds=2)
 @pytest.mark.holdfast(crashes=1)

@@ -32,7 +32,7 @@ class Counter(hf.Actor):
         return self.total
 
 async def works(actor_system, probe):
-    assert actor_system.node.loop is asyncio.get_running_loop()
+    assert actor_system._node.loop is asyncio.get_running_loop()
     counter = actor_system.spawn(hf.start(Counter), "counter")
     assert await asyncio.wait_for(counter.ask(Add(2)), 30) == 2
     probe.tell(counter, Add(1))

@@ -129,7 +129,7 @@ async def test_who_waits_when_the_probe_stops_hears_of_it(actor_system: GuardedS
 async def test_a_reply_of_another_type_than_declared_is_refused_at_the_call(probe: Probe) -> None:
     asked = probe.ref.ask(Ping())
     await probe.expect(Ping)
-    with pytest.raises(hf.BadMessage, match="the reply 5: Expected `str`, got `int`"):
+    with pytest.raises(hf.errors.BadMessage, match="the reply 5: Expected `str`, got `int`"):
         probe.reply(5)
     probe.reply("five")
     assert await asked == "five"

@@ -170,7 +170,7 @@ async def test_it_is_a_decorator_for_tests(system: GuardedSystem, simulation: Si
     await write(system, lines)
     assert len(lines) == 12
     assert asyncio.get_running_loop().time() == 10.0
-    assert system.node.clock.wall() == 1_700_000_010.0
+    assert system._node.clock.wall() == 1_700_000_010.0
     assert simulation.seed in range(5)
 
 

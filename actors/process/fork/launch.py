@@ -1,4 +1,4 @@
-"""How the fork server is started: its command and environment, and what it is told about this process."""
+"""Starts the fork server: its command, its environment, and what it is told about this process."""
 
 from __future__ import annotations
 

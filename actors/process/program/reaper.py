@@ -1,4 +1,4 @@
-"""The keeper of one external program: a small process between a program and the actor that owns it.
+"""The keeper of one external program: a small process that owns the program on behalf of its actor.
 
 It is run as a file (`external_program.py` does that) and imports next to nothing, so that it starts in some 15 ms.
 

@@ -1,4 +1,4 @@
-"""What a program is given to read."""
+"""Feeds the standard input of an external program."""
 
 from __future__ import annotations
 

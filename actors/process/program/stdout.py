@@ -1,4 +1,4 @@
-"""What an actor process prints, line by line."""
+"""Reads what a process prints, line by line."""
 
 from __future__ import annotations
 

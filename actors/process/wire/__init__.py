@@ -1,1 +1,1 @@
-"""What the root and an actor process say to each other: frames, their connection, and who may send which."""
+"""The wire between the root and actor processes: frames, connections, and who may send which."""

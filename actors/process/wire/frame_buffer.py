@@ -1,4 +1,4 @@
-"""Bytes that have come over a connection and are not taken in yet."""
+"""A buffer for the bytes that a connection has received and not yet decoded."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from ...errors import AskDeadlock, BadMessage, HoldfastError, type_name
+from ...errors import AskDeadlock, BadMessage, BadReply, HoldfastError, type_name
 from ...exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...kernel import links
 from ...kernel.address_host import AddressHost, Home, Place
@@ -181,7 +181,7 @@ class Peer:
         try:
             reply = self.codec.reply_decoder(type(ask.message))(frame.body)
         except Exception as error:  # msgspec's own, or what a hook raised: all say that it does not fit.
-            ask.fail(BadMessage("reply", message_name(type(ask.message)), str(error)))
+            ask.fail(BadReply(message_name(type(ask.message)), str(error)))
         else:
             ask.answer(reply)
 
@@ -250,7 +250,7 @@ class Peer:
             finally:
                 if frame.sender is not None:
                     ask.sender = self._sender(frame.sender)
-            if ask.chain and (ctx := cell.ctx) is not None and ctx.turn_in(ask.chain):
+            if ask.chain and (ctx := cell.ctx) is not None and ctx._turn_in(ask.chain):
                 raise AskDeadlock(cell.path, tuple(path for path, _ in ask.chain))
             cell.admit(cell, ask)
         except HoldfastError as error:
@@ -360,7 +360,7 @@ class RelayedAsk(Ask, eq=False):
             connection.send(frames.Reply(self.id, cast("Any", reply)))
         except BadMessage as error:
             self.is_over = False
-            self.fail(BadMessage("reply", error.message, error.problem))
+            self.fail(BadReply(error.message, error.problem))
 
     def answer_raw(self, body: bytes) -> None:
         """Pass an encoded reply on."""
@@ -373,7 +373,7 @@ class RelayedAsk(Ask, eq=False):
         try:
             kind, name, body = codec.encode_error(error)
         except BadMessage as bad:  # A Refusal with a field that cannot be sent is a reply that cannot.
-            kind, name, body = codec.encode_error(BadMessage("reply", type_name(type(error)), bad.problem))
+            kind, name, body = codec.encode_error(BadReply(type_name(type(error)), bad.problem))
         self.fail_raw(kind, name, body)
 
     def fail_raw(self, kind: str, name: str, body: bytes) -> None:

@@ -1,4 +1,4 @@
-"""Messages that wait for room at their receivers, on the receivers' side of a process border."""
+"""Messages that have crossed a process border and wait there for room at their receivers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The gate: what an actor process may say to the root. Each frame passes it before any handler sees it.
+"""The gate: checks what an actor process says to the root before any handler sees it.
 
 An actor process is trusted with its own actors and with nothing else: those at the address it was given, and below it.
 It may send to any address, but only as one of its own; what it claims (lives, state, names, children, links, events) it

@@ -22,7 +22,7 @@ async def start(system: hf.ActorSystem, kind: Any = Worker) -> hf.ActorRef[Any]:
 async def test_a_field_of_the_wrong_type_fails_the_ask_by_name(system: hf.ActorSystem) -> None:
     one = await start(system, Account)
     wrong: Any = "three"
-    with pytest.raises(hf.BadMessage) as refused:
+    with pytest.raises(hf.errors.BadMessage) as refused:
         await one.ask(Add(wrong))
     assert refused.value.actor == "/app/one"
     assert refused.value.message.endswith("players.Add")
@@ -52,11 +52,13 @@ async def test_a_value_that_cannot_be_coded_is_refused_at_the_call(system: hf.Ac
         one.kill()
         await ended
     message = Run("anything", threading.Lock())
-    with pytest.raises(hf.BadMessage, match=r"players\.Run to /app/one: field 'with_': a value of type _thread\.lock"):
+    with pytest.raises(
+        hf.errors.BadMessage, match=r"players\.Run to /app/one: field 'with_': a value of type _thread\.lock"
+    ):
         one.tell(message)
-    with pytest.raises(hf.BadMessage, match="field 'with_'"):
+    with pytest.raises(hf.errors.BadMessage, match="field 'with_'"):
         await one.ask(message)
-    with pytest.raises(hf.BadMessage, match="field 'with_'"):
+    with pytest.raises(hf.errors.BadMessage, match="field 'with_'"):
         await one.send(message)
     assert await one.ask(Add(1)) == 1, "nothing of them was sent"
 
@@ -69,9 +71,9 @@ async def test_a_message_that_is_too_large_is_refused_at_the_call(system: hf.Act
         one.kill()
         await ended
     message = Run("anything", bytes(MAX_BYTES + 100_000))
-    with pytest.raises(hf.BadMessage, match=rf"players\.Run to /app/one: field 'with_'.*limit is {MAX_BYTES}"):
+    with pytest.raises(hf.errors.BadMessage, match=rf"players\.Run to /app/one: field 'with_'.*limit is {MAX_BYTES}"):
         one.tell(message)
-    with pytest.raises(hf.BadMessage, match="send it in parts"):
+    with pytest.raises(hf.errors.BadMessage, match="send it in parts"):
         await one.ask(message)
     assert await one.ask(Add(1)) == 1
 
@@ -124,14 +126,14 @@ class Relay(hf.Actor):
 @pytest.mark.parametrize("what", ["wrong_reply", "huge_reply"])
 async def test_a_reply_that_cannot_be_sent_fails_the_ask(system: hf.ActorSystem, what: str) -> None:
     one = await start(system)
-    with pytest.raises(hf.BadMessage, match="reply"):
+    with pytest.raises(hf.errors.BadReply, match="reply"):
         await one.ask(Run(what, MAX_BYTES + 100_000), timeout=20)
     assert await one.ask(Add(1)) == 1
 
 
 async def test_a_reply_of_the_wrong_type_fails_the_ask(system: hf.ActorSystem) -> None:
     one = await start(system, Liar)
-    with pytest.raises(hf.BadMessage, match="Expected `int`, got `str`"):
+    with pytest.raises(hf.errors.BadReply, match="Expected `int`, got `str`"):
         await one.ask(Total())
 
 
@@ -159,7 +161,7 @@ async def test_an_error_with_text_that_cannot_be_coded_is_still_told(system: hf.
 
 
 async def test_a_payload_that_lies_about_its_array_is_refused(system: hf.ActorSystem) -> None:
-    codec = system.node.codec
+    codec = system._node.codec
     for data in (b"", b"\xff\xff\xff\xff", b"\x01\x00\x00\x00\xc0", b"\x04\x00\x00\x00\x92\xa1?\x90"):
         body = msgspec.msgpack.encode(msgspec.msgpack.Ext(2, data))
         with pytest.raises(msgspec.DecodeError):

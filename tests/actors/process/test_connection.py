@@ -204,7 +204,7 @@ async def test_what_is_queued_leaves_before_an_orderly_close() -> None:
 async def test_a_frame_above_the_limit_is_refused_and_the_next_one_goes_through() -> None:
     async with pair() as (one, other):
         number = one.connection.names.to_wire("/app/new")
-        with pytest.raises(hf.BadMessage) as refused:
+        with pytest.raises(hf.errors.BadMessage) as refused:
             one.connection.send(tell("huge", bytes(MAX_FRAME), to=number), "/app/new")
         assert "Blob" in str(refused.value)
         assert "field 'data'" in str(refused.value)
@@ -216,7 +216,7 @@ async def test_a_frame_above_the_limit_is_refused_and_the_next_one_goes_through(
 async def test_a_value_that_cannot_be_coded_is_refused_by_field() -> None:
     async with pair() as (one, other):
         body: Any = Blob("x", b"", object())
-        with pytest.raises(hf.BadMessage, match=r"Blob to /app/a: field 'other': a value of type object"):
+        with pytest.raises(hf.errors.BadMessage, match=r"Blob to /app/a: field 'other': a value of type object"):
             one.connection.send(frames.Tell("/app/a", "m:Blob", body), "/app/a")
         one.connection.send(frames.Beat())
         await other.get(1)

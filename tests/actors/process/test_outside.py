@@ -193,17 +193,17 @@ async def test_subscribe_at_run_time_and_no_more(make: Make, system: hf.ActorSys
     await one.ask(Heard())
     await other.ask(Publish("/more", ["no"]))
     assert await one.ask(Notes()) == ["yes"]
-    assert "/more" not in system.node.topics.names()
+    assert "/more" not in system._node.topics.names()
 
 
 async def test_subscriptions_end_with_the_life(make: Make, system: hf.ActorSystem) -> None:
     one = await make("one", restart="permanent")
     one.tell(Subscribe("/more"))
     await one.ask(Heard())
-    assert "/more" in system.node.topics.names()
+    assert "/more" in system._node.topics.names()
     one.kill()
     await one.ask(Heard())
-    assert system.node.topics.names() == ["/news"], "what the class subscribes to, and nothing else"
+    assert system._node.topics.names() == ["/news"], "what the class subscribes to, and nothing else"
 
 
 async def test_bindings(make: Make, system: hf.ActorSystem) -> None:
@@ -228,9 +228,9 @@ async def test_a_spawned_actor_is_reached_from_everywhere(make: Make, system: hf
     inner.tell(Note("from here"))
     await other.ask(Publish("/news", ["from there"]))
     assert await inner.ask(Notes()) == ["from here", "from there"]
-    with pytest.raises(hf.NoSuchActor):
+    with pytest.raises(hf.errors.NoSuchActor):
         system.ref("/app/one/nobody", Notebook)
-    with pytest.raises(hf.WrongActor):
+    with pytest.raises(hf.errors.WrongActor):
         system.ref("/app/one/inner", Stranger)
     with pytest.raises(hf.UnknownMessage):
         inner.tell(Unheard())
@@ -307,5 +307,5 @@ async def test_who_has_ended_is_said_to_have_ended_by_whatever_way_he_is_told(
         assert await one.ask(Send(other, 1)) == "0 ActorStopped"
         with pytest.raises(hf.RemoteCrash, match="ActorStopped: /app/other has stopped"):
             await one.ask(AskPort())
-        letters = [event.why for event in events.take() if isinstance(event, hf.DeadLetter)]
+        letters = [event.why for event in events.take() if isinstance(event, hf.events.DeadLetter)]
     assert letters == ["it has stopped"]

@@ -123,7 +123,7 @@ async def test_child_tells_child_and_is_known_as_the_sender(system: hf.ActorSyst
     await asyncio.gather(one.ask(Notes()), three.ask(Notes()))  # both have passed on what they were told
     # What they passed on crosses the root behind their replies: look until it is there.
     while len(found := await two.ask(Notes())) < 6 or len(await three.ask(Notes())) < 3:
-        await system.node.settled()
+        await system._node.settled()
     assert [note for note in found if note[0] == "a"] == ["a0", "a1", "a2"]
     assert [note for note in found if note[0] == "c"] == ["c0", "c1", "c2"]
     assert await three.ask(Notes()) == ["b0", "b1", "b2"]
@@ -405,9 +405,9 @@ async def test_a_handler_that_never_returns_is_killed_after_its_shutdown_seconds
     behind = worker.ask(Total(), timeout=20)
     await until(begun.exists)
     with system.events() as events:
-        begin = system.node.loop.time()
+        begin = system._node.loop.time()
         await system.stop(worker)
-        seconds = system.node.loop.time() - begin
+        seconds = system._node.loop.time() - begin
         assert (await next_event(events, ProcessDied)).reason == hf.KILLED
     assert seconds >= 0.2
     with pytest.raises(hf.AskFailed, match="killed"):
@@ -445,7 +445,7 @@ async def test_stopped_for_good_the_queue_is_refused(system: hf.ActorSystem, tmp
 async def test_start_that_fails_says_why(system: hf.ActorSystem, isolation: str) -> None:
     with pytest.raises(hf.StartFailed, match=r"/app/picky could not be started: RuntimeError: not like this"):
         await start(system, hf.start(Picky), isolation, name="picky")
-    with pytest.raises(hf.NoSuchActor):
+    with pytest.raises(hf.errors.NoSuchActor):
         system.ref("/app/picky", Picky)
 
 

@@ -134,7 +134,7 @@ def pids_now(system: hf.ActorSystem) -> list[int]:
     for path in ("/app/team", "/app/team/alice", "/app/team"):
         try:
             found.append(system.pid_of(system.ref(path, hf.Actor)))
-        except hf.NoSuchActor:
+        except hf.errors.NoSuchActor:
             continue
     return [pid for pid in found if pid != os.getpid() and psutil.pid_exists(pid)]
 
@@ -191,7 +191,7 @@ async def test_it_is_protected_and_lives_there_again_after_that(
 ) -> None:
     await system.start(team(recovery))
     alice = at(system, "alice")
-    for mechanism in (hf.PBR(), hf.LFR(), None):
+    for mechanism in (hf.ftm.PBR(), hf.ftm.LFR(), None):
         async with system.transaction(timeout=60.0) as change:
             change.protect(alice, mechanism)
         assert await alice.ask(Add(1), timeout=30.0) > 100

@@ -56,7 +56,7 @@ def test_a_script_with_a_guard_works(tmp_path: Path) -> None:
     assert output(file(tmp_path, "program.py", PROCESS + GUARD + RUN), folder=tmp_path) == "42"
 
 
-@pytest.mark.parametrize("how", ['isolation="process"', "mechanism=hf.PBR()"], ids=["process", "replicas"])
+@pytest.mark.parametrize("how", ['isolation="process"', "mechanism=hf.ftm.PBR()"], ids=["process", "replicas"])
 def test_a_script_without_a_guard_is_told_to_have_one(tmp_path: Path, how: str) -> None:
     said = output(file(tmp_path, "program.py", ACTOR.replace("{how}", how) + RUN), folder=tmp_path)
     assert said.startswith("/app/actor")

@@ -100,7 +100,7 @@ async def test_a_message_that_does_not_fit_is_alone_in_its_trouble(
 async def test_what_cannot_be_coded_raises_at_the_call_and_the_run_goes_on(keeper: hf.ActorRef[Keeper]) -> None:
     await keeper.ask(Number(0))
     keeper.tell(Number(1))
-    with pytest.raises(hf.BadMessage, match="padding"):
+    with pytest.raises(hf.errors.BadMessage, match="padding"):
         keeper.tell(Number(2, object()))  # type: ignore[arg-type]
     keeper.tell(Number(3))
     assert await keeper.ask(All()) == ["0", "1", "3"]
@@ -129,9 +129,9 @@ async def test_arrays_come_back_as_they_were(keeper: hf.ActorRef[Keeper], dtype:
 
 async def test_an_array_that_is_too_large_is_refused_by_name(keeper: hf.ActorRef[Keeper]) -> None:
     await keeper.ask(Number(1))
-    with pytest.raises(hf.BadMessage, match=r"field 'one'.*the limit is"):
+    with pytest.raises(hf.errors.BadMessage, match=r"field 'one'.*the limit is"):
         keeper.tell(Grids([], np.zeros(17 * 1024 * 1024, "u1")))
-    with pytest.raises(hf.BadMessage, match=r"cannot be sent"):
+    with pytest.raises(hf.errors.BadMessage, match=r"cannot be sent"):
         keeper.tell(Grids([np.zeros(LARGE_ARRAY), np.array([object()] * LARGE_ARRAY)]))
     small = np.arange(LARGE_ARRAY, dtype="u1")
     assert np.array_equal((await keeper.ask(Grids([small])))[0], small), "what was left of the refused ones is gone"

@@ -42,9 +42,9 @@ async def test_children_are_reached_by_address_from_the_root(system: hf.ActorSys
     assert system.tree()[1:] == [
         f"/app/team{name}" for name in ("", "/alice", "/bob", "/book", "/inner", "/inner/carol")
     ]
-    with pytest.raises(hf.NoSuchActor):
+    with pytest.raises(hf.errors.NoSuchActor):
         system.ref("/app/team/nobody", Account)
-    with pytest.raises(hf.WrongActor):
+    with pytest.raises(hf.errors.WrongActor):
         system.ref("/app/team/book", Account)
     children = await team.ask(WhichChildren())
     assert [child.id for child in children] == ["alice", "bob", "book", "inner"]

@@ -47,7 +47,7 @@ class Worker(hf.Actor):
                 await ref.ask(hf.StartChild(args=("x",), id="made"))
             else:
                 getattr(ref, message.verb)()
-        except hf.NotGranted as error:
+        except hf.errors.NotGranted as error:
             return str(error)
         return ""
 
@@ -62,7 +62,7 @@ class Worker(hf.Actor):
     @hf.on(Names)
     def names(self, message: Names) -> int:
         gc.collect()
-        return len(self.ctx.cell.node.ports.uplink._outside)
+        return len(self.ctx._cell.node.ports.uplink._outside)
 
 
 class Job(hf.Actor):
@@ -94,13 +94,13 @@ async def test_a_binding_grants_orders(system: hf.ActorSystem) -> None:
     worker = await system.start(hf.child("worker", hf.start(Worker), isolation="process", bindings=bound))
     with system.events() as events:
         assert await worker.ask(Order("kill", "/app/one"), timeout=SECONDS) == ""
-        assert (await next_event(events, hf.ChildTerminated)).address == "/app/one"
+        assert (await next_event(events, hf.events.ChildTerminated)).address == "/app/one"
     assert "may not order" in await worker.ask(Order("kill", "/app/two"), timeout=SECONDS)
     async with system.transaction() as change:
         change.bind(worker, "port", system.ref("/app/two", Job))
     with system.events() as events:
         assert await worker.ask(Order("kill", "/app/two"), timeout=SECONDS) == ""
-        assert (await next_event(events, hf.ChildTerminated)).address == "/app/two"
+        assert (await next_event(events, hf.events.ChildTerminated)).address == "/app/two"
 
 
 async def test_who_asked_once_is_not_remembered(system: hf.ActorSystem) -> None:
@@ -119,7 +119,7 @@ async def test_links_outlive_the_forgetting_of_names(system: hf.ActorSystem) -> 
     """Names begin anew while asks are open and messages are on their way, in order."""
     worker = await system.start(hf.child("worker", hf.start(Worker), isolation="process"))
     for at in range(MOST_NAMES + 10):
-        cell = Cell(system.node, None, f"/app/nobody-{at}", system.node.ports.here)
+        cell = Cell(system._node, None, f"/app/nobody-{at}", system._node.ports.here)
         system._workers.by_cell[worker._cell].connection.names.to_wire(cell.path)
     asks = [worker.ask(Ping(), timeout=SECONDS) for _ in range(100)]
     assert [await ask for ask in asks] == [1] * 100
@@ -144,7 +144,7 @@ async def test_no_descriptors_left_is_no_fault_of_the_actor() -> None:
                 pass
             with system.events() as events:
                 os.kill(pid, signal.SIGKILL)
-                await next_event(events, hf.ChildRestarted)
+                await next_event(events, hf.events.ChildRestarted)
             for file in held[:64]:
                 os.close(file)
             held = held[64:]

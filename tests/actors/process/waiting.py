@@ -14,10 +14,10 @@ from holdfast.actors.process.process_host import WorkerPlace
 
 SECONDS = 60.0
 
-E = TypeVar("E", bound=hf.Event)
+E = TypeVar("E", bound=hf.events.Event)
 
 
-async def next_event(stream: hf.EventStream, kind: type[E], when: Callable[[E], bool] = lambda event: True) -> E:
+async def next_event(stream: hf.events.EventStream, kind: type[E], when: Callable[[E], bool] = lambda event: True) -> E:
     """The next event of this kind for which `when` holds; others are passed over."""
     async with asyncio.timeout(SECONDS):
         async for event in stream:

@@ -104,7 +104,7 @@ def test_a_dtype_that_numpy_does_not_survive_is_refused(kind: Any) -> None:
 
 async def test_arrays_of_all_kinds_still_cross(system: hf.ActorSystem) -> None:
     np = pytest.importorskip("numpy")
-    codec = system.node.codec
+    codec = system._node.codec
     fields = np.zeros(3, dtype=[("a", "<i4"), ("b", "<f8", (2,)), ("c", [("d", "|S3")])])
     for array in (np.arange(6).reshape(2, 3), np.array(["a", "bc"]), np.array(["2026-01-01"], "M8[D]"), fields):
         back = codec.decode(np.ndarray, codec.encode(array, "x"))

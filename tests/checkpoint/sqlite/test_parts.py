@@ -292,7 +292,7 @@ async def test_a_store_that_goes_while_it_is_open_acknowledges_nothing_more(tmp_
             await ask_for_ever(doer)
         with pytest.raises(StoreFailed):
             await doer.send(Note("more"))
-        assert [event for event in events.take() if isinstance(event, hf.JournalStopped)]
+        assert [event for event in events.take() if isinstance(event, hf.events.JournalStopped)]
     # It was told while the system ran: that is all.
 
 
@@ -301,16 +301,16 @@ async def test_a_store_that_goes_unnoticed_is_told_of_at_the_end(
 ) -> None:
     monkeypatch.setattr(open_store, "LOOK_SECONDS", 3600.0)  # Nobody looks while it runs.
     path = tmp_path / "app.db"
-    told: list[hf.Event] = []
+    told: list[hf.events.Event] = []
     async with contextlib.AsyncExitStack() as stack:
         system = await stack.enter_async_context(hf.ActorSystem("app", store=f"sqlite:{path}", log=False))
-        system.node.events.add_sink(told.append)
+        system._node.events.add_sink(told.append)
         doer = await system.start(hf.child("doer", hf.start(Doer), recovery=hf.hybrid(interval=1000.0)))
         await doer.ask(Note("one"))
         remove_all(path)
         with pytest.raises(StoreFailed, match="deleted or moved while the store was open"):
             await stack.aclose()
-    assert [event for event in told if isinstance(event, hf.JournalStopped)]
+    assert [event for event in told if isinstance(event, hf.events.JournalStopped)]
 
 
 async def test_a_backup_of_all_parts_is_the_same_store(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
 
 
 def kill(here: Scene, who: str) -> None:
-    cell = here.system.node.find("/t/diagnosis" + f"/{who}" * bool(who))
+    cell = here.system._node.find("/t/diagnosis" + f"/{who}" * bool(who))
     assert cell is not None
     cell.kill()
 
@@ -57,7 +57,7 @@ async def test_whoever_is_killed_the_robot_is_repaired(system: hf.ActorSystem, w
     assert here.world.is_healthy()
     assert here.all(GaveUp) == []
     assert here.touched() == {"ja", "jn"}
-    assert arbiter_of(system.node).holder("/t/robot/jn") is None
+    assert arbiter_of(system._node).holder("/t/robot/jn") is None
 
 
 async def test_a_repairer_that_is_killed_again_and_again_has_no_more_attempts_than_others(

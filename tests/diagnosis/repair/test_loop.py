@@ -463,12 +463,12 @@ async def test_a_repairer_that_is_restarted_in_the_middle_goes_on(system: hf.Act
 async def test_repair_keeps_away_from_what_others_hold(system: hf.ActorSystem) -> None:
     # T63
     here = await scene(system, Policy(**QUICK))
-    grant = arbiter_of(system.node).claim("/t/robot/hm", Hand.FAILOVER, "its node is gone")
+    grant = arbiter_of(system._node).claim("/t/robot/hm", Hand.FAILOVER, "its node is gone")
     await here.change(stopped("hm"))
     ended = await here.hear(ActionEnded)
     assert (ended.outcome, ended.why) == (SKIPPED, "/t/robot/hm is in the hands of failover: its node is gone")
     assert here.done() == []
-    arbiter_of(system.node).release(grant)
+    arbiter_of(system._node).release(grant)
     await here.hear(Repaired)
 
 
@@ -477,10 +477,10 @@ async def test_an_action_ends_at_once_when_failover_takes_the_actor(system: hf.A
     here = await scene(system, Policy(**QUICK))
     await here.change(stopped("hm"))
     began = await here.hear(ActionBegan)
-    grant = arbiter_of(system.node).claim("/t/robot/hm", Hand.FAILOVER, "its node is gone")
+    grant = arbiter_of(system._node).claim("/t/robot/hm", Hand.FAILOVER, "its node is gone")
     assert grant.epoch > began.epoch
     ended = await here.hear(ActionEnded)
     assert (ended.outcome, ended.why) == (LOST, "failover has it now: its node is gone")
     assert "hm" not in here.world.running
-    arbiter_of(system.node).release(grant)
+    arbiter_of(system._node).release(grant)
     await here.hear(Repaired)

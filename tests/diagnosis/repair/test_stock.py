@@ -92,7 +92,7 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
 
 async def do(system: hf.ActorSystem, one: RepairAction, *names: str, check=lambda: None) -> None:
     caller = system.spawn(hf.start(Caller))
-    await system.node.settled()
+    await system._node.settled()
     actor = caller._cell.actor
     assert actor is not None
     act = Act(Step(one.name, names), 1, "a test", actor.ctx, check)
@@ -206,7 +206,7 @@ async def test_a_restart_that_has_begun_is_carried_out_whoever_ends_meanwhile(
             assert isinstance(actor, Repairing)
             actor.work.cancel()
         with pytest.raises(InOtherHands, match="its supervisor"):
-            arbiter_of(system.node).claim(path, Hand.REPAIR, "somebody else")
+            arbiter_of(system._node).claim(path, Hand.REPAIR, "somebody else")
         ending[1].set()
         kept = ["a", "b"] if restart is roll_back else ["a", "b", "c"]  # Its end in good order has saved all three.
         assert await system.ref(path, Notes).ask(Read()) == kept
@@ -225,19 +225,19 @@ async def test_a_supervisor_that_gives_up_in_the_middle_of_a_restart_leaves_nobo
         with system.events() as events:
             system.ref("/t/s/low/b", Node).kill()
             async for event in events:
-                if isinstance(event, hf.SupervisorGaveUp):
+                if isinstance(event, hf.events.SupervisorGaveUp):
                     break
             with pytest.raises(InOtherHands, match="its supervisor"):
-                arbiter_of(system.node).claim(path, Hand.REPAIR, "somebody else")
+                arbiter_of(system._node).claim(path, Hand.REPAIR, "somebody else")
             ending[1].set()
             await restarting
             async for event in events:
-                if isinstance(event, hf.ActorStarted) and event.address == "/t/s/low/b":
+                if isinstance(event, hf.events.ActorStarted) and event.address == "/t/s/low/b":
                     break
         assert await system.ref(path, Notes).ask(Read()) == ["a", "b", "c"]
         assert await life(system, "/t/s/low/b") == 1
         assert await states(system) == {"a": "running", "b": "running"}
-        arbiter_of(system.node).release(arbiter_of(system.node).claim(path, Hand.REPAIR, "somebody else"))
+        arbiter_of(system._node).release(arbiter_of(system._node).claim(path, Hand.REPAIR, "somebody else"))
 
 
 async def failing(work: Coroutine[Any, Any, None]) -> None:
@@ -255,11 +255,11 @@ async def test_what_an_operator_has_stopped_is_started_by_an_operator_only(syste
                 await do(system, one, "a")
         for address in (addresses["a"], "/t/s/low", "/t/s"):  # Nor with those above it: it would come with them.
             with pytest.raises(InOtherHands, match="an operator"):
-                arbiter_of(system.node).claim(address, Hand.REPAIR, "slow")
+                arbiter_of(system._node).claim(address, Hand.REPAIR, "slow")
         assert await states(system) == {"a": "stopped", "b": "running"}
         await keeper.ask(hf.RestartChild("a"))
         await do(system, restart_child(addresses), "a")
-        arbiter_of(system.node).release(arbiter_of(system.node).claim("/t/s", Hand.REPAIR, "slow"))
+        arbiter_of(system._node).release(arbiter_of(system._node).claim("/t/s", Hand.REPAIR, "slow"))
 
 
 async def test_what_an_operator_stops_while_repair_restarts_it_stays_stopped(system: hf.ActorSystem) -> None:
@@ -289,7 +289,7 @@ async def test_repair_leaves_those_alone_that_an_operator_has_stopped_and_that_a
     system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("holdfast.supervision.supervisor.DISMISSED", 2)
-    arbiter = arbiter_of(system.node)
+    arbiter = arbiter_of(system._node)
 
     def is_free(address: str) -> bool:
         try:
@@ -353,14 +353,14 @@ async def test_roll_back_to_an_older_snapshot(system: hf.ActorSystem) -> None:
     await do(system, roll_back({"n": path}), "n")
     # The stop in good order has taken one more snapshot, with all three.
     assert await system.ref(path, Notes).ask(Read()) == ["a", "b"]
-    with pytest.raises(hf.ControlFailed, match="stop it first"):
+    with pytest.raises(hf.errors.ControlFailed, match="stop it first"):
         system.roll_back(path)
 
 
 @pytest.mark.parametrize("recovery", [None, hf.hybrid(interval=1000.0)], ids=["unrecorded", "recorded"])
 async def test_if_there_is_nothing_to_go_back_to_the_actor_runs_again(system: hf.ActorSystem, recovery: Any) -> None:
     await system.start(hf.supervisor("s", children=[hf.child("notes", hf.start(Notes), recovery=recovery)]))
-    with pytest.raises(hf.ControlFailed, match="roll_back of /t/s/notes failed"):
+    with pytest.raises(hf.errors.ControlFailed, match="roll_back of /t/s/notes failed"):
         await do(system, roll_back({"n": "/t/s/notes"}), "n")
     assert await system.ref("/t/s/notes", Notes).ask(Read()) == []
 

@@ -25,8 +25,8 @@ class Wire:
     def __init__(self, system: hf.ActorSystem) -> None:
         self.epochs = {PROXY: 1, REPLICA: 1}
         sec = SEC(CA)
-        self.inner: Any = sec.open_link(system.node, "/app/c", REPLICA, lambda: self.epochs[REPLICA])
-        self.outer: Any = sec.open_link(system.node, "/app/c", PROXY, lambda: self.epochs[PROXY], lambda: [REPLICA])
+        self.inner: Any = sec.open_link(system._node, "/app/c", REPLICA, lambda: self.epochs[REPLICA])
+        self.outer: Any = sec.open_link(system._node, "/app/c", PROXY, lambda: self.epochs[PROXY], lambda: [REPLICA])
         self.done: list[bytes] = []
         self.refused: list[str] = []
         self.on_frame = lambda: None
@@ -91,7 +91,9 @@ async def test_a_revocation_ends_the_sessions_there_are(whom: str) -> None:
             await authority.ask(GetRoot())  # Whoever waited for a revocation has heard of it before this.
             asked = asyncio.ensure_future(wire.ask(b"after"))
             async with asyncio.timeout(20.0):
-                while not ({one.reason for one in events.take() if isinstance(one, hf.FrameRefused)} & {"revoked"}):
+                while not (
+                    {one.reason for one in events.take() if isinstance(one, hf.events.FrameRefused)} & {"revoked"}
+                ):
                     await asyncio.sleep(0)
             wire.is_wanted = False
             with pytest.raises(LinkLost):

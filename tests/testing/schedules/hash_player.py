@@ -49,7 +49,7 @@ async def lives(system: GuardedSystem, simulation: Simulation) -> None:
         "bert": {"recovery": hf.hybrid(interval=2)},
         "carl": {"isolation": "process"},
         "dora": {"isolation": "process", "recovery": hf.hybrid()},
-        "emil": {"mechanism": hf.PBR()},
+        "emil": {"mechanism": hf.ftm.PBR()},
         "fritz": {"recovery": hf.hybrid(durability="os")},
     }
     children = [hf.child(name, hf.start(Cell), **options[name]) for name in NAMES]

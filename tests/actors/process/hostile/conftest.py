@@ -43,14 +43,14 @@ class World:
         """Have the worker write this."""
         self.evil.tell(Write(data))
 
-    async def breached(self, events: hf.EventStream) -> hf.TrustBreached:
+    async def breached(self, events: hf.events.EventStream) -> hf.events.TrustBreached:
         """The worker is ended, it is told why, and its supervisor starts it again."""
-        breach = await next_event(events, hf.TrustBreached)
+        breach = await next_event(events, hf.events.TrustBreached)
         assert breach.address == "/app/sup/evil"
         assert breach.problem
-        died = await next_event(events, hf.ProcessDied)
+        died = await next_event(events, hf.events.ProcessDied)
         assert (died.address, died.pid) == ("/app/sup/evil", breach.pid)
-        await next_event(events, hf.ActorStarted, lambda event: event.address == "/app/sup/evil")
+        await next_event(events, hf.events.ActorStarted, lambda event: event.address == "/app/sup/evil")
         return breach
 
     async def judge(self) -> None:

@@ -70,14 +70,14 @@ class Evil(hf.Actor):
     port: hf.Binding[hf.Actor]
 
     def _socket(self) -> socket.socket:
-        connection = self.ctx.cell.node.ports.uplink.connection
+        connection = self.ctx._cell.node.ports.uplink.connection
         connection.flush()
         return connection._transport.get_extra_info("socket")
 
     @hf.on(Write)
     def write(self, message: Write) -> int:
         self._socket()
-        self.ctx.cell.node.ports.uplink.connection._transport.write(message.data)
+        self.ctx._cell.node.ports.uplink.connection._transport.write(message.data)
         return 1
 
     @hf.on(WriteLater)
@@ -95,21 +95,21 @@ class Evil(hf.Actor):
                 return  # We are ended: that is as it should be.
 
         thread = threading.Thread(target=write, daemon=True)
-        self.ctx.cell.node.loop.call_later(0.05, thread.start)  # Behind our answer.
+        self.ctx._cell.node.loop.call_later(0.05, thread.start)  # Behind our answer.
         return 1
 
     @hf.on(SetPage)
     async def set_page(self, message: SetPage) -> int:
-        page = self.ctx.cell.node.ports.uplink.page
+        page = self.ctx._cell.node.ports.uplink.page
         getattr(page, "_page", page)[message.place] = message.number
         self._socket()
-        self.ctx.cell.node.ports.uplink.connection._transport.write(message.nudge)
+        self.ctx._cell.node.ports.uplink.connection._transport.write(message.nudge)
         await asyncio.sleep(3600)
         return 1
 
     @hf.on(BeDeaf)
     def be_deaf(self, message: BeDeaf) -> int:
-        uplink = self.ctx.cell.node.ports.uplink
+        uplink = self.ctx._cell.node.ports.uplink
         uplink.node.loop.call_later(0.05, uplink.connection._transport.pause_reading)
         return 1
 
@@ -121,7 +121,7 @@ class Evil(hf.Actor):
     def kill(self, message: Kill) -> int:
         self._unbridle()
         victim = self.ctx.find(message.path, hf.Actor)
-        self.ctx.cell.node.loop.call_later(0.05, victim.kill)  # Behind our answer.
+        self.ctx._cell.node.loop.call_later(0.05, victim.kill)  # Behind our answer.
         return 1
 
     @hf.on(Terminate)
@@ -131,7 +131,7 @@ class Evil(hf.Actor):
         return 1
 
     def _unbridle(self) -> None:
-        self.ctx.cell.node.ports.uplink.require_granted = lambda path, order: None
+        self.ctx._cell.node.ports.uplink.require_granted = lambda path, order: None
 
 
 class House(hf.Supervisor):
@@ -144,7 +144,7 @@ class House(hf.Supervisor):
         lives: dict[str, dict[str, Any]] = {
             "plain": {},
             "recorded": {"recovery": hf.hybrid()},
-            "protected": {"mechanism": hf.PBR()},
+            "protected": {"mechanism": hf.ftm.PBR()},
         }
         options = lives[self.kind]
         evil = hf.child("evil", hf.start(Evil), bindings={"port": self.target}, **options)

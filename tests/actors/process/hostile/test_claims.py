@@ -42,7 +42,7 @@ class Town:
         pid = self.system.pid_of(self.system.ref("/app/other", Victim))
         with self.system.events() as events:
             evil.tell(order)
-            breach = await next_event(events, hf.TrustBreached)
+            breach = await next_event(events, hf.events.TrustBreached)
         assert breach.address.startswith(HOUSE)
         assert "has neither started nor is bound to" in breach.problem
         self.total += 1
@@ -55,7 +55,7 @@ class Town:
         async with asyncio.timeout(60):
             while True:
                 try:
-                    await self.system.node.cell_at(EVIL).ref.ask(Ping(), timeout=60)
+                    await self.system._node.cell_at(EVIL).ref.ask(Ping(), timeout=60)
                     return
                 except hf.HoldfastError:
                     await asyncio.sleep(0.01)
@@ -94,8 +94,8 @@ async def test_the_same_binding_made_by_the_root_grants_it(town: Town, kind: str
     town.system.bind(evil, "port", town.system.ref(SUP, hf.Supervisor))
     with town.system.events() as events:
         assert await evil.ask(Kill(VICTIM), timeout=60) == 1
-        assert (await next_event(events, hf.ChildTerminated)).address == VICTIM
-        assert hf.TrustBreached not in [type(event) for event in events.take()]
+        assert (await next_event(events, hf.events.ChildTerminated)).address == VICTIM
+        assert hf.events.TrustBreached not in [type(event) for event in events.take()]
 
 
 @pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["plain", "recorded"])
@@ -108,7 +108,7 @@ async def test_a_claim_that_moves_with_its_actor_is_still_one(town: Town, recove
     assert await evil.ask(Write(claimed), timeout=60) == 1
     assert await evil.ask(Ping(), timeout=60) == 1
     async with town.system.transaction() as change:
-        change.attach(evil, hf.PBR())
+        change.protect(evil, hf.ftm.PBR())
     assert evil.path + "/ftm" in town.system.tree()
     assert [cell.path for cell in evil._cell.extra().bindings.values()] == [SUP]
     await town.refused(evil, Kill(VICTIM))
@@ -137,4 +137,4 @@ async def test_bindings_that_cannot_be_are_a_breach(town: Town, told: Any) -> No
     wanted = Wanted(1, "a:B", [], hf.hybrid(), None, None, told)
     with town.system.events() as events:
         evil.tell(Write(frame(f.Record(f"{HOUSE}/x", raw(wanted)))))
-        assert (await next_event(events, hf.TrustBreached)).address == HOUSE
+        assert (await next_event(events, hf.events.TrustBreached)).address == HOUSE

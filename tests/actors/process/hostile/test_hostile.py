@@ -54,8 +54,8 @@ async def test_a_number_on_the_page_that_cannot_be(place: int, number: int) -> N
         victim = await system.start(hf.child("victim", hf.start(Victim)))
         with system.events() as events:
             evil.tell(SetPage(place, number, frame(f.PageChanged())))
-            assert (await next_event(events, hf.TrustBreached)).address == "/app/evil"
-            await next_event(events, hf.ActorStarted, lambda event: event.address == "/app/evil")
+            assert (await next_event(events, hf.events.TrustBreached)).address == "/app/evil"
+            await next_event(events, hf.events.ActorStarted, lambda event: event.address == "/app/evil")
         assert await victim.ask(Add()) == 1
         assert await evil.ask(Ping(), timeout=60) == 1
 
@@ -124,7 +124,7 @@ async def test_an_error_that_cannot_be_made_is_an_error(world: World) -> None:
 async def test_a_dead_letter_for_another_says_who_tells_it(world: World) -> None:
     with world.system.events() as events:
         await world.write(note("DeadLetter", address=VICTIM, message="m", why="none \x1b[2J"))
-        letter = await next_event(events, hf.DeadLetter)
+        letter = await next_event(events, hf.events.DeadLetter)
     assert (letter.address, letter.why) == (VICTIM, f"none ?[2J (told by {EVIL})")
 
 
