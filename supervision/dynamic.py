@@ -131,7 +131,7 @@ class DynamicSupervisor(Supervisor):
             self._try_to_note(one, lambda: self._note(one, one.spec))
 
     def _respecified(self, one: Child) -> None:
-        if self._flags.journal and self._is_in_place:
+        if self._flags.journal and self._is_in_place and self._template is None:  # Else arguments are noted, no more.
             self._try_to_note(one, lambda: self._note(one, one.spec))
 
     def _try_to_note(self, one: Child, note: Callable[[], None]) -> None:
