@@ -34,6 +34,8 @@ class Child:
     ignored_life: int = 0  # the end of this life is known already: its start failed, or we stopped it
     attempts: int = 0  # restarts in a row without a healthy life
     up_since: float = 0.0
+    due: ExitReason | None = None  # why it is restarted, if it waits for that; None: it does not wait
+    hurried: int = 0  # for which move of its supervisor it did not wait to the end
     retry: int = 0  # the number of the retry that counts; stale ones are dropped
     up: asyncio.Future[None] | None = None  # a start that is waited for outside our turn; None once it is known or void
     row: StartRow | None = None  # those that are started one after another, and it is one of them

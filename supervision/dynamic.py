@@ -27,7 +27,7 @@ from .children import STARTING, Child, StartRow, complete
 from .rules import Rule
 from .spec import NAMELESS, ChildSpec, Flags, Isolation, Plan, Restart, Shutdown, check_spec, child
 from .supervisor import Supervisor
-from .supervisor_changes import check_place, check_subtree
+from .supervisor_changes import Bequest, check_place, check_subtree, has_stood_down
 
 MADE_UP = b""
 """What is noted of a child whose id nobody knows when its supervisor is started again."""
@@ -41,7 +41,6 @@ class DynamicSupervisor(Supervisor):
 
     _is_dynamic: ClassVar[bool] = True
 
-    _template: ChildSpec | None
     _count: int
 
     def __init__(self, flags: Flags | None = None, template: ChildSpec | None = None) -> None:
@@ -104,26 +103,36 @@ class DynamicSupervisor(Supervisor):
         return dataclasses.replace(_filled(self._template, args, kwargs), id=name, made_up=made_up == [True])
 
     def _enlist(self, one: Child) -> None:
-        self._note(one)  # First: what is started must come back, also if we die in the middle of the start.
+        # First: what is started must come back, also if we die in the middle of the start. But of two, of which one is
+        # to take the place of the other, that is noted which has it.
+        if self._is_in_place and one.spec.start.begins_with is None:
+            self._note(one, one.spec)
         super()._enlist(one)
 
-    def _note(self, one: Child) -> None:
+    def _note(self, one: Child, spec: ChildSpec) -> None:
         """Note what becomes of a child when we are started again. Raises HoldfastError if that cannot be."""
         key, keeper = child_key(self.ctx.path, one.spec.id), self.ctx._cell.node.ports.keeper
         if self._flags.journal:
-            given = one.spec if self._template is None else (*_added(self._template, one.spec), one.spec.made_up)
+            given = spec if self._template is None else (*_added(self._template, spec), spec.made_up)
             keeper.note(key, pack_data(given, f"child {one.spec.id!r}"))
         elif one.spec.made_up and self._is_recorded(one):
             keeper.note(key, MADE_UP)
 
     def _give_away(self, name: str) -> Child:
         one = super()._give_away(name)
+        if has_stood_down(self.ctx._cell):
+            return one  # Whoever takes our place comes to what is noted.
         self._try_to_note(one, lambda: self.ctx._cell.node.ports.keeper.note(child_key(self.ctx.path, name), None))
         return one
 
     def _welcome(self, one: Child) -> None:
         super()._welcome(one)
-        self._try_to_note(one, lambda: self._note(one))
+        if self._is_in_place:
+            self._try_to_note(one, lambda: self._note(one, one.spec))
+
+    def _respecified(self, one: Child) -> None:
+        if self._flags.journal and self._is_in_place and self._template is None:  # Else arguments are noted, no more.
+            self._try_to_note(one, lambda: self._note(one, one.spec))
 
     def _try_to_note(self, one: Child, note: Callable[[], None]) -> None:
         """A child has come, or gone, whatever the store says."""
@@ -139,6 +148,8 @@ class DynamicSupervisor(Supervisor):
 
     def _forget(self, one: Child) -> None:
         super()._forget(one)
+        if not self._is_in_place:
+            return
         node, key = self.ctx._cell.node, child_key(self.ctx.path, one.spec.id)
         is_lost = one.spec.made_up and self._is_recorded(one)  # Nobody starts an id again that was made up.
         if self._flags.journal:
@@ -149,6 +160,16 @@ class DynamicSupervisor(Supervisor):
                 return
         if is_lost:
             self._errand(self._lose(one.spec.id))
+
+    def _bequest(self) -> Bequest:
+        return {"count": self._count}
+
+    def _inherit(self, left: Bequest) -> None:
+        count = left.get("count")
+        self._count = count if isinstance(count, int) else 0
+
+    def _keep_noted(self, one: Child, spec: ChildSpec) -> None:
+        self._try_to_note(one, lambda: self._note(one, spec))
 
     def _take(self, plan: Plan) -> None:
         """New flags and template; those who live now stay as they are, even if there are more than there may be."""

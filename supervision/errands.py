@@ -21,13 +21,14 @@ from ..actors.kernel.message import Refusal
 class Errand(Item):
     """One errand of one life. It is dropped where it stands when that life ends."""
 
-    __slots__ = ("_ctx", "_first", "is_over", "work")
+    __slots__ = ("_ctx", "_first", "is_over", "is_urgent", "work")
 
     def __init__(
         self, ctx: ActorContext, work: Coroutine[Any, Any, None], first: lifecycle.FirstTurn | None = None
     ) -> None:
         self._ctx, self.work, self._first = ctx, work, first
         self.is_over = False
+        self.is_urgent = False  # it goes on though the actor is suspended
 
     def step(self) -> None:
         """Go on until it waits. Raises what the coroutine raises."""
@@ -46,7 +47,7 @@ class Errand(Item):
     def _woken(self, awaited: asyncio.Future[Any]) -> None:
         cell = self._ctx._cell
         if not self._ctx._closed:
-            cell.push(self)
+            (cell.urge if self.is_urgent else cell.push)(self)
         cell.node.errand_goes_on()
 
     @staticmethod

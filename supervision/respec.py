@@ -84,8 +84,11 @@ def _change(cell: Cell, spec: ChildSpec | None, change: Change) -> None:
 def _tell_parent(cell: Cell) -> None:
     supervisor = cell.parent.actor if cell.parent is not None else None
     child = supervisor._children.get(cell.name) if isinstance(supervisor, Supervisor) else None
-    if child is not None and child.cell is cell and isinstance(cell.spec, ChildSpec):
+    if not isinstance(supervisor, Supervisor) or child is None:
+        return
+    if child.cell is cell and isinstance(cell.spec, ChildSpec) and child.spec is not cell.spec:
         child.spec = cell.spec
+        supervisor._respecified(child)
 
 
 def rebuilt(start: Start[Any], names: list[str], change: Change) -> Start[Any]:

@@ -10,8 +10,6 @@ import asyncio
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, ClassVar
 
-import msgspec
-
 from ..actors.errors import HoldfastError, SpecError, StartFailed, StartIgnored
 from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
 from ..actors.exit_reasons import SHUTDOWN, ExitReason, crash, unpack_exit
@@ -54,7 +52,17 @@ from .errands import Errand, answered
 from .inquiries import Inquiries
 from .intensity import admit_restart, recent_restarts
 from .spec import ChildSpec, Flags, Plan, check_spec
-from .supervisor_changes import TakeOver, account_of, check_place, new_plan, succession, take_over, why_occupied
+from .supervisor_changes import (
+    Bequest,
+    TakeOver,
+    account_of,
+    check_place,
+    new_plan,
+    succession,
+    take_over,
+    told,
+    why_occupied,
+)
 
 DISMISSED = 1000
 """Of the children that were stopped by order and whose specs are gone, so many are remembered, the newest."""
@@ -65,14 +73,15 @@ class Supervisor(Inquiries):
 
     _supervises: ClassVar[bool] = True
     _is_dynamic: ClassVar[bool] = False
-    _irreplaceable: ClassVar[str] = ""
-    """Why no other one can take the place of one of this class, and begin without children; "" if one can."""
+    _with_successor = "anew"
 
+    _template: ChildSpec | None = None  # of children that are started by their arguments
     _flags: Flags
     _restarts: tuple[float, ...]
     _planned: frozenset[str]
     _parked: set[str]
     _dismissed: dict[str, None]
+    _is_in_place: bool = True  # one that is to take the place of another one is not, before it does
     _first: Errand | None = None  # the errand of our own start
     _errands: Sequence[Errand] = ()  # those that wait; some that are over may be among them
 
@@ -121,8 +130,17 @@ class Supervisor(Inquiries):
         we answer meanwhile.
         """
         self.ctx.trap_exits = True  # Only our own parent can end us: the end of a stranger that is linked is no order.
-        self._begin(new_plan(self))
-        self._first = self._errand(self._come_all_up(), self.ctx._item)
+        start = self.ctx._cell.extra().start
+        if start is None or start.begins_with is None:
+            self._begin(new_plan(self))
+            work = self._start_all()
+        else:
+            flags, children = start.begins_with
+            self._is_in_place = False
+            Supervisor._begin(self, Plan.of(flags, children))
+            self._inherit({})
+            work = self._start_listed()
+        self._first = self._errand(self._come_all_up(work), self.ctx._item)
 
     def _begin(self, plan: Plan) -> None:
         """Take up the plan of this start."""
@@ -136,15 +154,19 @@ class Supervisor(Inquiries):
     def _is_starting(self) -> bool:
         return self._first is not None and not self._first.is_over
 
-    async def _come_all_up(self) -> None:
+    async def _come_all_up(self, work: Coroutine[Any, Any, None]) -> None:
         """The errand of our own start."""
-        await self._start_all()
+        await work
         for early in self._early:
             self.ctx._cell.push(early)
         self._early.clear()
 
     async def _start_all(self) -> None:
-        """Start the children of the plan."""
+        """Start the children of the plan, or those that there were before."""
+        await self._start_listed()
+
+    async def _start_listed(self) -> None:
+        """Start the children that are listed."""
         row = StartRow((one for one in self._children.values() if one.spec.autostart), STARTING)
         while (one := row.next()) is not None:
             try:
@@ -323,7 +345,7 @@ class Supervisor(Inquiries):
         one = self._listed().get(cell.name)
         if one is None or one.cell is not cell:
             return
-        self._forget(one)
+        self._give_away(one.spec.id)
         one.row, one.state = None, STOPPED
         one.retry += 1
 
@@ -378,7 +400,7 @@ class Supervisor(Inquiries):
             one.attempts = 0
         delay = backoff.delay(one.attempts, self.ctx.random)
         one.attempts += 1
-        one.state = RESTARTING
+        one.state, one.due = RESTARTING, reason
         one.retry += 1
         loop.call_later(delay, self._post, Retry(one, one.retry, reason))
 
@@ -389,6 +411,7 @@ class Supervisor(Inquiries):
     def _retry(self, one: Child, number: int, reason: ExitReason) -> None:
         """A restart is due, unless the child was stopped or started meanwhile."""
         if number == one.retry and one.state == RESTARTING:
+            one.due = None
             self._restart(one, reason)
 
     def _restart(self, one: Child, reason: ExitReason) -> None:
@@ -576,6 +599,9 @@ class Supervisor(Inquiries):
         """Another supervisor has this child from now on, and its life goes on."""
         return self._children.pop(name)
 
+    def _respecified(self, one: Child) -> None:
+        """The next lives of a child begin otherwise, or elsewhere."""
+
     def _welcome(self, one: Child) -> None:
         """A child that another supervisor has had is ours from now on."""
         self._children[one.spec.id] = one
@@ -716,13 +742,36 @@ class Supervisor(Inquiries):
             return self._fail(error)
         return None
 
-    def _stand_down(self) -> Any:
-        return None if why_occupied(self) else msgspec.to_builtins(account_of(self))
+    # -- another one takes its place ----------------------------------------------------------------------------------
+
+    def _told_account(self) -> Any:
+        return told(account_of(self))
+
+    def _wind_down(self, attempt: int) -> None:
+        """Whoever waits for a restart is restarted now, once: it is moved with its next life."""
+        for one in self._listed().values() if attempt else ():
+            if one.state == RESTARTING and one.due is not None and one.hurried != attempt:
+                one.hurried = attempt
+                one.retry += 1
+                self.ctx._cell.push(Retry(one, one.retry, one.due))
+
+    def _why_occupied(self) -> str:
+        return why_occupied(self)
 
     @on(TakeOver)
     def _take_over(self, message: TakeOver) -> None:
         """Take the place of another supervisor."""
         take_over(self, message.account)
+
+    def _bequest(self) -> Bequest:
+        """What our kind leaves beside its children to the one that takes our place."""
+        return {}
+
+    def _inherit(self, left: Bequest) -> None:
+        """Go on with what another one of our kind has left; with nothing as long as that has our place still."""
+
+    def _keep_noted(self, one: Child, spec: ChildSpec) -> None:
+        """Have our next life know that we have this child, which begins so, as far as our kind notes that."""
 
     def _take(self, plan: Plan) -> None:
         """Follow another plan from now on; raises SpecError if that cannot be."""

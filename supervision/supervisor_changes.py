@@ -1,18 +1,33 @@
-"""The plan of a supervisor (its flags and children): at its start, in a live change, in a succession."""
+"""What a supervisor is made of: at its start, when it is changed while it works, and when another takes its place.
+
+One that is to take the place of another one begins without children beside it. The children that live are given to it
+each with its life. All the rest is told: flags, which children there are and in which order, the specs of those that do
+not run, which restarts count, who was stopped by order, what its kind and its class know beside that, and whether it is
+suspended.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
 
+from ..actors.control.live_state import live_state, put_state
 from ..actors.errors import HoldfastError, Ignore, SpecError, StartIgnored, remote_crash, type_name
-from ..actors.kernel.cell import GONE
+from ..actors.events import HookFailed
+from ..actors.exit_reasons import crash
+from ..actors.kernel import mailbox
+from ..actors.kernel.cell import GONE, Cell
 from ..actors.kernel.message import RuntimeOrder
 from ..actors.kernel.node import Node
-from .admin import ChangeSupervisor, opened
+from ..actors.kernel.ref import ActorRef
+from ..actors.migration.luggage import PackedHandle, lift
+from ..actors.process.wire.start_codec import unpack_told
+from ..actors.values import UnsavableValue, decode_value, encode_value
+from .admin import Boxed, ChangeSupervisor, opened
 from .children import STOPPED, UP, Child, complete
+from .errands import Errand
 from .spec import ChildSpec, Flags, Plan, check_spec
 
 if TYPE_CHECKING:
@@ -124,13 +139,44 @@ def everything(specs: Iterable[ChildSpec]) -> Iterator[ChildSpec]:
             yield from everything(spec.below())
 
 
+Bequest: TypeAlias = "dict[str, int | list[str]]"
+"""What a kind of supervisor knows beside its children."""
+
+
+class Heir(msgspec.Struct, frozen=True):
+    """A child as the supervisor has it that leaves it."""
+
+    id: str
+    state: str
+    spec: Any
+    """In a box; from another process its bytes; None: it cannot be told."""
+    attempts: int
+    """Restarts in a row without a healthy life."""
+    up_for: float
+    """Seconds that its life has been up."""
+
+
 class Account(msgspec.Struct, frozen=True):
     """What a supervisor leaves to the one that takes its place."""
 
-    children: tuple[str, ...]
-    """The ids of its children, in start order."""
+    flags: Flags
+    children: tuple[Heir, ...]
+    """In start order."""
     restarts: tuple[float, ...]
     """How many seconds ago each restart was that may still count, the oldest first."""
+    parked: tuple[str, ...]
+    """Who was stopped by order, and would come back with its next life."""
+    dismissed: tuple[str, ...]
+    """Who was stopped by order, and is forgotten."""
+    planned: tuple[str, ...]
+    """Whom its own plan names."""
+    template: Any
+    """That of a dynamic supervisor, as the specs of the children; None: there is none."""
+    own: dict[str, int | list[str]]
+    """What its kind knows beside that: `Supervisor._bequest`."""
+    state: bytes | None
+    """That of a class of the user's own, as far as it can be saved; None: there is none."""
+    is_suspended: bool
 
 
 class TakeOver(RuntimeOrder[None]):
@@ -149,13 +195,134 @@ def why_occupied(supervisor: Supervisor) -> str:
 
 def account_of(supervisor: Supervisor) -> Account:
     """What a supervisor leaves to the one that takes its place."""
-    now = supervisor.ctx._cell.node.loop.time()
-    return Account(tuple(supervisor._listed()), tuple(now - at for at in supervisor._restarts))
+    cell = supervisor.ctx._cell
+    now = cell.node.loop.time()
+    return Account(
+        supervisor._flags,
+        tuple(
+            Heir(one.spec.id, one.state, Boxed(one.spec), one.attempts, now - one.up_since)
+            for one in supervisor._listed().values()
+        ),
+        tuple(now - at for at in supervisor._restarts),
+        tuple(supervisor._parked),
+        tuple(supervisor._dismissed),
+        tuple(supervisor._planned),
+        None if supervisor._template is None else Boxed(supervisor._template),
+        supervisor._bequest(),
+        _saved(supervisor),
+        bool(cell.more is not None and cell.more.suspended & mailbox.BY_USER),
+    )
+
+
+def has_stood_down(cell: Cell) -> bool:
+    """Whether a supervisor in a process does nothing any more, because another one is to take its place."""
+    hold = mailbox.held(cell)
+    return hold is not None and bool(hold.attempt)
+
+
+def told(account: Account) -> Any:
+    """An account as plain data."""
+    return msgspec.to_builtins(account, builtin_types=(bytes,), enc_hook=_packed)
+
+
+def _packed(spec: Boxed) -> bytes | None:
+    try:
+        return spec.packed()
+    except HoldfastError:
+        return None  # Whoever wants it moved is told so where it is to be known.
+
+
+def heard(data: Any) -> Account:
+    """An account that was told.
+
+    Raises:
+        msgspec.ValidationError: it is none.
+    """
+    account = msgspec.convert(data, Account, builtin_types=(bytes,))
+    heirs = tuple(msgspec.structs.replace(heir, spec=_opened(heir.spec)) for heir in account.children)
+    return msgspec.structs.replace(account, children=heirs, template=_opened(account.template))
+
+
+def _opened(data: Any) -> Boxed | None:
+    """A spec from another process, in a box; None if it cannot be made here, or gives more than that process has.
+
+    What it is bound to it may give orders to, if the root says so: no word from there makes the root do that.
+    """
+    try:
+        spec = unpack_told(data, ChildSpec) if isinstance(data, bytes) else None
+    except HoldfastError:
+        return None
+    return None if spec is None or any(one.bindings for one in everything((spec,))) else Boxed(spec)
+
+
+def _saved(supervisor: Supervisor) -> bytes | None:
+    """The state of a class of the user's own, as bytes; None if there is none, or it cannot be saved."""
+
+    def stand_in(value: Any) -> Any:
+        return PackedHandle("ref", value.path) if isinstance(value, ActorRef) else value
+
+    try:
+        state = lift(live_state(supervisor), stand_in)
+        return encode_value(state, where=supervisor.ctx.path) if state else None
+    except UnsavableValue:
+        return None  # It begins afresh there.
+    except Exception as error:  # The user's own `get_state`.
+        _tell_failed(supervisor, "get_state", error)
+        return None
+
+
+def _restore(supervisor: Supervisor, state: bytes) -> None:
+    node = supervisor.ctx._cell.node
+
+    def found(value: Any) -> Any:
+        return node.cell_at(value.key).ref if isinstance(value, PackedHandle) else value
+
+    try:
+        put_state(supervisor, lift(decode_value(state, imports=node.ports.uplink is not None), found))
+    except Exception as error:  # The user's own `set_state`, or a class that is not there: it begins afresh.
+        _tell_failed(supervisor, "set_state", error)
+
+
+def _tell_failed(supervisor: Supervisor, hook: str, error: Exception) -> None:
+    supervisor.ctx._cell.node.emit(HookFailed(supervisor.ctx.path, hook, crash(error)))
 
 
 def take_over(supervisor: Supervisor, account: Account) -> None:
-    """Have a supervisor go on with the children that it has got, in the order of the one that had them."""
-    now, known = supervisor.ctx._cell.node.loop.time(), supervisor._children
+    """Have a supervisor go on with what another one has left, whose living children it has got."""
+    cell, known = supervisor.ctx._cell, supervisor._children
+    now = cell.node.loop.time()
+    supervisor._flags = account.flags
     supervisor._restarts = tuple(sorted((*supervisor._restarts, *(now - ago for ago in account.restarts))))
-    first = {name: known[name] for name in account.children if name in known}
-    supervisor._children = {**first, **known}
+    supervisor._parked, supervisor._planned = set(account.parked), frozenset(account.planned)
+    supervisor._dismissed = dict.fromkeys(account.dismissed)
+    supervisor._template = opened(account.template, cell.node)
+    specs = {heir.id: opened(heir.spec, cell.node) for heir in account.children}
+    children = dict[str, Child]()
+    for heir in account.children:
+        one, spec = known.get(heir.id), specs[heir.id]
+        if one is None and heir.state == STOPPED and spec is not None:
+            one = Child(spec)
+        if one is not None:
+            children[heir.id] = one
+            one.attempts, one.up_since = heir.attempts, now - heir.up_for
+    supervisor._children, supervisor._is_in_place = {**children, **known}, True
+    supervisor._inherit(account.own)
+    for name, one in children.items():
+        supervisor._keep_noted(one, specs[name] or one.spec)
+    if account.state is not None:
+        _restore(supervisor, account.state)
+    if account.is_suspended:
+        _suspend(supervisor)
+
+
+def _suspend(supervisor: Supervisor) -> None:
+    """Handle no message any more; that those have come who are there is noted all the same."""
+    cell = supervisor.ctx._cell
+    for errand in supervisor._errands:
+        errand.is_urgent = True
+    queue = mailbox.queue_of(cell)
+    for index, item in enumerate(queue):
+        if isinstance(item, Errand):
+            queue[index] = mailbox.NOTHING  # Not removed: the run loop has counted it.
+            cell.urge(item)
+    mailbox.suspend(cell)

@@ -55,11 +55,18 @@ class Moves:
         self._under_way: dict[Cell, Move] = {}  # of mechanisms
 
     async def move(
-        self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float, gate: Gate | None = None
+        self,
+        cell: Cell,
+        isolation: Isolation,
+        limits: Limits | None,
+        timeout: float,
+        gate: Gate | None = None,
+        known: ChildSpec | None = None,
     ) -> bool:
         """Move an actor; if whoever wants it does not wait any more, the move comes to its end all the same.
 
-        With a gate it waits there when all is ready. Returns whether it has been moved: not if it lived there.
+        With a gate it waits there when all is ready. `known`: its spec, if no recipe at the root need have that.
+        Returns whether it has been moved: not if it lived there.
 
         Raises:
             CannotMove, ActorStopped, AskTimeout, ProcessUnavailable.
@@ -67,7 +74,7 @@ class Moves:
         caller = current.get(None)
         if caller is not None and caller._cell is cell and caller._in_turn():
             raise CannotMove(cell.path, "a turn of its own waits for it; call this from outside, or from a task")
-        settled = self._moved_there(cell, isolation, limits, timeout, gate)
+        settled = self._moved_there(cell, isolation, limits, timeout, gate, known)
         return await self._alone(cell, settled, f"move of {cell.path}", timeout, gate)
 
     def _over(self, task: asyncio.Task[Any]) -> None:
@@ -87,13 +94,20 @@ class Moves:
         return self._turns.setdefault(cell, asyncio.Lock())
 
     async def _moved_there(
-        self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float, gate: Gate | None
+        self,
+        cell: Cell,
+        isolation: Isolation,
+        limits: Limits | None,
+        timeout: float,
+        gate: Gate | None,
+        known: ChildSpec | None,
     ) -> bool:
         origin, place = place_of(cell), cell.host.place
-        known = cell.spec if isinstance(cell.spec, ChildSpec) else recipe_spec(cell)
+        if isinstance(cell.spec, ChildSpec) or recipe_spec(cell) is not None:
+            known = _spec_of(cell)
         if origin == isolation and (known is None or known.mechanism is None):
             return False
-        spec = _spec_there(cell, isolation, limits)
+        spec = _spec_there(cell, _spec_of(cell) if known is None else known, isolation, limits)
         if spec.mechanism is not None:  # Its replicas have processes: it lives there when nobody protects it.
             replace_place(cell, spec)
             cell.host.parent.respecified(cell, place.spec_data(cell))
@@ -264,7 +278,8 @@ class Moves:
         """
 
         def made() -> Move:
-            if _spec_of(cell).mechanism is None:
+            known = cell.spec if isinstance(cell.spec, ChildSpec) else recipe_spec(cell)
+            if known is None or known.mechanism is None:
                 return Pause(cell, leaving(cell), timeout)
             from ..ftm.migration.protection import rest_of_group
 
@@ -314,7 +329,7 @@ class Moves:
     async def _settle_in(
         self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float, gate: Gate | None = None
     ) -> None:
-        spec = _spec_there(cell, isolation, limits)
+        spec = _spec_there(cell, _spec_of(cell), isolation, limits)
         await self._moved(
             cell, timeout, lambda: self._made(cell, spec, timeout), lambda: replace_place(cell, spec), gate
         )
@@ -457,13 +472,12 @@ def place_of(cell: Cell) -> Isolation:
     return "process" if isinstance(cell.host.place, WorkerPlace) else "task"
 
 
-def _spec_there(cell: Cell, isolation: Isolation, limits: Limits | None) -> ChildSpec:
+def _spec_there(cell: Cell, spec: ChildSpec, isolation: Isolation, limits: Limits | None) -> ChildSpec:
     """The spec of an actor that lives there.
 
     Raises:
         CannotMove: it cannot.
     """
-    spec = _spec_of(cell)
     try:
         return dataclasses.replace(spec, isolation=isolation, limits=limits if limits is not None else spec.limits)
     except SpecError as error:

@@ -272,6 +272,33 @@ class Conclude(Order):
         return cls(data["attempt"], data["is_in_force"], data["suspended"])
 
 
+class GiveAccount(Order):
+    """What it leaves to another one, if one takes its place."""
+
+    verb = "give_account"
+
+    def run(self, cell: Cell, actor: Actor) -> Any:
+        return actor._told_account()
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class WindDown(Order):
+    """Another actor is to take this one's place: see to it that nothing is in the way of that. 0: it is not to be."""
+
+    verb: ClassVar[str] = "wind_down"
+    attempt: int
+
+    def run(self, cell: Cell, actor: Actor) -> None:
+        actor._wind_down(self.attempt)
+
+    def pack(self, where: str) -> dict[str, Any]:
+        return {"attempt": self.attempt}
+
+    @classmethod
+    def unpack(cls, data: dict[str, Any]) -> WindDown:
+        return cls(data["attempt"])
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class StandDown(Order):
     """Handle no message from now on, until `Conclude`: another actor is to take this one's place.
@@ -283,13 +310,13 @@ class StandDown(Order):
     attempt: int
 
     def run(self, cell: Cell, actor: Actor) -> Any:
-        left = actor._stand_down()
-        if left is not None:
-            mailbox.suspend(cell, mailbox.BY_TRANSACTION)
-            hold = mailbox.held(cell)
-            assert hold is not None
-            hold.attempt = self.attempt
-        return left
+        if actor._why_occupied():
+            return None
+        mailbox.suspend(cell, mailbox.BY_TRANSACTION)
+        hold = mailbox.held(cell)
+        assert hold is not None
+        hold.attempt = self.attempt
+        return actor._told_account()
 
     def pack(self, where: str) -> dict[str, Any]:
         return {"attempt": self.attempt}
@@ -359,6 +386,8 @@ ORDERS: dict[str, type[Order]] = {
         ReplaceState,
         ReplaceCode,
         Prepare,
+        GiveAccount,
+        WindDown,
         StandDown,
         Conclude,
         ObserveTurns,

@@ -136,6 +136,9 @@ class Actor:
     """Whether it starts children of its own by a spec, and restarts them."""
     _is_dynamic: ClassVar[bool] = False
     """Whether those children stop at the same time."""
+    _with_successor: ClassVar[Literal["moved", "anew", "awaited"]] = "moved"
+    """What becomes of it when another one takes its supervisor's place: it is moved there, or another one takes its own
+    place, too, or its end is waited for."""
     _is_part: ClassVar[bool] = False
     """Whether it is a part of the runtime: from another process only who was granted its address speaks to it."""
 
@@ -223,9 +226,16 @@ class Actor:
     def _child_lost(self, cell: Cell) -> None:
         """A child that lives on in another process has another supervisor from now on."""
 
-    def _stand_down(self) -> Any:
-        """What it leaves to another one that takes its place, as plain data; None: nobody can take it now."""
-        return None
+    def _told_account(self) -> Any:
+        """What it leaves to another one that takes its place, as plain data."""
+        return ()
+
+    def _wind_down(self, attempt: int) -> None:
+        """Another one is to take its place, as soon as nothing is in the way of that; 0: it is not to be any more."""
+
+    def _why_occupied(self) -> str:
+        """Why nobody can take its place at this instant; "" if somebody can."""
+        return ""
 
     async def _stop_children(self) -> None:
         """The life ends: its children go first, newest first."""
@@ -277,6 +287,8 @@ class Start(msgspec.Struct, Generic[S], frozen=True):
     kind: type[S]
     args: tuple[Any, ...] = ()
     kwargs: dict[str, Any] = {}
+    begins_with: tuple[Any, ...] | None = None
+    """Flags and children of a supervisor that takes the place of another one, instead of what its class says."""
 
     def check(self) -> None:
         """Raise TypeError if the arguments do not fit the class."""

@@ -29,6 +29,7 @@ from ..errors import (
     type_name,
 )
 from ..values.arrays import described_dtype
+from .cell import GONE
 from .message import Message, Refusal, UnknownRefusal, find_refusal, message_name, reply_type
 from .ref import ActorRef
 
@@ -152,10 +153,12 @@ class Codec:
     def message_in(self, cell: Cell, name: str, body: Any) -> Any:
         """A message that came encoded, for a cell: decoded if its actor is here, else as it came.
 
+        Where nobody lives any more nobody says what is handled there, and whoever has sent it hears just that.
+
         Raises:
             UnknownMessage: its class has no handler for this name. BadMessage: the payload does not fit the type.
         """
-        if cell.host.takes_parcels and cell.actor is None:
+        if cell.state is GONE or (cell.host.takes_parcels and cell.actor is None):
             return Parcel(name, bytes(body))
         kind = cell.table.named.get(name)
         if kind is None:

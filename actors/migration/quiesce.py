@@ -289,6 +289,29 @@ def part(cell: Cell) -> Cell:
     return old
 
 
+def replaced(cell: Cell) -> tuple[Cell, list[Any], list[Item]]:
+    """Part with a life whose place another one takes.
+
+    Returns that life, what has waited for it, and the commands ahead of that. What it had put aside comes first, and
+    what has waited for room in its mailbox last.
+    """
+    more = cell.extra()
+    stash, bound = list(more.stash or ()), more.bound
+    life = part(cell)
+    items, commands = sorted_out(cell)
+    late = without_room(cell) if bound is not None else []
+    return life, handed_on([*stash, *items, *late]), commands
+
+
+def without_room(cell: Cell) -> list[Any]:
+    """What waits for room in a bounded mailbox; those who wait to send try again, at whoever has the address then."""
+    bound = cell.extra().bound
+    assert bound is not None
+    waiting, bound.waiting = list(bound.waiting), deque()
+    cell.node.loop.call_soon(bound.release)
+    return waiting
+
+
 def farewell(old: Cell, stop: Item) -> None:
     """Have the life at a twin end; nobody is told but the actor itself."""
     old.queue = None

@@ -18,8 +18,8 @@ from ..kernel.links import Monitor
 from ..process.wire.frames import BadFrame
 from ..process.wire.peer import Arrived, RelayedAsk
 from ..process.wire.start_codec import unpack_recipe
-from .luggage import pack_items, pack_rest, unpack
-from .quiesce import PackLife, Settle, farewell, handed_on, now, part, resume, sorted_out
+from .luggage import let_come, pack_items, pack_rest, unpack
+from .quiesce import PackLife, Settle, farewell, now, replaced, resume
 from .words import Incoming, say
 
 if TYPE_CHECKING:
@@ -234,8 +234,8 @@ class Replaced:
     """The life of an actor whose place another one takes, which lives outside; its cell stands for that from now on."""
 
     def __init__(self, cell: Cell) -> None:
-        self._cell, self._life = cell, part(cell)
-        self._items, self._commands = sorted_out(cell)
+        self._cell = cell
+        self._life, self._items, self._commands = replaced(cell)
 
     def hand_on(self, outside: Host) -> None:
         """End, and give the other one, at host `outside`, what waits; the ties that only this process has stay."""
@@ -246,9 +246,14 @@ class Replaced:
             links.sever(cell, peer)
         for command in self._commands:
             command.undelivered(cell, why)
-        for item in handed_on(self._items):
-            cell.admit(cell, item)
+        let_come(cell, self._items)
         farewell(self._life, lifecycle.Stop(Shutdown(why)))
+
+
+def hand_on_stash(cell: Cell, to: Cell) -> None:
+    """Give another actor, which has taken the place of one, what that one has put aside."""
+    stash, cell.extra().stash = cell.extra().stash, None
+    let_come(to, stash or ())
 
 
 def _leave(cell: Cell, reason: ExitReason) -> None:

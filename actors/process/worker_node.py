@@ -30,7 +30,7 @@ from ..kernel.message import Message, RuntimeOrder, message_name
 from ..kernel.node import Node, Ports
 from ..kernel.ref import current
 from ..kernel.topics import Topics
-from ..migration.worker_moves import Attempt, GuestMoves, Replaced
+from ..migration.worker_moves import Attempt, GuestMoves, Replaced, hand_on_stash
 from ..persistence import Keeper
 from .wire import frames
 from .wire.connection import Connection
@@ -214,9 +214,14 @@ class Guest(Peer):
             return None
         cell = self._outside.get(path)
         if cell is None:
-            cell = self._outside[path] = Cell(self.node, None, path, self._host)
-            cell.state = RUNNING
-            cell.admit, cell.table = self._host.home.admit, OUTSIDE
+            cell = self._outside[path] = self._stand_in(path)
+        return cell
+
+    def _stand_in(self, path: str) -> Cell:
+        """A way to whoever lives at an address for the root."""
+        cell = Cell(self.node, None, path, self._host)
+        cell.state = RUNNING
+        cell.admit, cell.table = self._host.home.admit, OUTSIDE
         return cell
 
     def require_granted(self, path: str, order: str) -> None:
@@ -427,6 +432,8 @@ class Guest(Peer):
             self._disown(cell, self.connection.names.from_wire(frame.to), str(frame.data["path"]), frame.data["life"])
         elif frame.verb == "recipe":
             self.node.ports.respec(cell, unpack_recipe(frame.data["start"]))
+        elif frame.verb == "replaced":
+            hand_on_stash(cell, self._stand_in(cell.path))
         elif frame.verb == "bind":
             more, port = cell.extra(), str(frame.data["port"])
             more.bindings[port] = named(self.node, frame, "target")

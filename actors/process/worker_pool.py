@@ -179,6 +179,11 @@ class Worker(Peer):
         told = {"path": new, "life": cell.life}
         connection.send(frames.Command(connection.names.to_wire(old), "disown", told))
 
+    def replaced(self, cell: Cell) -> None:
+        """Another actor, elsewhere, has taken the place of this process's own: it gets what that has put aside."""
+        connection = self.connection
+        connection.send(frames.Command(connection.names.to_wire(cell.path), "replaced", {}))
+
     def give_back(self) -> None:
         """The actor is not moved into this process: it ends, and nobody is told."""
         self.cell = self._died = None

@@ -23,6 +23,7 @@ from ...actors.kernel.cell import DOWN
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message, Refusal
 from ...actors.kernel.ref import current
+from ..admin import StartChild
 from ..children import Child, StartLimit
 from ..dynamic import DynamicSupervisor
 from ..spec import ChildSpec
@@ -44,6 +45,7 @@ class JobActor(Actor):
     """
 
     deterministic = False
+    _with_successor = "awaited"
 
     def __init__(self, label: str, function: Any, args: tuple[Any, ...], is_awaited: bool, is_coded: bool) -> None:
         self._function: Callable[..., Any] = unpack_function(function) if is_coded else function
@@ -121,7 +123,26 @@ def _in_thread(threaded: ThreadContext, function: Callable[..., Any], args: tupl
 class TaskSupervisor(DynamicSupervisor):
     """Keeps jobs: a dynamic supervisor that does not wait until they are up. Started by `tasks(...)`."""
 
-    _irreplaceable = "its jobs are of those who have started them, and wait for them here"
+    _leaves_for = 0  # the attempt to put another one in our place: until then no other job is begun
+
+    @on(StartChild)
+    def _start_child(self, message: StartChild) -> Any:
+        """Start a job; while those that run are waited for, the next ones wait."""
+        if not self._leaves_for:
+            return super()._start_child(message)
+        self.ctx.stash()
+        return None
+
+    def _wind_down(self, attempt: int) -> None:
+        super()._wind_down(attempt)
+        self._leaves_for = attempt
+        if not attempt:
+            self.ctx.unstash()
+
+    def _why_occupied(self) -> str:
+        running = (one.spec.id for one in self._listed().values() if issubclass(one.spec.start.kind, JobActor))
+        job = next(running, None)
+        return super()._why_occupied() or ("" if job is None else f"its job {job!r} is not over")
 
     def _new_id(self, spec: ChildSpec) -> str:
         if not issubclass(spec.start.kind, JobActor):

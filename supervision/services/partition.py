@@ -20,6 +20,7 @@ from ..admin import DeleteChild, NoPartitions, NotSupported, RemoveChild, StartC
 from ..children import STOPPED, Child
 from ..spec import ChildSpec, Isolation, Plan, Restart, Shutdown, Strategy, check_spec, child
 from ..supervisor import Supervisor
+from ..supervisor_changes import Bequest
 from ..tree import supervisor
 
 
@@ -60,18 +61,21 @@ def partition_of(key: object, count: int) -> int:
 class UniformSupervisor(Supervisor):
     """Base of supervisors whose children are all alike: none of them is started or removed alone."""
 
-    _irreplaceable = "it is never without its children, which are all alike: remove it, and add it"
     instead: ClassVar[str]
     """What to do instead."""
 
     @on(StartChild)
     def _start_child(self, message: StartChild) -> Any:
         """Refuse, because all are alike."""
-        raise NotSupported(self.instead)
+        if self._is_in_place:
+            raise NotSupported(self.instead)
+        return super()._start_child(message)
 
     @on(RemoveChild)
-    def _remove_child(self, message: RemoveChild) -> ReplyHandle[Any]:
+    def _remove_child(self, message: RemoveChild) -> ReplyHandle[None] | None:
         """Refuse to remove one alone, if there is such a one."""
+        if not self._is_in_place:
+            return super()._remove_child(message)
         self._child(message.id)
         raise NotSupported(self.instead)
 
@@ -93,9 +97,19 @@ class PartitionSupervisor(UniformSupervisor):
     def _begin(self, plan: Plan) -> None:
         if [spec.id for spec in plan.children] != [str(number) for number in range(len(plan.children))]:
             raise SpecError(self.ctx.path, "the ids of partitions are their numbers: make it with partitions(...)")
-        self._now, self._all = len(plan.children), plan.children
-        self._resizing = asyncio.Lock()
+        self._have(len(plan.children), plan.children)
         super()._begin(plan)
+
+    def _have(self, count: int, every: tuple[ChildSpec, ...]) -> None:
+        self._now, self._all = count, every
+        self._resizing = asyncio.Lock()
+
+    def _bequest(self) -> Bequest:
+        return {"count": self._now}
+
+    def _inherit(self, left: Bequest) -> None:
+        count = left.get("count")
+        self._have(count if isinstance(count, int) else 0, self._given.children)
 
     def _take(self, plan: Plan) -> None:
         if len(plan.children) != len(self._all):

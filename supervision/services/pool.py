@@ -26,6 +26,7 @@ from ...actors.persistence import child_key
 from ..children import Child
 from ..rules import Rule
 from ..spec import ChildSpec, Isolation, Plan, Restart, Shutdown, check_spec, child
+from ..supervisor_changes import Bequest
 from ..tree import supervisor
 from .partition import UniformSupervisor
 from .readiness import by_name
@@ -73,18 +74,40 @@ class PoolSupervisor(UniformSupervisor):
     instead = "the children of a pool are its workers: use ResizePool"
 
     _crew: list[Child]  # who gets messages, in the router's order; not those that are on their way out
-    _template: ChildSpec
 
     def _begin(self, plan: Plan) -> None:
         self._check(plan)
-        self._leaving: set[str] = set()
-        self._growing = asyncio.Lock()
+        self._open()
         self._template = plan.children[0]
         *workers, router = plan.children
         ids = {spec.id for spec in workers}
-        added = [dataclasses.replace(self._template, id=name) for name in self._added() if name not in ids]
+        added = [dataclasses.replace(self._worker, id=name) for name in self._added() if name not in ids]
         super()._begin(Plan.of(plan.flags, (*workers, *added, router)))
         self._crew = [one for one in self._children.values() if one.spec.id != ROUTER]
+
+    @property
+    def _worker(self) -> ChildSpec:
+        """As which workers that are added begin."""
+        assert self._template is not None
+        return self._template
+
+    def _open(self) -> None:
+        self._leaving: set[str] = set()
+        self._growing = asyncio.Lock()
+
+    def _bequest(self) -> Bequest:
+        return {"crew": [one.spec.id for one in self._crew]}
+
+    def _inherit(self, left: Bequest) -> None:
+        self._open()
+        self._template = self._template or self._given.children[0]
+        crew = left.get("crew", [])
+        self._crew = [self._children[name] for name in crew if name in self._children] if isinstance(crew, list) else []
+        self._wake_router()
+
+    def _keep_noted(self, one: Child, spec: ChildSpec) -> None:
+        if one.spec.id not in {first.id for first in self._given.children}:
+            self._try_to_note(one, b"")
 
     def _added(self) -> list[str]:
         """The recorded workers that an earlier life of ours has added, the lowest number first."""
@@ -94,8 +117,14 @@ class PoolSupervisor(UniformSupervisor):
 
     def _note(self, name: str, value: bytes | None) -> None:
         """Keep in mind that there is a recorded worker more than at the start. Raises HoldfastError."""
-        if self._template.has_home:
+        if self._worker.has_home:
             self.ctx._cell.node.ports.keeper.note(child_key(self.ctx.path, name), value)
+
+    def _try_to_note(self, one: Child, value: bytes | None) -> None:
+        try:
+            self._note(one.spec.id, value)
+        except HoldfastError as error:
+            self.ctx._cell.node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
 
     def _check(self, plan: Plan) -> None:
         *workers, router = (spec.id for spec in plan.children) if plan.children else ("",)
@@ -110,16 +139,18 @@ class PoolSupervisor(UniformSupervisor):
 
     def _is_up(self, one: Child) -> None:
         super()._is_up(one)
+        self._wake_router()
+
+    def _wake_router(self) -> None:
+        """Have it look for a worker again."""
         router = self._children.get(ROUTER)
         if router is not None and router.cell is not None and isinstance(router.cell.actor, Router):
             router.cell.actor.look_again()
 
     def _forget(self, one: Child) -> None:
         super()._forget(one)
-        try:
-            self._note(one.spec.id, None)
-        except HoldfastError as error:  # It is over all the same, but will come back with us.
-            self.ctx._cell.node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
+        if self._is_in_place:
+            self._try_to_note(one, None)  # If the store refuses, it is over all the same, but will come back with us.
         if one in self._crew:  # A temporary one that has ended is none any more.
             self._crew.remove(one)
 
@@ -163,7 +194,7 @@ class PoolSupervisor(UniformSupervisor):
         """
         number = next(number for number in itertools.count() if str(number) not in self._children)
         self._note(str(number), b"")  # First: what it accepts is not lost, also if we die in the middle of its start.
-        one = self._children[str(number)] = Child(dataclasses.replace(self._template, id=str(number)))
+        one = self._children[str(number)] = Child(dataclasses.replace(self._worker, id=str(number)))
         self._children[ROUTER] = self._children.pop(ROUTER)  # It stays the last: the first to be stopped.
         try:
             if not await self._start(one):

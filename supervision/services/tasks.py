@@ -18,7 +18,6 @@ from ...actors.control.orders import pack_function
 from ...actors.errors import AskTimeout, SpecError
 from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.ref import ActorRef, current
-from ...actors.process.wire.peer import OutsideHost
 from ..admin import StartChild, WhichChildren
 from ..spec import NAMELESS, ChildSpec, Flags, Isolation, Restart, Shutdown
 from .awaited_jobs import FOREVER, Failed, Job, Ok, follow, followed, returned, seen
@@ -293,7 +292,9 @@ class Tasks:
         started.add_done_callback(seen)
         work = follow(job, started, ctx if linked else None)
         task = node.loop.create_task(work, name=f"job of {self.ref.path}", context=node.base_context.copy())
-        keep = (self.ref._cell if ctx is None else ctx._cell).extra().belongings.tasks
+        # Who is no actor lives as long as the system.
+        own = (node.root or self.ref._cell) if ctx is None else ctx._cell
+        keep = own.extra().belongings.tasks
         keep.add(task)
         task.add_done_callback(keep.discard)
         task.add_done_callback(functools.partial(followed, job, started))
@@ -309,7 +310,7 @@ class Tasks:
         restart: Restart,
         is_awaited: bool,
     ) -> ChildSpec:
-        if isinstance(self.ref._cell.host, OutsideHost):
+        if not self.ref._cell.living.host.place.is_here:
             raise SpecError(
                 "job",
                 f"{self.ref.path} lives in another process, and functions are not sent there: start a task supervisor "

@@ -7,23 +7,24 @@ with them, so that a restart of a supervisor keeps it.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from ...actors.errors import HoldfastError, NameTaken
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import GONE, RUNNING, Cell
 from ...actors.kernel.ref import ActorRef
+from ...actors.persistence import child_key
 from ...actors.process.wire.peer import OutsidePlace
-from ...actors.process.wire.start_codec import pack_recipe
+from ...actors.process.wire.start_codec import pack_data, pack_recipe
 from ...checkpoint.addresses import renamed
 from ...supervision.admin import ChangeSupervisor
 from ...supervision.children import UP, Child, complete, new_cell
-from ...supervision.respec import recipe_spec
+from ...supervision.respec import recipe_spec, respec
 from ...supervision.spec import ChildSpec, Flags
 from ...supervision.supervisor import Supervisor
 from .draft import START_TIMEOUT, DraftPlace, is_elsewhere
-from .lasting import Renamed, Specs, keep, recipe, recipe_flags, recipe_specs
+from .lasting import Renamed, Specs, keep, recipe, recipe_flags, recipe_parts, recipe_specs
 from .operation import Operation, wrong
 
 if TYPE_CHECKING:
@@ -119,7 +120,12 @@ class Arrangement:
             if place in self._rearranged and isinstance(cell.actor, Supervisor)
         }
         changed = [place for place in cells if place in self._rearranged]
-        moved = [child for place in changed for child in place.children.values() if child.has_moved]
+        moved = [
+            child
+            for place in changed
+            for child in place.children.values()
+            if child.has_moved and child in self.handings
+        ]
         was = {child: f"{cells[_left(child)].path}/{child.name}" for child in moved}
         if moved or self.successions:
             settle_bindings(system._node.root)
@@ -131,15 +137,29 @@ class Arrangement:
         now |= dict(one.leave_tree(system) for one in reversed(self.successions))
         now = {old: new for old, new in now.items() if old != new}
         left = {one.left for one in self.successions}
+        renamed = Renamed(now)
         if now and system._node.root is not None:  # First: what comes now is called by addresses as they are now.
-            Renamed(now).keep(system._node.root)
+            renamed.keep(system._node.root)
+        for place in (one.place for one in reversed(self.successions)):
+            place.was.start = _start_after(place, renamed.start(_start_before(place)), taken)
         for place, supervisor in here.items():
             _respecify(place, supervisor)
         for place, cell in [(place, cell) for place, cell in cells.items() if place not in left]:
-            keep(cell, lambda flags, specs, place=place: _edited(place, flags, specs, taken))  # type: ignore[misc]
+            if place.was.start is None:
+                keep(cell, lambda flags, specs, place=place: _edited(place, flags, specs, taken))  # type: ignore[misc]
+            elif not isinstance(cell.host.place, OutsidePlace):  # Else it stands in the recipe of one above it.
+                respec(cell, place.was.start)
         if now:
             system._homes.move(now)
             system._mechanism_notes.moved(now)
+        for place, cell in cells.items():
+            if place.is_noted and is_elsewhere(cell):  # It hears of it later, and may die before.
+                for child in place.children.values():
+                    spec = (
+                        taken[child].spec if child in taken else child.was.start and planned_spec(child, in_force=True)
+                    )
+                    if spec is not None:
+                        system._homes.note(child_key(cell.path, child.name), pack_data(spec, f"child {child.name!r}"))
         for child in moved:  # Before anything else is said to their processes.
             for cell in every_cell(taken[child].cell) if was[child] in now else ():
                 cell.host.place.readdress(cell, was[child], now[was[child]])
@@ -148,10 +168,10 @@ class Arrangement:
                 self.handings[child].commit(top)
         for one in reversed(self.successions):
             one.commit(system)
-        for cell in [cells[place] for place in changed if place not in left]:
+        for place, cell in [(place, cells[place]) for place in changed if place not in left]:
             # Its next life may begin in the process that it is in.
-            start = recipe(cell) if isinstance(cell.host.place, OutsidePlace) else None
-            if start is not None:
+            start = place.was.start or recipe(cell)
+            if start is not None and isinstance(cell.host.place, OutsidePlace):
                 cell.host.told(cell, "recipe", {"start": pack_recipe(start, cell.path)})
         if now:
             tell_bindings(system._node.root, {new: old for old, new in now.items()})
@@ -220,7 +240,13 @@ def planned_spec(place: DraftPlace, *, in_force: bool) -> ChildSpec:
     bound = {port: to for port, to in place.bindings.items() if port in spec.bindings}
     paths = {port: to.path if in_force or to.cell is None else to.cell.path for port, to in bound.items()}
     changes: dict[str, Any] = {"bindings": {**spec.bindings, **paths}}
-    if place.flags is not None and len(spec.start.args) == 2 and not place.is_dynamic:
+    if place.was.start is not None:  # It takes the place of another one.
+        start, begins_with = place.was.start, None
+        if not in_force and place.is_supervisor:
+            planned = (one for one in place.children.values() if one.is_planned)
+            begins_with = place.flags, tuple(planned_spec(one, in_force=in_force) for one in planned)
+        changes["start"] = Start(start.kind, start.args, start.kwargs, begins_with)
+    elif place.flags is not None and len(spec.start.args) == 2 and not place.is_dynamic:
         below = tuple(
             planned_spec(one, in_force=in_force)
             for one in place.children.values()
@@ -230,6 +256,21 @@ def planned_spec(place: DraftPlace, *, in_force: bool) -> ChildSpec:
     elif place.flags is not None and len(spec.start.args) == 2:
         changes["start"] = Start(spec.start.kind, (place.flags, spec.start.args[1]), spec.start.kwargs)
     return dataclasses.replace(spec, **changes)
+
+
+def _start_before(place: DraftPlace) -> Start[Any]:
+    """What the next life of one whose place is taken would have begun with."""
+    assert place.was.start is not None
+    return place.was.start
+
+
+def _start_after(place: DraftPlace, start: Start[Any], taken: dict[DraftPlace, Child]) -> Start[Any]:
+    """The same of the one that takes the place, with the children that the transaction gives it."""
+    flags, specs = recipe_parts(start)
+    if flags is None or specs is None:
+        return start
+    flags, specs = _edited(place, flags, specs, taken)
+    return Start(start.kind, (flags, start.args[1] if place.is_dynamic else specs), start.kwargs)
 
 
 def _below(place: DraftPlace) -> DraftPlace:
@@ -249,18 +290,25 @@ def _taken(
 ) -> Child:
     """The child as its new supervisor has it from now on; the old one, if it lives in this process, has it no more."""
     if _left(child) in here:
-        one = here[_left(child)]._give_away(child.name)
+        one = lose_child(here[_left(child)], child.name, _left(child))
         one.spec = handing.spec(one.spec)
         return one
     cell, above = child.cell, cells[_below(child)]
     assert cell is not None
-    known = recipe_spec(cell)
+    known = recipe_spec(cell) or child.spec
     assert known is not None
     spec = handing.spec(known)
     if _below(child) in here:
         spec = complete(above, spec)
     cell.spec, cell.extra().start = spec, spec.start
     return Child(spec, cell, UP, up_since=cell.node.loop.time())
+
+
+def lose_child(supervisor: Supervisor, name: str, place: DraftPlace | None) -> Child:
+    """A supervisor of this process has a child no more. Whoever takes its place comes to what it has noted."""
+    if place is not None and place.was.start is not None:
+        return supervisor._children.pop(name)
+    return supervisor._give_away(name)
 
 
 def _arrange(place: DraftPlace, supervisor: Supervisor, taken: dict[DraftPlace, Child]) -> None:
@@ -307,6 +355,7 @@ def _respecify(place: DraftPlace, supervisor: Supervisor) -> None:
             continue
         if child.is_planned:
             one.spec = planned_spec(child, in_force=True)
+            supervisor._respecified(one)
         elif child.is_switched and child.spec is not None:
             one.spec = dataclasses.replace(one.spec, autostart=child.spec.autostart)
         else:
@@ -325,15 +374,20 @@ def _edited(place: DraftPlace, flags: Flags, specs: Specs, taken: dict[DraftPlac
     known = {spec.id: spec for spec in specs}
     left = place.was.children - place.children.keys()
     after: list[ChildSpec] = []
-    for name, child in place.children.items():
-        spec, is_new = known.pop(name, None), child.is_planned or child in taken
+    children: Iterable[DraftPlace] = place.children.values()
+    if place.is_uniform:  # It begins with as many as its recipe says, in that order.
+        children = [place.children[name] for name in known if name in place.children]
+    for child in children:
+        was = known.pop(child.name, None)
+        spec, is_new = was, child.is_planned or child in taken
         if child.is_planned:
             spec = planned_spec(child, in_force=True)
         elif child in taken:
             spec = taken[child].spec
         elif spec is not None and child.is_switched and child.spec is not None:
             spec = dataclasses.replace(spec, autostart=child.spec.autostart)
-        if spec is not None and not child.is_leaving and not (is_new and spec.restart == "temporary"):
+        is_known = was is not None and place.was.start is not None
+        if spec is not None and not child.is_leaving and (is_known or not (is_new and spec.restart == "temporary")):
             after.append(spec)
     after += [spec for name, spec in known.items() if name not in left]
     return dataclasses.replace(flags, **place.wanted), tuple(after)

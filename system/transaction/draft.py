@@ -7,25 +7,30 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
+from ...actors.control.orders import GiveAccount
+from ...actors.control.orders_lane import order
 from ...actors.errors import ActorRestarting, NoSuchActor
 from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.node import Node, cell_kind
 from ...actors.kernel.ref import ActorRef
 from ...actors.process.process_host import WorkerPlace
 from ...actors.process.wire.peer import OutsidePlace
-from ...supervision.admin import WhichChildren
-from ...supervision.children import Child
+from ...supervision.children import STOPPED, Child
 from ...supervision.dynamic import DynamicSupervisor
-from ...supervision.services.partition import PartitionSupervisor
+from ...supervision.respec import recipe_spec
+from ...supervision.services.partition import PartitionSupervisor, UniformSupervisor
 from ...supervision.spec import ChildSpec, Flags
 from ...supervision.supervisor import Supervisor
+from ...supervision.supervisor_changes import Account, heard
 from ..mechanism_notes import part_of
 from ..recovery import RecoverySupervisor
 from .lasting import recipe_flags, recipe_specs
 from .operation import wrong
 
 if TYPE_CHECKING:
-    from ...actors.kernel.actor import Actor
+    from ...actors.kernel.actor import Actor, Start
     from .arrangement import Arrangement
     from .relocation import Relocation
     from .rework import Rework
@@ -44,6 +49,8 @@ class PlaceBefore:
     """Its supervisor."""
     children: frozenset[str] = frozenset()
     """The names of those that were below it."""
+    start: Start[Any] | None = None
+    """Of a supervisor whose place another one takes: what the next life there begins with; None: nobody takes it."""
     brought_back: bool = False
     """Whether its supervisor starts it when that is restarted itself: its recipe says so."""
     bound: dict[str, DraftPlace] = field(default_factory=dict[str, "DraftPlace"])
@@ -72,6 +79,7 @@ class DraftPlace:
         "relocation",
         "rework",
         "spec",
+        "told",
         "wanted",
         "was",
     )
@@ -90,6 +98,7 @@ class DraftPlace:
         self.names: list[str] = []
         self.was = PlaceBefore(parent)
         self.is_switched = False  # its spec says otherwise whether it is started with the others
+        self.told: dict[str, ChildSpec] = {}  # of its children, as a supervisor in another process says
         self.candidate = 0  # as which it is started, if it is added
         self.wanted: dict[str, Any] = {}  # flags that change
         self.rework: Rework | None = None  # what is changed in the actor itself
@@ -136,14 +145,40 @@ class DraftPlace:
         return self.kind is not None and issubclass(self.kind, Supervisor)
 
     @property
+    def begins_anew(self) -> bool:
+        """Whether another one takes its place where its supervisor's place is taken."""
+        return self.kind is not None and self.kind._with_successor == "anew"
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether its supervisor's place is not taken before it has ended."""
+        return self.kind is not None and self.kind._with_successor == "awaited"
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether it does not run, and goes along as a spec where its supervisor's place is taken."""
+        below = self.was.below
+        return self.is_stopped and below is not None and below.was.start is not None
+
+    @property
     def is_dynamic(self) -> bool:
         """Whether its children have no order."""
         return self.kind is not None and issubclass(self.kind, DynamicSupervisor)
 
     @property
+    def is_noted(self) -> bool:
+        """Whether a journal says which children it has; one that begins anew comes to that of the other one."""
+        return self.flags is not None and self.flags.journal and self.was.start is None
+
+    @property
     def is_partitioned(self) -> bool:
         """Whether its children are all alike, and not ours to give."""
         return self.kind is not None and issubclass(self.kind, PartitionSupervisor)
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether its children are all alike, so that none of them comes or goes alone."""
+        return self.kind is not None and issubclass(self.kind, UniformSupervisor)
 
     @property
     def actor(self) -> Supervisor | None:
@@ -156,6 +191,17 @@ class DraftPlace:
         """Whether it lives as a group of replicas now."""
         spec = self.cell.spec if self.cell is not None else None
         return isinstance(spec, ChildSpec) and spec.mechanism is not None
+
+    def know_spec(self) -> ChildSpec | None:
+        """Its spec; one that is not known here is that in a recipe of the root, else what its supervisor has told."""
+        if self.spec is None and self.cell is not None:
+            self.spec = recipe_spec(self.cell)
+        if self.spec is None and self.parent is not None:
+            specs = (recipe_specs(self.parent.cell) or ()) if self.parent.cell is not None else ()
+            self.spec = next((one for one in specs if one.id == self.name), None) or self.parent.told.get(self.name)
+        if self.kind is None and self.spec is not None:
+            self.kind = self.spec.start.kind
+        return self.spec
 
     def rework_of(self) -> Rework:
         """What is changed in the actor itself; a step has asked for it."""
@@ -367,13 +413,23 @@ class Draft:
                 raise ActorRestarting(place.path)
             if place not in self._asked:  # It is in another process, and knows best.
                 self._asked.add(place)
-                ref: ActorRef[Supervisor] = ActorRef(cell)
-                known = place.children
-                below = [info.id for info in await ref.ask(WhichChildren())]
-                told = {name: known.get(name) or DraftPlace(name, place, None, None) for name in below}
-                place.children = {**told, **{name: one for name, one in known.items() if name not in told}}
-                place.was.children = frozenset(place.children)
+                account = heard_account(place.path, await order(cell, GiveAccount(), START_TIMEOUT))
+                self._learn(place, account)
         return place
+
+    @staticmethod
+    def _learn(place: DraftPlace, account: Account) -> None:
+        """What a supervisor in another process says of itself and its children."""
+        known = place.children
+        told = {heir.id: known.get(heir.id) or DraftPlace(heir.id, place, None, None) for heir in account.children}
+        for heir in account.children:
+            told[heir.id].is_stopped = heir.state == STOPPED
+        place.told = {heir.id: heir.spec.value for heir in account.children if heir.spec is not None}
+        place.children = {**told, **{name: one for name, one in known.items() if name not in told}}
+        place.was.children = frozenset(place.children)
+        place.is_suspended = account.is_suspended
+        if place.flags is None:
+            place.flags = account.flags
 
     def check(self) -> None:
         """What must hold when all is done.
@@ -436,6 +492,18 @@ class Draft:
     def lines(self) -> list[str]:
         """The tree when all is done, a line for each address."""
         return [line for place in self.staying() for line in (place.line(), *place.brick_lines())]
+
+
+def heard_account(path: str, told: Any) -> Account:
+    """What a supervisor in another process leaves, as that says.
+
+    Raises:
+        SpecError: that is no such account.
+    """
+    try:
+        return heard(told)
+    except msgspec.ValidationError as error:
+        raise wrong(path, f"its process gives no account of it: {error}") from error
 
 
 def check_awake(place: DraftPlace) -> None:

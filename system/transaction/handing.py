@@ -21,7 +21,6 @@ from ...actors.process.process_host import WorkerPlace
 from ...checkpoint.places.far_parent import FarParent
 from ...checkpoint.places.subtree_place import SubtreePlace
 from ...supervision.admin import Boxed, RemoveChild, StartChild
-from ...supervision.respec import recipe_spec
 from ...supervision.supervisor_changes import check_subtree
 from ..live_moves import place_of
 from .arrangement import planned_spec
@@ -35,6 +34,13 @@ if TYPE_CHECKING:
     from ...supervision.spec import ChildSpec
     from ...supervision.supervisor import Supervisor
     from ..system import ActorSystem
+
+
+UNKNOWN = (
+    "no recipe at the root has its spec, and its supervisor, in another process, cannot tell one that has bindings, a "
+    "mechanism, or a class that is not loaded here"
+)
+"""Why a child cannot be given away."""
 
 
 def is_far(supervisor: DraftPlace) -> bool:
@@ -54,6 +60,8 @@ def check_handing(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> None:
         SpecError: why not.
     """
     check_handed(place, old, new)
+    if place.cell is None or place.is_stopped:
+        raise wrong(place.path, "it does not run, and a supervisor lives in another process: start it first")
     if is_far(new):
         for one in (recipe_specs(new.cell) or ()) if new.cell is not None else ():
             early = one.bindings.keys() - one.late
@@ -75,13 +83,9 @@ def check_handed(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> None:
     Raises:
         SpecError: why not.
     """
-    cell, spec = place.cell, place.spec
-    if cell is None or place.is_stopped:
-        raise wrong(place.path, "it does not run, and a supervisor lives in another process: start it first")
-    if spec is None or (is_far(old) and recipe_spec(cell) is None):
-        raise wrong(
-            place.path, "no recipe at the root has its spec: its supervisor alone, in another process, knows it"
-        )
+    spec = place.spec
+    if spec is None:
+        raise wrong(place.path, UNKNOWN)
     if is_far(new):
         check_subtree(new.path, (spec,))
         Boxed(spec).packed()
@@ -126,7 +130,7 @@ class Handing:
             raise wrong(place.path, "it goes to another process's supervisor: change it in a transaction of its own")
         cell = place.living(system._node)
         if not place.is_protected and place_of(cell) != "process":
-            work = functools.partial(system._moves.move, cell, "process", None, MOVED_WITHIN)
+            work = functools.partial(system._moves.move, cell, "process", None, MOVED_WITHIN, known=place.spec)
             self._is_lodged |= await self._lodging.done(system, work)
         above = self._above.living(system._node)
         if not is_elsewhere(above) or (self._asked is above and self._life == above.life and not self._has_failed()):

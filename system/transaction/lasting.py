@@ -23,12 +23,12 @@ Edit = Callable[[Flags, Specs], tuple[Flags, Specs]]
 
 def recipe_flags(cell: Cell) -> Flags | None:
     """The flags in a supervisor's recipe, if it has one with flags."""
-    return _parts(_recipe(cell)[1])[0]
+    return recipe_parts(_recipe(cell)[1])[0]
 
 
 def recipe_specs(cell: Cell) -> Specs | None:
     """The children in a supervisor's recipe, if it has one."""
-    return _parts(_recipe(cell)[1])[1]
+    return recipe_parts(_recipe(cell)[1])[1]
 
 
 def recipe(cell: Cell) -> Start[Any] | None:
@@ -39,7 +39,7 @@ def recipe(cell: Cell) -> Start[Any] | None:
 def keep(cell: Cell, edit: Edit) -> None:
     """Have the next lives of a supervisor begin with a changed recipe."""
     holder, start = _recipe(cell)
-    flags, specs = _parts(start)
+    flags, specs = recipe_parts(start)
     if start is None or flags is None or specs is None:
         return
     flags_after, specs_after = edit(flags, specs)
@@ -65,7 +65,7 @@ class Renamed:
             if isinstance(cell.spec, ChildSpec):
                 cell.spec = self._spec(cell.spec)
             if cell.more is not None and cell.more.start is not None:
-                cell.more.start = self._start(cell.more.start)
+                cell.more.start = self.start(cell.more.start)
             if isinstance(cell.actor, Supervisor):
                 for one in cell.actor._listed().values():
                     one.spec = self._spec(one.spec)
@@ -79,15 +79,16 @@ class Renamed:
     def _spec(self, spec: ChildSpec) -> ChildSpec:
         if id(spec) not in self._made:
             bindings = {port: self._path(path) for port, path in spec.bindings.items()}
-            start, new = self._start(spec.start), spec
+            start, new = self.start(spec.start), spec
             if bindings != spec.bindings or start is not spec.start:
                 new = dataclasses.replace(spec, bindings=bindings, start=start)
             self._made[id(spec)] = (spec, new)
         new_spec: ChildSpec = self._made[id(spec)][1]
         return new_spec
 
-    def _start(self, start: Start[Any]) -> Start[Any]:
-        specs = _parts(start)[1]
+    def start(self, start: Start[Any]) -> Start[Any]:
+        """A recipe with them."""
+        specs = recipe_parts(start)[1]
         if id(start) not in self._made:
             below = tuple(map(self._spec, specs or ()))
             new = start
@@ -112,7 +113,7 @@ def _recipe(cell: Cell) -> tuple[Cell, Start[Any] | None]:
 
 def _inner(start: Start[Any], names: list[str]) -> Start[Any] | None:
     for name in names:
-        specs = _parts(start)[1]
+        specs = recipe_parts(start)[1]
         spec = next((spec for spec in specs or () if spec.id == name), None)
         if spec is None:
             return None
@@ -120,7 +121,8 @@ def _inner(start: Start[Any], names: list[str]) -> Start[Any] | None:
     return start
 
 
-def _parts(start: Start[Any] | None) -> tuple[Flags | None, Specs | None]:
+def recipe_parts(start: Start[Any] | None) -> tuple[Flags | None, Specs | None]:
+    """Flags and children in a recipe; None where it has none, or its class has an `init` of its own."""
     if start is None or not issubclass(start.kind, Supervisor) or len(start.args) != 2:
         return None, None
     if start.kind.init is not Supervisor.init:

@@ -18,10 +18,9 @@ from ...checkpoint.home.recorded_home import switch_of
 from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import SnapshotNow
 from ...supervision.children import STOPPED, UP
-from ...supervision.respec import recipe_spec
 from .arrangement import busy, child_of
 from .draft import Draft, DraftPlace, Target, is_elsewhere
-from .handing import Handing, check_handed, check_handing, is_far
+from .handing import UNKNOWN, Handing, check_handed, check_handing, is_far
 from .living import OnSharedWork
 from .operation import Operation, StagedWork, text_of, wrong
 from .relocation import MOVED_WITHIN, Gated
@@ -52,8 +51,11 @@ class Reparent(OnSharedWork):
         place = draft.find(self._at)
         new, old = await draft.supervisor(self._to), place.parent
         self.target = place.path
-        if place.spec is None and place.cell is not None:  # Its supervisor lives in another process.
-            place.spec = recipe_spec(place.cell)
+        if old is not None and old.is_supervisor and is_far(old):
+            await draft.supervisor(old.path)  # It tells whom it has.
+        place.know_spec()
+        if place.spec is None and old is not None and old.is_supervisor and is_far(old):
+            raise wrong(place.path, UNKNOWN)
         if old is None or not old.is_supervisor or place.spec is None:
             raise wrong(place.path, "no supervisor looks after it, so it cannot be moved to another")
         if new in place.walk():
@@ -62,7 +64,6 @@ class Reparent(OnSharedWork):
         if any(one.place is place for one in draft.arrangement.successions):
             raise wrong(place.path, "it begins anew there by this very transaction: move it once")
         if is_far(old) or is_far(new):
-            await draft.supervisor(old.path)  # It tells whom it has before it has one less in the draft.
             check_handing(place, old, new)
         for above in new.upwards():
             if above.comes_last:
@@ -120,10 +121,10 @@ class Regrouping(StagedWork):
             self._successions.append(succession)
             arrangement = self._draft.arrangement
             arrangement.successions.append(succession)
-            for holder in (succession.left, place):
+            for holder in (succession.left, place) if place.is_supervisor else ():
                 arrangement.touch(holder, step)
             for child in place.children.values():
-                if not (child.is_supervisor or child.is_moved):
+                if not (child.begins_anew or child.is_awaited or child.is_moved or child.is_idle):
                     self.hand(child)
                     child.is_moved = True
 
@@ -131,6 +132,8 @@ class Regrouping(StagedWork):
         """Have recorded and protected actors rest: no turn of theirs is to be repeated under another address."""
         if not (self._candidate or self._moved):
             return
+        for succession in self._successions:
+            await succession.wind_down(system)
         if self._why_not_moved(system):
             await self._let_go(system)  # Whoever has stood down restarts nobody.
         if self._candidate is not None:
@@ -281,6 +284,8 @@ class Regrouping(StagedWork):
     async def release(self, system: ActorSystem) -> None:
         try:
             await self._let_go(system)
+            for succession in self._successions:
+                await succession.give_up(system)
             for rest in self._rests.values():
                 await rest.give_up()
             for _, handing in self._handings:
@@ -336,15 +341,15 @@ async def successors(draft: Draft, place: DraftPlace, new: DraftPlace, *, is_giv
     Raises:
         SpecError: they cannot, or somebody below them cannot be given to another supervisor.
     """
-    await draft.supervisor(place.path)  # It tells whom it has.
-    check_succession(place, new)
+    if place.is_supervisor:
+        await draft.supervisor(place.path)  # It tells whom it has.
+    check_succession(place)
     found = [place]
     for child in list(place.children.values()):
-        if child.spec is None and child.cell is not None:
-            child.spec = recipe_spec(child.cell)
-        if is_given or is_far(place):
+        child.know_spec()
+        if (is_given or is_far(place)) and not child.is_awaited:
             check_handed(child, place, new)
-        if child.is_supervisor:
+        if child.begins_anew and not child.is_stopped:
             found += await successors(draft, child, new, is_given=is_given)
     return found
 

@@ -2,8 +2,9 @@
 
 The new one is started beside it, at the new address and without children. All its children are moved there, each as if
 it were moved alone; at the commit, when it has none any more, all that others have tied to the old one is tied to the
-new one: refs, links, monitors, names, bindings, what waits for it. Of itself the new one has what its start gives it,
-and the restarts of the old one that still count. The old one ends, and nobody but itself hears of that.
+new one: refs, links, monitors, names, bindings, what waits for it, and it is told what the old one leaves to it
+(`supervision/supervisor_changes.py`). The old one ends, and nobody but itself hears of that. A part of a supervisor
+that is nothing without it beside it, such as the router of a pool, gives way to another one in the same way.
 """
 
 from __future__ import annotations
@@ -14,23 +15,24 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from ...actors.control.orders import Conclude, StandDown
+from ...actors.control.orders import Conclude, StandDown, WindDown
 from ...actors.control.orders_lane import order
 from ...actors.errors import ActorStopped, AskFailed
 from ...actors.exit_reasons import Shutdown
 from ...actors.kernel import lifecycle, links, mailbox
-from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import GONE, RUNNING, Cell
-from ...actors.migration.quiesce import ATTEMPTS, farewell, handed_on, part, sorted_out
+from ...actors.migration.luggage import let_come
+from ...actors.migration.quiesce import ATTEMPTS, farewell, handed_on, replaced, without_room
 from ...actors.process.process_host import WorkerPlace
 from ...actors.process.wire.peer import OutsideHost
 from ...actors.process.worker_pool import Worker
-from ...supervision.children import complete
-from ...supervision.spec import Flags
+from ...supervision.admin import Boxed
+from ...supervision.children import STOPPED, complete
 from ...supervision.supervisor import Supervisor
-from ...supervision.supervisor_changes import Account, TakeOver, account_of, take_over, why_occupied
-from .arrangement import busy, child_of, planned_spec
-from .draft import DraftPlace, check_awake, is_elsewhere
+from ...supervision.supervisor_changes import Account, Heir, TakeOver, account_of, take_over
+from .arrangement import child_of, lose_child, planned_spec
+from .draft import DraftPlace, heard_account, is_elsewhere
+from .lasting import recipe_parts
 from .operation import wrong
 from .rework import CONCLUDED_WITHIN, PREPARED_WITHIN
 from .structure import Newcomer, fill
@@ -43,30 +45,16 @@ ENDS_WITHIN = 5.0
 """Seconds that the process of a supervisor may take to end when it has none any more."""
 
 
-def check_succession(place: DraftPlace, above: DraftPlace) -> None:
-    """Whether another supervisor, which will be below `above`, can take the place of this one.
+def check_succession(place: DraftPlace) -> None:
+    """Whether another one can take the place of this supervisor, or of this part of one.
 
     Raises:
         SpecError: why not.
     """
-    if above.flags is not None and above.flags.journal:
-        raise wrong(above.path, "its journal would say that this one begins without children")
-    spec, kind = place.spec, place.kind
-    if spec is None or kind is None or place.cell is None or place.is_planned:
+    if place.spec is None or place.cell is None or place.is_planned:
         raise wrong(place.path, "it has begun, or moved, by this very transaction: use the next one")
     if place.is_stopped:
         raise wrong(place.path, "it does not run: start it first")
-    check_awake(place)
-    assert issubclass(kind, Supervisor)
-    if kind._irreplaceable:
-        raise wrong(place.path, kind._irreplaceable)
-    args = spec.start.args
-    if kind.init is not Supervisor.init:
-        raise wrong(place.path, "its class has an init of its own, which alone says with which children it begins")
-    if len(args) != 2 or not isinstance(args[0], Flags) or place.flags is None:
-        raise wrong(place.path, "its recipe does not say its flags and children")
-    if place.flags.journal:
-        raise wrong(place.path, "its journal is kept under its address")
     changed = (one for one in place.children.values() if one.is_planned or one.is_leaving or one.is_switched)
     if (one := next(changed, None)) is not None:
         raise wrong(one.path, "it is changed by this very transaction: move its supervisor in the next one")
@@ -154,7 +142,6 @@ class Succession:
 
     def __init__(self, place: DraftPlace, draft: Draft) -> None:
         assert place.spec is not None
-        assert place.flags is not None
         self.place = place
         """That of the supervisor, in which the new one will be."""
         self.left = DraftPlace(place.name, place.was.below, place.cell, place.spec)
@@ -162,19 +149,34 @@ class Succession:
         self._attempt = next(ATTEMPTS)
         self._is_asked = False  # to stand down, in another process
         self._held: tuple[Cell, int] | None = None  # which life has done so
+        self._winding: tuple[Cell, int] | None = None  # which life was told that another one is to take its place
         self._account: Account | None = None
         for one in draft.places():
             if one.was.below is place:
                 one.was.below = self.left
         if place.parent is place.was.below and place.parent is not None:  # Its place is free at once.
             place.parent.was.children -= {place.name}
-        self.left.was.children = place.was.children
-        template = place.spec.start.args[1] if place.is_dynamic else ()
-        start = Start(place.spec.start.kind, (place.flags, template), place.spec.start.kwargs)
-        place.spec = dataclasses.replace(place.spec, start=start)
+        self.left.was.children, self.left.kind = place.was.children, place.kind
+        place.was.start = self.left.was.start = place.spec.start
         place.cell, place.is_planned = None, True
 
     # -- before the commit --------------------------------------------------------------------------------------------
+
+    async def wind_down(self, system: ActorSystem) -> None:
+        """Have nothing be in the way of its end, as far as that is its own."""
+        cell = self.left.living(system._node)
+        if self._winding == (cell, cell.life):
+            return
+        self._winding = cell, cell.life
+        with contextlib.suppress(AskFailed, ActorStopped):  # It has ended: its next life is told.
+            await order(cell, WindDown(self._attempt), PREPARED_WITHIN)
+
+    async def give_up(self, system: ActorSystem) -> None:
+        """Nobody takes its place."""
+        cell, winding, self._winding = self.left.now(system._node), self._winding, None
+        if cell is not None and winding is not None:
+            with contextlib.suppress(AskFailed, ActorStopped):
+                await order(cell, WindDown(0), CONCLUDED_WITHIN)
 
     async def hold(self, system: ActorSystem) -> None:
         """Have it give orders no more, if it lives in another process."""
@@ -185,7 +187,8 @@ class Succession:
         with contextlib.suppress(AskFailed, ActorStopped):  # It has ended: its next life is asked.
             told = await order(cell, StandDown(self._attempt), PREPARED_WITHIN)
             if told is not None:
-                self._held, self._account = (cell, life), msgspec.convert(told, Account)
+                self._held = cell, life
+                self._account = heard_account(cell.path, told) if self.place.is_supervisor else None
 
     async def let_go(self, system: ActorSystem) -> None:
         """It goes on."""
@@ -202,20 +205,20 @@ class Succession:
             HoldfastError: it cannot be done any more.
         """
         cell = self.left.living(system._node)
-        if not is_elsewhere(cell):
-            why = busy(cell)
-            supervisor = cell.actor
-            if why or not isinstance(supervisor, Supervisor):
-                return why
-            if occupied := why_occupied(supervisor):
+        if is_elsewhere(cell):
+            if self._held != (cell, cell.life) or not cell.host.is_up(cell) or cell.host.place.is_ending:
+                return f"{cell.path} has not stood down yet"
+        else:
+            actor = cell.actor
+            if actor is None or not cell.host.is_up(cell) or cell.extra().turn is not None:
+                return f"{cell.path} is in the middle of something"
+            if occupied := actor._why_occupied():
                 return f"{cell.path}: {occupied}"
-            self._account = account_of(supervisor)
-        elif self._held != (cell, cell.life) or not cell.host.is_up(cell) or cell.host.place.is_ending:
-            return f"{cell.path} has not stood down yet"
-        assert self._account is not None
-        known = self.left.was.children
-        if come := [name for name in self._account.children if name not in known]:
-            raise wrong(cell.path, f"it has another child by now, {come[0]!r}: try again")
+            self._account = account_of(actor) if isinstance(actor, Supervisor) else None
+        for heir in self._account.children if self._account is not None else ():
+            known = self.place.children.get(heir.id)
+            if heir.id not in self.left.was.children or (known is not None and known.is_idle and heir.state != STOPPED):
+                raise wrong(cell.path, f"it has another child by now, {heir.id!r}: try again")
         return ""
 
     # -- the commit ---------------------------------------------------------------------------------------------------
@@ -233,23 +236,36 @@ class Succession:
         else:
             (above.children or {}).pop(old.name, None)
             if one is not None and isinstance(above.actor, Supervisor):
-                del above.actor._children[old.name]
+                lose_child(above.actor, old.name, self.left.was.below)
         old.parent, old.name = new, ""  # Its address is that of the new one, wherever that goes.
         return self._was, new.path
 
     def commit(self, system: ActorSystem) -> None:
         """From here on the new one is the one; its children are below it already."""
-        old, new, account = self._ends, self.place.living(system._node), self._account
-        assert account is not None
+        old, new = self._ends, self.place.living(system._node)
         _hand_over(old, new)
         waiting = _end(old, new, self._was)
-        account = Account(tuple(self.place.children), account.restarts)
-        if isinstance(new.actor, Supervisor):
-            take_over(new.actor, account)
-        else:
-            new.admit(new, TakeOver(account))
-        for item in waiting:
-            new.admit(new, item)
+        if self._account is not None:
+            account = self._bequest(self._account)
+            if isinstance(new.actor, Supervisor):
+                take_over(new.actor, account)
+            else:
+                new.admit(new, TakeOver(account))
+        let_come(new, waiting)
+
+    def _bequest(self, account: Account) -> Account:
+        """What is left, as the transaction makes it: the children that stay, in their order."""
+        heirs = {heir.id: heir for heir in account.children}
+        assert self.place.was.start is not None
+        recipe = {spec.id: spec for spec in recipe_parts(self.place.was.start)[1] or ()}
+        children = list[Heir]()
+        for name, child in self.place.children.items():
+            if name in heirs:
+                known = recipe.get(name) or child.spec
+                spec = heirs[name].spec if known is None else Boxed(known)
+                children.append(msgspec.structs.replace(heirs[name], spec=spec))
+        flags = dataclasses.replace(account.flags, **self.place.wanted)
+        return msgspec.structs.replace(account, flags=flags, children=tuple(children))
 
 
 def _hand_over(old: Cell, new: Cell) -> None:
@@ -277,20 +293,21 @@ def _end(old: Cell, new: Cell, was: str) -> list[object]:
     """End the old one, wherever it lives, without telling anybody; returns what has waited for it."""
     host, reason = old.host, Shutdown(f"moved to {new.path}")
     if old.actor is not None:
-        life = part(old)
-        items, commands = sorted_out(old)
+        life, items, commands = replaced(old)
         for command in commands:
             command.undelivered(old, str(reason))
         farewell(life, lifecycle.Stop(reason))
     elif isinstance(host.place, WorkerPlace):
         worker, outlet = host.place.process(old), old.extra().outlet
         _, queued = outlet.close()
-        items = [*queued, *(old.queue or ())]
+        late = without_room(old) if old.extra().bound is not None else []
+        items = handed_on([*queued, *(old.queue or ()), *late])
         if worker is not None:
             again = set(map(id, queued))
             worker.pending = {key: ask for key, ask in worker.pending.items() if id(ask) not in again}
             if was != new.path:
                 worker.readdress(was, new.path)  # It hears of its end by the address that its actor has here.
+            worker.replaced(old)
             worker.leave(old, reason, ENDS_WITHIN, answers=True)
     else:
         assert isinstance(host, OutsideHost)
@@ -299,4 +316,4 @@ def _end(old: Cell, new: Cell, was: str) -> list[object]:
         items = []
     old.queue = old.children = None
     old.state, old.admit = GONE, mailbox.admit_gone  # Whoever has a ref to it reaches the new one.
-    return handed_on(items)
+    return items

@@ -299,3 +299,12 @@ def test_who_waits_at_a_made_up_id_when_the_root_dies_is_told_by_the_next(tmp_pa
     assert outcome == "ActorStopped"
     assert dead == ["Hold", "Ping"]
     assert not still_recorded
+
+
+async def test_a_child_comes_back_where_it_lives_now_and_as_what_it_is(store: str | None) -> None:
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        supervisor = await system.start(school())
+        ann = await supervisor.ask(hf.StartChild(hf.child("ann", hf.start(Pupil))))
+        await system.set_isolation(ann, "process")
+        await system.ref("/app", hf.Supervisor).ask(hf.RestartChild("school", running=True))
+        assert system.pid_of(system.ref("/app/school/ann", Pupil)) != os.getpid()

@@ -19,6 +19,8 @@ AWAITED = "tests/supervision/test_awaited.py"
 CERTIFIED = "tests/system/test_moved_certificates.py"
 AT_ODDS = "tests/migration/test_moves_at_odds.py"
 SUPERVISORS = "tests/migration/test_moved_supervisors.py"
+KINDS = "tests/migration/test_moved_kinds.py"
+JOURNALS = "tests/supervision/test_dynamic_journal.py"
 
 CHECKS = {
     "the states are in the store together": Check(
@@ -226,7 +228,7 @@ CHECKS = {
     ),
     "a supervisor within a process has its recipe as it is now": Check(
         "system/transaction/arrangement.py",
-        "            if start is not None:\n",
+        "            if start is not None and isinstance(cell.host.place, OutsidePlace):\n",
         "            if False:\n",
         FAR,
         "test_a_supervisor_within_a_process",
@@ -655,8 +657,8 @@ CHECKS = {
     ),
     "nobody is lost who was started beside a move of its supervisor": Check(
         "system/transaction/succession.py",
-        "        if come := [name for name in self._account.children if name not in known]:",
-        "        if come := list[str]():",
+        "            if heir.id not in self.left.was.children or ",
+        "            if ",
         SUPERVISORS,
         "test_who_has_come_meanwhile",
     ),
@@ -667,6 +669,97 @@ CHECKS = {
         SUPERVISORS,
         "test_who_has_left_the_address",
     ),
+    "who is to take the place of another one erases nothing of what that has noted": Check(
+        "supervision/dynamic.py",
+        "        super()._forget(one)\n        if not self._is_in_place:\n            return\n",
+        "        super()._forget(one)\n",
+        KINDS,
+        "test_what_was_noted_is_true and template and process",
+    ),
+    "a pool that is to take the place of another one erases nothing either": Check(
+        "supervision/services/pool.py",
+        "        super()._forget(one)\n        if self._is_in_place:\n",
+        "        super()._forget(one)\n        if True:\n",
+        KINDS,
+        "test_what_was_noted_is_true and pool and process",
+    ),
+    "a supervisor that is to take a place is in no journal before": Check(
+        "supervision/dynamic.py",
+        "        if self._is_in_place and one.spec.start.begins_with is None:\n",
+        "        if self._is_in_place:\n",
+        KINDS,
+        "test_a_journal_says_which_supervisor_has_come",
+    ),
+    "a journal says as what a child lives": Check(
+        "supervision/respec.py",
+        "        supervisor._respecified(child)\n",
+        "",
+        JOURNALS,
+        "test_a_child_comes_back_where_it_lives_now",
+    ),
+    "who waits for a restart is not waited for": Check(
+        "supervision/supervisor.py",
+        "                self.ctx._cell.push(Retry(one, one.retry, one.due))\n",
+        "                pass\n",
+        KINDS,
+        "test_who_waits_for_a_restart",
+    ),
+    "jobs that were asked for while others were waited for begin when the move is given up": Check(
+        "system/transaction/reparenting.py",
+        "                await succession.give_up(system)\n",
+        "                pass\n",
+        KINDS,
+        "test_jobs_begin_again",
+    ),
+    "jobs that run are waited for": Check(
+        "supervision/services/jobs.py",
+        'f"its job {job!r} is not over")',
+        '"")',
+        KINDS,
+        "test_jobs_that_run",
+    ),
+    "the children of a suspended one are there when it takes the place": Check(
+        "supervision/supervisor_changes.py",
+        "        errand.is_urgent = True\n",
+        "        pass\n",
+        KINDS,
+        "test_a_suspended_one",
+    ),
+    "what only a process says of a binding makes no grant": Check(
+        "supervision/supervisor_changes.py",
+        "any(one.bindings for one in everything((spec,)))",
+        "False",
+        KINDS,
+        "test_what_a_process_alone_says",
+    ),
+    "what it has put aside goes along": Check(
+        "actors/migration/quiesce.py",
+        "handed_on([*stash, *items, *late])",
+        "handed_on([*items, *late])",
+        KINDS,
+        "test_what_it_has_put_aside and near",
+    ),
+    "what it has put aside in a process of its own goes along": Check(
+        "actors/process/worker_node.py",
+        "            hand_on_stash(cell, self._stand_in(cell.path))\n",
+        "            pass\n",
+        KINDS,
+        "test_what_it_has_put_aside and task",
+    ),
+    "a pool begins with its first size again": Check(
+        "system/transaction/arrangement.py",
+        "    if place.is_uniform:  # It begins",
+        "    if False:  # It begins",
+        KINDS,
+        "test_a_pool_that_has_grown",
+    ),
+    "who has ended is said to have ended": Check(
+        "actors/kernel/codec.py",
+        "        if cell.state is GONE or (cell",
+        "        if (cell",
+        "tests/actors/process/test_outside.py",
+        "test_who_has_ended and process",
+    ),
     "restarts count on where another supervisor takes the place": Check(
         "supervision/supervisor_changes.py",
         "    supervisor._restarts = tuple(sorted((*supervisor._restarts, *(now - ago for ago in account.restarts))))\n",
@@ -676,8 +769,8 @@ CHECKS = {
     ),
     "children keep their order below another supervisor": Check(
         "supervision/supervisor_changes.py",
-        "{**first, **known}",
-        "{**known, **first}",
+        "{**children, **known}",
+        "{**known, **children}",
         SUPERVISORS,
         "test_its_flags_and_the_order",
     ),
@@ -718,8 +811,8 @@ CHECKS = {
     ),
     "a journal says who has come": Check(
         "supervision/dynamic.py",
-        "        self._try_to_note(one, lambda: self._note(one))\n",
-        "        pass\n",
+        "            self._try_to_note(one, lambda: self._note(one, one.spec))\n\n    def _respecified",
+        "            pass\n\n    def _respecified",
         SUPERVISORS,
         "test_a_journal_says_who",
     ),

@@ -38,6 +38,14 @@ class _Packed:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class _PackedSuccessor:
+    """A Start of who takes the place of another one."""
+
+    start: _Packed
+    begins_with: tuple[Any, ...]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class _PackedData:
     """A dataclass that holds a Start somewhere, such as a child spec."""
 
@@ -81,6 +89,21 @@ def unpack_data(data: bytes) -> Any:
     return _raise_up(decode_value(data))
 
 
+def unpack_told(data: bytes, kind: type[T]) -> T:
+    """A dataclass that another process has told, with recipes in it. Nothing is imported, and nothing else is made.
+
+    Raises:
+        SpecError: it is none, or names what is not loaded here. DamagedValue: these are no such bytes.
+    """
+    try:
+        value = _raise_up(decode_value(data, imports=False), imports=False, told=kind)
+    except TypeError as error:  # Fields that there are not.
+        raise SpecError("recipe", f"the data is no {kind.__name__}: {error}") from error
+    if not isinstance(value, kind):
+        raise SpecError("recipe", f"the data is no {kind.__name__}")
+    return value
+
+
 def unpack_recipe(data: bytes, *, imports: bool = True) -> Start[Any]:
     """The recipe again. Imports the module that defines the class, if `imports`: not for what others name.
 
@@ -99,7 +122,9 @@ def _lower(value: Any, where: str) -> Any:
         kind = value.kind
         if "<locals>" in kind.__qualname__:
             raise SpecError(where, f"{type_name(kind)} is defined in a function, so another process cannot import it")
-        return _Packed(message_name(kind), _lower(value.args, where), _lower(value.kwargs, where))
+        start = _Packed(message_name(kind), _lower(value.args, where), _lower(value.kwargs, where))
+        begins_with = value.begins_with
+        return start if begins_with is None else _PackedSuccessor(start, _lower(begins_with, where))
     if type(value) in (list, tuple):
         return type(value)(_lower(inner, where) for inner in value)
     if type(value) is dict:
@@ -115,15 +140,21 @@ def _lower(value: Any, where: str) -> Any:
     return value
 
 
-def _raise_up(value: Any, *, imports: bool = True) -> Any:
+def _raise_up(value: Any, *, imports: bool = True, told: type | None = None) -> Any:
+    """The value with every Start again; without imports a dataclass with one is made only if it is a `told`."""
+
     def up(inner: Any) -> Any:
-        return _raise_up(inner, imports=imports)
+        return _raise_up(inner, imports=imports, told=told)
 
     if isinstance(value, _Packed):
         if not imports and loaded(value.kind, Actor) is None:
             raise SpecError("recipe", f"{value.kind} is no actor class that is loaded here")
         return Start(_find(value.kind, Actor), up(value.args), up(value.kwargs))
-    if not imports and isinstance(value, (_PackedData, _Description)):
+    if isinstance(value, _PackedSuccessor):
+        start = up(value.start)
+        return Start(start.kind, start.args, start.kwargs, up(value.begins_with))
+    is_told = told is not None and isinstance(value, _PackedData) and value.kind == message_name(told)
+    if not (imports or is_told) and isinstance(value, (_PackedData, _Description)):
         raise SpecError("recipe", "another process names what is to be made of its words: nothing is")
     if isinstance(value, _PackedData):
         return _find(value.kind, object)(**up(value.fields))

@@ -20,6 +20,7 @@ from tests.actors.process.observers import (
     HeardSome,
     Observer,
     Publish,
+    Send,
     Spawn,
     StopChild,
     Subscribe,
@@ -290,3 +291,21 @@ async def test_a_spawned_actor_ends_with_its_process(system: hf.ActorSystem) -> 
         await inner.ask(Heard())
     await one.ask(Spawn("inner"))
     assert await inner.ask(Heard()) == [], "somebody lives at the address again"
+
+
+async def test_who_has_ended_is_said_to_have_ended_by_whatever_way_he_is_told(
+    system: hf.ActorSystem, make: Make
+) -> None:
+    """Nobody there has a class that could say that it does not know the message."""
+    one, other = await make("one"), await system.start(hf.child("other", hf.start(Observer)))
+    system.bind(one, "port", other)
+    assert await one.ask(AskPort()) == os.getpid()
+    assert await one.ask(Send(other, 1)) == "1 sent"
+    with system.events() as events:
+        await system.stop(other)
+        one.tell(Pass(other, "too late"))
+        assert await one.ask(Send(other, 1)) == "0 ActorStopped"
+        with pytest.raises(hf.RemoteCrash, match="ActorStopped: /app/other has stopped"):
+            await one.ask(AskPort())
+        letters = [event.why for event in events.take() if isinstance(event, hf.events.DeadLetter)]
+    assert len(letters) == 1
