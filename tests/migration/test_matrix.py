@@ -1,4 +1,4 @@
-"""Every actor, wherever it lives, taken to every other place: the table in docs/control.md, cell by cell.
+"""Every actor, wherever it lives, taken to every other place: the table in docs/moves.md, cell by cell.
 
 No cell refuses.
 `HOLDFAST_MATRIX=n` runs the walks with faults n times as often.
@@ -20,7 +20,7 @@ import holdfast as hf
 from holdfast.actors.migration.move import Move
 from tests.migration.travellers import BELOW, KINDS, OWN_BELOW, Luggage, Stream, Traveller, path, take, tree
 
-TEXT = (Path(__file__).parents[2] / "docs" / "control.md").read_text("utf-8")
+TEXT = (Path(__file__).parents[2] / "docs" / "moves.md").read_text("utf-8")
 TIMES = int(os.environ.get("HOLDFAST_MATRIX", "1"))
 
 
