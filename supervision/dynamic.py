@@ -113,7 +113,8 @@ class DynamicSupervisor(Supervisor):
         """Note what becomes of a child when we are started again. Raises HoldfastError if that cannot be."""
         key, keeper = child_key(self.ctx.path, one.spec.id), self.ctx._cell.node.ports.keeper
         if self._flags.journal:
-            given = spec if self._template is None else (*_added(self._template, spec), spec.made_up)
+            made = self._template is not None and _is_made_of(self._template, spec)
+            given = (*_added(self._template, spec), spec.made_up) if made else spec
             keeper.note(key, pack_data(given, f"child {one.spec.id!r}"))
         elif one.spec.made_up and self._is_recorded(one):
             keeper.note(key, MADE_UP)
@@ -131,7 +132,7 @@ class DynamicSupervisor(Supervisor):
             self._try_to_note(one, lambda: self._note(one, one.spec))
 
     def _respecified(self, one: Child) -> None:
-        if self._flags.journal and self._is_in_place and self._template is None:  # Else arguments are noted, no more.
+        if self._flags.journal and self._is_in_place:
             self._try_to_note(one, lambda: self._note(one, one.spec))
 
     def _try_to_note(self, one: Child, note: Callable[[], None]) -> None:
@@ -305,6 +306,15 @@ def _filled(template: ChildSpec, args: tuple[Any, ...], kwargs: dict[str, Any]) 
     except TypeError as error:
         raise SpecError("StartChild", f"start({type_name(own.kind)}, ...): {error}") from error
     return dataclasses.replace(template, start=start)
+
+
+def _is_made_of(template: ChildSpec, spec: ChildSpec) -> bool:
+    """Whether a child is what its template says, arguments aside: nobody has changed its code or its place."""
+    own = template.start
+    like = dataclasses.replace(
+        spec, start=own, id=template.id, comes_back=template.comes_back, made_up=template.made_up
+    )
+    return spec.start.kind is own.kind and like == template
 
 
 def _added(template: ChildSpec, spec: ChildSpec) -> tuple[tuple[Any, ...], dict[str, Any]]:

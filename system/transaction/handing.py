@@ -209,9 +209,11 @@ class Handing:
         """The new supervisor forgets it, and it lives where it did."""
         try:
             self._is_lodged |= await self._lodging.give_up()
-            await self._withdraw()
-        finally:
-            await self._settle(system)
+        finally:  # The other one goes in any case.
+            try:
+                await self._withdraw()
+            finally:
+                await self._settle(system)
 
     async def _withdraw(self) -> None:
         start, parent, asked = self._start, self._parent, self._asked

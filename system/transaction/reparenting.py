@@ -282,16 +282,19 @@ class Regrouping(StagedWork):
             await self._settle_certificates(is_moved=True)
 
     async def release(self, system: ActorSystem) -> None:
+        """All of it is let go of, whatever cannot be: that is told then."""
         try:
             await self._let_go(system)
             for succession in self._successions:
                 await succession.give_up(system)
             for rest in self._rests.values():
                 await rest.give_up()
-            for _, handing in self._handings:
-                await handing.release(system)
+            releases = [handing.release(system) for _, handing in self._handings]
+            problems = [one for one in await asyncio.gather(*releases, return_exceptions=True) if one is not None]
             if self._candidate is not None:
                 await self._candidate.release(system)
+            for problem in problems:
+                raise problem
         finally:
             await self._settle_certificates(is_moved=False)
 

@@ -45,6 +45,30 @@ class Shy(hf.Actor):
         return ["here"]
 
 
+class Student(hf.Actor):
+    """The next release of a pupil: its words are numbered."""
+
+    formerly = (f"{__name__}:Pupil",)
+    schema_version = 2
+
+    def __init__(self, name: str = "nobody", town: str = "nowhere") -> None:
+        self.numbered = {0: f"{name} of {town}"}
+
+    @classmethod
+    def migrate(cls, state: dict[str, Any], old: type[hf.Actor]) -> dict[str, Any]:
+        assert old is Pupil
+        return {"numbered": dict(enumerate(state["words"]))}
+
+    @hf.on(Note)
+    def note(self, message: Note) -> int:
+        self.numbered[len(self.numbered)] = message.text
+        return len(self.numbered)
+
+    @hf.on(Seen, readonly=True)
+    def read(self, message: Seen) -> list[str]:
+        return list(self.numbered.values())
+
+
 PUPIL = hf.child(None, hf.start(Pupil), recovery=hf.hybrid())
 
 
@@ -308,3 +332,37 @@ async def test_a_child_comes_back_where_it_lives_now_and_as_what_it_is(store: st
         await system.set_isolation(ann, "process")
         await system.ref("/app", hf.Supervisor).ask(hf.RestartChild("school", running=True))
         assert system.pid_of(system.ref("/app/school/ann", Pupil)) != os.getpid()
+
+
+@pytest.mark.parametrize("of", ["template", "spec"])
+async def test_code_that_was_replaced_comes_back_with_the_supervisor(
+    store: str | None, isolation: Any, of: str
+) -> None:
+    """Its state is that of the new class by then: the old one could not take it, and would be rolled back."""
+    async with running(store) as system:
+        above = await system.start(school(PUPIL if of == "template" else None, isolation=isolation))
+        first = (
+            hf.StartChild(args=("ann",), id="ann")
+            if of == "template"
+            else hf.StartChild(hf.child("ann", hf.start(Pupil, "ann"), recovery=hf.hybrid()))
+        )
+        ann = await above.ask(first)
+        await ann.ask(Note("one"))
+        async with system.transaction() as change:
+            change.replace_code(ann, Student)
+        assert await ann.ask(Note("two")) == 3
+        for _ in range(2):
+            with system.events() as events:
+                await restarted(system)
+                assert await ann.ask(Seen(), timeout=20.0) == ["ann of nowhere", "one", "two"]
+                assert not [
+                    one for one in events.take() if isinstance(one, (hf.events.RolledBack, hf.events.RecoveryFailed))
+                ]
+        if of == "template":  # Others begin as the template says.
+            ben = await above.ask(hf.StartChild(args=("ben",), id="ben"))
+            assert await ben.ask(Seen()) == ["ben of nowhere"]
+        if isolation == "task":
+            await system.set_isolation(ann, "process")
+            await restarted(system)
+            assert await ann.ask(Note("three"), timeout=20.0) == 4
+            assert system.pid_of(ann) != os.getpid()
