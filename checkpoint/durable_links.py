@@ -70,8 +70,8 @@ class DurableTies:
         """These, as a snapshot has them."""
         self._kept = Counter(ties)
 
-    def loaded(self) -> None:
-        """All has been read back from the store: nothing of it is tied yet."""
+    def untie(self) -> None:
+        """Nothing is tied until somebody lives here: it was read back from the store, or the address is free."""
         self._untied = Counter(self._kept)
 
     def tie(self) -> None:

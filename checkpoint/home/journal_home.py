@@ -272,6 +272,7 @@ class JournalHome(RecordedHome):
         diverged = self.switch.life.diverged
         drop_all(self.switch, "for good" if diverged is None else str(diverged), keep_tells=restarting)
         let_go(self.switch)
+        self.switch.ties.untie()
         why = "its supervisor has ended" if restarting else "it is not started again"
         self.homes.recoveries.given_up(cell.path, why)
 
