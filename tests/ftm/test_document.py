@@ -1,4 +1,4 @@
-"""What docs/mechanisms.md and docs/mechanisms-trouble.md say, against declarations and real runs."""
+"""What the pages about mechanisms say, against declarations and real runs."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ from tests.ftm.accounts import Add, Closed, Counter, Load, Tags
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "mechanisms.md").read_text("utf-8")
+FAILOVER = (ROOT / "docs" / "failover.md").read_text("utf-8")
 TROUBLE = (ROOT / "docs" / "mechanisms-trouble.md").read_text("utf-8")
 SCRIPT = ROOT / "examples" / "scripts" / "protect.py"
 AUDIT_TRAIL = ROOT / "examples" / "mechanisms" / "audit_trail.py"
@@ -75,7 +76,7 @@ def test_what_is_chosen() -> None:
 
 
 def test_how_replicas_are_watched() -> None:
-    table = rows("setting")
+    table = rows("setting", FAILOVER)
     said = {name: None if cells[0] == "none" else float(cells[0]) for name, cells in table.items()}
     assert said == dataclasses.asdict(hf.ftm.Detection())
 
@@ -114,7 +115,7 @@ async def test_the_steps_of_a_failover(system: hf.ActorSystem) -> None:
     await load.reached(20)
     await load.stop()
     load.check(await ref.ask(Tags()))
-    assert steps[:5] == list(rows("step"))
+    assert steps[:5] == list(rows("step", FAILOVER))
 
 
 async def test_the_mechanism_of_the_example_runs_from_its_file(system: hf.ActorSystem, tmp_path: Path) -> None:

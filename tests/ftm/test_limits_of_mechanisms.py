@@ -1,4 +1,4 @@
-"""What mechanisms do not do: "Limits" in docs/mechanisms.md. When one of these is lifted, its line there goes too."""
+"""What mechanisms do not do: docs/mechanisms-limits.md. When one of these is lifted, its line there goes too."""
 
 from __future__ import annotations
 
