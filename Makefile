@@ -18,7 +18,7 @@ test: $(VENV)/.dev
 
 # Hours of it: every kind of end, again and again, every safety check removed once, every test under both event loops
 # with other random examples each time, all combinations of its parameters and fork servers started by exec, all tests on
-# each other version of Python, and mutants. See docs/testing.md.
+# each other version of Python, and mutants. See docs/campaigns.md.
 campaign: $(VENV)/.dev
 	HOLDFAST_RANDOM=1 HOLDFAST_LOOPS=both HOLDFAST_CROSSED=1 HOLDFAST_COLD=1 $(MAKE) --no-print-directory test
 	$(foreach python,$(shell .ci/pythons),HOLDFAST_RANDOM=1 $(MAKE) --no-print-directory test \
@@ -41,7 +41,7 @@ campaign: $(VENV)/.dev
 	HOLDFAST_BUILDS=1 $(BIN)/python -m pytest -q -s tests/packaging
 	HOLDFAST_MUTANTS=100 $(BIN)/python -m pytest -q -s -o faulthandler_timeout=0 tests/test_mutants.py
 
-# Memory, descriptors, processes, threads and the store stay as they are under kills, for so many hours. See docs/testing.md.
+# Memory, descriptors, processes, threads and the store stay as they are under kills, for so many hours. See docs/campaigns.md.
 HOURS ?= 8
 soak: $(VENV)/.dev
 	$(BIN)/python -m tests.soak $(HOURS) $(SEED)

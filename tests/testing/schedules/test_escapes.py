@@ -290,7 +290,7 @@ def test_texts_that_show_no_living_object_and_what_is_only_logged_are_not_told(t
 
 
 def test_a_number_from_id_in_a_message_and_an_order_that_changes_no_turn_are_not_found() -> None:
-    """The limits, as docs/testing.md has them."""
+    """The limits, as docs/simulation.md has them."""
     kept: list[Plain] = []
     seen: list[str] = []
 
