@@ -1,0 +1,96 @@
+"""Monitors, watches and links of a recorded actor belong to its address: they outlive each end of a life (T14)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.checkpoint.players import until
+
+
+class Tie(hf.Message):
+    """Watch the others, in each way."""
+
+
+class Told(hf.Message[list[str]]): ...
+
+
+class Other(hf.Actor):
+    def on_start(self, restored: bool) -> None:
+        self.ctx.trap_exits = True  # The end of whoever is linked is not its own.
+
+
+class Watcher(hf.Actor):
+    """Is told of the end of others; ties itself to them in the hook that it is given, or when it is asked."""
+
+    def __init__(self, hook: str) -> None:
+        self.hook = hook
+        self.told: list[str] = []
+
+    def on_start(self, restored: bool) -> None:
+        self.ctx.trap_exits = True
+        if restored and self.hook == "on_start":
+            self._tie()
+
+    def on_recovered(self) -> None:
+        if self.hook == "on_recovered":
+            self._tie()
+
+    def _tie(self) -> None:
+        self.ctx.monitor(self.ctx.find("/app/monitored", Other))
+        self.ctx.watch(self.ctx.find("/app/watched", Other))
+        self.ctx.link(self.ctx.find("/app/linked", Other))
+
+    @hf.on(Tie)
+    def tie(self, message: Tie) -> None:
+        self._tie()
+
+    @hf.on(Told, readonly=True)
+    def read(self, message: Told) -> list[str]:
+        return self.told
+
+    def on_down(self, source: hf.ActorRef[Any], reason: hf.ExitReason, recovering: bool) -> None:
+        self.told.append(f"DOWN {source.path}")
+
+    def on_exit(self, source: hf.ActorRef[Any], reason: hf.ExitReason) -> None:
+        self.told.append(f"EXIT {source.path}")
+
+
+@pytest.mark.parametrize("hook", ["none", "on_start", "on_recovered"])
+@pytest.mark.parametrize("end", ["crash", "terminated and restarted", "its supervisor is restarted"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_they_are_there_once_in_the_next_life(
+    system: hf.ActorSystem, isolation: Any, end: str, hook: str
+) -> None:
+    for name in ("monitored", "watched", "linked"):
+        await system.start(hf.child(name, hf.start(Other), restart="temporary"))
+    spec = hf.child("watcher", hf.start(Watcher, hook), recovery=hf.hybrid(), isolation=isolation)
+    above = await system.start(hf.supervisor("above", children=[spec], intensity=5))
+    watcher = system.ref("/app/above/watcher", Watcher)
+    await watcher.ask(Tie())
+    if end == "crash":
+        watcher.kill()
+    elif end == "terminated and restarted":
+        await above.ask(hf.TerminateChild("watcher"))
+        await above.ask(hf.RestartChild("watcher"))
+    else:
+        with system.events() as events:
+            above.kill()
+            async for event in events:
+                if isinstance(event, hf.events.Recovered):
+                    break
+    assert await watcher.ask(Told(), timeout=20.0) == []
+    for name in ("monitored", "watched", "linked"):
+        await system.stop(system.ref(f"/app/{name}", Other))
+    told: list[str] = []
+
+    async def all_told() -> bool:
+        told[:] = await watcher.ask(Told(), timeout=20.0)
+        return len(told) >= 3
+
+    while not await all_told():
+        pass
+    await until(lambda: True)
+    assert sorted(await watcher.ask(Told())) == ["DOWN /app/monitored", "DOWN /app/watched", "EXIT /app/linked"]
