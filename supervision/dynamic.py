@@ -113,8 +113,9 @@ class DynamicSupervisor(Supervisor):
         """Note what becomes of a child when we are started again. Raises HoldfastError if that cannot be."""
         key, keeper = child_key(self.ctx.path, one.spec.id), self.ctx._cell.node.ports.keeper
         if self._flags.journal:
-            made = self._template is not None and _is_made_of(self._template, spec)
-            given = (*_added(self._template, spec), spec.made_up) if made else spec
+            template = self._template
+            is_made = template is not None and _is_made_of(template, spec)
+            given = (*_added(template, spec), spec.made_up) if template is not None and is_made else spec
             keeper.note(key, pack_data(given, f"child {one.spec.id!r}"))
         elif one.spec.made_up and self._is_recorded(one):
             keeper.note(key, MADE_UP)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from ...actors.process.fork.child_processes import parent_of
 from ...actors.process.wire import frames
 from ...actors.process.wire.frames import BadFrame
 from ..protocol import Released, Snapshot, ToHome, ToLife, TurnEnd, Wanted
@@ -44,7 +43,7 @@ def records_of(worker: Worker, take: Callable[[ToHome], None]) -> frames.TakeRec
             gate.claims(record.bindings)
         elif isinstance(record, Snapshot) and record.image is not None:
             pid = record.image.pid
-            if pid != worker.pid and parent_of(pid) != worker.pid:
+            if not worker.forked.owns(pid):
                 raise BadFrame(f"an image in the memory of process {pid}")
         take(record)
 

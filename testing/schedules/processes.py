@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import itertools
+import os
 import signal
 from collections import deque
 from collections.abc import Callable
@@ -20,11 +21,13 @@ from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.cell import Cell
 from ...actors.process import worker_node
 from ...actors.process.fork.boot import PAGE_BYTES
+from ...actors.process.fork.child_processes import parent_of
 from ...actors.process.process_host import on_frame
 from ...actors.process.resource_limits import Limits
 from ...actors.process.wire import frames
 from ...actors.process.wire.connection import HIGH_BYTES, Connection
 from ...actors.process.worker_pool import Worker, Workers
+from ...checkpoint.life.recorded_context import RecordedContext
 from ...system.worker_main import WorkerComposition
 from ..swaps import Swaps
 from .choices import Choices
@@ -187,6 +190,10 @@ class SimulatedProcess(SimulatedPlace):
         self.die(int(signum or signal.SIGKILL))
         return True
 
+    def owns(self, pid: int) -> bool:
+        """Whether a process is the real one in which all simulated ones are, or a child of it."""
+        return os.getpid() in (pid, parent_of(pid))
+
     def close(self) -> None:
         """Nothing to be given back."""
 
@@ -225,7 +232,17 @@ class SimulatedProcess(SimulatedPlace):
             return
         self._end.end()
         self.pool.loop.drop(self)
+        self._give_back()
         self.pool.loop.call_soon(self._on_exit, status, context=self.pool.root_context)
+
+    def _give_back(self) -> None:
+        """Close the memory in which its actors had images of their states, as the kernel does for a real one."""
+        waiting = [cell for cell in (self.guest.node.root,) if cell is not None]
+        while waiting:
+            cell = waiting.pop()
+            if isinstance(cell.ctx, RecordedContext):
+                cell.ctx.recorded.images.close()
+            waiting.extend((cell.children or {}).values())
 
 
 class SimulatedServer:

@@ -15,7 +15,7 @@ from typing import Any
 from ...errors import ProcessUnavailable
 from ...shared_memory import keep_size, unnamed
 from .boot import HEADER, PAGE_BYTES, PacketKind
-from .child_processes import signal_by
+from .child_processes import parent_of, signal_by
 
 SOCKET_BYTES = 2 * 1024 * 1024
 
@@ -44,6 +44,10 @@ class Forked:
         Returns whether that could be.
         """
         return self.pidfd < 0 or signal_by(self.pidfd, signal.SIGKILL if signum is None else signum)
+
+    def owns(self, pid: int) -> bool:
+        """Whether a process is this one or a child of it, so that this one may name its memory."""
+        return self.pid in (pid, parent_of(pid))
 
     def close(self) -> None:
         """Give everything back; may be called twice. The process sees the end of its socket."""

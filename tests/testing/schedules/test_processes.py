@@ -84,6 +84,33 @@ async def test_a_recorded_actor_loses_nothing_when_its_process_is_killed(
     assert await ref.ask(Total()) == 5
 
 
+class Grow(hf.Message[int]):
+    size: int
+
+
+class Large(hf.Actor):
+    """Its state is passed on in shared memory."""
+
+    def __init__(self) -> None:
+        self.data = b""
+
+    @hf.on(Grow)
+    def grow(self, message: Grow) -> int:
+        self.data += bytes(message.size)
+        return len(self.data)
+
+
+@simulate(seeds=3, latency=(0.0, 0.01), intensity=1000)
+async def test_a_state_of_megabytes_survives_a_kill(system: GuardedSystem, simulation: Simulation) -> None:
+    system.expect_crashes()
+    spec = hf.child("large", hf.start(Large), isolation="process", recovery=hf.hybrid(), backoff=hf.Backoff(0.001))
+    ref = await system.start(spec)
+    assert await ref.ask(Grow(3_000_000)) == 3_000_000
+    await system.checkpoint(ref)
+    simulation.kill_process(ref)
+    assert await ref.ask(Grow(1)) == 3_000_001
+
+
 @pytest.mark.parametrize("point", ["frame out", "frame in"])
 @pytest.mark.parametrize("number", range(12))
 def test_a_kill_at_each_frame_loses_nothing(point: str, number: int) -> None:
