@@ -520,7 +520,20 @@ def is_elsewhere(cell: Cell) -> bool:
 def difference(before: list[str], after: list[str]) -> list[str]:
     """What changes from one description to another: lines with `-` go, lines with `+` come.
 
-    >>> difference(["a", "b"], ["a", "c"])
-    ['- b', '+ c']
+    What is said of one address stands together, if it changes where it is.
+
+    >>> difference(["a", "b: 1", "c: 1"], ["a", "b: 2", "c: 2"])
+    ['- b: 1', '+ b: 2', '- c: 1', '+ c: 2']
     """
-    return [line.rstrip() for line in difflib.ndiff(before, after) if line[:2] in ("- ", "+ ")]
+    told: list[str] = []
+    for _, begin, end, begins, ends in difflib.SequenceMatcher(None, before, after, autojunk=False).get_opcodes():
+        old, new = before[begin:end], after[begins:ends]
+        if old == new:
+            continue
+        come = {line.partition(":")[0]: line for line in new}
+        for line in old:
+            told.append(f"- {line}")
+            if (now := come.pop(line.partition(":")[0], None)) is not None:
+                told.append(f"+ {now}")
+        told += [f"+ {line}" for line in come.values()]
+    return [line.rstrip() for line in told]

@@ -369,6 +369,7 @@ class Doors:
             self._swaps.undo()
 
     def _through_ref(self, send: Any) -> Any:
+        @functools.wraps(send)
         def checked(ref: ActorRef[Any], message: Message[Any], *rest: Any, **options: Any) -> Any:
             self._check(ref._cell, message)
             return send(ref, message, *rest, **options)
@@ -377,6 +378,7 @@ class Doors:
         return checked
 
     def _through_ask(self, ask: Any) -> Any:
+        @functools.wraps(ask)
         def checked(ref: ActorRef[Any], message: Message[Any], *rest: Any, **options: Any) -> Any:
             cell = ref._cell
             checks = self.checks.get(cell.node)
@@ -390,6 +392,7 @@ class Doors:
         return checked
 
     def _through_context(self, send: Any) -> Any:
+        @functools.wraps(send)
         def checked(ctx: ActorContext, cell: Cell, message: Message[Any]) -> Any:
             self._check(cell, message)
             return send(ctx, cell, message)
@@ -397,6 +400,7 @@ class Doors:
         return checked
 
     def _through_answer(self, answer: Any) -> Any:
+        @functools.wraps(answer)
         def checked(ask: Ask, reply: object) -> None:
             checks = self.checks.get(ask.to.node) if ask.to is not None else None
             if checks is not None:

@@ -251,7 +251,7 @@ def test_a_refusal_of_a_class_that_is_not_loaded_keeps_its_name_and_fields(codec
 
 def test_a_refusal_whose_fields_have_wrong_types_is_not_built(codec: Codec) -> None:
     got = codec.decode_error("refusal", message_name(Overdrawn), msgspec.msgpack.encode(["five"]))
-    assert isinstance(got, hf.errors.BadMessage)
+    assert isinstance(got, hf.errors.BadReply)
     assert "cannot be made" in str(got)
 
 

@@ -21,7 +21,7 @@ class Place:
     """Stands for `ctx`: all that saving asks of it is the address, and that no recovery file names its variables."""
 
     path = "/app/it"
-    named_variables = None
+    _named_variables = None
 
 
 def at_place(actor: hf.Actor) -> Any:

@@ -95,7 +95,7 @@ async def test_what_left_before_the_kill_leaves_once_and_in_order(
     middle = "flush" if release == "flush" else f"{release} 2"
     asked = ref.ask(Do(["tell 1", middle, "tell 3", f"gate {gate}", "tell 4"], notes), timeout=30.0)
     await until(gate.exists)
-    for _ in range(3):
+    for _ in range(2):
         gate.unlink()
         await struck(system, ref)
         await until(gate.exists)

@@ -131,7 +131,7 @@ async def test_a_message_that_kills_the_process_is_quarantined_and_its_neighbour
     await two.ask(Note("before"))
     with pytest.raises(hf.Quarantined):
         await one.ask(Do([f"die {tmp_path}/deaths"]), timeout=15.0)
-    assert (tmp_path / "deaths").read_text() == "x" * 5
+    assert (tmp_path / "deaths").read_text() == "x" * 3
     assert await one.ask(Note("after"), timeout=30.0) == 1
     assert await two.ask(Note("after"), timeout=30.0) == 2
 
@@ -176,7 +176,7 @@ async def test_turns_that_wait_are_blamed_for_what_a_sibling_without_recovery_do
     await system.start(hf.supervisor("team", isolation="process", intensity=1000, children=children))
     two, begun = at(system, "two"), tmp_path / "gate"
     waiting = two.ask(Do([f"gate {begun}"]), timeout=60.0)
-    for death in range(5):
+    for death in range(3):
         await until(begun.exists)
         begun.unlink()
         at(system, "one").tell(Do([f"once {tmp_path}/fuse{death}"]))

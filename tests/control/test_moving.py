@@ -347,13 +347,9 @@ async def test_a_state_that_cannot_be_saved_is_refused_by_name(system: hf.ActorS
 
 
 async def test_who_cannot_be_moved_is_told_so(system: hf.ActorSystem) -> None:
-    crew = await system.start(hf.supervision.partitions("crew", hf.start(Account), 2))
     spawned = system.spawn(hf.start(Account), "spawned")
     spawner = await system.start(hf.child("spawner", hf.start(Spawns)))
-    pool = await system.start(hf.dynamic("pool", template=hf.child("one", hf.start(Account)), isolation="process"))
     for ref, why in (
-        (await pool.ask(hf.StartChild()), "its supervisor lives in another process, and no recipe here has its spec"),
-        (crew, "which are all alike"),
         (spawned, "nobody restarts it"),
         (spawner, r"children of its own \(own\)"),
     ):

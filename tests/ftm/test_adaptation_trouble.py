@@ -271,7 +271,7 @@ async def test_parts_of_a_mechanism_are_not_changed_one_by_one(system: hf.ActorS
         lambda change: change.replace_state(f"{ftm}/r1/server", dict),
     ]
     for step in steps:
-        with pytest.raises(hf.TransactionRefused, match=r"part of the mechanism of /app/alice.*transition or update"):
+        with pytest.raises(hf.TransactionRefused, match=r"part of the mechanism of /app/alice.*protect or update"):
             async with system.transaction() as change:
                 step(change)
     with pytest.raises(hf.SpecError, match="part of the mechanism"):

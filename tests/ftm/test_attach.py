@@ -411,7 +411,7 @@ async def test_if_the_new_life_cannot_begin_the_old_one_goes_on(
 
 async def test_a_protected_actor_is_not_moved_by_anything_else(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=PBR()))
-    with pytest.raises(hf.TransactionRefused, match="detach"):
+    with pytest.raises(hf.TransactionRefused, match="`protect` it by None"):
         async with system.transaction() as change:
             change.replace_state(ref, dict)
     assert await ref.ask(Add(0)) == 1

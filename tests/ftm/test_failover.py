@@ -469,7 +469,7 @@ async def test_control_reaches_the_replica_that_leads(system: hf.ActorSystem) ->
     ref = await started(system)
     await ref.ask(Add(7))
     assert await system.get_state(ref) == {"total": 1, "tags": [7]}
-    with pytest.raises(hf.errors.ControlFailed, match="detach"):
+    with pytest.raises(hf.errors.ControlFailed, match="`protect` it by None"):
         await system.replace_state(ref, dict)
     await system.suspend(ref)
     asked = asyncio.ensure_future(ref.ask(Add(8)))

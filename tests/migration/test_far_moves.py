@@ -398,13 +398,15 @@ async def test_what_cannot_be_is_refused_before_anything_is_done(system: hf.Acto
         hf.StartChild(hf.child("pooled", hf.start(Traveller))), IN_TIME
     )
     refusals: dict[str, Any] = {
-        "no supervisor looks after it": lambda change: change.move(pooled.path, "/app/near"),
         "it does not run": lambda change: change.move("/app/near/two", "/app/far"),
     }
     for why, step in refusals.items():
         with pytest.raises(hf.TransactionRefused, match=why):
             async with system.transaction(timeout=IN_TIME) as change:
                 step(change)
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.move(pooled.path, "/app/near")  # Only its supervisor, in its process, has its spec.
+    assert (await pooled.ask(Seen(), IN_TIME))["added"] == []
 
     def both(change: Any) -> None:
         change.move("/app/far/one", "/app/near")

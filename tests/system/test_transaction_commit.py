@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.system.transaction.draft import difference
 from tests.system.trees import Add, Boom, Client, Counter, Double, Life, Stumble, Where, counter, picture, ref
 
 # A transaction that fails ends with its block, which collects several steps.
@@ -848,3 +849,10 @@ async def test_a_root_that_is_killed_comes_back_with_all_states_or_none(
     assert await asyncio.wait_for(dying.wait(), 60) == -signal.SIGKILL
     both = {"prepare": [(1000, 1000)], "commit": [(1000, 1000)], "finish": [(900, 1100)]}
     assert await accounts(store, "", isolation) in both[when]
+
+
+def test_the_difference_of_large_trees_is_told_and_takes_no_recursion() -> None:
+    """Lines that are alike, each changed: what was compared letter by letter failed from some hundreds on."""
+    before = [f"/app/near/team/more-{number}: Traveller, permanent, task" for number in range(3000)]
+    after = [line.replace("/near/", "/far/") for line in before]
+    assert difference(before, after) == [*(f"- {line}" for line in before), *(f"+ {line}" for line in after)]
