@@ -133,7 +133,8 @@ class DynamicSupervisor(Supervisor):
             self._try_to_note(one, lambda: self._note(one, one.spec))
 
     def _respecified(self, one: Child) -> None:
-        if self._flags.journal and self._is_in_place:
+        template = self._template  # What only it says need not be noted again: each note is the newest in the journal.
+        if self._flags.journal and self._is_in_place and (template is None or not _is_made_of(template, one.spec)):
             self._try_to_note(one, lambda: self._note(one, one.spec))
 
     def _try_to_note(self, one: Child, note: Callable[[], None]) -> None:
@@ -310,12 +311,8 @@ def _filled(template: ChildSpec, args: tuple[Any, ...], kwargs: dict[str, Any]) 
 
 
 def _is_made_of(template: ChildSpec, spec: ChildSpec) -> bool:
-    """Whether a child is what its template says, arguments aside: nobody has changed its code or its place."""
-    own = template.start
-    like = dataclasses.replace(
-        spec, start=own, id=template.id, comes_back=template.comes_back, made_up=template.made_up
-    )
-    return spec.start.kind is own.kind and like == template
+    """Whether a child is of the class that its template says, so that its arguments say all of it."""
+    return spec.start.kind is template.start.kind
 
 
 def _added(template: ChildSpec, spec: ChildSpec) -> tuple[tuple[Any, ...], dict[str, Any]]:

@@ -361,7 +361,7 @@ async def test_code_that_was_replaced_comes_back_with_the_supervisor(
         if of == "template":  # Others begin as the template says.
             ben = await above.ask(hf.StartChild(args=("ben",), id="ben"))
             assert await ben.ask(Seen()) == ["ben of nowhere"]
-        if isolation == "task":
+        if isolation == "task":  # Where it lives is noted with its class.
             await system.set_isolation(ann, "process")
             await restarted(system)
             assert await ann.ask(Note("three"), timeout=20.0) == 4
