@@ -7,6 +7,9 @@ from typing import Protocol
 
 from .errors import ControlFailed
 
+UNFIT = "what is recorded of it does not fit the code"
+"""How the reason of a failed start begins if only other code can help, and no older state."""
+
 
 class Keeper(Protocol):
     """Keeps state and messages of addresses, and small facts; there is one for each node."""

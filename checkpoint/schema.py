@@ -16,6 +16,7 @@ from msgspec import inspect
 from ..actors.errors import HoldfastError, StartFailed, type_name
 from ..actors.kernel.actor import Actor
 from ..actors.kernel.message import Message, find_refusal, message_name, reply_type
+from ..actors.persistence import UNFIT
 from ..actors.process.wire.start_codec import loaded
 from .protocol import MESSAGE, PIPE, REPLY, START, TICK, Answer
 
@@ -156,7 +157,7 @@ class Shapes:
         """
         problem = self._other_class(class_of(cell)) or self._other_fields()
         if problem:
-            raise StartFailed(cell.path, f"what is recorded of it does not fit the code: {problem}")
+            raise StartFailed(cell.path, f"{UNFIT}: {problem}")
 
     def _other_class(self, kind: type[Actor] | None) -> str:
         if kind is None or not self.kind:

@@ -17,6 +17,7 @@ from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Start, on
 from ..actors.kernel.cell import DOWN, GONE, Cell
 from ..actors.kernel.envelope import Item, ReplyHandle
+from ..actors.persistence import UNFIT
 from .admin import (
     AlreadyPresent,
     AlreadyStarted,
@@ -171,8 +172,8 @@ class Supervisor(Inquiries):
         while (one := row.next()) is not None:
             try:
                 await self._come_up_in(row, one)
-            except HoldfastError:
-                self._blame(one)
+            except HoldfastError as error:
+                self._blame(one, str(error))
                 raise
 
     async def _start(self, one: Child) -> bool:
@@ -438,15 +439,19 @@ class Supervisor(Inquiries):
     def _give_up(self, one: Child, reason: ExitReason, told: ExitReason) -> None:
         """We end: too many restarts, or a rule says that this end is one for whoever is above us."""
         one.state = STOPPED
-        self._blame(one)
+        self._blame(one, str(reason))
         node = self.ctx._cell.node
         node.gave_up = SupervisorGaveUp(self.ctx.path, one.spec.id, reason)
         node.emit(node.gave_up)
         self.ctx.stop(told)
 
-    def _blame(self, one: Child) -> None:
-        """We end because of this child."""
-        self.ctx._cell.node.ports.keeper.blame(self._path_of(one))
+    def _blame(self, one: Child, why: str) -> None:
+        """We end because of this child: it may begin with an older state than that from which it has failed.
+
+        Not if what is recorded does not fit its class: an older state would only lose what was acknowledged.
+        """
+        if UNFIT not in why:
+            self.ctx._cell.node.ports.keeper.blame(self._path_of(one))
 
     def _path_of(self, one: Child) -> str:
         return f"{self.ctx.path}/{one.spec.id}"

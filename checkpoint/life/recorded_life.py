@@ -20,6 +20,7 @@ from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import Message, message_name
+from ...actors.persistence import UNFIT
 from ...actors.state_hooks import state_getter
 from ..method import Method
 from ..protocol import (
@@ -49,7 +50,7 @@ from ..protocol import (
     pieces,
 )
 from ..snapshot.image_writer import Imaging
-from ..snapshot.key_variables import check_keys, restore_state, save_state, variables
+from ..snapshot.key_variables import StateMismatch, check_keys, restore_state, save_state, variables
 from ..turn_word import WAITS
 from .determinism_guard import DeterminismGuard
 from .life_state import HookTimers, LifeStage, RestoredState, SnapshotState
@@ -141,7 +142,8 @@ class Life:
                 self.images.last_bytes = len(data)
                 restore_state(actor, data, (restored.variables, self.saving.variables))
             except BaseException as error:
-                self._give_up(f"its state could not be restored: {error}", error)
+                why = UNFIT if isinstance(error, StateMismatch) else "its state could not be restored"
+                self._give_up(f"{why}: {error}", error)
             restored.seconds = time.perf_counter() - begin
             self.saving.turn = turn
             if start.kind.on_recovered is not Actor.on_recovered and self._is_replayed_from_snapshots:

@@ -53,6 +53,8 @@ class PlaceBefore:
     """Of a supervisor whose place another one takes: what the next life there begins with; None: nobody takes it."""
     brought_back: bool = False
     """Whether its supervisor starts it when that is restarted itself: its recipe says so."""
+    told: dict[str, ChildSpec] = field(default_factory=dict[str, "ChildSpec"])
+    """The specs of its children, as a supervisor in another process has told them."""
     bound: dict[str, DraftPlace] = field(default_factory=dict[str, "DraftPlace"])
     """To whom its spec binds its ports."""
 
@@ -79,7 +81,6 @@ class DraftPlace:
         "relocation",
         "rework",
         "spec",
-        "told",
         "wanted",
         "was",
     )
@@ -98,7 +99,6 @@ class DraftPlace:
         self.names: list[str] = []
         self.was = PlaceBefore(parent)
         self.is_switched = False  # its spec says otherwise whether it is started with the others
-        self.told: dict[str, ChildSpec] = {}  # of its children, as a supervisor in another process says
         self.candidate = 0  # as which it is started, if it is added
         self.wanted: dict[str, Any] = {}  # flags that change
         self.rework: Rework | None = None  # what is changed in the actor itself
@@ -198,7 +198,7 @@ class DraftPlace:
             self.spec = recipe_spec(self.cell)
         if self.spec is None and self.parent is not None:
             specs = (recipe_specs(self.parent.cell) or ()) if self.parent.cell is not None else ()
-            self.spec = next((one for one in specs if one.id == self.name), None) or self.parent.told.get(self.name)
+            self.spec = next((one for one in specs if one.id == self.name), None) or self.parent.was.told.get(self.name)
         if self.kind is None and self.spec is not None:
             self.kind = self.spec.start.kind
         return self.spec
@@ -424,7 +424,7 @@ class Draft:
         told = {heir.id: known.get(heir.id) or DraftPlace(heir.id, place, None, None) for heir in account.children}
         for heir in account.children:
             told[heir.id].is_stopped = heir.state == STOPPED
-        place.told = {heir.id: heir.spec.value for heir in account.children if heir.spec is not None}
+        place.was.told = {heir.id: heir.spec.value for heir in account.children if heir.spec is not None}
         place.children = {**told, **{name: one for name, one in known.items() if name not in told}}
         place.was.children = frozenset(place.children)
         place.is_suspended = account.is_suspended
