@@ -45,8 +45,8 @@ class Keeper(Protocol):
         """The supervisor above this address ends because of the actor there."""
         ...
 
-    def returned(self, path: str, period: float) -> None:
-        """The supervisor at `path` is started again by its own, whose window is `period` seconds long.
+    def returned(self, path: str) -> None:
+        """The supervisor at `path` is started again by its own.
 
         Whoever below was to blame for its end is brought back as its method says (`on_escalate`).
         """
@@ -84,7 +84,7 @@ class NothingKept:
     def blame(self, path: str) -> None:
         """Do nothing: nobody is brought back from records."""
 
-    def returned(self, path: str, period: float) -> None:
+    def returned(self, path: str) -> None:
         """Do nothing: nobody is brought back from records."""
 
     def note(self, key: str, value: bytes | None) -> None:

@@ -41,7 +41,7 @@ class Method:
     max_deliveries: int = 3
     journal_limit: int = JOURNAL_LIMIT
     keep: int = 2
-    on_escalate: OnEscalate | None = None
+    on_escalate: OnEscalate = "restore"
     pacing: Pacing = "fast"
     skip: bool = True
     check_readonly: bool = False
@@ -74,9 +74,9 @@ class Method:
             if value is not None and (not _whole(value) or value < 1):
                 raise SpecError(where, f"{name} must be a whole number >= 1 or left out, not {value!r}")
         check_compress(where, self.compress)
-        if self.on_escalate is not None and self.on_escalate not in get_args(OnEscalate):
+        if self.on_escalate not in get_args(OnEscalate):
             known = ", ".join(map(repr, get_args(OnEscalate)))
-            raise SpecError(where, f"on_escalate must be one of {known} or left out, not {self.on_escalate!r}")
+            raise SpecError(where, f"on_escalate must be one of {known}, not {self.on_escalate!r}")
         if self.durability is not None and self.durability not in get_args(Durability):
             known = ", ".join(map(repr, get_args(Durability)))
             raise SpecError(where, f"durability must be one of {known} or left out, not {self.durability!r}")
@@ -89,16 +89,6 @@ class Method:
     def trigger(self) -> int:
         """Bytes of journal at which something has to be done."""
         return min(self.journal_limit, self.journal_bytes or self.journal_limit)
-
-    def after_escalation(self, times: int) -> OnEscalate:
-        """Choose how an actor comes back that has ended its supervisor for the `times`-th time in the window.
-
-        >>> [hybrid().after_escalation(times) for times in (1, 2, 3)]
-        ['restore', 'older_snapshot', 'restore']
-        """
-        if self.on_escalate is not None:
-            return self.on_escalate
-        return "older_snapshot" if times == 2 else "restore"
 
     @property
     def records(self) -> bool:
@@ -163,7 +153,7 @@ def checkpoint_only(
     max_deliveries: int = 3,
     journal_limit: int = JOURNAL_LIMIT,
     keep: int = 2,
-    on_escalate: OnEscalate | None = None,
+    on_escalate: OnEscalate = "restore",
     every: int | None = None,
     journal_bytes: int | None = None,
     compress: bool | int = False,
@@ -202,7 +192,7 @@ def replay_only(
     pacing: Pacing = "fast",
     max_deliveries: int = 3,
     journal_limit: int = JOURNAL_LIMIT,
-    on_escalate: OnEscalate | None = None,
+    on_escalate: OnEscalate = "restore",
     skip: bool = True,
     check_readonly: bool = False,
     durability: Durability | None = None,
@@ -243,7 +233,7 @@ def hybrid(
     max_deliveries: int = 3,
     journal_limit: int = JOURNAL_LIMIT,
     keep: int = 2,
-    on_escalate: OnEscalate | None = None,
+    on_escalate: OnEscalate = "restore",
     skip: bool = True,
     check_readonly: bool = False,
     safe_state: str | Sequence[str] | SafeState | None = None,
@@ -270,8 +260,7 @@ def hybrid(
             In memory two are kept at most.
         on_escalate: what happens when its supervisor has ended because of it and was restarted: "restore" what there
             is; go back to the "older_snapshot", without the turns since; begin "fresh". In all cases what has not been
-            handled stays queued. Left out: an older snapshot the second time within the window of whoever restarted
-            the supervisor, else restore.
+            handled stays queued. All but "restore" lose what was acknowledged since.
         skip: leave out of the replay what changes nothing: messages of `@on(readonly=True)`, and of
             `@on(supersedes=...)` those that a later one has made useless.
         check_readonly: end the life (NotReadonly) when a handler that is declared readonly changes the state. This

@@ -424,7 +424,7 @@ class Supervisor(Inquiries):
             return
         self._restarts = window
         if one.spec.is_supervisor:  # Perhaps it has ended because of somebody below it: that one comes back as it says.
-            node.ports.keeper.returned(self._path_of(one), flags.period)
+            node.ports.keeper.returned(self._path_of(one))
         if node.events.has_listeners:
             node.emit(ChildRestarted(self._path_of(one), reason, len(window), flags.intensity))
         order = list(self._children.values())

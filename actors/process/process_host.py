@@ -608,7 +608,7 @@ def keep(worker: Worker, frame: frames.Command) -> None:
             case "blame":
                 keeper.blame(path)
             case "returned":
-                keeper.returned(path, float(frame.data.get("period", 0.0)))
+                keeper.returned(path)
             case "note":
                 above, _, name = path.rpartition("/")
                 keeper.note(child_key(above, name), frame.data.get("value"))

@@ -60,7 +60,6 @@ class Homes:
         self.on_home: Callable[[Switch], None] = nobody  # a home has a life again, or for the first time
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
         self.file = file
-        self._returns: dict[str, list[float]] = {}  # when that came back to an address, on the loop's clock
         self.planted: dict[str, Saved] = {}  # what the next life at an address begins with, whatever is recorded
         unfinished = journal.notes(ERASING).get(ERASING)
         self._stored = set(journal.addresses()) - {PLACE}
@@ -181,7 +180,6 @@ class Homes:
             self._switches = {paths.get(path, path): switch for path, switch in self._switches.items()}
             self._stored = {paths.get(path, path) for path in self._stored}
             self._blamed = {paths.get(path, path) for path in self._blamed}
-            self._returns = {paths.get(path, path): times for path, times in self._returns.items()}
             self.planted = {paths.get(path, path): saved for path, saved in self.planted.items()}
             for path, switch in self._switches.items():
                 if switch.path != path:
@@ -280,7 +278,6 @@ class Homes:
         self.quarantine.forget(path)
         self._stored.discard(path)
         self._blamed.discard(path)
-        self._returns.pop(path, None)
         self.planted.pop(path, None)
         switch = self._switches.pop(path, None)
         if switch is not None:
@@ -306,18 +303,14 @@ class Homes:
         """A life begins there: what happens from now on has other causes."""
         self._blamed.discard(path)
 
-    def returned(self, path: str, period: float) -> None:
+    def returned(self, path: str) -> None:
         """The supervisor at `path` is started again by its own: who was to blame comes back as its method says."""
-        prefix, now = f"{path}/", self.node.loop.time()
-        for blamed in [one for one in self._blamed if one.startswith(prefix)]:
+        for blamed in [one for one in self._blamed if one.startswith(f"{path}/")]:
             switch = self._switches.get(blamed)
             if switch is None:
                 continue
-            times = [*(when for when in self._returns.get(blamed, ()) if now - when <= period), now]
-            self._returns[blamed] = times
-            why = f"its supervisor has ended because of it, {len(times)} time(s) within {period:g} s"
             try:
-                roll_back(switch, switch.method.after_escalation(len(times)), why)
+                roll_back(switch, switch.method.on_escalate, "its supervisor has ended because of it")
             except HoldfastError as error:
                 self.node.emit(RecoveryFailed(blamed, f"it comes back as it was: {error}"))
 

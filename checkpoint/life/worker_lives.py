@@ -151,9 +151,9 @@ class GuestKeeper:
         """The supervisor above this address ends because of the actor there."""
         self._say("blame", path)
 
-    def returned(self, path: str, period: float) -> None:
+    def returned(self, path: str) -> None:
         """A supervisor in this process is started again."""
-        self._say("returned", path, period=period)
+        self._say("returned", path)
 
     def note(self, key: str, value: bytes | None) -> None:
         """Keep the fact that a supervisor has a child; None forgets it."""

@@ -282,21 +282,25 @@ class Regrouping(StagedWork):
             await self._settle_certificates(is_moved=True)
 
     async def release(self, system: ActorSystem) -> None:
-        """All of it is let go of, whatever cannot be: that is told then."""
+        """Let go of all of it, whatever of it cannot be let go of: that is told then."""
+        problems: list[Exception] = []
         try:
-            await self._let_go(system)
-            for succession in self._successions:
-                await succession.give_up(system)
-            for rest in self._rests.values():
-                await rest.give_up()
-            releases = [handing.release(system) for _, handing in self._handings]
-            problems = [one for one in await asyncio.gather(*releases, return_exceptions=True) if one is not None]
-            if self._candidate is not None:
-                await self._candidate.release(system)
-            for problem in problems:
-                raise problem
+            for works in (
+                [succession.let_go(system) for succession in self._successions],
+                [succession.give_up(system) for succession in self._successions],
+                [rest.give_up() for rest in self._rests.values()],
+                [handing.release(system) for _, handing in self._handings],
+            ):
+                done = await asyncio.gather(*works, return_exceptions=True)
+                problems += [one for one in done if isinstance(one, Exception)]
         finally:
-            await self._settle_certificates(is_moved=False)
+            try:
+                if self._candidate is not None:
+                    await self._candidate.release(system)
+            finally:
+                await self._settle_certificates(is_moved=False)
+        for problem in problems:
+            raise problem
 
 
 def addressed(place: DraftPlace) -> Iterator[DraftPlace]:

@@ -33,24 +33,27 @@ async def rolled_back(system: hf.ActorSystem, isolation: str) -> list[hf.events.
         return [one for one in stream.take() if isinstance(one, hf.events.RolledBack)]
 
 
-async def test_the_second_time_an_older_snapshot_comes_back_and_only_to_whom_it_was_due(
-    store: str | None, isolation: str
-) -> None:
+async def test_only_whoever_is_to_blame_goes_back_as_its_method_says(store: str | None, isolation: str) -> None:
+    options = {"on_escalate": "older_snapshot"}
     async with running(store) as system:
-        await system.start(tree(isolation, doing(isolation), doing(isolation, "other"), intensity=0))
+        children = doing(isolation, **options), doing(isolation, "other", **options)
+        await system.start(tree(isolation, *children, intensity=0))
         await two_snapshots(system)
         await add(system, "mine", name="other")
-        assert await rolled_back(system, isolation) == []
-        assert await seen(system) == ["a", "b", "c"]
-        await until(lambda: at(system)._cell.host.home.switch.ledger.state_turn >= 4)  # type: ignore[attr-defined]
         (event,) = await rolled_back(system, isolation)
-        assert await seen(system) == ["a", "b"]
-        assert event.address == "/app/top/doer"
+        assert (event.address, event.reason) == ("/app/top/doer", "its supervisor has ended because of it")
         assert event.from_turn > event.to_turn > 0
+        assert await seen(system) == ["a"]
         assert await seen(system, "other") == ["mine"]
-        await add(system, "d")
-        assert await rolled_back(system, isolation) == [], "more than that is done by hand only"
-        assert await seen(system) == ["a", "b", "d"]
+
+
+async def test_by_default_no_escalation_costs_what_was_acknowledged(store: str | None, isolation: str) -> None:
+    async with running(store) as system:
+        await system.start(tree(isolation, doing(isolation), intensity=0))
+        await two_snapshots(system)
+        for _ in range(4):
+            assert await rolled_back(system, isolation) == []
+            assert await seen(system) == ["a", "b", "c"]
 
 
 @pytest.mark.parametrize(
@@ -216,32 +219,18 @@ async def test_what_is_restarted_by_hand_or_killed_is_no_escalation(store: str |
 
 
 @pytest.mark.asyncio(loop_factories=["virtual"])
-async def test_the_window_is_that_of_whoever_restarts_the_supervisor() -> None:
-    async with hf.ActorSystem("app", log=False, intensity=1000, period=10.0) as system:
-        await system.start(tree("task", doing("task"), intensity=0))
-        await two_snapshots(system)
-        for _ in range(4):
-            assert await rolled_back(system, "task") == []
-            await asyncio.sleep(10.1)
-        assert await rolled_back(system, "task") == []
-        await asyncio.sleep(9.9)
-        assert len(await rolled_back(system, "task")) == 1
-
-
-async def test_a_child_whose_restore_fails_again_and_again_goes_back_the_second_time(
-    store: str | None, tmp_path: Path
-) -> None:
+async def test_a_child_whose_restore_fails_goes_back_if_its_method_says_so(store: str | None, tmp_path: Path) -> None:
     """Its supervisor cannot even start with it: that is an escalation too, and the older snapshot is the way out."""
     marker = tmp_path / "marker"
     async with running(store) as system:
-        await system.start(tree("task", doing("task"), intensity=0))
+        await system.start(tree("task", doing("task", on_escalate="older_snapshot"), intensity=0))
         await two_snapshots(system)
         await at(system).ask(Do([f"replayed {marker}"]))
         with system.events() as stream:
             with contextlib.suppress(hf.HoldfastError):
                 await at(system).ask(Do(["raise it"]))
             event = await back(stream, hf.events.RolledBack)
-        assert "2 time(s)" in event.reason
+        assert event.address == "/app/top/doer"
         assert await seen(system) == ["a"]
 
 

@@ -18,7 +18,7 @@ ENDS: dict[str, dict[str, str]] = {}
 for parameter in cells("end of a recorded child"):
     row, column, cell = parameter.values
     ENDS.setdefault(row, {})[column] = cell
-TIMES = {"the first time": 1, "the second time": 2, "the third time": 3}
+TIMES = {"once": 1, "again": 2}
 
 
 async def end(system: hf.ActorSystem, how: str, spec: hf.ChildSpec, gate: Path) -> None:

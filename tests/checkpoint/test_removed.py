@@ -367,6 +367,34 @@ CHECKS = {
         "tests/checkpoint/test_controller_held.py",
         "test_sends_and_asks_wait_at_block and task",
     ),
+    "a state that does not fit is not exchanged for an older one": Check(
+        "supervision/supervisor.py",
+        "        if UNFIT not in why:\n",
+        "        if True:\n",
+        "tests/checkpoint/test_unfit_states.py",
+        "test_code_that_does_not_fit",
+    ),
+    "monitors and links of an address are tied again in its next life": Check(
+        "checkpoint/home/journal_home.py",
+        "        self.switch.ties.untie()\n",
+        "",
+        "tests/checkpoint/test_ties_of_an_address.py",
+        "test_they_are_there_once",
+    ),
+    "who asks learns why a replay has failed": Check(
+        "checkpoint/home/journal_home.py",
+        '        drop_all(self.switch, "for good" if diverged is None else str(diverged), keep_tells=restarting)\n',
+        '        drop_all(self.switch, "for good", keep_tells=restarting)\n',
+        "tests/checkpoint/test_recovery_refused.py",
+        "test_replay_of_an_actor_that_is_not_deterministic",
+    ),
+    "a subscriber gets only what it has a handler for": Check(
+        "actors/kernel/node.py",
+        "        if not isinstance(error, (ActorStopped, UnknownMessage)):\n",
+        "        if not isinstance(error, ActorStopped):\n",
+        "tests/actors/test_topics.py",
+        "test_a_subscriber_gets_only",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)

@@ -40,7 +40,7 @@ class Newer(Cart):
 
 
 def carts(kind: type[Cart], above: Any, own: Any) -> hf.ChildSpec:
-    template = hf.child(None, hf.start(kind), recovery=hf.hybrid(), isolation=own)
+    template = hf.child(None, hf.start(kind), recovery=hf.hybrid(on_escalate="older_snapshot"), isolation=own)
     return hf.dynamic("carts", template=template, journal=True, isolation=above, intensity=2)
 
 

@@ -17,6 +17,8 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.system.transaction.relocation import Gated
+from holdfast.system.transaction.succession import Succession
 from tests.actors.process.waiting import next_event
 from tests.migration.far_places import IN_TIME, PLACES, Pump, processes, traveller
 from tests.migration.travellers import KINDS, Add, Give, Later, Luggage, Stream, Traveller
@@ -213,6 +215,36 @@ async def test_a_move_that_is_given_up_leaves_all_where_it_was(system: hf.ActorS
     await move(system, new, way=way)
     for pump in pumps:
         await pump.judge()
+
+
+@pytest.mark.parametrize("what", [Gated, Succession])
+@pytest.mark.parametrize("way", ["far to near", "near to far", "to a process"])
+async def test_what_cannot_be_let_go_of_keeps_nothing_else(
+    system: hf.ActorSystem, way: str, what: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is told; the supervisor that was to take the place goes in any case, as the candidates of the others do."""
+    give_up, stuck = what.give_up, list[Any]()
+
+    async def fails_once(one: Any, *given: Any) -> Any:
+        was_done = await give_up(one, *given)
+        if not stuck and was_done is not False:  # Of those that are lent a process: one that has had it.
+            stuck.append(one)
+            raise hf.errors.CannotMove("/app/it", "it did not come to rest")
+        return was_done
+
+    old, new = WAYS[way]
+    await plant(system, old, spec_for(way, "plain", "task"), old, new)
+    refs = [system.ref(f"/app/{old}/team/{name}", Traveller) for name in ("zero", "one", "inner/two")]
+    where, tree = [processes(system, ref) for ref in refs], system.tree()
+    monkeypatch.setattr(what, "give_up", fails_once)
+    with pytest.raises(hf.TransactionFailed, match="there was a stone") as failed:
+        await move(system, new, Stumble(), way=way)
+    assert len(stuck) == 1
+    assert "it did not come to rest" in failed.value.kept[0]
+    await is_whole(system, old, (old, new))
+    assert ([processes(system, ref) for ref in refs], system.tree()) == (where, tree)
+    await move(system, new, way=way)
+    await is_whole(system, new, (old, new))
 
 
 class Know(hf.Message[bool]):
@@ -583,7 +615,9 @@ async def test_who_falls_when_its_supervisor_has_stood_down_is_restarted(system:
     assert await one.ask(Add(3), IN_TIME) == 3
 
     async def fall(system: hf.ActorSystem) -> None:
+        fallen = one._cell.living.ended()
         one.kill()
+        await fallen
 
     await move(system, new, Stumble(fall), way=way)
     assert await one.ask(Add(3), IN_TIME) == 3

@@ -818,8 +818,8 @@ CHECKS = {
     ),
     "whoever has stood down goes on while somebody has to be restarted": Check(
         "system/transaction/reparenting.py",
-        "            await self._let_go(system)  # Whoever has stood down restarts nobody.\n",
-        "            pass\n",
+        "        for succession in self._successions:\n            await succession.let_go(system)\n",
+        "        return\n",
         SUPERVISORS,
         "test_who_falls_when_its_supervisor",
     ),
@@ -850,6 +850,35 @@ CHECKS = {
         "one.cell = new",
         SUPERVISORS,
         "test_the_new_one_is_restarted and to",
+    ),
+    "a move that cannot let go of one lets go of all others": Check(
+        "system/transaction/reparenting.py",
+        "                done = await asyncio.gather(*works, return_exceptions=True)\n",
+        "                done = await asyncio.gather(*works)\n",
+        SUPERVISORS,
+        "test_what_cannot_be_let_go_of",
+    ),
+    "the supervisor that was to take the place goes in any case": Check(
+        "system/transaction/reparenting.py",
+        "                if self._candidate is not None:\n                    await self._candidate.release(system)",
+        "                if self._candidate is not None and not problems:\n"
+        "                    await self._candidate.release(system)",
+        SUPERVISORS,
+        "test_what_cannot_be_let_go_of",
+    ),
+    "code that was replaced is noted with a child of a template": Check(
+        "supervision/dynamic.py",
+        "    return spec.start.kind is template.start.kind\n",
+        "    return True\n",
+        JOURNALS,
+        "test_code_that_was_replaced and template",
+    ),
+    "what only the template says is not noted again": Check(
+        "supervision/dynamic.py",
+        " and (template is None or not _is_made_of(template, one.spec)):",
+        ":",
+        KINDS,
+        "test_what_was_noted_is_true and template",
     ),
 }
 

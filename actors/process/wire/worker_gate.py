@@ -11,7 +11,6 @@ process and nothing else.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, Final
@@ -394,9 +393,6 @@ def _keep(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     _home(gate, to, frame)
     gate.require_own(frame.data.get("path"), "what is kept")
     text(frame, "what")
-    period = frame.data.get("period", 0.0)
-    if not isinstance(period, (int, float)) or not math.isfinite(period):
-        raise BadFrame(f"a period of {period!r}")
     if type(frame.data.get("answer", 0)) is not int:
         raise BadFrame(f"an answer under {frame.data['answer']!r}")
 

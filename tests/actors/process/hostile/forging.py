@@ -127,7 +127,6 @@ BREACHES: dict[str, Callable[[], bytes]] = {
     "no subscription of another": lambda: command(VICTIM, "unsubscribe", topic="/t"),
     "a topic that is none": lambda: command(EVIL, "subscribe", topic=5),
     "erase what another has": lambda: command(EVIL, "keep", what="erase", path=VICTIM, below=True),
-    "keep for no time": lambda: command(EVIL, "keep", what="returned", path=EVIL, period=float("nan")),
     "keep for nothing": lambda: command(EVIL, "keep", what="nothing", path=f"{EVIL}/x"),
     "an order from below": lambda: command(VICTIM, "control", id=1, order="suspend", data=b"", left=1.0),
     "a binding of another": lambda: command(VICTIM, "bind", port="x", target=EVIL),
