@@ -13,6 +13,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.errors import UnsavableValue
+from tests.actors.process.waiting import next_event
 from tests.ftm.test_failover import group_of, pid_of, two_again
 
 IN_TIME = 25.0
@@ -148,10 +149,6 @@ async def test_a_recovery_that_begins_with_what_nobody_can_save_fails(tmp_path: 
         note.touch()
         with system.events() as events:
             ref.kill()
-            async with asyncio.timeout(IN_TIME):
-                async for event in events:
-                    if isinstance(event, hf.events.RecoveryFailed):
-                        assert "Early.lock" in event.reason
-                        break
+            assert "Early.lock" in (await next_event(events, hf.events.RecoveryFailed)).reason
         note.unlink()
         assert await ref.ask(Count(), timeout=IN_TIME) == 4

@@ -7,7 +7,6 @@ import contextlib
 import os
 import random
 import signal
-import sys
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -19,8 +18,20 @@ import holdfast as hf
 from tests.migration.far_places import IN_TIME, processes
 from tests.migration.kinds import SPECS, Clients, Own, Visits, is_as_before, leaf, leaves, plant_kind, shape
 from tests.migration.travellers import Add, Seen, Traveller
-from tests.migration.ways import IN_PLACE, WAYS, below, isolation_for, move, plant, put, team_of
-from tests.system.test_transaction_commit import Die
+from tests.migration.ways import (
+    IN_FORCE,
+    WAYS,
+    WHENS,
+    below,
+    check_is_where,
+    dies,
+    isolation_for,
+    move,
+    move_and_die,
+    plant,
+    put,
+    team_of,
+)
 from tests.system.trees import Stumble
 
 SOME_WAYS = list(WAYS) if os.environ.get("HOLDFAST_CROSSED") else ["far to near", "near to far", "to a process"]
@@ -106,44 +117,25 @@ async def killed(store: str, when: str, kind: str, way: str) -> None:
             await system.ref(f"/app/{old}/team/below", hf.Supervisor).ask(hf.StartChild(leaf("one")), IN_TIME)
         for name in leaves(system):
             await system.ref(f"/app/{old}/team/{name}", Traveller).ask(Add(7))
-        if when == "finish":
-            async with system.transaction(timeout=IN_TIME) as change:
-                change.step(Die(when))
-                put(system, change, new, way)
-        else:
-            await move(system, new, Die("finish" if when == "settled" else when), way=way)
+        await move_and_die(system, new, when, way)
 
 
-PROGRAM = """
-import asyncio, sys
-from tests.migration.test_moved_kinds import killed
-
-if __name__ == "__main__":
-    asyncio.run(killed(*sys.argv[1:]))
-"""
 COUNTS = {"own": 2, "pool": 2, "partitions": 3, "template": 2, "journal": 1, "stopped": 2}
 
 
 @pytest.mark.pairs
 @pytest.mark.parametrize("way", SOME_WAYS)
 @pytest.mark.parametrize("kind", list(COUNTS))
-@pytest.mark.parametrize("when", ["prepare", "commit", "finish", "settled"])
+@pytest.mark.parametrize("when", WHENS)
 async def test_a_root_that_is_killed_has_all_of_it_at_one_of_the_two(
     tmp_path: Path, when: str, kind: str, way: str
 ) -> None:
-    (tmp_path / "program.py").write_text(PROGRAM)
     old, new = WAYS[way]
-    here = str(Path(__file__).parents[2])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
-    arguments = (str(tmp_path / "program.py"), str(tmp_path / "store"), when, kind, way)
-    process = await asyncio.create_subprocess_exec(sys.executable, *arguments, env=environment)
-    assert await asyncio.wait_for(process.wait(), IN_TIME) == -signal.SIGKILL
+    await dies(tmp_path, __name__, when, kind, way)
     async with program(str(tmp_path / "store"), kind, way) as system:
-        at = new if when in ("finish", "settled") else old
+        at = new if when in IN_FORCE else old
         assert team_of(system).path == f"/app/{at}/team"
-        if way in IN_PLACE:
-            has_changed = (system.pid_of(team_of(system)) != os.getpid()) == (IN_PLACE[way] == "process")
-            assert has_changed == (when in ("finish", "settled"))
+        check_is_where(system, when, way)
         names = leaves(system)
         assert len(names) == COUNTS[kind]
         for name in names:

@@ -8,7 +8,6 @@ import dataclasses
 import os
 import random
 import signal
-import sys
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -22,8 +21,20 @@ from holdfast.system.transaction.succession import Succession
 from tests.actors.process.waiting import next_event
 from tests.migration.far_places import IN_TIME, PLACES, Pump, processes, traveller
 from tests.migration.travellers import KINDS, Add, Give, Later, Luggage, Stream, Traveller
-from tests.migration.ways import IN_PLACE, WAYS, below, isolation_for, move, plant, put, team_of
-from tests.system.test_transaction_commit import Die
+from tests.migration.ways import (
+    IN_FORCE,
+    WAYS,
+    WHENS,
+    below,
+    check_is_where,
+    dies,
+    isolation_for,
+    move,
+    move_and_die,
+    plant,
+    put,
+    team_of,
+)
 from tests.system.trees import Stumble
 
 # A refused or failed transaction ends with its block, which collects several steps.
@@ -148,43 +159,22 @@ async def killed(store: str, when: str, way: str, place: str) -> None:
     async with program(store, way, place) as system:
         for name in ("zero", "one", "inner/two"):
             await system.ref(f"/app/{old}/team/{name}", Traveller).ask(Add(7))
-        if when == "finish":
-            async with system.transaction(timeout=IN_TIME) as change:
-                change.step(Die(when))
-                put(system, change, new, way)
-        else:
-            await move(system, new, Die("finish" if when == "settled" else when), way=way)
-
-
-PROGRAM = """
-import asyncio, sys
-from tests.migration.test_moved_supervisors import killed
-
-if __name__ == "__main__":
-    asyncio.run(killed(*sys.argv[1:]))
-"""
+        await move_and_die(system, new, when, way)
 
 
 @pytest.mark.pairs
 @pytest.mark.parametrize("way", list(WAYS))
 @pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize("when", ["prepare", "commit", "finish", "settled"])
+@pytest.mark.parametrize("when", WHENS)
 async def test_a_root_that_is_killed_has_all_of_it_at_one_of_the_two(
     tmp_path: Path, when: str, place: str, way: str
 ) -> None:
-    (tmp_path / "program.py").write_text(PROGRAM)
     old, new = WAYS[way]
-    here = str(Path(__file__).parents[2])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
-    arguments = (str(tmp_path / "program.py"), str(tmp_path / "store"), when, way, place)
-    process = await asyncio.create_subprocess_exec(sys.executable, *arguments, env=environment)
-    assert await asyncio.wait_for(process.wait(), IN_TIME) == -signal.SIGKILL
+    await dies(tmp_path, __name__, when, way, place)
     async with program(str(tmp_path / "store"), way, place) as system:
-        at = new if when in ("finish", "settled") else old
+        at = new if when in IN_FORCE else old
         await is_whole(system, at, (old, new))
-        if way in IN_PLACE:
-            has_changed = (system.pid_of(team_of(system)) != os.getpid()) == (IN_PLACE[way] == "process")
-            assert has_changed == (when in ("finish", "settled"))
+        check_is_where(system, when, way)
         for name in ("zero", "one", "inner/two"):
             ref = system.ref(f"/app/{at}/team/{name}", Traveller)
             assert await ref.ask(Add(1), IN_TIME) == 8

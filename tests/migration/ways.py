@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
+import signal
+import sys
+from pathlib import Path
 from typing import Any
 
 import holdfast as hf
 from tests.migration.far_places import IN_TIME
+from tests.system.test_transaction_commit import Die
 
 HOMES: dict[str, Any] = {"near": "task", "next": "task", "far": "process", "other": "process"}
 WAYS = {
@@ -58,3 +63,40 @@ def team_of(system: hf.ActorSystem) -> hf.ActorRef[hf.Supervisor]:
 async def below(system: hf.ActorSystem, at: str) -> list[tuple[str, str]]:
     told = await system.ref(at, hf.Supervisor).ask(hf.WhichChildren(), IN_TIME)
     return [(one.id, one.state) for one in told]
+
+
+# -- the root is killed in the middle of a move, by a step ----------------------------------------------------------------------------------
+
+WHENS = ["prepare", "commit", "finish", "settled"]
+IN_FORCE = ("finish", "settled")
+
+
+async def move_and_die(system: hf.ActorSystem, to: str, when: str, way: str) -> None:
+    """The root is killed by a step of the move, or by one before it that finishes first."""
+    if when == "finish":
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.step(Die(when))
+            put(system, change, to, way)
+    else:
+        await move(system, to, Die("finish" if when == "settled" else when), way=way)
+
+
+async def dies(folder: Path, module: str, *arguments: str) -> None:
+    """`killed` of a test module is killed when it runs as a program of its own, with a store in the folder."""
+    program = folder / "program.py"
+    program.write_text(
+        f"import asyncio, sys\nfrom {module} import killed\n\n"
+        'if __name__ == "__main__":\n    asyncio.run(killed(*sys.argv[1:]))\n'
+    )
+    here = str(Path(__file__).parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
+    command = (str(program), str(folder / "store"), *arguments)
+    process = await asyncio.create_subprocess_exec(sys.executable, *command, env=environment)
+    assert await asyncio.wait_for(process.wait(), IN_TIME) == -signal.SIGKILL
+
+
+def check_is_where(system: hf.ActorSystem, when: str, way: str) -> None:
+    """It lives where the specification in force says, if it is moved by its place alone."""
+    if way in IN_PLACE:
+        has_changed = (system.pid_of(team_of(system)) != os.getpid()) == (IN_PLACE[way] == "process")
+        assert has_changed == (when in IN_FORCE)

@@ -115,21 +115,27 @@ async def test_it_waits_for_somebody_in_a_process_that_begins() -> None:
             assert not told(events, hf.events.ChildStartFailed)
 
 
+async def waiting_here(system: hf.ActorSystem, gate: Gate) -> hf.ActorRef[hf.Supervisor]:
+    """Have `one` wait for `two`, which does not come up before the gate is opened; returns its supervisor."""
+    here, there = system.ref("/app/here", hf.Supervisor), system.ref("/app/there", hf.Supervisor)
+    there.kill()
+    async with asyncio.timeout(IN_TIME):
+        while gate.came < 2:
+            await asyncio.sleep(0)
+        here.kill()
+        while system._node.find("/app/here/one") is not None or here._cell.actor is None:
+            await asyncio.sleep(0)
+        (info,) = await here.ask(WhichChildren(), IN_TIME)
+    assert (info.id, info.state) == ("one", "starting")
+    return here
+
+
 async def test_whoever_waits_holds_up_nobody_and_answers() -> None:
     gate = Gate()
     async with hf.ActorSystem("app", log=False, intensity=2, period=60.0) as system:
         await tree(system, gate=gate)
         before = system._node.find("/app/here/one")
-        here, there = system.ref("/app/here", hf.Supervisor), system.ref("/app/there", hf.Supervisor)
-        there.kill()
-        async with asyncio.timeout(IN_TIME):
-            while gate.came < 2:
-                await asyncio.sleep(0)
-            here.kill()
-            while system._node.find("/app/here/one") is not None or here._cell.actor is None:
-                await asyncio.sleep(0)
-        (info,) = await here.ask(WhichChildren(), IN_TIME)
-        assert (info.id, info.state) == ("one", "starting")
+        await waiting_here(system, gate)
         gate.opened.set()
         assert await asked(system, "/app/here/one", before) == "/app/there/two"
 
@@ -138,16 +144,8 @@ async def test_one_that_waits_can_be_stopped_and_its_supervisor_too() -> None:
     gate = Gate()
     async with hf.ActorSystem("app", log=False, intensity=2, period=60.0) as system:
         await tree(system, gate=gate)
-        here, there = system.ref("/app/here", hf.Supervisor), system.ref("/app/there", hf.Supervisor)
-        there.kill()
+        here = await waiting_here(system, gate)
         async with asyncio.timeout(IN_TIME):
-            while gate.came < 2:
-                await asyncio.sleep(0)
-            here.kill()
-            while system._node.find("/app/here/one") is not None or here._cell.actor is None:
-                await asyncio.sleep(0)
-            (info,) = await here.ask(WhichChildren(), IN_TIME)
-            assert info.state == "starting"
             await here.ask(hf.TerminateChild("one"), IN_TIME)
             await system.stop(here)
         gate.opened.set()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -34,8 +32,8 @@ from tests.system.test_moved_replicas import (
     changes,
     fail_over,
     group_of,
+    kill_replicas,
     moved,
-    pids,
     program,
     resident,
     whole,
@@ -308,13 +306,7 @@ async def test_replicas_that_are_killed_at_a_step_of_the_move(there: str, when: 
         for count in (1, 2, 3):
             assert await one.ask(Add(), IN_TIME) == count
 
-        def strike() -> None:
-            primary = group_of(one).membership.primary
-            for name, pid in pids(one).items():
-                if whom == "all" or (name == primary) is (whom == "leader"):
-                    os.kill(pid, signal.SIGKILL)
-
-        await moved(system, then=Strike(when, strike))
+        await moved(system, then=Strike(when, lambda: kill_replicas(one, whom)))
         assert one.path == THERE
         assert await one.ask(Add(), IN_TIME) == 4
         await fail_over(one)

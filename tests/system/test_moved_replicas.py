@@ -221,6 +221,14 @@ def group_of(ref: hf.ActorRef[Any]) -> Any:
     return place.group
 
 
+def kill_replicas(ref: hf.ActorRef[Any], whom: str) -> None:
+    """Kill the processes of the "leader", of the "follower", or of "all"."""
+    primary = group_of(ref).membership.primary
+    for name, pid in pids(ref).items():
+        if whom == "all" or (name == primary) is (whom == "leader"):
+            os.kill(pid, signal.SIGKILL)
+
+
 def pids(ref: hf.ActorRef[Any]) -> dict[str, int]:
     replicas = group_of(ref).replicas
     workers = {name: replicas.worker_of(name) for name in group_of(ref).membership.names}
@@ -705,13 +713,7 @@ async def test_replicas_that_are_killed_at_a_step_of_the_move(there: str, when: 
         for count in (1, 2, 3):
             assert await one.ask(Add(), IN_TIME) == count
 
-        def strike() -> None:
-            primary = group_of(one).membership.primary
-            for name, pid in pids(one).items():
-                if whom == "all" or (name == primary) is (whom == "leader"):
-                    os.kill(pid, signal.SIGKILL)
-
-        await moved(system, then=Strike(when, strike))
+        await moved(system, then=Strike(when, lambda: kill_replicas(one, whom)))
         assert one.path == THERE
         begins = await one.ask(Add(), IN_TIME) - 1
         if whom != "all" or kind == "recorded":  # Else it begins afresh, or where it was saved last.
