@@ -65,7 +65,7 @@ async def below(system: hf.ActorSystem, at: str) -> list[tuple[str, str]]:
     return [(one.id, one.state) for one in told]
 
 
-# -- the root is killed in the middle of a move, by a step ----------------------------------------------------------------------------------
+# -- the root is killed in the middle of a move, by a step ------------------------------------------------------------
 
 WHENS = ["prepare", "commit", "finish", "settled"]
 IN_FORCE = ("finish", "settled")
