@@ -10,6 +10,8 @@ from .actors.errors import (
     BadReply,
     CannotMove,
     ControlFailed,
+    EffectFailed,
+    EffectInDoubt,
     HoldfastError,
     Ignore,
     MailboxFull,
@@ -29,6 +31,7 @@ from .actors.errors import (
     TreeFailed,
     UnknownMessage,
     UnsavableValue,
+    WaitTimeout,
     WrongActor,
     WrongThread,
 )
@@ -68,6 +71,8 @@ from .system.script import UntrustedFile
 from .system.transaction.errors import TransactionFailed, TransactionRefused
 
 __all__ = [
+    "EffectFailed",
+    "EffectInDoubt",
     "ActorRestarting",
     "ActorStopped",
     "AlreadyPresent",
@@ -134,6 +139,7 @@ __all__ = [
     "TreeFailed",
     "Unbound",
     "UnknownMessage",
+    "WaitTimeout",
     "UnknownRefusal",
     "UnsavableValue",
     "UntrustedFile",

@@ -232,6 +232,16 @@ class TurnsLost(Event, frozen=True, eq=False):
     turn: int
 
 
+class EffectRepeated(Event, frozen=True, eq=False):
+    """An actor has ended while an effect was out, and its next life performs the effect again.
+
+    `effect` is its key, and `message` the type of the message whose handler wants it.
+    """
+
+    effect: str
+    message: str
+
+
 class ReplayPaced(Event, frozen=True, eq=False):
     """A replay that waits between messages: `turns` are still to be fed, and the last is due in `seconds`.
 

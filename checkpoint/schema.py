@@ -212,6 +212,8 @@ def shape_name(answer: Answer) -> str:
     """Under which name the fields of an ask's outcome are kept; "" if they are not."""
     if answer.kind == "refusal":
         return REFUSAL + answer.name
+    if answer.kind == MESSAGE:
+        return answer.name
     return REPLY_TO + answer.name if answer.kind == REPLY and answer.name else ""
 
 

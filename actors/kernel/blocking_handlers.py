@@ -151,7 +151,7 @@ class ThreadContext:
     def __getattr__(self, name: str) -> Any:
         if threading.get_ident() != self._thread:
             return getattr(self._ctx, name)  # The loop's own business, or a background task's.
-        if name in ("create_task", "flush", "pipe_to_self", "publish"):
+        if name in ("create_task", "effect", "flush", "pipe_to_self", "publish", "sleep", "sleep_until", "wait_for"):
             raise HoldfastError(f"{self._ctx.path}: a blocking handler cannot use ctx.{name}; make it `async def`")
         value = self._on_loop(getattr, self._ctx, name)
         if not callable(value) or name == "random":

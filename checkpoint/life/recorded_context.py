@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import hashlib
 import random
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
+from ...actors.effects import Effect
 from ...actors.errors import ControlFailed, HoldfastError, remote_crash
 from ...actors.exit_reasons import NORMAL, ExitReason
 from ...actors.kernel.actor import Actor
@@ -19,7 +21,8 @@ from ...actors.kernel.envelope import Ask, Item, ReplyHandle
 from ...actors.kernel.links import Monitor
 from ...actors.kernel.message import Message, message_name, require_message
 from ...actors.kernel.ref import ActorRef, current
-from ..protocol import Feed, PipeDone
+from ...actors.values import encode_value
+from ..protocol import REPLY, Answer, Feed, Performed, PipeDone
 from .recorded_inbox import INIT, STARTED, Fed
 
 if TYPE_CHECKING:
@@ -105,8 +108,8 @@ class RecordedContext(ActorContext):
             )
 
     def now(self) -> float:
-        feed = self.recorded.feed
-        return self._cell.node.clock.wall() if feed is None else feed.time
+        life = self.recorded
+        return self._cell.node.clock.wall() if life.feed is None else max(life.feed.time, life.moment)
 
     @property
     def random(self) -> random.Random:
@@ -246,6 +249,69 @@ class RecordedContext(ActorContext):
             self.recorded.port.to_home(record)
             if k:
                 self.recorded.pipe_back()
+
+    # -- the outside ------------------------------------------------------------------------------------------------
+
+    @property
+    def message_id(self) -> str:
+        feed = self.recorded.feed
+        if feed is None:
+            raise HoldfastError(f"{self.path}: no message is in hand")
+        said = f"{self.path}|{feed.id}|{feed.time}"
+        return hashlib.blake2b(said.encode(), digest_size=16).hexdigest()
+
+    async def _performed(self, effect: Effect, at_most_once: bool) -> object:
+        if not self._in_turn():
+            return await super()._performed(effect, at_most_once)
+        life = self.recorded
+        k = life.put("effect", effect.key, "at most once" if at_most_once else "")
+        outcome: asyncio.Future[object] = self._cell.node.loop.create_future()
+        life.asks[life.turn, k] = outcome, effect
+        life.release()
+        return await outcome
+
+    async def _rest(self, verb: str, name: str, until: float, kinds: dict[str, type[Message[Any]]]) -> Any:
+        """Wait for what the home waits for; nothing of it is out."""
+        life = self.recorded
+        k = life.put(verb, "", name, seconds=until)
+        outcome: asyncio.Future[Any] = self._cell.node.loop.create_future()
+        life.asks[life.turn, k] = outcome, kinds
+        life.release()
+        life.resting += 1
+        try:
+            return await outcome
+        finally:
+            life.resting -= 1
+
+    async def _slept(self, until: float) -> None:
+        if self._in_turn():
+            await self._rest("sleep", "", until, {})
+        else:
+            await super()._slept(until)
+
+    async def _signal(self, kinds: tuple[type[Message[Any]], ...], timeout: float | None) -> Message[Any]:
+        if not self._in_turn():
+            raise HoldfastError(f"{self.path}: only a turn can wait for a message")
+        until = 0.0 if timeout is None else self.now() + timeout
+        names = {message_name(kind): kind for kind in kinds}
+        message: Message[Any] = await self._rest("wait", "|".join(names), until, names)
+        return message
+
+    def perform(self, turn: int, k: int, effect: Effect, outcome: asyncio.Future[Any]) -> None:
+        """Perform an effect of the turn in hand, in a task of its own, and have the home journal what it comes to."""
+        task = self._beside(self._carried_out(turn, k, effect), "effect")
+        outcome.add_done_callback(lambda _: task.cancel())  # The handler does not wait for it any more.
+
+    async def _carried_out(self, turn: int, k: int, effect: Effect) -> None:
+        node, life = self._cell.node, self.recorded
+        try:
+            value = await effect.perform(node.threads.run, node.numbers.next_seed())
+            said = msgspec.msgpack.encode((node.clock.wall(), encode_value(value, where=f"the result of {effect.key}")))
+            answer = Answer(REPLY, "", said)
+        except Exception as error:
+            answer = life.answer_error(error)
+        if not self._closed and (turn, k) in life.asks:
+            life.port.to_home(Performed(turn, k, answer))
 
     # -- stash, links, subscriptions --------------------------------------------------------------------------------
 

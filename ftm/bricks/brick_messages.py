@@ -12,11 +12,11 @@ from ...checkpoint.protocol import (
     Hooked,
     Ignored,
     Live,
-    Outcome,
+    PastInputs,
+    Performed,
     PipeDone,
     Released,
     Snapshot,
-    SnapshotNow,
     TurnEnd,
     Unsaved,
 )
@@ -172,17 +172,18 @@ class Done(Message[Taken]):
 
 
 class Inward(Message):
-    """From the home to the life, past the bricks: outcomes of asks, an order for a snapshot."""
+    """From the home to the life, past the bricks: outcomes of asks and effects, orders for an effect or a snapshot."""
 
     epoch: int
-    records: list[Outcome | SnapshotNow]
+    records: list[PastInputs]
 
 
 class Outward(Message):
-    """From the life to the home, past the bricks: what is released in the middle of a turn that is at the front."""
+    """From the life to the home, past the bricks, of a turn that is at the front: what is released in the middle of it,
+    and what its effects have come to."""
 
     epoch: int
-    records: list[Released | PipeDone | Snapshot | Unsaved | Ignored | Hooked]
+    records: list[Released | Performed]
 
 
 class PartEnded(Message):
