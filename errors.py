@@ -71,8 +71,6 @@ from .system.script import UntrustedFile
 from .system.transaction.errors import TransactionFailed, TransactionRefused
 
 __all__ = [
-    "EffectFailed",
-    "EffectInDoubt",
     "ActorRestarting",
     "ActorStopped",
     "AlreadyPresent",
@@ -91,6 +89,8 @@ __all__ = [
     "ChildParked",
     "ControlFailed",
     "DamagedStore",
+    "EffectFailed",
+    "EffectInDoubt",
     "ForeignStore",
     "GrantLost",
     "HoldfastError",
@@ -139,10 +139,10 @@ __all__ = [
     "TreeFailed",
     "Unbound",
     "UnknownMessage",
-    "WaitTimeout",
     "UnknownRefusal",
     "UnsavableValue",
     "UntrustedFile",
+    "WaitTimeout",
     "WrongActor",
     "WrongThread",
 ]

@@ -16,7 +16,7 @@ from .errors import EffectFailed, HoldfastError, SpecError, error_text, type_nam
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Retry:
-    """How often an effect is attempted, and how long it waits between two attempts.
+    """Say how often an effect is attempted, and how long it waits between two attempts.
 
     Attributes:
         attempts: how often at most, >= 1.

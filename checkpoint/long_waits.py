@@ -31,6 +31,11 @@ class LongWaits:
         self._clocks: dict[Place, asyncio.TimerHandle] = {}
         self.wanted: dict[Place, tuple[str, ...]] = {}  # types of messages, in the order in which turns wait for them
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether the turn in hand waits for a moment or a message."""
+        return bool(self._clocks or self.wanted)
+
     def begin(self, turn: int, key: int, out: Out) -> None:
         """The turn with input `key` waits: until a moment, or for a message, for which there may be a time limit."""
         place = turn, out.k

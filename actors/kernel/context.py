@@ -314,9 +314,9 @@ class ActorContext:
 
     @property
     def message_id(self) -> str:
-        """What identifies the message in hand for ever: a handler that is run again for it gets the same text.
+        """Return the text that identifies the message in hand for ever: a key for the other side of an effect.
 
-        It is an idempotency key for the other side of an effect. Another message never has it, of whatever actor.
+        A handler that is run again for this message gets the same text. No other message of any actor ever has it.
 
         Raises:
             HoldfastError: the actor has no recovery, so no handler is run again; or nothing is in hand.
@@ -324,7 +324,7 @@ class ActorContext:
         raise HoldfastError(f"{self.path}: only messages of an actor with recovery have an identity")
 
     @overload
-    async def effect(
+    def effect(
         self,
         function: Callable[[*Ts], Awaitable[T]],
         *args: *Ts,
@@ -332,10 +332,10 @@ class ActorContext:
         timeout: float | None = None,
         retry: Retry | None = None,
         at_most_once: bool = False,
-    ) -> T: ...
+    ) -> asyncio.Future[T]: ...
 
     @overload
-    async def effect(
+    def effect(
         self,
         function: Callable[[*Ts], T],
         *args: *Ts,
@@ -343,9 +343,9 @@ class ActorContext:
         timeout: float | None = None,
         retry: Retry | None = None,
         at_most_once: bool = False,
-    ) -> T: ...
+    ) -> asyncio.Future[T]: ...
 
-    async def effect(  # type: ignore[misc]  # whatever the two above have found to fit
+    def effect(  # type: ignore[misc]  # whatever the two above have found to fit
         self,
         function: Callable[..., Any],
         *args: Any,
@@ -353,13 +353,14 @@ class ActorContext:
         timeout: float | None = None,
         retry: Retry | None = None,
         at_most_once: bool = False,
-    ) -> Any:
+    ) -> asyncio.Future[Any]:
         """Do something to the outside world, such as a payment, once: an actor with recovery has its outcome journaled.
 
         A handler that is run again after a crash gets the outcome from the journal, and the function is not called. It
         begins when all that precedes it is as safe as the store makes it. If a crash comes between the function and the
         record of its outcome, it is called again: at least once, so give the other side `message_id`. In hooks that
-        are no turns, and without recovery, it is called each time.
+        are no turns, and without recovery, it is called each time. Several may be out at once: call them in the turn
+        itself, and `await asyncio.gather(...)` what they return.
 
         Args:
             function: is awaited if it is async, and runs in a thread otherwise. It may not use `ctx`.
@@ -370,23 +371,27 @@ class ActorContext:
             at_most_once: a crash while it is out raises EffectInDoubt instead of calling it again.
 
         Returns:
-            What the function has returned; it must be a value that a snapshot can hold (`UnsavableValue` says why not).
+            A future of what the function returns; that must be a value that a snapshot can hold (`UnsavableValue` says
+            why it is not).
 
         Raises:
+            HoldfastError: this is a background task of an actor with recovery; call the function itself there.
+
+        Raises (by the future):
             EffectFailed: the function has raised, or has taken too long, at the last attempt.
             EffectInDoubt: it is performed at most once, and the actor has ended while it was out.
             HoldfastError: the function itself has raised that, a Refusal for instance: it is an outcome too.
         """
         self._alive()
         effect = effect_of(function, args, key, timeout, retry, at_most_once=at_most_once, is_async=is_async(function))
-        return await self._performed(effect, at_most_once)
+        return self._performed(effect, at_most_once)
 
-    async def _performed(self, effect: Effect, at_most_once: bool) -> object:
+    def _performed(self, effect: Effect, at_most_once: bool) -> asyncio.Future[object]:
         """The outcome of an effect: without recovery, whatever it comes to now."""
         node = self._cell.node
-        return await effect.perform(node.threads.run, node.numbers.next_seed())
+        return self._beside(effect.perform(node.threads.run, node.numbers.next_seed()), "effect")
 
-    async def sleep_until(self, when: float) -> None:
+    def sleep_until(self, when: float) -> asyncio.Future[None]:
         """Have the turn in hand wait until a moment, be it days away.
 
         In an actor with recovery the wait outlives its process, and with a durable store the program: the handler is
@@ -394,24 +399,30 @@ class ActorContext:
 
         Args:
             when: Unix time in seconds; a moment that has passed ends the wait at once.
+
+        Returns:
+            A future, to be awaited.
+
+        Raises:
+            HoldfastError: this is a background task of an actor with recovery; use `asyncio.sleep` there.
         """
         self._alive()
         if not isinstance(when, int | float) or isinstance(when, bool) or not math.isfinite(when):
             raise SpecError("sleep_until", f"takes Unix time in seconds, not {when!r}")
-        await self._slept(float(when))
+        return self._slept(float(when))
 
-    async def sleep(self, seconds: float) -> None:
+    def sleep(self, seconds: float) -> asyncio.Future[None]:
         """Have the turn in hand wait for so many seconds from `now()` on; see `sleep_until`."""
         self._alive()
         if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds < math.inf:
             raise SpecError("sleep", f"takes a number of seconds >= 0, not {seconds!r}")
-        await self._slept(self.now() + seconds)
+        return self._slept(self.now() + seconds)
 
-    async def _slept(self, until: float) -> None:
+    def _slept(self, until: float) -> asyncio.Future[None]:
         """Wait until a moment: without recovery, in this life."""
-        await asyncio.sleep(until - self._cell.node.clock.wall())
+        return self._beside(asyncio.sleep(until - self._cell.node.clock.wall()), "sleep")
 
-    async def wait_for(self, *kinds: type[M], timeout: float | None = None) -> M:
+    def wait_for(self, *kinds: type[M], timeout: float | None = None) -> asyncio.Future[M]:
         """Have the turn in hand wait for a message of one of these classes: a signal. It needs recovery.
 
         The oldest one that is in the mailbox is taken, before all that came earlier, or the first one that comes. Who
@@ -421,9 +432,14 @@ class ActorContext:
             kinds: classes of messages whose reply is None.
             timeout: seconds from `now()` on; left out, it waits for as long as it takes.
 
+        Returns:
+            A future of the message.
+
         Raises:
+            HoldfastError: the actor has no recovery, or lives behind a mechanism; or this is no turn.
+
+        Raises (by the future):
             WaitTimeout: none has come in time.
-            HoldfastError: the actor has no recovery, or lives behind a mechanism; or no turn is in hand.
         """
         self._alive()
         if not kinds or not all(isinstance(kind, type) and issubclass(kind, Message) for kind in kinds):
@@ -434,9 +450,9 @@ class ActorContext:
             not isinstance(timeout, int | float) or isinstance(timeout, bool) or not 0 < timeout < math.inf
         ):
             raise SpecError("wait_for", f"timeout must be a number of seconds > 0, or None, not {timeout!r}")
-        return cast("M", await self._signal(kinds, timeout))
+        return cast("asyncio.Future[M]", self._signal(kinds, timeout))
 
-    async def _signal(self, kinds: tuple[type[Message[Any]], ...], timeout: float | None) -> Message[Any]:
+    def _signal(self, kinds: tuple[type[Message[Any]], ...], timeout: float | None) -> asyncio.Future[Message[Any]]:
         """Wait for a message: only a home can."""
         raise HoldfastError(f"{self.path}: a turn can wait for a message only in an actor with recovery")
 

@@ -26,7 +26,7 @@ from ..protocol import REPLY, Answer, Feed, Performed, PipeDone
 from .recorded_inbox import INIT, STARTED, Fed
 
 if TYPE_CHECKING:
-    from .recorded_life import Life
+    from .recorded_life import Awaited, Life
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -104,7 +104,8 @@ class RecordedContext(ActorContext):
             raise HoldfastError(f"{self.path}: {why}; act in on_start, or in on_recovered")
         if not life.hook or _in_background():
             raise HoldfastError(
-                f"{self.path}: background tasks of a recorded actor may not send; report with ctx.pipe_to_self()"
+                f"{self.path}: background tasks of a recorded actor may not send, nor use ctx.effect or ctx.sleep "
+                "(asyncio.gather makes one of a coroutine); report with ctx.pipe_to_self()"
             )
 
     def now(self) -> float:
@@ -260,42 +261,40 @@ class RecordedContext(ActorContext):
         said = f"{self.path}|{feed.id}|{feed.time}"
         return hashlib.blake2b(said.encode(), digest_size=16).hexdigest()
 
-    async def _performed(self, effect: Effect, at_most_once: bool) -> object:
+    def _performed(self, effect: Effect, at_most_once: bool) -> asyncio.Future[object]:
         if not self._in_turn():
-            return await super()._performed(effect, at_most_once)
-        life = self.recorded
-        k = life.put("effect", effect.key, "at most once" if at_most_once else "")
-        outcome: asyncio.Future[object] = self._cell.node.loop.create_future()
-        life.asks[life.turn, k] = outcome, effect
-        life.release()
-        return await outcome
+            self._outside()
+            return super()._performed(effect, at_most_once)
+        return self._awaited("effect", effect.key, "at most once" if at_most_once else "", 0.0, effect)
 
-    async def _rest(self, verb: str, name: str, until: float, kinds: dict[str, type[Message[Any]]]) -> Any:
-        """Wait for what the home waits for; nothing of it is out."""
+    def _awaited(self, verb: str, to: str, name: str, until: float, kind: Awaited) -> asyncio.Future[Any]:
+        """An output of the turn in hand, and a future of what comes of it; the turn need not wait for that."""
         life = self.recorded
-        k = life.put(verb, "", name, seconds=until)
+        k = life.put(verb, to, name, seconds=until)
         outcome: asyncio.Future[Any] = self._cell.node.loop.create_future()
-        life.asks[life.turn, k] = outcome, kinds
+        life.asks[life.turn, k] = outcome, kind
         life.release()
-        life.resting += 1
-        try:
-            return await outcome
-        finally:
-            life.resting -= 1
+        return outcome
 
-    async def _slept(self, until: float) -> None:
+    def _rest(self, verb: str, name: str, until: float, kinds: dict[str, type[Message[Any]]]) -> asyncio.Future[Any]:
+        """Wait for what the home waits for: nothing of it is out."""
+        life, outcome = self.recorded, self._awaited(verb, "", name, until, kinds)
+        resting = life.resting
+        resting.add(outcome)
+        outcome.add_done_callback(resting.discard)
+        return outcome
+
+    def _slept(self, until: float) -> asyncio.Future[None]:
         if self._in_turn():
-            await self._rest("sleep", "", until, {})
-        else:
-            await super()._slept(until)
+            return self._rest("sleep", "", until, {})
+        self._outside()
+        return super()._slept(until)
 
-    async def _signal(self, kinds: tuple[type[Message[Any]], ...], timeout: float | None) -> Message[Any]:
+    def _signal(self, kinds: tuple[type[Message[Any]], ...], timeout: float | None) -> asyncio.Future[Message[Any]]:
         if not self._in_turn():
             raise HoldfastError(f"{self.path}: only a turn can wait for a message")
-        until = 0.0 if timeout is None else self.now() + timeout
         names = {message_name(kind): kind for kind in kinds}
-        message: Message[Any] = await self._rest("wait", "|".join(names), until, names)
-        return message
+        return self._rest("wait", "|".join(names), 0.0 if timeout is None else self.now() + timeout, names)
 
     def perform(self, turn: int, k: int, effect: Effect, outcome: asyncio.Future[Any]) -> None:
         """Perform an effect of the turn in hand, in a task of its own, and have the home journal what it comes to."""

@@ -108,7 +108,7 @@ class Life:
         self.asks: dict[tuple[int, int], tuple[asyncio.Future[Any], Awaited]] = {}
         self.pipes = 0
         self.moment = 0.0  # until which the turn in hand has waited
-        self.resting = 0  # how many moments and messages it waits for
+        self.resting: set[asyncio.Future[Any]] = set()  # the moments and messages that it waits for
         self.stash: list[Fed] = []
         self.returned: dict[int, Fed] = {}
         self.is_live = False
@@ -282,6 +282,8 @@ class Life:
         if self.returned:
             self.returned.pop(feed.id, None)  # It has come again: its feed may have been here before it was put back.
         self.feed, self.outs, self.last_k, self.moment = feed, [], 0, 0.0
+        if self.resting:
+            self.resting = set()
         if self.page is not None:
             self.page[0] = feed.id + 1
 

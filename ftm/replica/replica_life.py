@@ -106,7 +106,7 @@ class ServerContext(RecordedContext):
         self._server.begins_task()
         return super().create_task(work)
 
-    async def _signal(self, kinds: tuple[type[Message[Any]], ...], timeout: float | None) -> Message[Any]:
+    def _signal(self, kinds: tuple[type[Message[Any]], ...], timeout: float | None) -> asyncio.Future[Message[Any]]:
         raise HoldfastError(f"{self.path}: a turn cannot wait for a message behind a mechanism; use a turn for each")
 
     def waits_for_room(self, topic: str) -> bool:

@@ -1,0 +1,271 @@
+"""Effects of recorded actors: made once, with an outcome that every replay gets; what a crash in between means."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.effects.clerk import IN_TIME, Clerk, Do, Done, clerk, lines, words
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> str:
+    return str(tmp_path / "world")
+
+
+def running(tmp_path: Path, durability: str) -> hf.ActorSystem:
+    store = None if durability == "memory" else f"sqlite:{tmp_path / 'app.db'}"
+    return hf.ActorSystem("app", log=False, store=store, intensity=99)
+
+
+async def crash(system: hf.ActorSystem) -> None:
+    """End the life between two turns, and wait until the next one is there."""
+    with system.events() as stream:
+        system.ref("/app/clerk", Clerk).kill()
+        async with asyncio.timeout(IN_TIME):
+            async for event in stream:
+                if isinstance(event, hf.events.Recovered):
+                    return
+
+
+@pytest.mark.parametrize("durability", ["memory", "os"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_replay_gets_the_outcome_and_makes_no_effect(
+    tmp_path: Path, world: str, isolation: str, durability: str
+) -> None:
+    """A result, one of a thread, a refusal, a failure, success at a later attempt, what cannot be kept."""
+    asked = ["a", "thread", "b:no", "c:raise9", "d:raise2", "e:slow", "f:unsavable"]
+    async with running(tmp_path, durability) as system:
+        ref = await system.start(clerk(isolation))
+        said = await ref.ask(Do(world, asked), IN_TIME)
+        assert "a! thread! (No(why='b'))" in said
+        assert "has failed at attempt 3: ConnectionError: no line to c" in said
+        assert "d! e!" in said
+        assert "cannot be saved" in said
+        made = words(world)
+        assert made == ["a", "thread", "b", "c", "c", "c", "d", "d", "d", "e", "e", "f"]
+        for _ in range(2):
+            await crash(system)
+            assert await ref.ask(Done(), IN_TIME) == [said]
+        assert words(world) == made
+    if durability == "os":
+        async with running(tmp_path, durability) as system:
+            ref = await system.start(clerk(isolation))
+            assert await ref.ask(Done(), IN_TIME) == [said]
+            assert words(world) == made
+
+
+@pytest.mark.parametrize("durability", ["memory", "os"])
+@pytest.mark.parametrize("at", [0, 1, 2])
+async def test_what_was_made_before_the_crash_is_not_made_again(
+    tmp_path: Path, world: str, durability: str, at: int
+) -> None:
+    async with running(tmp_path, durability) as system:
+        ref = await system.start(clerk())
+        assert await ref.ask(Do(world, ["a", "thread", "c"], dies_after=at), IN_TIME) == "a! thread! c!"
+        assert words(world) == ["a", "thread", "c"]
+        assert await ref.ask(Done(), IN_TIME) == ["a! thread! c!"]
+
+
+async def test_an_effect_that_was_out_is_made_again_with_the_same_key(tmp_path: Path, world: str) -> None:
+    async with running(tmp_path, "memory") as system:
+        ref = await system.start(clerk())
+        with system.events() as stream:
+            assert await ref.ask(Do(world, ["a", "b:die", "c"]), IN_TIME) == "a! b! c!"
+            told = stream.take()
+        assert words(world) == ["a", "b", "b", "c"]
+        assert len({line.split()[1] for line in lines(world)}) == 1
+        again = [event for event in told if isinstance(event, hf.events.EffectRepeated)]
+        assert [(event.address, event.effect, event.message) for event in again] == [
+            ("/app/clerk", "deed", "tests.effects.clerk:Do")
+        ]
+
+
+async def test_one_that_is_made_at_most_once_is_in_doubt(tmp_path: Path, world: str) -> None:
+    """So it is in each later replay, too."""
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(clerk())
+        said = await ref.ask(Do(world, ["a", "once:die", "c"]), IN_TIME)
+        assert said.startswith("a! (/app/clerk has ended while its effect deed was out")
+        for _ in range(2):
+            await crash(system)
+            assert await ref.ask(Done(), IN_TIME) == [said]
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(clerk())
+        assert await ref.ask(Done(), IN_TIME) == [said]
+        assert words(world) == ["a", "once", "c"]
+
+
+async def test_each_message_has_a_key_of_its_own_whatever_becomes_of_the_store(tmp_path: Path, world: str) -> None:
+    for number in range(2):
+        async with running(tmp_path / str(number), "memory") as system:
+            ref = await system.start(clerk("task"))
+            other = await system.start(hf.child("other", hf.start(Clerk), recovery=hf.hybrid()))
+            for one in (ref, other, ref):
+                await one.ask(Do(world, ["a"]))
+    keys = [line.split()[1] for line in lines(world)]
+    assert len(keys) == len(set(keys)) == 6
+
+
+@pytest.mark.parametrize("method", [hf.hybrid, hf.replay_only])
+async def test_the_interrupted_turn_goes_on(tmp_path: Path, world: str, method: Any) -> None:
+    async with running(tmp_path, "memory") as system:
+        ref = await system.start(clerk(recovery=method()))
+        assert await ref.ask(Do(world, ["a", "b"], dies_after=0), IN_TIME) == "a! b!"
+        assert words(world) == ["a", "b"]
+
+
+async def test_where_nothing_is_replayed_the_interrupted_turn_is_over(tmp_path: Path, world: str) -> None:
+    async with running(tmp_path, "memory") as system:
+        ref = await system.start(clerk(recovery=hf.checkpoint_only()))
+        with pytest.raises(hf.AskFailed, match="replays nothing"):
+            await ref.ask(Do(world, ["a", "b"], dies_after=0), IN_TIME)
+        assert words(world) == ["a"]
+
+
+class Task(hf.Message[str]):
+    verb: str
+
+
+class Scattering(hf.Actor):
+    @hf.on(Task)
+    async def scatter(self, message: Task) -> str:
+        async def one() -> None:
+            await (self.ctx.effect(int, "3") if message.verb == "effect" else self.ctx.sleep(0.0))
+
+        try:
+            await asyncio.gather(one())
+        except hf.HoldfastError as error:
+            return str(error)
+        return "done"
+
+
+@pytest.mark.parametrize("verb", ["effect", "sleep"])
+async def test_a_task_beside_the_turn_has_none(verb: str) -> None:
+    """No replay could repeat it: to make it without a record would be worse than to refuse."""
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("scattering", hf.start(Scattering), recovery=hf.hybrid()))
+        assert "nor use ctx.effect or ctx.sleep" in await ref.ask(Task(verb))
+
+
+async def test_without_recovery_it_is_made_and_there_is_no_key(world: str) -> None:
+    class Plain(hf.Actor):
+        @hf.on(Do)
+        async def do(self, message: Do) -> str:
+            with pytest.raises(hf.HoldfastError, match="recovery"):
+                self.ctx.message_id  # noqa: B018  # it raises
+            with pytest.raises(hf.errors.EffectFailed, match=r"attempt 1: ValueError: invalid literal"):
+                await self.ctx.effect(int, "x")
+            return await self.ctx.effect(str.upper, "a")
+
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("plain", hf.start(Plain)))
+        assert await ref.ask(Do(world, [])) == "A"
+
+
+class Wrong(hf.Message[str]):
+    which: int
+
+
+class Strange(hf.Actor):
+    @hf.on(Wrong)
+    async def wrong(self, message: Wrong) -> str:
+        effect: Any = self.ctx.effect
+        calls: list[tuple[tuple[Any, ...], dict[str, Any]]] = [
+            ((3,), {}),
+            ((str,), {"timeout": 0}),
+            ((str,), {"timeout": float("nan")}),
+            ((str,), {"timeout": True}),
+            ((str,), {"retry": 3}),
+            ((str,), {"key": 3}),
+            ((str,), {"at_most_once": True, "retry": hf.Retry()}),
+        ]
+        args, options = calls[message.which]
+        try:
+            await effect(*args, **options)
+        except hf.SpecError as error:
+            return str(error)
+        return "nothing wrong"
+
+
+@pytest.mark.parametrize(
+    ("which", "says"),
+    list(enumerate(["function", "timeout", "timeout", "timeout", "retry", "key", "at most once"])),
+)
+@pytest.mark.parametrize("recovery", [hf.fresh(), hf.hybrid()])
+async def test_what_is_wrong_is_said_at_the_call(recovery: Any, which: int, says: str) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("strange", hf.start(Strange), recovery=recovery))
+        assert says in await ref.ask(Wrong(which))
+
+
+@pytest.mark.parametrize(
+    "options", [{"attempts": 0}, {"attempts": True}, {"backoff": 1.0}, {"on": ValueError}, {"on": (3,)}]
+)
+def test_a_wrong_retry_is_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(hf.SpecError, match=next(iter(options))):
+        hf.Retry(**options)
+
+
+class Sneak(hf.Message[str]): ...
+
+
+class Sneaky(hf.Actor):
+    """What its effect tells the actor would be no part of any turn."""
+
+    def __init__(self) -> None:
+        self.told = 0
+
+    @hf.on(Sneak)
+    async def sneak(self, message: Sneak) -> str:
+        async def tell() -> None:
+            self.ctx.ref.tell(Done())
+
+        try:
+            await self.ctx.effect(tell)
+        except hf.HoldfastError as error:
+            return str(error)
+        return "told"
+
+    @hf.on(Done)
+    def done(self, message: Done) -> list[str]:
+        self.told += 1
+        return []
+
+
+async def test_an_effect_may_not_send_in_the_name_of_the_actor() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("sneaky", hf.start(Sneaky), recovery=hf.hybrid()))
+        assert "may not send" in await ref.ask(Sneak())
+
+
+class Gather(hf.Message[list[str]]):
+    file: str
+    count: int
+    dies: bool = False
+
+
+class Gathering(Clerk):
+    @hf.on(Gather)
+    async def gather(self, message: Gather) -> list[str]:
+        works = [self.effect(message.file, f"a{number}") for number in range(message.count)]
+        said = await asyncio.gather(*works)
+        if message.dies and self.ctx.life == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return said
+
+
+async def test_many_at_once_are_each_made_once(tmp_path: Path, world: str) -> None:
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(
+            hf.child("clerk", hf.start(Gathering), isolation="process", recovery=hf.hybrid(interval=1000.0))
+        )
+        said = await ref.ask(Gather(world, 50, dies=True), IN_TIME)
+        assert said == [f"a{number}!" for number in range(50)]
+        assert sorted(words(world)) == sorted(f"a{number}" for number in range(50))

@@ -1,0 +1,94 @@
+"""Behind mechanisms an effect is made once for each request, by whoever leads; all other runs get the outcome."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.ftm import LFR, NVP, PBR, RB, TMR, TR
+from tests.effects.clerk import IN_TIME, Clerk, Do, Done, lines, words
+
+
+class Second(Clerk):
+    """Another version of it, which says so."""
+
+    @hf.on(Do)
+    async def do(self, message: Do) -> str:
+        said = [await self.attempted(message.file, word) for word in message.words]
+        self.done.append(f"second: {' '.join(said)}")
+        return self.done[-1]
+
+
+class Third(Clerk):
+    """A version that is no different."""
+
+
+def is_second(reply: object) -> bool:
+    """A test that the class itself never passes."""
+    return not isinstance(reply, str) or reply.startswith("second")
+
+
+STACKS: dict[str, tuple[Any, ...]] = {
+    "pbr": (PBR(),),
+    "lfr": (LFR(),),
+    "tmr": (TMR(),),
+    "tr": (TR(),),
+    "pbr + tr": (PBR(), TR()),
+    "lfr + tr": (LFR(), TR()),
+}
+WITH_VERSIONS: dict[str, tuple[Any, ...]] = {
+    "rb": (RB(alternates=(Second,), test=(is_second,)),),
+    "nvp": (NVP(versions=(Third, Second)),),
+}
+
+
+def protected(stack: tuple[Any, ...]) -> hf.ChildSpec[Clerk]:
+    return hf.child("clerk", hf.start(Clerk), recovery=hf.hybrid(), mechanism=stack)
+
+
+@pytest.mark.parametrize("name", [*STACKS, *WITH_VERSIONS])
+async def test_each_is_made_once_for_each_request(tmp_path: Path, name: str) -> None:
+    world = str(tmp_path / "world")
+    async with hf.ActorSystem("app", log=False, intensity=99) as system:
+        ref = await system.start(protected((STACKS | WITH_VERSIONS)[name]))
+        asked = [Do(world, [f"a{number}", f"thread{number}", f"b{number}:no"]) for number in range(8)]
+        said = await asyncio.gather(*(ref.ask(one, IN_TIME) for one in asked))
+        plain = [f"a{number}! thread{number}! (No(why='b{number}'))" for number in range(8)]
+        assert said == ([f"second: {one}" for one in plain] if name == "rb" else plain)
+        if name != "rb":
+            assert await ref.ask(Done(), IN_TIME) == plain
+    assert words(world) == [f"{word}{number}" for number in range(8) for word in ("a", "thread", "b")]
+    assert len({line.split()[1] for line in lines(world)}) == 8
+
+
+@pytest.mark.parametrize("name", ["pbr", "lfr", "tmr", "lfr + tr"])
+@pytest.mark.parametrize("word", ["b", "once"])
+async def test_whoever_leads_next_goes_on_where_the_last_one_has_died(tmp_path: Path, name: str, word: str) -> None:
+    """It dies in the middle of the effect: that is made again with the same key, or is in doubt."""
+    world = str(tmp_path / "world")
+    async with hf.ActorSystem("app", log=False, intensity=99) as system:
+        ref = await system.start(protected(STACKS[name]))
+        await whole(system, ref)
+        said = await ref.ask(Do(world, ["a", f"{word}:die", "c"]), IN_TIME)
+        again = await ref.ask(Done(), IN_TIME)
+        await whole(system, ref)
+        assert await ref.ask(Done(), IN_TIME) == again == [said]
+    if word == "b":
+        assert said == "a! b! c!"
+        assert words(world) == ["a", "b", "b", "c"]
+    else:
+        assert said.startswith("a! (/app/clerk has ended while its effect deed was out")
+        assert said.endswith(" c!")
+        assert words(world) == ["a", "once", "c"]
+    assert len({line.split()[1] for line in lines(world)}) == 1
+
+
+async def whole(system: hf.ActorSystem, ref: hf.ActorRef[Clerk]) -> None:
+    """Wait until all replicas count."""
+    async with asyncio.timeout(IN_TIME):
+        while not (await system.protection(ref)).is_whole:
+            await asyncio.sleep(0.01)
