@@ -74,23 +74,26 @@ class Effect:
             EffectFailed: the last attempt has raised, or has taken too long.
             HoldfastError: the function has raised one itself: that is its answer, and is not attempted again.
         """
-        numbers = random.Random(seed)
+        numbers: random.Random | None = None
         attempt = 0
         while True:
             attempt += 1
+            limit = asyncio.timeout(self.timeout)
             try:
-                async with asyncio.timeout(self.timeout) as limit:
-                    if self.is_async:
-                        return await self.function(*self.args)
-                    return await in_thread(self.function, *self.args)
+                work = self.function(*self.args) if self.is_async else in_thread(self.function, *self.args)
+                if self.timeout is None:
+                    return await work
+                async with limit:
+                    return await work
             except HoldfastError:
                 raise
             except Exception as error:
                 kind, text = type_name(type(error)), error_text(error)
-                if limit.expired() and isinstance(error, TimeoutError):
+                if self.timeout is not None and limit.expired() and isinstance(error, TimeoutError):
                     text = f"it took longer than {self.timeout:g} s"
                 if attempt >= self.retry.attempts or not isinstance(error, self.retry.on):
                     raise EffectFailed(self.key, attempt, kind, text) from error
+            numbers = numbers or random.Random(seed)
             await asyncio.sleep(self.retry.backoff.delay(attempt - 1, numbers))
 
 

@@ -380,10 +380,10 @@ class Switch:
                 self.cell.kill()
 
     def _released(self, record: Released) -> None:
-        batch = Batch()
+        batch, known = Batch(), len(self.ledger.released)
         self._take(record.turn, record.id, record.outs, batch)
-        if record.turn > self.ledger.turn:
-            self.note(record.turn, self.ledger.released_entry(record.turn), batch)
+        if record.turn > self.ledger.turn and len(self.ledger.released) > known:
+            self.note(record.turn, self.ledger.released_entry(record.turn, known), batch)
         batch.commit(self.journal)
 
     def _take(self, turn: int, key: int, outs: list[Out], batch: Batch) -> None:

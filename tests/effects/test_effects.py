@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from tests.effects.clerk import IN_TIME, Clerk, Do, Done, clerk, lines, words
+from tests.checkpoint.test_commits import Slow
+from tests.effects.clerk import IN_TIME, Clerk, Do, Done, clerk, deed, lines, words
 
 
 @pytest.fixture
@@ -269,3 +270,85 @@ async def test_many_at_once_are_each_made_once(tmp_path: Path, world: str) -> No
         said = await ref.ask(Gather(world, 50, dies=True), IN_TIME)
         assert said == [f"a{number}!" for number in range(50)]
         assert sorted(words(world)) == sorted(f"a{number}" for number in range(50))
+
+
+class Begin(hf.Message[int]): ...
+
+
+async def test_an_effect_waits_until_all_before_it_is_safe(tmp_path: Path) -> None:
+    engine, goes_on, made = Slow(tmp_path / "app.db"), asyncio.Event(), list[str]()
+    engine.let_sync.set()
+
+    async def make() -> int:
+        made.append("made")
+        return 1
+
+    class Careful(hf.Actor):
+        @hf.on(Begin)
+        async def begin(self, message: Begin) -> int:
+            await goes_on.wait()
+            return await self.ctx.effect(make)
+
+    options: dict[str, Any] = {"store": engine, "durability": "fsync", "log": False}
+    async with hf.ActorSystem("app", **options) as system:
+        ref = await system.start(hf.child("careful", hf.start(Careful), recovery=hf.hybrid(interval=1000.0)))
+        asked = ref.ask(Begin(), IN_TIME)
+        async with asyncio.timeout(IN_TIME):
+            while not goes_on._waiters:  # type: ignore[attr-defined]  # that its turn has come so far
+                await asyncio.sleep(0.001)
+        engine.let_sync.clear()  # From here on nothing becomes safe.
+        goes_on.set()
+        done, _ = await asyncio.wait([asked], timeout=0.2)
+        assert (done, made) == (set(), [])
+        engine.let_sync.set()
+        assert await asked == 1
+        assert made == ["made"]
+
+
+class Leave(hf.Message[int]):
+    file: str
+
+
+class Leaving(Clerk):
+    @hf.on(Leave)
+    async def leave(self, message: Leave) -> int:
+        left = self.ctx.effect(deed, message.file, "left:slow", self.ctx.message_id)
+        await self.ctx.effect(deed, message.file, "other", self.ctx.message_id)
+        left.cancel()
+        return 1
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_what_a_turn_has_left_without_an_outcome_is_not_made_by_its_replay(
+    tmp_path: Path, world: str, isolation: Any
+) -> None:
+    async with running(tmp_path, "memory") as system:
+        spec = hf.child("clerk", hf.start(Leaving), isolation=isolation, recovery=hf.hybrid(interval=1000.0))
+        ref = await system.start(spec)
+        assert await ref.ask(Leave(world), IN_TIME) == 1
+        await crash(system)
+        assert await ref.ask(Done(), IN_TIME) == []
+    assert words(world) == ["left", "other"]
+
+
+async def test_an_effect_ends_when_its_handler_does_not_wait_any_more() -> None:
+    ends = asyncio.Event()
+
+    async def endless() -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            ends.set()
+
+    class Hasty(hf.Actor):
+        @hf.on(Begin)
+        async def begin(self, message: Begin) -> int:
+            effect = self.ctx.effect(endless)
+            await self.ctx.sleep(0.01)
+            effect.cancel()
+            return 1
+
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("hasty", hf.start(Hasty), recovery=hf.hybrid(interval=1000.0)))
+        assert await ref.ask(Begin(), IN_TIME) == 1
+        await asyncio.wait_for(ends.wait(), IN_TIME)

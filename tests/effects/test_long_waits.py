@@ -96,15 +96,17 @@ async def test_the_message_that_has_waited_longest_is_taken_from_the_mailbox(
     """Before all that came earlier; whoever has asked hears that it was taken."""
     async with running(tmp_path) as system:
         ref = await system.start(patient(isolation, mailbox=mailbox))
-        asked = ref.ask(Go(["s0.1", "c", "c", "c"]), IN_TIME)
-        count = ref.ask(Count(), IN_TIME)
-        ref.tell(Call("first"))
-        second = ref.ask(Call("second"), IN_TIME)
-        ref.tell(Never())
-        assert await asked == "slept, call first, call second, never"
-        await second
-        assert await count == 1
-        assert await ref.ask(Look(), IN_TIME) == ["slept, call first, call second, never"]
+        with system.events() as stream:
+            asked = ref.ask(Go(["s0.1", "c", "c", "c"]), IN_TIME)
+            count = ref.ask(Count(), IN_TIME)
+            ref.tell(Call("first"))
+            second = ref.ask(Call("second"), IN_TIME)
+            ref.tell(Never())
+            assert await asked == "slept, call first, call second, never"
+            await second
+            assert await count == 1
+            assert await ref.ask(Look(), IN_TIME) == ["slept, call first, call second, never"]
+            assert not [event for event in stream.take() if isinstance(event, hf.events.ActorCrashed)]
 
 
 @pytest.mark.parametrize("isolation", ["task", "process"])
@@ -172,6 +174,19 @@ async def test_a_turn_goes_on_in_the_next_program(tmp_path: Path, isolation: str
         ref.tell(Call("b"))
         assert await ref.ask(Look(), IN_TIME) == ["effect 1, call a, slept, call b"]
         assert len(lines(world)) == 1
+
+
+async def test_a_turn_that_is_over_waits_for_nothing(tmp_path: Path) -> None:
+    """With the method that replays nothing it is over when the life is."""
+    async with running(tmp_path) as system:
+        ref = await system.start(patient(recovery=hf.checkpoint_only()))
+        asked = ref.ask(Go(["c"]), IN_TIME)
+        await waits(system)
+        ref.kill()
+        with pytest.raises(hf.AskFailed, match="replays nothing"):
+            await asked
+        await ref.ask(Call("a"), IN_TIME)
+        assert await ref.ask(Look(), IN_TIME) == ["no turn has waited for a"]
 
 
 # -- refusals --------------------------------------------------------------------------------------------------------
