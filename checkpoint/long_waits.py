@@ -26,6 +26,8 @@ Place = tuple[int, int]
 class LongWaits:
     """What the turn in hand at one home waits for. It ends with the life; the next one's turn waits again."""
 
+    __slots__ = ("_clocks", "_home", "wanted")
+
     def __init__(self, home: Switch) -> None:
         self._home = home
         self._clocks: dict[Place, asyncio.TimerHandle] = {}

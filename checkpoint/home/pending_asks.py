@@ -131,8 +131,7 @@ class PendingCalls:
 
     Attributes:
         asks: asks of its own turns, by (turn, output).
-        sends: sends and publications of its own turns whose receivers have no room yet.
-        effects: effects of its own turns that were ordered, and have no outcome.
+        sends: sends and publications of its own turns whose receivers have no room yet, and effects that are out.
         later: asks of others that are to be answered later, by input.
         owed: the same as read back from the store: asker and origin.
     """
@@ -141,7 +140,6 @@ class PendingCalls:
         self._home = home
         self.asks: dict[tuple[int, int], SwitchAsk] = {}
         self.sends: set[tuple[int, int]] = set()
-        self.effects: set[tuple[int, int]] = set()
         self.later: dict[int, Ask] = {}
         self.owed: dict[int, tuple[str, str]] = {}
 
@@ -202,13 +200,13 @@ class PendingCalls:
     def order(self, turn: int, k: int) -> None:
         """Have the present life perform an effect: all that precedes it is safe."""
         if self._home.life.port is not None:
-            self.effects.add((turn, k))
+            self.sends.add((turn, k))
             self._home.life.port.to_life(Perform(turn, k))
 
     def performed(self, record: Performed) -> None:
         """An effect that was ordered has come to something."""
-        if (record.turn, record.k) in self.effects:
-            self.effects.remove((record.turn, record.k))
+        if (record.turn, record.k) in self.sends:
+            self.sends.remove((record.turn, record.k))
             self.outcome(record.turn, record.k, record.answer, None)
 
     def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None, taken: int = -1) -> None:
@@ -229,7 +227,6 @@ class PendingCalls:
             ask.is_over, ask.future = True, OVER
         self.asks.clear()
         self.sends.clear()
-        self.effects.clear()
         self._home.long_waits.abandon()
 
     def sent(self, turn: int, k: int, error: HoldfastError | None) -> None:

@@ -279,9 +279,8 @@ class RecordedContext(ActorContext):
     def _rest(self, verb: str, name: str, until: float, kinds: dict[str, type[Message[Any]]]) -> asyncio.Future[Any]:
         """Wait for what the home waits for: nothing of it is out."""
         life, outcome = self.recorded, self._awaited(verb, "", name, until, kinds)
-        resting = life.resting
-        resting.add(outcome)
-        outcome.add_done_callback(resting.discard)
+        life.resting += 1
+        outcome.add_done_callback(life.rested)
         return outcome
 
     def _slept(self, until: float) -> asyncio.Future[None]:

@@ -7,6 +7,7 @@ already. Only time and randomness come from the input instead of the world.
 from __future__ import annotations
 
 import asyncio
+import functools
 import hashlib
 import time
 import types
@@ -108,7 +109,7 @@ class Life:
         self.asks: dict[tuple[int, int], tuple[asyncio.Future[Any], Awaited]] = {}
         self.pipes = 0
         self.moment = 0.0  # until which the turn in hand has waited
-        self.resting: set[asyncio.Future[Any]] = set()  # the moments and messages that it waits for
+        self.resting = 0  # how many moments and messages it waits for
         self.stash: list[Fed] = []
         self.returned: dict[int, Fed] = {}
         self.is_live = False
@@ -281,9 +282,7 @@ class Life:
             self.turn += 1
         if self.returned:
             self.returned.pop(feed.id, None)  # It has come again: its feed may have been here before it was put back.
-        self.feed, self.outs, self.last_k, self.moment = feed, [], 0, 0.0
-        if self.resting:
-            self.resting = set()
+        self.feed, self.outs, self.last_k, self.moment, self.resting = feed, [], 0, 0.0, 0
         if self.page is not None:
             self.page[0] = feed.id + 1
 
@@ -335,6 +334,19 @@ class Life:
             if self.returned:
                 self.handle_returned()
 
+    def leave_turn(self, reason: ExitReason) -> bool:
+        """End in the middle of a turn that rests, for that may be for days: the next life's goes on. False: none does.
+
+        There is no snapshot of such a moment, and `on_stop` is not called in it.
+        """
+        turn = None if self.cell.more is None else self.cell.more.turn
+        if not self.resting or turn is None or turn.then is not None:
+            return False
+        self.feed, self.outs = None, []  # What its handler says while it is cancelled does not count.
+        turn.then = functools.partial(lifecycle.finish, self.cell, reason, is_orderly=False)
+        turn.runner.task.cancel()
+        return True
+
     def ignore(self, why: str) -> None:
         """The actor does not want to be started: turn 0 stays open for the next start."""
         self.feed, self.outs, self.stage.ignored_why = None, [], why
@@ -383,6 +395,10 @@ class Life:
         else:
             self.outs.append(out)
         return k
+
+    def rested(self, _: asyncio.Future[Any]) -> None:
+        """Something has come that a turn has waited for, perhaps an earlier one."""
+        self.resting = max(0, self.resting - 1)
 
     def enter(self, hook: str) -> None:
         """A hook begins that is no turn."""
@@ -621,7 +637,7 @@ class LifePlace(lifecycle.HerePlace):
         self.life = life
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
-        if cell.state is RUNNING and self.life is not None:
+        if cell.state is RUNNING and self.life is not None and not self.life.leave_turn(reason):
             cell.urge(StopRecorded(self.life, reason))
 
 

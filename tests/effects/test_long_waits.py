@@ -160,13 +160,14 @@ async def test_a_turn_waits_on_whatever_ends(tmp_path: Path, isolation: str, dur
 
 @pytest.mark.parametrize("isolation", ["task", "process"])
 async def test_a_turn_goes_on_in_the_next_program(tmp_path: Path, isolation: str) -> None:
+    """An orderly stop does not wait for it, however long it may."""
     world = str(tmp_path / "world")
     async with running(tmp_path, "os") as system:
-        ref = await system.start(patient(isolation, shutdown=0.05))
+        ref = await system.start(patient(isolation, shutdown="infinity"))
         ref.tell(Go(["e", "c", "s0.3", "c"], world))
         await waits(system)
     async with running(tmp_path, "os") as system:
-        ref = await system.start(patient(isolation, shutdown=0.05))
+        ref = await system.start(patient(isolation, shutdown="infinity"))
         await ref.ask(Call("a"), IN_TIME)
         await waits(system)
     async with running(tmp_path, "os") as system:
