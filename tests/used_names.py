@@ -8,22 +8,10 @@ import ast
 import doctest
 import importlib
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 
+from tests.public_docs import ROOMS
 from tests.test_docs import DOCUMENTS, MODULES, ROOT, program, python_blocks, source_of
 
-ROOMS = (
-    "holdfast",
-    "holdfast.adapters",
-    "holdfast.checkpoint",
-    "holdfast.diagnosis",
-    "holdfast.errors",
-    "holdfast.events",
-    "holdfast.ftm",
-    "holdfast.supervision",
-    "holdfast.system",
-    "holdfast.testing",
-)
 NOTHING = object()
 
 
