@@ -204,7 +204,7 @@ class SafeStateOverdue(Event, frozen=True, eq=False):
 
 
 class HeldMessages(Event, frozen=True, eq=False):
-    """While an actor was recovered, messages came: `held` wait for it, `dropped` and `refused` by its held policy."""
+    """Messages came while an actor was recovered whose method has `held=`: how many wait for it, and what became of more."""
 
     held: int
     dropped: int
