@@ -204,7 +204,7 @@ class SafeStateOverdue(Event, frozen=True, eq=False):
 
 
 class HeldMessages(Event, frozen=True, eq=False):
-    """Messages came while an actor was recovered whose method has `held=`: how many wait for it, and what became of more."""
+    """Messages came while an actor was recovered whose method has `held=`: how many wait, and what became of more."""
 
     held: int
     dropped: int

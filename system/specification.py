@@ -274,7 +274,7 @@ class Specifications:
         try:
             return (None if spec is None else self._packer.pack(spec)), ""
         except UnsavableValue as error:  # Its own text is for the state of an actor.
-            return None, f"{error.where}: {error.problem} cannot be stored; give what it is made from to the actor instead"
+            return None, f"{error.where}: {error.problem} cannot be stored; give the actor what it is made from"
         except HoldfastError as error:
             return None, str(error)
 

@@ -260,7 +260,7 @@ async def test_what_cannot_be_stored_is_told_and_the_next_root_begins_as_the_pro
         assert told.address == "/app/left"
         assert told.why == (
             "child 'y'.fields['start'].args[0]: a value of type function cannot be stored; "
-            "give what it is made from to the actor instead"
+            "give the actor what it is made from"
         )
     async with program(tmp_path / "store") as system:
         assert system._node.find("/app/left/x") is None
