@@ -331,7 +331,7 @@ class TurnSlow(Event, frozen=True, eq=False):
 
 
 class LoopLagged(Event, frozen=True, eq=False):
-    """The event loop of a node (`address`) came `seconds` late to what was due."""
+    """The event loop of the root process came `seconds` late to what was due; `address` is the root's."""
 
     seconds: float
 
