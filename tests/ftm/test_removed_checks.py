@@ -30,6 +30,13 @@ CHECKS = {
         PBR,
         "test_lower_epochs",
     ),
+    "who is alone again says so again": Check(
+        "ftm/bricks/standing.py",
+        '        self.state, self.missed_by = "live", ""\n',
+        '        self.state = "live"\n',
+        PBR,
+        "test_who_is_alone_again",
+    ),
     "what was replayed is decided before `on_recovered` is called": Check(
         "ftm/bricks/bricks.py",
         "            is_replay = go is not None and",
