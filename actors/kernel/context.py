@@ -394,8 +394,8 @@ class ActorContext:
     def sleep_until(self, when: float) -> asyncio.Future[None]:
         """Have the turn in hand wait until a moment, be it days away.
 
-        In an actor with recovery the wait outlives its process, and with a durable store the program: the handler is
-        run again from its start, and gets the outcomes that it had. No other message is handled meanwhile.
+        In an actor whose recovery replays, the wait outlives its process, and with a durable store the program: the
+        handler is run again from its start, and gets the outcomes that it had. No other message is handled meanwhile.
 
         Args:
             when: Unix time in seconds; a moment that has passed ends the wait at once.

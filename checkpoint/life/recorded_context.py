@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import msgspec
 
 from ...actors.effects import Effect
-from ...actors.errors import ControlFailed, HoldfastError, remote_crash
+from ...actors.errors import BadMessage, BadReply, ControlFailed, EffectFailed, HoldfastError, error_text, remote_crash, type_name
 from ...actors.exit_reasons import NORMAL, ExitReason
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import Cell
@@ -307,9 +307,24 @@ class RecordedContext(ActorContext):
             said = msgspec.msgpack.encode((node.clock.wall(), encode_value(value, where=f"the result of {effect.key}")))
             answer = Answer(REPLY, "", said)
         except Exception as error:
-            answer = life.answer_error(error)
-        if not self._closed and (turn, k) in life.asks:
+            answer = self._kept(effect, error)
+        if self._closed or (turn, k) not in life.asks:
+            return
+        try:
             life.port.to_home(Performed(turn, k, answer))
+        except BadMessage as error:
+            why = f"what it has returned is too large to leave its process: {error.problem}; return where it is instead"
+            life.port.to_home(Performed(turn, k, self._kept(effect, BadReply(effect.key, why))))
+
+    def _kept(self, effect: Effect, error: Exception) -> Answer:
+        """An error as the outcome of an effect, or why it cannot be one."""
+        text = error_text(error)
+        try:
+            if isinstance(error, HoldfastError):
+                return self.recorded.answer_error(error)
+        except Exception as problem:  # It has fields of the user's own, of whatever types.
+            text = f"what it has raised cannot be kept: {error_text(problem)}"
+        return self.recorded.answer_error(EffectFailed(effect.key, 1, type_name(type(error)), text))
 
     # -- stash, links, subscriptions --------------------------------------------------------------------------------
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -352,3 +353,72 @@ async def test_an_effect_ends_when_its_handler_does_not_wait_any_more() -> None:
         ref = await system.start(hf.child("hasty", hf.start(Hasty), recovery=hf.hybrid(interval=1000.0)))
         assert await ref.ask(Begin(), IN_TIME) == 1
         await asyncio.wait_for(ends.wait(), IN_TIME)
+
+
+class Rotten(BaseException):
+    def __str__(self) -> str:
+        raise KeyboardInterrupt
+
+
+class Locked(hf.Refusal):
+    what: object
+
+
+RAISED: dict[str, tuple[Any, str]] = {
+    "exit": (lambda: SystemExit(3), "SystemExit: 3"),
+    "interrupt": (lambda: KeyboardInterrupt(), "KeyboardInterrupt"),
+    "cancelled": (lambda: asyncio.CancelledError("inside"), "CancelledError: inside"),
+    "generator exit": (lambda: GeneratorExit(), "GeneratorExit"),
+    "base": (lambda: BaseException("base"), "BaseException: base"),
+    "group": (lambda: BaseExceptionGroup("two", [SystemExit(), ValueError()]), "BaseExceptionGroup: two"),
+    "no text": (lambda: Rotten(), "Rotten: <its text cannot be shown: KeyboardInterrupt>"),
+    "no refusal": (lambda: Locked(threading.Lock()), "what it has raised cannot be kept"),
+    "stop": (lambda: StopIteration(3), "StopIteration"),
+    "too large": (None, "too large to leave its process"),
+}
+
+
+def explode(name: str) -> bytes:
+    """Raise that, or return too much for one frame."""
+    made = RAISED[name][0]
+    if made is None:
+        return bytes(200_000_000)
+    raise made()
+
+
+async def explode_async(name: str) -> bytes:
+    """The same, awaited."""
+    return explode(name)
+
+
+class Explode(hf.Message[str]):
+    name: str
+    is_async: bool
+
+
+class Exploding(Clerk):
+    @hf.on(Explode)
+    async def explode(self, message: Explode) -> str:
+        try:
+            value = await self.ctx.effect(explode_async if message.is_async else explode, message.name)
+        except hf.HoldfastError as error:
+            return str(error)
+        return f"{len(value)} bytes"
+
+
+@pytest.mark.parametrize("is_async", [True, False])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("name", RAISED)
+async def test_whatever_an_effect_raises_is_its_outcome(name: str, isolation: Any, is_async: bool) -> None:
+    """The turn gets it, and neither hangs nor ends its actor; nor does the program end."""
+    async with hf.ActorSystem("app", log=False) as system:
+        spec = hf.child("clerk", hf.start(Exploding), isolation=isolation, recovery=hf.hybrid(interval=1000.0))
+        ref = await system.start(spec)
+        with system.events() as stream:
+            said = await ref.ask(Explode(name, is_async), IN_TIME)
+            if (name, isolation) == ("too large", "task"):
+                assert said == "200000000 bytes"
+            else:
+                assert RAISED[name][1] in said
+            assert await ref.ask(Done(), IN_TIME) == []
+            assert not [event for event in stream.take() if isinstance(event, hf.events.ActorCrashed)]
