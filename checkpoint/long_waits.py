@@ -9,7 +9,7 @@ import msgspec
 
 from ..actors.errors import WaitTimeout
 from .inputs import Batch, Input
-from .protocol import MESSAGE, MOMENT, REPLY, Answer, Out
+from .protocol import MESSAGE, MOMENT, REPLY, Answer, Out, timed
 
 if TYPE_CHECKING:
     from .home.switch import Switch
@@ -70,9 +70,9 @@ class LongWaits:
         """The message is no input any more, but an outcome of the turn, in one append."""
         home, batch = self._home, Batch()
         self._forget(place)
-        said = msgspec.msgpack.encode((home.node.clock.wall(), source.body))
         home.end_without_turn(source, HAD if source.ask is not None else Answer(), batch)
-        home.calls.outcome(*place, Answer(MESSAGE, source.name, said), batch, taken=source.id)
+        outcome = timed(Answer(MESSAGE, source.name, source.body), home.node.clock.wall())
+        home.calls.outcome(*place, outcome, batch, taken=source.id)
         batch.commit(home.journal)
 
     def _look(self, place: Place, when: float) -> None:
@@ -85,10 +85,10 @@ class LongWaits:
         names = self.wanted.get(place)
         self._forget(place)
         if names is None:
-            answer = Answer(MOMENT, "", msgspec.msgpack.encode(now))
+            answer = Answer(MOMENT)
         else:
             answer = Answer(*home.node.codec.encode_error(WaitTimeout(home.path, " or ".join(names))))
-        home.calls.outcome(*place, answer, None)
+        home.calls.outcome(*place, timed(answer, now), None)
 
     def _forget(self, place: Place) -> None:
         clock = self._clocks.pop(place, None)

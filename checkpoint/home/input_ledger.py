@@ -221,6 +221,12 @@ class InputLedger:
             cause = f"the reply to {past.input.name} is not what it was before the crash; {DIVERGES}"
             raise ReplayDiverged(self.path, number, seen + 1, cause)
 
+    def digest_of(self, turn: int, k: int) -> int:
+        """The digest of what was output (turn, k) before; 0: that is not known any more."""
+        past = self.turns.get(turn)
+        digests = self.released if turn > self.turn else past.digests if past is not None else []
+        return digests[k - 1] if k <= len(digests) else 0
+
     def note_outcome(self, turn: int, k: int, answer: Answer) -> bool:
         """Keep the outcome of the ask that was output (turn, k); False if no replay will want it."""
         if turn <= self.state_turn:

@@ -13,7 +13,7 @@ from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, ReplyHandle
 from ...actors.process.wire.peer import RelayedAsk
 from ..inputs import Batch, Input
-from ..protocol import REPLY, Answer, Out, Outcome, Perform, Performed
+from ..protocol import REPLY, Answer, Out, Outcome, Perform, Performed, timed
 from ..schema import shape_name
 from .input_ledger import outcome_entry
 
@@ -191,7 +191,8 @@ class PendingCalls:
         if turn <= home.ledger.turn:
             return  # Its turn has ended without waiting for it, and does so again.
         if out.name:
-            self.outcome(turn, out.k, Answer(*home.node.codec.encode_error(EffectInDoubt(home.path, out.to))), None)
+            doubt = Answer(*home.node.codec.encode_error(EffectInDoubt(home.path, out.to)))
+            self.outcome(turn, out.k, timed(doubt, home.node.clock.wall()), None)
             return
         source = home.ledger.open.get(key)
         home.node.emit(EffectRepeated(home.path, out.to, "" if source is None else source.name))
@@ -207,7 +208,7 @@ class PendingCalls:
         """An effect that was ordered has come to something."""
         if (record.turn, record.k) in self.sends:
             self.sends.remove((record.turn, record.k))
-            self.outcome(record.turn, record.k, record.answer, None)
+            self.outcome(record.turn, record.k, timed(record.answer, self._home.node.clock.wall()), None)
 
     def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None, taken: int = -1) -> None:
         """An ask of ours has its outcome: journal it, then tell the turn that waits. `taken`: the input that it was."""
@@ -242,4 +243,4 @@ class PendingCalls:
 
     def _tell(self, turn: int, k: int, answer: Answer, taken: int = -1) -> None:
         if self._home.life.port is not None:
-            self._home.life.port.to_life(Outcome(turn, k, answer, taken))
+            self._home.life.port.to_life(Outcome(turn, k, answer, taken, self._home.ledger.digest_of(turn, k)))

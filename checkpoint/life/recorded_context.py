@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import msgspec
 
 from ...actors.effects import Effect
-from ...actors.errors import BadMessage, BadReply, ControlFailed, EffectFailed, HoldfastError, error_text, remote_crash, type_name
+from ...actors.errors import (
+    BadMessage,
+    BadReply,
+    ControlFailed,
+    EffectFailed,
+    HoldfastError,
+    error_text,
+    remote_crash,
+    type_name,
+)
 from ...actors.exit_reasons import NORMAL, ExitReason
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import Cell
@@ -304,8 +313,7 @@ class RecordedContext(ActorContext):
         node, life = self._cell.node, self.recorded
         try:
             value = await effect.perform(node.threads.run, node.numbers.next_seed())
-            said = msgspec.msgpack.encode((node.clock.wall(), encode_value(value, where=f"the result of {effect.key}")))
-            answer = Answer(REPLY, "", said)
+            answer = Answer(REPLY, "", encode_value(value, where=f"the result of {effect.key}"))
         except Exception as error:
             answer = self._kept(effect, error)
         if self._closed or (turn, k) not in life.asks:

@@ -14,8 +14,6 @@ import types
 from collections.abc import Callable, Coroutine, Generator
 from typing import Any, Final, NoReturn, Protocol, TypeAlias, TypeVar
 
-import msgspec
-
 from ...actors.effects import Effect
 from ...actors.errors import ActorStopped, BadMessage, BadReply, ControlFailed, HoldfastError, StartFailed, remote_crash
 from ...actors.exit_reasons import ExitReason
@@ -56,6 +54,7 @@ from ..protocol import (
     TurnEnd,
     Unsaved,
     pieces,
+    untimed,
 )
 from ..snapshot.image_writer import Imaging
 from ..snapshot.key_variables import StateMismatch, check_keys, restore_state, save_state, variables
@@ -240,8 +239,9 @@ class Life:
         future, kind = waiting
         if future.done():
             return
-        answer = record.answer
         try:
+            answer, when = untimed(record.answer)
+            self.moment = max(self.moment, when)
             if answer.kind in (REPLY, MESSAGE, MOMENT):
                 future.set_result(self._result(answer, kind))
             else:
@@ -251,19 +251,14 @@ class Life:
             future.set_exception(BadReply(name, str(error)))
 
     def _result(self, answer: Answer, awaited: Awaited) -> object:
-        """What a turn gets that has waited; its clock moves on to when that came, if it may have waited for long."""
-        codec = self.cell.node.codec
-        if awaited is None:
-            return None  # a `send` that was accepted
-        if isinstance(awaited, type):
-            return codec.decode_reply(awaited, answer.body)
-        if answer.kind == MOMENT:
-            self.moment = msgspec.msgpack.decode(answer.body, type=float)
+        """What a turn gets that has waited."""
+        if awaited is None or answer.kind == MOMENT:
             return None
-        self.moment, body = msgspec.msgpack.decode(answer.body, type=tuple[float, bytes])
+        if isinstance(awaited, type):
+            return self.cell.node.codec.decode_reply(awaited, answer.body)
         if isinstance(awaited, Effect):
-            return decode_value(body)
-        return codec.decode(awaited[answer.name], body)
+            return decode_value(answer.body)
+        return self.cell.node.codec.decode(awaited[answer.name], answer.body)
 
     def _perform(self, turn: int, k: int) -> None:
         """An effect of the turn in hand has no outcome yet."""

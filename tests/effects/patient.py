@@ -52,6 +52,7 @@ class Patient(hf.Actor):
                     said.append(f"call {call.word}" if isinstance(call, Call) else "never")
                 except hf.errors.WaitTimeout as error:
                     said.append(str(error))
+                    assert self.ctx.now() >= begin + float(step[1:])
         self.seen.append(", ".join(said))
         return self.seen[-1]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import signal
 import threading
@@ -13,7 +14,7 @@ import pytest
 
 import holdfast as hf
 from tests.checkpoint.test_commits import Slow
-from tests.effects.clerk import IN_TIME, Clerk, Do, Done, clerk, deed, lines, words
+from tests.effects.clerk import IN_TIME, Clerk, Do, Done, No, clerk, deed, lines, words
 
 
 @pytest.fixture
@@ -304,6 +305,35 @@ async def test_an_effect_waits_until_all_before_it_is_safe(tmp_path: Path) -> No
         engine.let_sync.set()
         assert await asked == 1
         assert made == ["made"]
+
+
+class Hours(hf.Message[float]): ...
+
+
+class Late(hf.Actor):
+    @hf.on(Hours)
+    async def late(self, message: Hours) -> float:
+        begin = self.ctx.now()
+        for how in ("passes", "fails", "refuses"):
+            with contextlib.suppress(hf.HoldfastError):
+                await self.ctx.effect(an_hour, how)
+        await self.ctx.sleep(3600.0)
+        return self.ctx.now() - begin
+
+
+async def an_hour(how: str) -> None:
+    await asyncio.sleep(3600.0)
+    if how == "fails":
+        raise ConnectionError
+    if how == "refuses":
+        raise No("not today")
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_the_clock_of_a_turn_moves_on_whatever_its_effects_come_to() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("late", hf.start(Late), recovery=hf.hybrid(interval=1e6)))
+        assert await ref.ask(Hours(), 5 * 3600.0) == pytest.approx(4 * 3600.0, abs=1.0)
 
 
 class Leave(hf.Message[int]):

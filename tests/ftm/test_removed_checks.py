@@ -16,6 +16,13 @@ SPOILED = "tests/ftm/test_spoiled_states.py"
 RANDOM_HOOKS = "tests/ftm/test_random_hooks.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 CHECKS = {
+    "an alternate gets the outcome of no other effect": Check(
+        "ftm/bricks/runs.py",
+        "is_alike = asked == out.digest() if sent is None",
+        "is_alike = asked != 0 if sent is None",
+        "tests/effects/test_effects_protected.py",
+        "test_an_alternate_gets_the_outcome_of_its_own",
+    ),
     "T36: a batch of an earlier epoch is refused": Check(
         "ftm/bricks/request_protocol.py",
         "        if work.epoch != standing.epoch or work.config",
