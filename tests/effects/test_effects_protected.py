@@ -11,6 +11,7 @@ import pytest
 import holdfast as hf
 from holdfast.ftm import LFR, NVP, PBR, RB, TMR, TR
 from tests.effects.clerk import IN_TIME, Clerk, Do, Done, deed, lines, words
+from tests.effects.patient import Go, Patient
 
 
 class Second(Clerk):
@@ -139,3 +140,16 @@ async def whole(system: hf.ActorSystem, ref: hf.ActorRef[Clerk]) -> None:
     async with asyncio.timeout(IN_TIME):
         while not (await system.protection(ref)).is_whole:
             await asyncio.sleep(0.01)
+
+
+WATCHED = hf.ftm.Detection(interval=0.02, watch_turns=0.2)
+
+
+@pytest.mark.parametrize("mechanism", [PBR(detection=WATCHED), TR(detection=WATCHED)])
+async def test_a_turn_that_rests_is_not_taken_for_one_that_hangs(mechanism: Any) -> None:
+    async with hf.ActorSystem("app", log=False, intensity=99) as system:
+        spec = hf.child("patient", hf.start(Patient), recovery=hf.hybrid(), mechanism=mechanism)
+        ref = await system.start(spec)
+        with system.events() as stream:
+            assert await ref.ask(Go(["s1.5"]), IN_TIME) == "slept"
+            assert not [event for event in stream.take() if isinstance(event, hf.events.TurnHung)]
