@@ -23,7 +23,7 @@ from tests.effects.effect_player import WORKERS, program
 
 ROOTS = (str(Path(holdfast.__file__).parents[1]), str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))
 PATHS = os.pathsep.join(filter(None, ROOTS))
-KILLS = int(os.environ.get("HOLDFAST_EFFECTS", "16"))
+KILLS = int(os.environ.get("HOLDFAST_EFFECTS", "8"))
 SEED = int(os.environ.get("HOLDFAST_SEED", "20261126"))
 ROUND = 4
 """Kills of one store, before it is looked at what has happened."""
