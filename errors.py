@@ -61,7 +61,7 @@ from .supervision.admin import (
 )
 from .supervision.arbiter import GrantLost, InOtherHands
 from .supervision.services.program import InputRefused
-from .supervision.services.registrar import KeyTaken, NotAnActor, NotUnique
+from .supervision.services.registrar import NotAnActor, NotUnique
 from .supervision.services.registry import AlreadyRegistered
 from .supervision.services.router import NoRoute
 from .system.script import UntrustedFile
@@ -92,7 +92,6 @@ __all__ = [
     "Ignore",
     "InOtherHands",
     "InputRefused",
-    "KeyTaken",
     "MailboxFull",
     "MaxChildren",
     "MechanismRefused",

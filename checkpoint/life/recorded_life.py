@@ -13,7 +13,16 @@ import types
 from collections.abc import Callable, Coroutine, Generator
 from typing import Any, Final, NoReturn, Protocol, TypeVar
 
-from ...actors.errors import ActorStopped, BadMessage, BadReply, ControlFailed, HoldfastError, StartFailed, remote_crash
+from ...actors.errors import (
+    ActorStopped,
+    BadMessage,
+    BadReply,
+    ControlFailed,
+    HoldfastError,
+    StartFailed,
+    remote_crash,
+    type_name,
+)
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.actor import Actor, Start
@@ -232,7 +241,7 @@ class Life:
             else:
                 future.set_exception(codec.decode_error(answer.kind, answer.name, answer.body))
         except Exception as error:
-            future.set_exception(BadReply("send" if kind is None else message_name(kind), str(error)))
+            future.set_exception(BadReply("send" if kind is None else type_name(kind), str(error)))
 
     # -- turns ------------------------------------------------------------------------------------------------------
 
