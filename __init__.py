@@ -11,6 +11,8 @@ from holdfast import events as events
 from holdfast import ftm as ftm
 from holdfast import supervision as supervision
 from holdfast import system as system
+from holdfast.actors.backoff import Backoff
+from holdfast.actors.effects import Retry
 from holdfast.actors.errors import (
     ActorStopped,
     AskFailed,
@@ -55,7 +57,6 @@ from holdfast.actors.process.resource_limits import Limits
 from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
 from holdfast.checkpoint.recovery_file import load_recovery
 from holdfast.supervision.admin import DeleteChild, RestartChild, StartChild, TerminateChild, WhichChildren
-from holdfast.supervision.backoff import Backoff
 from holdfast.supervision.config import load_tree
 from holdfast.supervision.dynamic import dynamic
 from holdfast.supervision.rules import rule
@@ -104,6 +105,7 @@ __all__ = [
     "RemoteCrash",
     "ReplyHandle",
     "RestartChild",
+    "Retry",
     "SHUTDOWN",
     "SendError",
     "Shutdown",

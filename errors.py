@@ -10,6 +10,8 @@ from .actors.errors import (
     BadReply,
     CannotMove,
     ControlFailed,
+    EffectFailed,
+    EffectInDoubt,
     HoldfastError,
     Ignore,
     MailboxFull,
@@ -29,6 +31,7 @@ from .actors.errors import (
     TreeFailed,
     UnknownMessage,
     UnsavableValue,
+    WaitTimeout,
     WrongActor,
     WrongThread,
 )
@@ -86,6 +89,8 @@ __all__ = [
     "ChildParked",
     "ControlFailed",
     "DamagedStore",
+    "EffectFailed",
+    "EffectInDoubt",
     "ForeignStore",
     "GrantLost",
     "HoldfastError",
@@ -136,6 +141,7 @@ __all__ = [
     "UnknownRefusal",
     "UnsavableValue",
     "UntrustedFile",
+    "WaitTimeout",
     "WrongActor",
     "WrongThread",
 ]

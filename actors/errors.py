@@ -13,6 +13,9 @@ HoldfastError
 ├── AskFailed            the receiver ended in the middle of the turn
 ├── RemoteCrash          the receiver's handler raised
 ├── Quarantined          the message ended its actor's process again and again
+├── EffectFailed         what a turn does to the outside has failed, also at the last attempt
+├── EffectInDoubt        a crash came while an effect that is performed at most once was out
+├── WaitTimeout          the message that a turn waits for has not come in time
 ├── ReplayDiverged       a replayed turn released something else than before
 ├── StartFailed          an actor could not be started
 │   └── StartIgnored     it did not want to be started, which is no failure
@@ -228,6 +231,40 @@ class RemoteCrash(HoldfastError):
         return f"{self.type_name}: {self.text}" if self.text else self.type_name
 
 
+class EffectFailed(HoldfastError, text="{effect} has failed at attempt {attempt}: {error}: {reason}"):
+    """An effect of a turn has failed: what `ctx.effect` called has raised, or has taken too long, at the last attempt.
+
+    It is an outcome like any other: it is journaled, and a replay gets it again. `effect` is the effect's key, `error`
+    the class of what was raised, and `reason` its text.
+    """
+
+    effect: str
+    attempt: int
+    error: str
+    reason: str
+
+
+class EffectInDoubt(
+    HoldfastError,
+    text="{actor} has ended while its effect {effect} was out, and that is performed at most once: ask the other side "
+    "whether it has happened",
+):
+    """The actor has ended between an effect that is performed at most once and the record of its outcome.
+
+    It may have happened or not: only the other side can say. The effect is not performed again.
+    """
+
+    actor: str
+    effect: str
+
+
+class WaitTimeout(HoldfastError, text="{actor} has waited for {message}, and its time is over"):
+    """`ctx.wait_for` has waited as long as it was told to, and no such message has come. It is journaled."""
+
+    actor: str
+    message: str
+
+
 class ReplayDiverged(HoldfastError):
     """A replayed turn went another way than before the crash: another output or reply, or no end at all.
 
@@ -396,7 +433,7 @@ def error_text(error: BaseException) -> str:
     """What an exception says; a user's `__str__` may itself raise, the report must not."""
     try:
         return portable(str(error))
-    except Exception as broken:
+    except BaseException as broken:
         return f"<its text cannot be shown: {type_name(type(broken))}>"
 
 

@@ -204,7 +204,7 @@ class SafeStateOverdue(Event, frozen=True, eq=False):
 
 
 class HeldMessages(Event, frozen=True, eq=False):
-    """While an actor was recovered, messages came: `held` wait for it, `dropped` and `refused` by its held policy."""
+    """Messages came while an actor was recovered whose method has `held=`: how many wait, and what became of more."""
 
     held: int
     dropped: int
@@ -230,6 +230,16 @@ class TurnsLost(Event, frozen=True, eq=False):
 
     count: int
     turn: int
+
+
+class EffectRepeated(Event, frozen=True, eq=False):
+    """An actor has ended while an effect was out, and its next life performs the effect again.
+
+    `effect` is its key, and `message` the type of the message whose handler wants it.
+    """
+
+    effect: str
+    message: str
 
 
 class ReplayPaced(Event, frozen=True, eq=False):
@@ -331,7 +341,7 @@ class TurnSlow(Event, frozen=True, eq=False):
 
 
 class LoopLagged(Event, frozen=True, eq=False):
-    """The event loop of a node (`address`) came `seconds` late to what was due."""
+    """The event loop of the root process came `seconds` late to what was due; `address` is the root's."""
 
     seconds: float
 

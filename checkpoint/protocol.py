@@ -19,11 +19,14 @@ from .method import Method
 # Kinds of inputs: every call into user code that may change state.
 MESSAGE, START, TICK, EXIT, DOWN, PIPE = "message", "start", "tick", "exit", "down", "pipe"
 # Outputs whose turn waits for what becomes of them.
-AWAITED = ("ask", "send", "publish")
+AWAITED = ("ask", "send", "publish", "effect", "sleep", "wait")
 # How a turn can end.
 OK, FAILED, DROPPED, STASHED = "ok", "failed", "dropped", "stashed"
 # How an ask can be answered; LATER keeps it open, NOTHING means that nobody asked.
 REPLY, REFUSAL, ERROR, CRASH, LATER, NOTHING = "reply", "refusal", "error", "crash", "later", ""
+# What else a turn can wait for: a moment, or (MESSAGE) a message. If it may have waited for long, the kind of the
+# outcome begins with TIMED, and its body has the Unix time at which it came in front.
+MOMENT, TIMED = "moment", "timed "
 
 
 class Out(msgspec.Struct, array_like=True, gc=False):
@@ -49,6 +52,23 @@ class Answer(msgspec.Struct, array_like=True, gc=False):
     kind: str = NOTHING
     name: str = ""
     body: bytes = b""
+
+
+def timed(answer: Answer, when: float) -> Answer:
+    """The same outcome, with the time at which it came."""
+    return Answer(TIMED + answer.kind, answer.name, msgspec.msgpack.encode((when, answer.body)))
+
+
+def untimed(answer: Answer) -> tuple[Answer, float]:
+    """The outcome itself, and when it came; 0.0 if that is not known.
+
+    >>> untimed(timed(Answer("reply", "", b"x"), 3.0))
+    (Answer(kind='reply', name='', body=b'x'), 3.0)
+    """
+    if not answer.kind.startswith(TIMED):
+        return answer, 0.0
+    when, body = msgspec.msgpack.decode(answer.body, type=tuple[float, bytes])
+    return Answer(answer.kind.removeprefix(TIMED), answer.name, body), when
 
 
 def answer_digest(answer: Answer) -> int:
@@ -89,11 +109,23 @@ class Feed(msgspec.Struct, array_like=True, tag=1, gc=False):
 
 
 class Outcome(msgspec.Struct, array_like=True, tag=2):
-    """The outcome of the ask that was output (turn, k)."""
+    """The outcome of what was output (turn, k), whose digest is `asked` (0: not known).
+
+    The input `taken` is the message that it waited for, and is not fed.
+    """
 
     turn: int
     k: int
     answer: Answer
+    taken: int = -1
+    asked: int = 0
+
+
+class Perform(msgspec.Struct, array_like=True, tag=22):
+    """The effect that was output (turn, k) has no outcome, and all that precedes it is safe: perform it."""
+
+    turn: int
+    k: int
 
 
 class Go(msgspec.Struct, array_like=True, tag=3):
@@ -186,7 +218,10 @@ class Respec(msgspec.Struct, array_like=True, tag=10):
     limits: dict[str, Any] = {}
 
 
-ToLife = Feed | Outcome | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec
+PastInputs = Outcome | Perform | SnapshotNow
+"""What a home says to a life beside its inputs: it overtakes those that wait."""
+
+ToLife = Feed | Outcome | Perform | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec
 
 
 # -- life to home ----------------------------------------------------------------------------------------------------
@@ -275,6 +310,14 @@ class PipeDone(msgspec.Struct, array_like=True, tag=15):
     body: bytes
 
 
+class Performed(msgspec.Struct, array_like=True, tag=23):
+    """The effect that was output (turn, k) has this outcome."""
+
+    turn: int
+    k: int
+    answer: Answer
+
+
 class Unsaved(msgspec.Struct, array_like=True, tag=16):
     """The state could not be saved: no snapshot came of it."""
 
@@ -321,7 +364,9 @@ class Ignored(msgspec.Struct, array_like=True, tag=19):
     why: str
 
 
-ToHome = Ignored | Released | TurnEnd | Hooked | Live | Snapshot | PipeDone | Unsaved | Wanted | Closed | Marked
+ToHome = (
+    Ignored | Released | TurnEnd | Hooked | Live | Snapshot | PipeDone | Performed | Unsaved | Wanted | Closed | Marked
+)
 
 
 class LifePort(Protocol):

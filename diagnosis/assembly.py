@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
+from ..actors.backoff import Backoff
 from ..actors.kernel.actor import Start
 from ..actors.kernel.mailbox import bounded
-from ..supervision.backoff import Backoff
 from ..supervision.spec import ChildSpec, child
 from ..supervision.tree import supervisor
 from .diagnoser import SERVER, DiagnoserActor

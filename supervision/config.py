@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from ..actors.backoff import Backoff
 from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.mailbox import bounded
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.start_codec import imported
-from .backoff import Backoff
 from .dynamic import dynamic
 from .rules import rule
 from .services.partition import partitions

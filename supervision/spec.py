@@ -10,6 +10,7 @@ from typing import Any, Generic, Literal, Protocol, TypeGuard, get_args
 
 from typing_extensions import TypeVar
 
+from ..actors.backoff import Backoff
 from ..actors.errors import SpecError, type_name
 from ..actors.events import ShutdownError
 from ..actors.exit_reasons import KILLED, SHUTDOWN, ExitReason
@@ -20,7 +21,6 @@ from ..actors.kernel.mailbox import Bounded
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.start_codec import pack_recipe
 from ..actors.values import UnsavableValue
-from .backoff import Backoff
 from .decisions import decide, is_as_told
 from .patience import end_within
 from .rules import Rule

@@ -102,6 +102,10 @@ class HandlerThreads(concurrent.futures.Executor):
 def _answer(done: concurrent.futures.Future[Any], work: Callable[[], Any]) -> None:
     try:
         value = work()
+    except StopIteration as error:  # No future takes it; a coroutine that raises it is told the same.
+        stopped = RuntimeError("a function in a thread has raised StopIteration")
+        stopped.__cause__ = error
+        done.set_exception(stopped)
     except BaseException as error:  # Whoever waits for it gets it.
         done.set_exception(error)
     else:
@@ -151,7 +155,7 @@ class ThreadContext:
     def __getattr__(self, name: str) -> Any:
         if threading.get_ident() != self._thread:
             return getattr(self._ctx, name)  # The loop's own business, or a background task's.
-        if name in ("create_task", "flush", "pipe_to_self", "publish"):
+        if name in ("create_task", "effect", "flush", "pipe_to_self", "publish", "sleep", "sleep_until", "wait_for"):
             raise HoldfastError(f"{self._ctx.path}: a blocking handler cannot use ctx.{name}; make it `async def`")
         value = self._on_loop(getattr, self._ctx, name)
         if not callable(value) or name == "random":

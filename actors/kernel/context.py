@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import random
 import uuid
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
 from contextvars import ContextVar, copy_context
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, TypeVarTuple, cast, overload
 
-from ..errors import ActorStopped, AskDeadlock, HoldfastError, remote_crash
+from ..effects import Effect, Retry, effect_of
+from ..errors import ActorStopped, AskDeadlock, HoldfastError, SpecError, remote_crash
 from ..exit_reasons import NORMAL, ExitReason
 from . import links, mailbox
+from .blocking_handlers import is_async
 from .envelope import Ask, Chain, Envelope, Item, ReplyHandle, chain_of, message_in
 from .links import Monitor
-from .message import Message, require_message
+from .message import Message, reply_type, require_message
 from .timers import Timer
 from .topics import NOT_TAKEN, publish
 
@@ -25,8 +28,10 @@ if TYPE_CHECKING:
     from .ref import ActorRef
 
 A = TypeVar("A", bound="Actor")
+M = TypeVar("M", bound=Message[Any])
 T = TypeVar("T")
 R = TypeVar("R")
+Ts = TypeVarTuple("Ts")
 
 begun_in: ContextVar[Any] = ContextVar("begun_in", default=None)
 """In a background task: what was being handled when it was created. That turn may wait for it, a later one does not."""
@@ -304,6 +309,152 @@ class ActorContext:
         if isinstance(error, asyncio.CancelledError):  # By whoever else had the work in hand; that is no result.
             return HoldfastError(f"{self.path}: work that was given to pipe_to_self was cancelled")
         return error
+
+    # -- the outside ------------------------------------------------------------------------------------------------
+
+    @property
+    def message_id(self) -> str:
+        """Return the text that identifies the message in hand for ever: a key for the other side of an effect.
+
+        A handler that is run again for this message gets the same text. No other message of any actor ever has it.
+
+        Raises:
+            HoldfastError: the actor has no recovery, so no handler is run again; or nothing is in hand.
+        """
+        raise HoldfastError(f"{self.path}: only messages of an actor with recovery have an identity")
+
+    @overload
+    def effect(
+        self,
+        function: Callable[[*Ts], Awaitable[T]],
+        *args: *Ts,
+        key: str = "",
+        timeout: float | None = None,
+        retry: Retry | None = None,
+        at_most_once: bool = False,
+    ) -> asyncio.Future[T]: ...
+
+    @overload
+    def effect(
+        self,
+        function: Callable[[*Ts], T],
+        *args: *Ts,
+        key: str = "",
+        timeout: float | None = None,
+        retry: Retry | None = None,
+        at_most_once: bool = False,
+    ) -> asyncio.Future[T]: ...
+
+    def effect(  # type: ignore[misc]  # whatever the two above have found to fit
+        self,
+        function: Callable[..., Any],
+        *args: Any,
+        key: str = "",
+        timeout: float | None = None,
+        retry: Retry | None = None,
+        at_most_once: bool = False,
+    ) -> asyncio.Future[Any]:
+        """Do something to the outside world, such as a payment, once: an actor with recovery has its outcome journaled.
+
+        A handler that is run again after a crash gets the outcome from the journal, and the function is not called. It
+        begins when all that precedes it is as safe as the store makes it. If a crash comes between the function and the
+        record of its outcome, it is called again: at least once, so give the other side `message_id`. In hooks that
+        are no turns, and without recovery, it is called each time. Several may be out at once: call them in the turn
+        itself, and `await asyncio.gather(...)` what they return.
+
+        Args:
+            function: is awaited if it is async, and runs in a thread otherwise. It may not use `ctx`.
+            args: its arguments.
+            key: names the effect, where a replay is compared, and in errors; left out, the function's name does.
+            timeout: seconds that one attempt may take. A thread cannot be stopped: it is left behind.
+            retry: how often it is attempted; left out, once.
+            at_most_once: a crash while it is out raises EffectInDoubt instead of calling it again.
+
+        Returns:
+            A future of what the function returns; that must be a value that a snapshot can hold (`UnsavableValue` says
+            why it is not).
+
+        Raises:
+            HoldfastError: this is a background task of an actor with recovery; call the function itself there.
+
+        Raises (by the future):
+            EffectFailed: the function has raised, or has taken too long, at the last attempt.
+            EffectInDoubt: it is performed at most once, and the actor has ended while it was out.
+            HoldfastError: the function itself has raised that, a Refusal for instance: it is an outcome too.
+        """
+        self._alive()
+        effect = effect_of(function, args, key, timeout, retry, at_most_once=at_most_once, is_async=is_async(function))
+        return self._performed(effect, at_most_once)
+
+    def _performed(self, effect: Effect, at_most_once: bool) -> asyncio.Future[object]:
+        """The outcome of an effect: without recovery, whatever it comes to now."""
+        node = self._cell.node
+        return self._beside(effect.perform(node.threads.run, node.numbers.next_seed()), "effect")
+
+    def sleep_until(self, when: float) -> asyncio.Future[None]:
+        """Have the turn in hand wait until a moment, be it days away.
+
+        In an actor whose recovery replays, the wait outlives its process, and with a durable store the program: the
+        handler is run again from its start, and gets the outcomes that it had. No other message is handled meanwhile.
+
+        Args:
+            when: Unix time in seconds; a moment that has passed ends the wait at once.
+
+        Returns:
+            A future, to be awaited.
+
+        Raises:
+            HoldfastError: this is a background task of an actor with recovery; use `asyncio.sleep` there.
+        """
+        self._alive()
+        if not isinstance(when, int | float) or isinstance(when, bool) or not math.isfinite(when):
+            raise SpecError("sleep_until", f"takes Unix time in seconds, not {when!r}")
+        return self._slept(float(when))
+
+    def sleep(self, seconds: float) -> asyncio.Future[None]:
+        """Have the turn in hand wait for so many seconds from `now()` on; see `sleep_until`."""
+        self._alive()
+        if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds < math.inf:
+            raise SpecError("sleep", f"takes a number of seconds >= 0, not {seconds!r}")
+        return self._slept(self.now() + seconds)
+
+    def _slept(self, until: float) -> asyncio.Future[None]:
+        """Wait until a moment: without recovery, in this life."""
+        return self._beside(asyncio.sleep(until - self._cell.node.clock.wall()), "sleep")
+
+    def wait_for(self, *kinds: type[M], timeout: float | None = None) -> asyncio.Future[M]:
+        """Have the turn in hand wait for a message of one of these classes: a signal. It needs recovery.
+
+        The oldest one that is in the mailbox is taken, before all that came earlier, or the first one that comes. Who
+        has asked gets None as its reply. Everything else waits. As with `sleep_until`, the wait outlives the process.
+
+        Args:
+            kinds: classes of messages whose reply is None.
+            timeout: seconds from `now()` on; left out, it waits for as long as it takes.
+
+        Returns:
+            A future of the message.
+
+        Raises:
+            HoldfastError: the actor has no recovery, or lives behind a mechanism; or this is no turn.
+
+        Raises (by the future):
+            WaitTimeout: none has come in time.
+        """
+        self._alive()
+        if not kinds or not all(isinstance(kind, type) and issubclass(kind, Message) for kind in kinds):
+            raise SpecError("wait_for", f"takes classes of messages, not {kinds!r}")
+        if answered := [kind.__name__ for kind in kinds if reply_type(kind) is not None]:
+            raise SpecError("wait_for", f"takes messages whose reply is None, and {', '.join(answered)} has another")
+        if timeout is not None and (
+            not isinstance(timeout, int | float) or isinstance(timeout, bool) or not 0 < timeout < math.inf
+        ):
+            raise SpecError("wait_for", f"timeout must be a number of seconds > 0, or None, not {timeout!r}")
+        return cast("asyncio.Future[M]", self._signal(kinds, timeout))
+
+    def _signal(self, kinds: tuple[type[Message[Any]], ...], timeout: float | None) -> asyncio.Future[Message[Any]]:
+        """Wait for a message: only a home can."""
+        raise HoldfastError(f"{self.path}: a turn can wait for a message only in an actor with recovery")
 
     # -- stash ------------------------------------------------------------------------------------------------------
 

@@ -88,8 +88,9 @@ class Clock:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
-        self.wall: Callable[[], float] = time.time
         self.is_monotonic = abs(monotonic() - loop.time()) < SAME_CLOCK  # whether the loop has the machine's clock
+        begin = time.time() - loop.time()  # On a virtual clock Unix time passes with the loop's, too.
+        self.wall: Callable[[], float] = time.time if self.is_monotonic else lambda: begin + loop.time()
 
     def is_past(self, deadline: float) -> bool:
         """Whether a deadline is over that was set in this process or another one of the system.

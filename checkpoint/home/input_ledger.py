@@ -221,6 +221,12 @@ class InputLedger:
             cause = f"the reply to {past.input.name} is not what it was before the crash; {DIVERGES}"
             raise ReplayDiverged(self.path, number, seen + 1, cause)
 
+    def digest_of(self, turn: int, k: int) -> int:
+        """The digest of what was output (turn, k) before; 0: that is not known any more."""
+        past = self.turns.get(turn)
+        digests = self.released if turn > self.turn else past.digests if past is not None else []
+        return digests[k - 1] if k <= len(digests) else 0
+
     def note_outcome(self, turn: int, k: int, answer: Answer) -> bool:
         """Keep the outcome of the ask that was output (turn, k); False if no replay will want it."""
         if turn <= self.state_turn:
@@ -328,9 +334,9 @@ class InputLedger:
         ended = {turn.input.id for turn in self.turns.values() if turn.status != STASHED}
         return entries + [("drop", key) for key in dict.fromkeys(self.ended_in_the_stash()) if key not in ended]
 
-    def released_entry(self, turn: int) -> Entry:
-        """What the journal has of a turn that has not ended."""
-        return "out", turn, self.begun, tuple(self.released)
+    def released_entry(self, turn: int, since: int = 0) -> Entry:
+        """What the journal has of a turn that has not ended; `since`: so many of its outputs stand there already."""
+        return "out", turn, self.begun, tuple(self.released[since:]), *((since,) if since else ())
 
     def read_entry(self, position: int, entry: tuple[Any, ...]) -> bool:
         """Take a journal entry up again, in order; False if it is of another kind."""
@@ -348,10 +354,11 @@ class InputLedger:
                     self.positions_of(turn).append(position)
                     self.released = list(digests)
                     self.end_turn(self.open[key], turn, status, *more)
-            case ("out", turn, key, digests):
+            case ("out", turn, key, digests, *more):
                 self.positions_of(turn).append(position)
                 if turn > self.turn:
-                    self.released, self.begun = list(digests), key
+                    self.released[more[0] if more else 0 :] = digests
+                    self.begun = key
             case ("got", turn, k, kind, name, body):
                 self.positions_of(turn).append(position)
                 self.outcomes[turn, k] = Answer(kind, name, body)

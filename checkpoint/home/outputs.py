@@ -51,6 +51,10 @@ class Outputs:
                 self._send(node.cell_at(out.to), out, batch, functools.partial(home.calls.sent, turn, out.k))
             case "ask":
                 self._ask(turn, key, out, batch)
+            case "effect":
+                batch.after.append(lambda: home.calls.order(turn, out.k))
+            case "sleep" | "wait":
+                batch.after.append(lambda: home.long_waits.begin(turn, key, out))
             case "publish":
                 self._publish(turn, out, batch)
             case "reply":

@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ...actors.errors import AskTimeout, BadMessage, BadReply, HoldfastError
+from ...actors.errors import AskTimeout, BadMessage, BadReply, EffectInDoubt, HoldfastError
+from ...actors.events import EffectRepeated
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, ReplyHandle
 from ...actors.process.wire.peer import RelayedAsk
 from ..inputs import Batch, Input
-from ..protocol import REPLY, Answer, Out, Outcome
+from ..protocol import REPLY, Answer, Out, Outcome, Perform, Performed, timed
 from ..schema import shape_name
 from .input_ledger import outcome_entry
 
@@ -130,7 +131,7 @@ class PendingCalls:
 
     Attributes:
         asks: asks of its own turns, by (turn, output).
-        sends: sends and publications of its own turns whose receivers have no room yet.
+        sends: sends and publications of its own turns whose receivers have no room yet, and effects that are out.
         later: asks of others that are to be answered later, by input.
         owed: the same as read back from the store: asker and origin.
     """
@@ -169,6 +170,13 @@ class PendingCalls:
         """An ask or send that was made before the crash: answered from the journal, or when its pending call is."""
         k, home = out.k, self._home
         answer = home.ledger.outcomes.get((turn, k))
+        if answer is None and out.verb == "effect":
+            self._resume(turn, key, out)
+            return
+        if answer is None and out.verb in ("sleep", "wait"):
+            if turn > home.ledger.turn:  # Else it has ended without waiting for it, and does so again.
+                home.long_waits.begin(turn, key, out)
+            return
         if answer is None and out.verb in ("send", "publish"):
             answer = None if (turn, k) in self.sends else ACCEPTED
         elif answer is None and (turn, k) not in self.asks and not home.homes.rejoin.joins(home, turn, key, out):
@@ -177,15 +185,40 @@ class PendingCalls:
         if answer is not None:
             self._tell(turn, k, answer)
 
-    def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None) -> None:
-        """An ask of ours has its outcome: journal it, then tell the turn that waits."""
+    def _resume(self, turn: int, key: int, out: Out) -> None:
+        """An effect was out when the last life ended, and nobody knows what became of it."""
+        home = self._home
+        if turn <= home.ledger.turn:
+            return  # Its turn has ended without waiting for it, and does so again.
+        if out.name:
+            doubt = Answer(*home.node.codec.encode_error(EffectInDoubt(home.path, out.to)))
+            self.outcome(turn, out.k, timed(doubt, home.node.clock.wall()), None)
+            return
+        source = home.ledger.open.get(key)
+        home.node.emit(EffectRepeated(home.path, out.to, "" if source is None else source.name))
+        self.order(turn, out.k)
+
+    def order(self, turn: int, k: int) -> None:
+        """Have the present life perform an effect: all that precedes it is safe."""
+        if self._home.life.port is not None:
+            self.sends.add((turn, k))
+            self._home.life.port.to_life(Perform(turn, k))
+
+    def performed(self, record: Performed) -> None:
+        """An effect that was ordered has come to something."""
+        if (record.turn, record.k) in self.sends:
+            self.sends.remove((record.turn, record.k))
+            self.outcome(record.turn, record.k, timed(record.answer, self._home.node.clock.wall()), None)
+
+    def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None, taken: int = -1) -> None:
+        """An ask of ours has its outcome: journal it, then tell the turn that waits. `taken`: the input that it was."""
         own = batch if batch is not None else Batch()
         self.asks.pop((turn, k), None)
         if self._home.ledger.note_outcome(turn, k, answer):
             if self._home.journal.durable:
                 self._home.note_shape(shape_name(answer), own)
             self._home.note(turn, outcome_entry(turn, k, answer), own)
-        own.after.append(lambda: self._tell(turn, k, answer))
+        own.after.append(lambda: self._tell(turn, k, answer, taken))
         if batch is None:
             own.commit(self._home.journal)
 
@@ -195,6 +228,7 @@ class PendingCalls:
             ask.is_over, ask.future = True, OVER
         self.asks.clear()
         self.sends.clear()
+        self._home.long_waits.abandon()
 
     def sent(self, turn: int, k: int, error: HoldfastError | None) -> None:
         """A `send` or `publish` of ours was accepted, or not.
@@ -207,6 +241,6 @@ class PendingCalls:
         else:
             self.outcome(turn, k, Answer(*self._home.node.codec.encode_error(error)), None)
 
-    def _tell(self, turn: int, k: int, answer: Answer) -> None:
+    def _tell(self, turn: int, k: int, answer: Answer, taken: int = -1) -> None:
         if self._home.life.port is not None:
-            self._home.life.port.to_life(Outcome(turn, k, answer))
+            self._home.life.port.to_life(Outcome(turn, k, answer, taken, self._home.ledger.digest_of(turn, k)))

@@ -23,6 +23,7 @@ from ..durable_links import DurableTies
 from ..durable_timers import Timers
 from ..inputs import Batch, HomeJournal, Input, Turn
 from ..journal import Saved
+from ..long_waits import LongWaits
 from ..method import Method
 from ..protocol import (
     AWAITED,
@@ -43,6 +44,7 @@ from ..protocol import (
     Live,
     Marked,
     Out,
+    Performed,
     PipeDone,
     Released,
     Restore,
@@ -88,6 +90,7 @@ class Switch:
         self.intake = Intake()
         self.calls = PendingCalls(self)
         self.timers = Timers(self)
+        self.long_waits = LongWaits(self)
         self.topics: dict[str, None] = {}
         self.ties = DurableTies(self)
         self.outputs = Outputs(self)
@@ -229,6 +232,8 @@ class Switch:
         if source.held:
             return
         life, bound = self.life, self.intake.bound
+        if self.long_waits.wanted and self.long_waits.takes(source):
+            return
         if life.is_released and life.port is not None and (bound is None or bound.may_feed(source)):
             if source.ask is not None and life.port.begins:
                 source.ask.started = True
@@ -325,6 +330,7 @@ class Switch:
     def died(self, running: int, ordered: bool) -> None:
         """The life is over. `running` is the input in hand, -1 if none; `ordered`: it was not its doing."""
         self.life.die()
+        self.long_waits.abandon()
         self.replay.cancel()
         if self.intake.bound is not None:
             self.intake.bound.restart()
@@ -354,6 +360,8 @@ class Switch:
                     self.let_at()
                 case PipeDone():
                     self.outputs.work_done(record)
+                case Performed():
+                    self.calls.performed(record)
                 case Hooked():
                     self.outputs.hooked(record)
                 case Unsaved():
@@ -372,10 +380,10 @@ class Switch:
                 self.cell.kill()
 
     def _released(self, record: Released) -> None:
-        batch = Batch()
+        batch, known = Batch(), len(self.ledger.released)
         self._take(record.turn, record.id, record.outs, batch)
-        if record.turn > self.ledger.turn:
-            self.note(record.turn, self.ledger.released_entry(record.turn), batch)
+        if record.turn > self.ledger.turn and len(self.ledger.released) > known:
+            self.note(record.turn, self.ledger.released_entry(record.turn, known), batch)
         batch.commit(self.journal)
 
     def _take(self, turn: int, key: int, outs: list[Out], batch: Batch) -> None:

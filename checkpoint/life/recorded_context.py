@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import hashlib
 import random
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
-from ...actors.errors import ControlFailed, HoldfastError, remote_crash
+from ...actors.effects import Effect
+from ...actors.errors import (
+    BadMessage,
+    BadReply,
+    ControlFailed,
+    EffectFailed,
+    HoldfastError,
+    error_text,
+    remote_crash,
+    type_name,
+)
 from ...actors.exit_reasons import NORMAL, ExitReason
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import Cell
@@ -19,11 +30,12 @@ from ...actors.kernel.envelope import Ask, Item, ReplyHandle
 from ...actors.kernel.links import Monitor
 from ...actors.kernel.message import Message, message_name, require_message
 from ...actors.kernel.ref import ActorRef, current
-from ..protocol import Feed, PipeDone
+from ...actors.values import encode_value
+from ..protocol import REPLY, Answer, Feed, Performed, PipeDone
 from .recorded_inbox import INIT, STARTED, Fed
 
 if TYPE_CHECKING:
-    from .recorded_life import Life
+    from .recorded_life import Awaited, Life
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -101,12 +113,13 @@ class RecordedContext(ActorContext):
             raise HoldfastError(f"{self.path}: {why}; act in on_start, or in on_recovered")
         if not life.hook or _in_background():
             raise HoldfastError(
-                f"{self.path}: background tasks of a recorded actor may not send; report with ctx.pipe_to_self()"
+                f"{self.path}: background tasks of a recorded actor may not send, nor use ctx.effect or ctx.sleep "
+                "(asyncio.gather makes one of a coroutine); report with ctx.pipe_to_self()"
             )
 
     def now(self) -> float:
-        feed = self.recorded.feed
-        return self._cell.node.clock.wall() if feed is None else feed.time
+        life = self.recorded
+        return self._cell.node.clock.wall() if life.feed is None else max(life.feed.time, life.moment)
 
     @property
     def random(self) -> random.Random:
@@ -246,6 +259,80 @@ class RecordedContext(ActorContext):
             self.recorded.port.to_home(record)
             if k:
                 self.recorded.pipe_back()
+
+    # -- the outside ------------------------------------------------------------------------------------------------
+
+    @property
+    def message_id(self) -> str:
+        feed = self.recorded.feed
+        if feed is None:
+            raise HoldfastError(f"{self.path}: no message is in hand")
+        said = f"{self.path}|{feed.id}|{feed.time}"
+        return hashlib.blake2b(said.encode(), digest_size=16).hexdigest()
+
+    def _performed(self, effect: Effect, at_most_once: bool) -> asyncio.Future[object]:
+        if not self._in_turn():
+            self._outside()
+            return super()._performed(effect, at_most_once)
+        return self._awaited("effect", effect.key, "at most once" if at_most_once else "", 0.0, effect)
+
+    def _awaited(self, verb: str, to: str, name: str, until: float, kind: Awaited) -> asyncio.Future[Any]:
+        """An output of the turn in hand, and a future of what comes of it; the turn need not wait for that."""
+        life = self.recorded
+        k = life.put(verb, to, name, seconds=until)
+        outcome: asyncio.Future[Any] = self._cell.node.loop.create_future()
+        life.asks[life.turn, k] = outcome, kind
+        life.release()
+        return outcome
+
+    def _rest(self, verb: str, name: str, until: float, kinds: dict[str, type[Message[Any]]]) -> asyncio.Future[Any]:
+        """Wait for what the home waits for: nothing of it is out."""
+        life, outcome = self.recorded, self._awaited(verb, "", name, until, kinds)
+        life.resting += 1
+        outcome.add_done_callback(life.rested)
+        return outcome
+
+    def _slept(self, until: float) -> asyncio.Future[None]:
+        if self._in_turn():
+            return self._rest("sleep", "", until, {})
+        self._outside()
+        return super()._slept(until)
+
+    def _signal(self, kinds: tuple[type[Message[Any]], ...], timeout: float | None) -> asyncio.Future[Message[Any]]:
+        if not self._in_turn():
+            raise HoldfastError(f"{self.path}: only a turn can wait for a message")
+        names = {message_name(kind): kind for kind in kinds}
+        return self._rest("wait", "|".join(names), 0.0 if timeout is None else self.now() + timeout, names)
+
+    def perform(self, turn: int, k: int, effect: Effect, outcome: asyncio.Future[Any]) -> None:
+        """Perform an effect of the turn in hand, in a task of its own, and have the home journal what it comes to."""
+        task = self._beside(self._carried_out(turn, k, effect), "effect")
+        outcome.add_done_callback(lambda _: task.cancel())  # The handler does not wait for it any more.
+
+    async def _carried_out(self, turn: int, k: int, effect: Effect) -> None:
+        node, life = self._cell.node, self.recorded
+        try:
+            value = await effect.perform(node.threads.run, node.numbers.next_seed())
+            answer = Answer(REPLY, "", encode_value(value, where=f"the result of {effect.key}"))
+        except Exception as error:
+            answer = self._kept(effect, error)
+        if self._closed or (turn, k) not in life.asks:
+            return
+        try:
+            life.port.to_home(Performed(turn, k, answer))
+        except BadMessage as error:
+            why = f"what it has returned is too large to leave its process: {error.problem}; return where it is instead"
+            life.port.to_home(Performed(turn, k, self._kept(effect, BadReply(effect.key, why))))
+
+    def _kept(self, effect: Effect, error: Exception) -> Answer:
+        """An error as the outcome of an effect, or why it cannot be one."""
+        text = error_text(error)
+        try:
+            if isinstance(error, HoldfastError):
+                return self.recorded.answer_error(error)
+        except Exception as problem:  # It has fields of the user's own, of whatever types.
+            text = f"what it has raised cannot be kept: {error_text(problem)}"
+        return self.recorded.answer_error(EffectFailed(effect.key, 1, type_name(type(error)), text))
 
     # -- stash, links, subscriptions --------------------------------------------------------------------------------
 

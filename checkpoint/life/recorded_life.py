@@ -7,12 +7,14 @@ already. Only time and randomness come from the input instead of the world.
 from __future__ import annotations
 
 import asyncio
+import functools
 import hashlib
 import time
 import types
 from collections.abc import Callable, Coroutine, Generator
-from typing import Any, Final, NoReturn, Protocol, TypeVar
+from typing import Any, Final, NoReturn, Protocol, TypeAlias, TypeVar
 
+from ...actors.effects import Effect
 from ...actors.errors import (
     ActorStopped,
     BadMessage,
@@ -31,9 +33,12 @@ from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import Message, message_name
 from ...actors.persistence import UNFIT
 from ...actors.state_hooks import state_getter
+from ...actors.values import decode_value
 from ..method import Method
 from ..protocol import (
     FAILED,
+    MESSAGE,
+    MOMENT,
     OK,
     REPLY,
     START,
@@ -48,6 +53,7 @@ from ..protocol import (
     Live,
     Out,
     Outcome,
+    Perform,
     Released,
     Restore,
     Snapshot,
@@ -57,6 +63,7 @@ from ..protocol import (
     TurnEnd,
     Unsaved,
     pieces,
+    untimed,
 )
 from ..snapshot.image_writer import Imaging
 from ..snapshot.key_variables import StateMismatch, check_keys, restore_state, save_state, variables
@@ -69,6 +76,10 @@ from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSna
 from .replay_guard import digest_of
 
 T = TypeVar("T")
+
+Awaited: TypeAlias = "type[Message[Any]] | Effect | dict[str, type[Message[Any]]] | None"
+"""What a turn waits for: the reply to a message of that class, an effect, a message of one of these types (none: a
+moment), or that a `send` is accepted."""
 
 NOT_SAVED: Final = -2
 """In place of the turn after which the last snapshot was made: none has the state as it is."""
@@ -103,8 +114,10 @@ class Life:
         self.feed: Feed | None = None
         self.outs: list[Out] = []
         self.last_k = 0
-        self.asks: dict[tuple[int, int], tuple[asyncio.Future[Any], type[Message[Any]] | None]] = {}
+        self.asks: dict[tuple[int, int], tuple[asyncio.Future[Any], Awaited]] = {}
         self.pipes = 0
+        self.moment = 0.0  # until which the turn in hand has waited
+        self.resting = 0  # how many moments and messages it waits for
         self.stash: list[Fed] = []
         self.returned: dict[int, Fed] = {}
         self.is_live = False
@@ -186,6 +199,8 @@ class Life:
                 self._take(record)
             case Outcome():
                 self._outcome(record)
+            case Perform():
+                self._perform(record.turn, record.k)
             case Go():
                 self._queue(GoLive(self, record))
             case SnapshotNow(urgent=True):
@@ -225,23 +240,41 @@ class Life:
         self.cell.schedule()
 
     def _outcome(self, record: Outcome) -> None:
+        if record.taken >= 0:
+            self._drop(lambda feed: feed.id == record.taken)
         waiting = self.asks.pop((record.turn, record.k), None)
         if waiting is None:
             return
         future, kind = waiting
         if future.done():
             return
-        answer, codec = record.answer, self.cell.node.codec
         try:
-            if kind is None and answer.kind == REPLY:
-                future.set_result(None)  # a `send` that was accepted
-            elif answer.kind == REPLY:
-                assert kind is not None
-                future.set_result(codec.decode_reply(kind, answer.body))
+            answer, when = untimed(record.answer)
+            self.moment = max(self.moment, when)
+            if answer.kind in (REPLY, MESSAGE, MOMENT):
+                future.set_result(self._result(answer, kind))
             else:
-                future.set_exception(codec.decode_error(answer.kind, answer.name, answer.body))
+                future.set_exception(self.cell.node.codec.decode_error(answer.kind, answer.name, answer.body))
         except Exception as error:
-            future.set_exception(BadReply("send" if kind is None else type_name(kind), str(error)))
+            name = type_name(kind) if isinstance(kind, type) else kind.key if isinstance(kind, Effect) else "send"
+            future.set_exception(BadReply(name, str(error)))
+
+    def _result(self, answer: Answer, awaited: Awaited) -> object:
+        """What a turn gets that has waited."""
+        if awaited is None or answer.kind == MOMENT:
+            return None
+        if isinstance(awaited, type):
+            return self.cell.node.codec.decode_reply(awaited, answer.body)
+        if isinstance(awaited, Effect):
+            return decode_value(answer.body)
+        return self.cell.node.codec.decode(awaited[answer.name], answer.body)
+
+    def _perform(self, turn: int, k: int) -> None:
+        """An effect of the turn in hand has no outcome yet."""
+        outcome, effect = self.asks.get((turn, k), (None, None))
+        ctx = self.cell.ctx
+        if outcome is not None and isinstance(effect, Effect) and isinstance(ctx, RecordedContext):
+            ctx.perform(turn, k, effect, outcome)
 
     # -- turns ------------------------------------------------------------------------------------------------------
 
@@ -253,7 +286,7 @@ class Life:
             self.turn += 1
         if self.returned:
             self.returned.pop(feed.id, None)  # It has come again: its feed may have been here before it was put back.
-        self.feed, self.outs, self.last_k = feed, [], 0
+        self.feed, self.outs, self.last_k, self.moment, self.resting = feed, [], 0, 0.0, 0
         if self.page is not None:
             self.page[0] = feed.id + 1
 
@@ -283,7 +316,7 @@ class Life:
 
     def _mark(self, feed: Feed | None, how: int = 0) -> None:
         if self.page is not None and feed is not None and feed is self.feed:  # Else its life was abandoned.
-            self.page[0] = feed.id + 1 | how
+            self.page[0] = 0 if how and self.resting else feed.id + 1 | how  # What rests for days ends no process.
 
     def close_turn(self, status: str, answer: Answer) -> None:
         """A turn has ended: report it, with what it sent."""
@@ -304,6 +337,19 @@ class Life:
             self.stage.begun = -1
             if self.returned:
                 self.handle_returned()
+
+    def leave_turn(self, reason: ExitReason) -> bool:
+        """End in the middle of a turn that rests, for that may be for days: the next life's goes on. False: none does.
+
+        There is no snapshot of such a moment, and `on_stop` is not called in it.
+        """
+        turn = None if self.cell.more is None else self.cell.more.turn
+        if not self.resting or turn is None or turn.then is not None:
+            return False
+        self.feed, self.outs = None, []  # What its handler says while it is cancelled does not count.
+        turn.then = functools.partial(lifecycle.finish, self.cell, reason, is_orderly=False)
+        turn.runner.task.cancel()
+        return True
 
     def ignore(self, why: str) -> None:
         """The actor does not want to be started: turn 0 stays open for the next start."""
@@ -354,6 +400,10 @@ class Life:
             self.outs.append(out)
         return k
 
+    def rested(self, _: asyncio.Future[Any]) -> None:
+        """Something has come that a turn has waited for, perhaps an earlier one."""
+        self.resting = max(0, self.resting - 1)
+
     def enter(self, hook: str) -> None:
         """A hook begins that is no turn."""
         self.hook, self.last_k = hook, 0
@@ -370,9 +420,13 @@ class Life:
         """Ticks that are queued here, or on their way, are dropped here and at home."""
         self.put("cancel", key)
         self.timers.cancelled.add(key)
+        self._drop(lambda feed: feed.kind == TICK and feed.origin == key and feed.turn < 0)
+
+    def _drop(self, is_over: Callable[[Feed], bool]) -> None:
+        """Forget inputs that are queued, and are none any more."""
         queue = mailbox.queue_of(self.cell)
         for index, item in enumerate(queue):  # Not removed: the run loop has counted them.
-            if type(item) is Fed and item.feed.kind == TICK and item.feed.origin == key and item.feed.turn < 0:
+            if type(item) is Fed and is_over(item.feed):
                 queue[index] = mailbox.NOTHING
 
     def release(self) -> None:
@@ -587,7 +641,7 @@ class LifePlace(lifecycle.HerePlace):
         self.life = life
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
-        if cell.state is RUNNING and self.life is not None:
+        if cell.state is RUNNING and self.life is not None and not self.life.leave_turn(reason):
             cell.urge(StopRecorded(self.life, reason))
 
 

@@ -10,9 +10,9 @@ from types import TracebackType
 from typing import TypeVar
 from urllib.parse import urlsplit
 
+from ...actors.backoff import Backoff
 from ...actors.errors import HoldfastError
 from ...actors.streams import connect
-from ...supervision.backoff import Backoff
 from .board_frames import (
     Answer,
     AskMeasurements,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from ...actors.backoff import Backoff
 from ...actors.kernel.actor import Start
-from ...supervision.backoff import Backoff
 from ...supervision.spec import ChildSpec, child
 from ..model import Declaration, Model, System
 from ..planning import Planner

@@ -12,11 +12,11 @@ from ...checkpoint.protocol import (
     Hooked,
     Ignored,
     Live,
-    Outcome,
+    PastInputs,
+    Performed,
     PipeDone,
     Released,
     Snapshot,
-    SnapshotNow,
     TurnEnd,
     Unsaved,
 )
@@ -54,7 +54,11 @@ class CannotJoin(Refusal):
     why: str
 
 
-class RequestDropped(Refusal):
+class RequestDropped(
+    Refusal,
+    text="a brick of {path} has neither passed request {number} on nor ended it (may_have_run={may_have_run}): "
+    "mend the brick",
+):
     """A brick of the mechanism has neither passed this request on nor ended it.
 
     `may_have_run`: a turn was handled whose outcome was lost in the bricks too, and that may be this one.
@@ -65,7 +69,9 @@ class RequestDropped(Refusal):
     may_have_run: bool = False
 
 
-class ReplyEvicted(Refusal):
+class ReplyEvicted(
+    Refusal, text="{path} has handled request {number}, but does not keep its reply any more: do not ask again blindly"
+):
     """The request was handled, but its reply is not kept any more: the reply log is bounded."""
 
     path: str
@@ -172,17 +178,18 @@ class Done(Message[Taken]):
 
 
 class Inward(Message):
-    """From the home to the life, past the bricks: outcomes of asks, an order for a snapshot."""
+    """From the home to the life, past the bricks: outcomes of asks and effects, orders for an effect or a snapshot."""
 
     epoch: int
-    records: list[Outcome | SnapshotNow]
+    records: list[PastInputs]
 
 
 class Outward(Message):
-    """From the life to the home, past the bricks: what is released in the middle of a turn that is at the front."""
+    """From the life to the home, past the bricks, of a turn that is at the front: what is released in the middle of it,
+    and what its effects have come to."""
 
     epoch: int
-    records: list[Released | PipeDone | Snapshot | Unsaved | Ignored | Hooked]
+    records: list[Released | Performed]
 
 
 class PartEnded(Message):

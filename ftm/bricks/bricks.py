@@ -20,7 +20,18 @@ from ...actors.kernel.bindings import Binding
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message
 from ...actors.kernel.ref import current
-from ...checkpoint.protocol import DROPPED, MESSAGE, REPLY, Answer, Live, Outcome, Released, Snapshot, TurnEnd
+from ...checkpoint.protocol import (
+    DROPPED,
+    MESSAGE,
+    REPLY,
+    Answer,
+    Live,
+    Outcome,
+    Performed,
+    Released,
+    Snapshot,
+    TurnEnd,
+)
 from .brick_messages import FORWARDED, Beside, Done, Inward, Outward, PartEnded, Request, StaleLeader, Taken, Work
 from .letters import FOREVER as FOREVER
 from .peer_channel import Inbox, Posting
@@ -392,7 +403,7 @@ class Proceed(Brick):
                 await self.heard(record)
             self._standing.server.inward(record)
 
-    def tell_outward(self, record: Released) -> None:
+    def tell_outward(self, record: Released | Performed) -> None:
         """Tell a message that the protected actor has let out, if this replica leads and is not fenced."""
         standing = self._standing
         if standing.leads and not standing.is_fenced:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 
 import msgspec
 
-from ...checkpoint.protocol import DROPPED, Feed, Go, Outcome, SnapshotNow, ToLife
+from ...checkpoint.protocol import DROPPED, Feed, Go, Outcome, PastInputs, Perform, SnapshotNow, ToLife
 from ..bricks.brick_messages import MOST_REQUESTS
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class Delivery:
     """
 
     waiting: deque[Feed | Go] = dataclasses.field(default_factory=deque)
-    inward: list[Outcome | SnapshotNow] = dataclasses.field(default_factory=list)
+    inward: list[PastInputs] = dataclasses.field(default_factory=list)
     finished: list[PartEnded] = dataclasses.field(default_factory=list)
     fed: dict[int, Feed] = dataclasses.field(default_factory=dict)
     earlier: dict[int, list[Feed]] = dataclasses.field(default_factory=dict)
@@ -95,7 +95,7 @@ class Delivery:
                 self.waiting.append(record)
             case Go():
                 self.waiting.append(record)
-            case Outcome() | SnapshotNow():
+            case Outcome() | Perform() | SnapshotNow():
                 self.inward.append(record)
             case _:
                 return False
@@ -106,7 +106,7 @@ class Delivery:
         self.is_live = True
         self.earlier.clear()
 
-    def next_inward(self) -> list[Outcome | SnapshotNow]:
+    def next_inward(self) -> list[PastInputs]:
         """Take what goes past the bricks; a snapshot is asked for when the home knows all that a replica does."""
         records, self.inward = self.inward, []
         if self.inside:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from ...actors.backoff import Backoff
 from ...actors.errors import HoldfastError, StartFailed
 from ...actors.exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
 from ...actors.kernel import lifecycle
@@ -28,7 +29,6 @@ from ...checkpoint.home.homes import Homes
 from ...checkpoint.home.journal_home import Entered, JournalHome
 from ...checkpoint.method import Method
 from ...checkpoint.protocol import Restore
-from ...supervision.backoff import Backoff
 from ...supervision.respec import replace_mechanism, respec
 from ...supervision.spec import ChildSpec, Flags, child
 from ...supervision.supervisor import Supervisor

@@ -37,6 +37,8 @@ from ...checkpoint.protocol import (
     Ignored,
     Live,
     Outcome,
+    PastInputs,
+    Performed,
     PipeDone,
     Released,
     Restore,
@@ -110,7 +112,7 @@ class Driver(Protocol):
         """See to it that what waits to go home is taken."""
         ...
 
-    def tell_outward(self, record: Released) -> None:
+    def tell_outward(self, record: Released | Performed) -> None:
         """Something leaves in the middle of a turn."""
         ...
 
@@ -986,7 +988,7 @@ class Server(lifecycle.HerePlace):
                     if record.status == FAILED:
                         self.attempts.failed = record.id
                 self.part.ends.append(record)
-            case Released():
+            case Released() | Performed():
                 if self._driver is not None:
                     self._driver.tell_outward(record)
             case Live():
@@ -1006,14 +1008,14 @@ class Server(lifecycle.HerePlace):
         if life is not None and cell is not None:
             self._life_ended(life, cell.extra().reason)
 
-    def inward(self, record: Outcome | SnapshotNow) -> None:
+    def inward(self, record: PastInputs) -> None:
         """Take what came from home past the bricks."""
         if isinstance(record, Outcome):
             self.traces.heard[record.turn, record.k] = record
-            if self.life is not None:
-                self.life.to_life(record)
-        else:
+        if isinstance(record, SnapshotNow):
             self.want_snapshot()
+        elif self.life is not None:
+            self.life.to_life(record)
 
     # -- what goes home beside the ends of turns ---------------------------------------------------------------------
 

@@ -16,6 +16,7 @@ from typing import Any, TypeAlias, TypeGuard
 import msgspec
 
 from ...actors import exit_reasons
+from ...actors.backoff import Backoff
 from ...actors.errors import SpecError
 from ...actors.events import HookFailed, LogLine, ProcessDied, ProcessStarted
 from ...actors.exit_reasons import ExitReason
@@ -25,7 +26,6 @@ from ...actors.kernel.message import Message, Refusal
 from ...actors.process.fork.launch import outside_environment
 from ...actors.process.program.external_program import KeptProgram, ProgramFailed
 from ...actors.process.resource_limits import Limits
-from ..backoff import Backoff
 from ..rules import Rule
 from ..spec import ChildSpec, Restart, Shutdown, child
 from .readiness import ReadySign, Sign, by_name, reached

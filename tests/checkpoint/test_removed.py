@@ -9,6 +9,76 @@ from __future__ import annotations
 from tests.removing import Check, as_tests
 
 CHECKS = {
+    "an effect leaves when all before it is safe": Check(
+        "checkpoint/home/outputs.py",
+        "batch.after.append(lambda: home.calls.order(turn, out.k))",
+        "home.calls.order(turn, out.k)",
+        "tests/effects/test_effects.py",
+        "test_an_effect_waits_until_all_before_it_is_safe",
+    ),
+    "what is made at most once is not made again": Check(
+        "checkpoint/home/pending_asks.py",
+        "        if out.name:\n",
+        "        if False:\n",
+        "tests/effects/test_effects.py",
+        "test_one_that_is_made_at_most_once",
+    ),
+    "the replay of a turn that has ended makes no effect": Check(
+        "checkpoint/home/pending_asks.py",
+        "        if turn <= home.ledger.turn:\n            return  # Its turn has ended without waiting",
+        "        if False:\n            return  # Its turn has ended without waiting",
+        "tests/effects/test_effects.py",
+        "test_what_a_turn_has_left_without_an_outcome",
+    ),
+    "a task beside the turn has no effect": Check(
+        "checkpoint/life/recorded_context.py",
+        "            self._outside()\n            return super()._performed(effect, at_most_once)",
+        "            return super()._performed(effect, at_most_once)",
+        "tests/effects/test_effects.py",
+        "test_a_task_beside_the_turn_has_none and effect",
+    ),
+    "an effect whose handler does not wait any more comes to nothing": Check(
+        "checkpoint/life/recorded_context.py",
+        "        outcome.add_done_callback(lambda _: task.cancel())  # The handler",
+        "        _ = task  # The handler",
+        "tests/effects/test_effects.py",
+        "test_an_effect_ends_when_its_handler",
+    ),
+    "a message that a turn has waited for is no input any more": Check(
+        "checkpoint/long_waits.py",
+        "        home.end_without_turn(source, HAD if source.ask is not None else Answer(), batch)\n",
+        "",
+        "tests/effects/test_long_waits.py",
+        "test_a_turn_waits_on_whatever_ends and task",
+    ),
+    "the life forgets a message that was taken from its mailbox": Check(
+        "checkpoint/life/recorded_life.py",
+        "        if record.taken >= 0:\n",
+        "        if False:\n",
+        "tests/effects/test_long_waits.py",
+        "test_the_message_that_has_waited_longest",
+    ),
+    "a turn that rests is not blamed for the end of its process": Check(
+        "checkpoint/life/recorded_life.py",
+        "0 if how and self.resting else ",
+        "",
+        "tests/effects/test_long_waits.py",
+        "test_a_turn_waits_on_whatever_ends and process",
+    ),
+    "the journal goes on with the outputs of a turn where it had come to": Check(
+        "checkpoint/home/input_ledger.py",
+        "self.released[more[0] if more else 0 :] = digests",
+        "self.released[:] = digests",
+        "tests/effects/test_long_waits.py",
+        "test_a_turn_goes_on_in_the_next_program",
+    ),
+    "a wait ends with the life": Check(
+        "checkpoint/home/switch.py",
+        "        self.long_waits.abandon()\n",
+        "",
+        "tests/effects/test_long_waits.py",
+        "test_a_turn_that_is_over_waits_for_nothing",
+    ),
     "T13: after a failed sync nothing takes effect": Check(
         "checkpoint/group_commit.py",
         "        if error is not None:\n            failure =",

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import random
 
-from ..actors.errors import SpecError
+from .errors import SpecError
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -1,0 +1,102 @@
+"""What turns of a recorded actor wait for in days: moments and messages. Clocks run, and messages come, at home."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from ..actors.errors import WaitTimeout
+from .inputs import Batch, Input
+from .protocol import MESSAGE, MOMENT, REPLY, Answer, Out, timed
+
+if TYPE_CHECKING:
+    from .home.switch import Switch
+
+LONGEST: Final = 3600.0
+"""Seconds after which a longer wait looks at the wall clock again: that may have been set, or the machine has slept."""
+HAD: Final = Answer(REPLY, "", msgspec.msgpack.encode(None))
+"""What the sender of a message gets that a turn has waited for."""
+
+Place = tuple[int, int]
+"""A turn, and the number of its output."""
+
+
+class LongWaits:
+    """What the turn in hand at one home waits for. It ends with the life; the next one's turn waits again."""
+
+    __slots__ = ("_clocks", "_home", "wanted")
+
+    def __init__(self, home: Switch) -> None:
+        self._home = home
+        self._clocks: dict[Place, asyncio.TimerHandle] = {}
+        self.wanted: dict[Place, tuple[str, ...]] = {}  # types of messages, in the order in which turns wait for them
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether the turn in hand waits for a moment or a message."""
+        return bool(self._clocks or self.wanted)
+
+    def begin(self, turn: int, key: int, out: Out) -> None:
+        """The turn with input `key` waits: until a moment, or for a message, for which there may be a time limit."""
+        place = turn, out.k
+        if place in self._clocks or place in self.wanted:
+            return
+        if out.verb == "wait":
+            names = tuple(out.name.split("|"))
+            source = next((one for one in self._home.ledger.open.values() if self._suits(one, names, key)), None)
+            if source is not None:
+                self._take(place, source)
+                return
+            self.wanted[place] = names
+        if out.seconds:
+            self._look(place, out.seconds)
+
+    def _suits(self, source: Input, names: tuple[str, ...], running: int) -> bool:
+        """Whether an input is a message that a turn waits for, and nobody has begun it."""
+        is_free = source.kind == MESSAGE and source.id != running and not source.held
+        return is_free and source.name in names and source.id not in self._home.ledger.stashed()
+
+    def takes(self, source: Input) -> bool:
+        """Whether a message that has come is what a turn waits for; it has it then."""
+        place = next((place for place, names in self.wanted.items() if source.name in names), None)
+        if place is None or source.kind != MESSAGE:
+            return False
+        self._take(place, source)
+        return True
+
+    def _take(self, place: Place, source: Input) -> None:
+        """The message is no input any more, but an outcome of the turn, in one append."""
+        home, batch = self._home, Batch()
+        self._forget(place)
+        home.end_without_turn(source, HAD if source.ask is not None else Answer(), batch)
+        outcome = timed(Answer(MESSAGE, source.name, source.body), home.node.clock.wall())
+        home.calls.outcome(*place, outcome, batch, taken=source.id)
+        batch.commit(home.journal)
+
+    def _look(self, place: Place, when: float) -> None:
+        """Is it time?"""
+        home = self._home
+        now = home.node.clock.wall()
+        if now < when:
+            self._clocks[place] = home.node.loop.call_later(min(when - now, LONGEST), self._look, place, when)
+            return
+        names = self.wanted.get(place)
+        self._forget(place)
+        if names is None:
+            answer = Answer(MOMENT)
+        else:
+            answer = Answer(*home.node.codec.encode_error(WaitTimeout(home.path, " or ".join(names))))
+        home.calls.outcome(*place, timed(answer, now), None)
+
+    def _forget(self, place: Place) -> None:
+        clock = self._clocks.pop(place, None)
+        self.wanted.pop(place, None)
+        if clock is not None:
+            clock.cancel()
+
+    def abandon(self) -> None:
+        """The life is over."""
+        for place in {*self._clocks, *self.wanted}:
+            self._forget(place)

@@ -1,0 +1,249 @@
+"""Turns that wait for a moment or for a message, over the end of their process, of their life and of the program."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.checkpoint.home.recorded_home import switch_of
+from holdfast.testing import advance
+from tests.effects.clerk import lines
+from tests.effects.patient import IN_TIME, Call, Count, Go, Look, Never, Patient, patient
+
+DAY = 86400.0
+VIRTUAL = pytest.mark.asyncio(loop_factories=["virtual"])
+
+
+def running(tmp_path: Path, durability: str = "memory") -> hf.ActorSystem:
+    store = None if durability == "memory" else f"sqlite:{tmp_path / 'app.db'}"
+    return hf.ActorSystem("app", log=False, store=store, intensity=99)
+
+
+async def waits(system: hf.ActorSystem) -> None:
+    """Wait until the turn of the patient waits, and its home knows."""
+    async with asyncio.timeout(IN_TIME):
+        while not ((home := switch_of(system._node.cell_at("/app/patient"))) and home.long_waits.is_busy):
+            await asyncio.sleep(0.001)
+
+
+async def end_of(system: hf.ActorSystem, isolation: str) -> None:
+    """End the life in the middle of its turn, and wait until the next one is there."""
+    with system.events() as stream:
+        if isolation == "process":
+            os.kill(system.pid_of(system.ref("/app/patient", Patient)), signal.SIGKILL)
+        else:
+            system.ref("/app/patient", Patient).kill()
+        async with asyncio.timeout(IN_TIME):
+            async for event in stream:
+                if isinstance(event, hf.events.Recovered):
+                    return
+
+
+# -- moments ---------------------------------------------------------------------------------------------------------
+
+
+@VIRTUAL
+async def test_days_pass_and_crashes_make_them_no_longer(tmp_path: Path) -> None:
+    async with running(tmp_path) as system:
+        ref = await system.start(patient())
+        begin = ref.ask(Count())
+        assert await begin == 1
+        asked = asyncio.ensure_future(ref.ask(Go([f"s{10 * DAY}", f"s{5 * DAY}"]), 30 * DAY))
+        loop = asyncio.get_running_loop()
+        start = loop.time()
+        for _ in range(4):
+            await advance(3 * DAY)
+            await end_of(system, "task")
+        assert await asked == "slept, slept"
+        assert 15 * DAY <= loop.time() - start < 15.01 * DAY
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_moment_that_has_passed_ends_the_wait_at_once(tmp_path: Path, isolation: str) -> None:
+    async with running(tmp_path) as system:
+        ref = await system.start(patient(isolation))
+        assert await ref.ask(Go(["s0", "s0.0"]), IN_TIME) == "slept, slept"
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_what_comes_meanwhile_is_handled_behind(tmp_path: Path, isolation: str) -> None:
+    async with running(tmp_path) as system:
+        ref = await system.start(patient(isolation))
+        asked = ref.ask(Go(["s0.2"]), IN_TIME)
+        counts = [ref.ask(Count(), IN_TIME) for _ in range(3)]
+        order: list[object] = []
+        asked.add_done_callback(lambda done: order.append(done.result()))
+        for one in counts:
+            one.add_done_callback(lambda done: order.append(done.result()))
+        assert await asyncio.gather(*counts) == [1, 2, 3]
+        assert order == ["slept", 1, 2, 3]
+
+
+# -- messages --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("mailbox", [None, hf.bounded(8)])
+async def test_the_message_that_has_waited_longest_is_taken_from_the_mailbox(
+    tmp_path: Path, isolation: str, mailbox: Any
+) -> None:
+    """Before all that came earlier; whoever has asked hears that it was taken."""
+    async with running(tmp_path) as system:
+        ref = await system.start(patient(isolation, mailbox=mailbox))
+        with system.events() as stream:
+            asked = ref.ask(Go(["s0.1", "c", "c", "c"]), IN_TIME)
+            count = ref.ask(Count(), IN_TIME)
+            ref.tell(Call("first"))
+            second = ref.ask(Call("second"), IN_TIME)
+            ref.tell(Never())
+            assert await asked == "slept, call first, call second, never"
+            await second
+            assert await count == 1
+            assert await ref.ask(Look(), IN_TIME) == ["slept, call first, call second, never"]
+            assert not [event for event in stream.take() if isinstance(event, hf.events.ActorCrashed)]
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_the_first_that_comes_is_taken_and_no_other(tmp_path: Path, isolation: str) -> None:
+    async with running(tmp_path) as system:
+        ref = await system.start(patient(isolation))
+        asked = ref.ask(Go(["c"]), IN_TIME)
+        await waits(system)
+        for word in ("a", "b"):
+            ref.tell(Call(word))
+        assert await asked == "call a"
+        assert await ref.ask(Look(), IN_TIME) == ["call a", "no turn has waited for b"]
+
+
+@VIRTUAL
+async def test_a_time_limit_is_an_outcome(tmp_path: Path) -> None:
+    async with running(tmp_path) as system:
+        ref = await system.start(patient())
+        asked = asyncio.ensure_future(ref.ask(Go([f"c{DAY}", "c"]), 9 * DAY))
+        await advance(2 * DAY)
+        await end_of(system, "task")
+        ref.tell(Call("late"))
+        said = await asked
+        assert said.startswith("/app/patient has waited for tests.effects.patient:Call or ")
+        assert said.endswith(", call late")
+
+
+# -- ends ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("durability", ["memory", "os"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_turn_waits_on_whatever_ends(tmp_path: Path, isolation: str, durability: str) -> None:
+    """Ended more often than a message may end a process: it was not at work."""
+    world = str(tmp_path / "world")
+    async with running(tmp_path, durability) as system:
+        ref = await system.start(patient(isolation))
+        asked = asyncio.ensure_future(ref.ask(Go(["e", "c", "c", "e"], world), IN_TIME))
+        for word in ("a", "b"):
+            for _ in range(4):
+                await waits(system)
+                await end_of(system, isolation)
+            await waits(system)
+            await ref.ask(Call(word), IN_TIME)
+        assert await asked == "effect 1, call a, call b, effect 2"
+        assert len(lines(world)) == 2
+        await end_of(system, "task")  # A replay of the whole turn.
+        assert await ref.ask(Look(), IN_TIME) == ["effect 1, call a, call b, effect 2"]
+        assert len(lines(world)) == 2
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_turn_goes_on_in_the_next_program(tmp_path: Path, isolation: str) -> None:
+    """An orderly stop does not wait for it, however long it may."""
+    world = str(tmp_path / "world")
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(patient(isolation, shutdown="infinity"))
+        ref.tell(Go(["e", "c", "s0.3", "c"], world))
+        await waits(system)
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(patient(isolation, shutdown="infinity"))
+        await ref.ask(Call("a"), IN_TIME)
+        await waits(system)
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(patient(isolation))
+        ref.tell(Call("b"))
+        assert await ref.ask(Look(), IN_TIME) == ["effect 1, call a, slept, call b"]
+        assert len(lines(world)) == 1
+
+
+async def test_a_turn_that_is_over_waits_for_nothing(tmp_path: Path) -> None:
+    """With the method that replays nothing it is over when the life is."""
+    async with running(tmp_path) as system:
+        ref = await system.start(patient(recovery=hf.checkpoint_only()))
+        asked = ref.ask(Go(["c"]), IN_TIME)
+        await waits(system)
+        ref.kill()
+        with pytest.raises(hf.AskFailed, match="replays nothing"):
+            await asked
+        await ref.ask(Call("a"), IN_TIME)
+        assert await ref.ask(Look(), IN_TIME) == ["no turn has waited for a"]
+
+
+# -- refusals --------------------------------------------------------------------------------------------------------
+
+
+class Ask(hf.Message[int]): ...
+
+
+class Wrong(hf.Message[str]):
+    which: int
+
+
+class Strange(Patient):
+    @hf.on(Wrong)
+    async def wrong(self, message: Wrong) -> str:
+        ctx: Any = self.ctx
+        calls = [
+            lambda: ctx.wait_for(),
+            lambda: ctx.wait_for(int),
+            lambda: ctx.wait_for(Ask),
+            lambda: ctx.wait_for(Call, timeout=0),
+            lambda: ctx.sleep(-1),
+            lambda: ctx.sleep(float("inf")),
+            lambda: ctx.sleep_until("tomorrow"),
+        ]
+        try:
+            await calls[message.which]()
+        except hf.SpecError as error:
+            return str(error)
+        return "nothing wrong"
+
+
+@pytest.mark.parametrize(
+    ("which", "says"),
+    [
+        (0, "classes"),
+        (1, "classes"),
+        (2, "Ask has another"),
+        (3, "timeout"),
+        (4, ">= 0"),
+        (5, ">= 0"),
+        (6, "Unix time"),
+    ],
+)
+async def test_what_is_wrong_is_said_at_the_call(which: int, says: str) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("strange", hf.start(Strange), recovery=hf.hybrid()))
+        assert says in await ref.ask(Wrong(which))
+
+
+@pytest.mark.parametrize("mechanism", [None, hf.ftm.TR()])
+async def test_where_no_home_can_hold_a_message_for_it_a_turn_does_not_wait(mechanism: Any) -> None:
+    recovery = hf.fresh() if mechanism is None else hf.hybrid()
+    async with hf.ActorSystem("app", log=False, intensity=99) as system:
+        spec = hf.child("patient", hf.start(Patient), recovery=recovery, mechanism=mechanism)
+        ref = await system.start(spec)
+        with pytest.raises(hf.RemoteCrash, match=r"recovery|mechanism"):
+            await ref.ask(Go(["c"]), IN_TIME)
+        assert await ref.ask(Go(["s0.01"]), IN_TIME) == "slept"
