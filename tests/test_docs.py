@@ -2,7 +2,7 @@
 
 A block of a Markdown file is a part of a program that is made of all blocks of that file, in order. A block that opens
 with a comment holding a path is a quotation instead: it must stand word for word in that file. A program comes to each
-`except` that it shows.
+`except` of an error of holdfast that it shows.
 """
 
 import ast
@@ -86,9 +86,9 @@ class Branch(NamedTuple):
 
 
 def error_branches(text: str) -> Iterator[Branch]:
-    """Each `except` of a program, unless a statement with a body of its own comes first in it."""
+    """Each `except hf...` of a program, unless a statement with a body of its own comes first in it."""
     for node in ast.walk(ast.parse(text)):
-        if not isinstance(node, ast.ExceptHandler):
+        if not isinstance(node, ast.ExceptHandler) or node.type is None or "hf." not in ast.unparse(node.type):
             continue
         first = node.body[0]
         if not any(isinstance(inner, ast.stmt) for inner in ast.iter_child_nodes(first)):
@@ -97,7 +97,7 @@ def error_branches(text: str) -> Iterator[Branch]:
 
 
 def marking(text: str, folder: Path) -> str:
-    """The program, which leaves a file in `folder` for each `except` that it comes to, named after the line."""
+    """The program, which leaves a file in `folder` for each `except hf...` that it comes to, named after the line."""
     lines = text.splitlines()
     for line, row, column in error_branches(text):
         mark = f"__import__('pathlib').Path({str(folder / str(line))!r}).touch(); "
@@ -174,9 +174,11 @@ def test_blocks_keep_their_lines() -> None:
 
 
 def test_an_error_that_is_not_met_is_noticed(tmp_path: Path) -> None:
-    text = "try:\n    {}[0]\nexcept KeyError as é:\n    x = 'é'; y = x\nexcept ValueError:\n    pass\n"
+    text = (
+        "try:\n    raise hf.SendError\nexcept hf.SendError as é:\n    x = 'é'; y = x\nexcept hf.AskFailed:\n    pass\n"
+    )
     assert [branch.line for branch in error_branches(text)] == [3, 5]
-    exec(compile(marking(text, tmp_path), "script", "exec"), {})
+    exec(compile(marking(text, tmp_path), "script", "exec"), {"hf": holdfast})
     assert [one.name for one in tmp_path.iterdir()] == ["3"]
 
 
