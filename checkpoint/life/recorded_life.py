@@ -15,7 +15,16 @@ from collections.abc import Callable, Coroutine, Generator
 from typing import Any, Final, NoReturn, Protocol, TypeAlias, TypeVar
 
 from ...actors.effects import Effect
-from ...actors.errors import ActorStopped, BadMessage, BadReply, ControlFailed, HoldfastError, StartFailed, remote_crash
+from ...actors.errors import (
+    ActorStopped,
+    BadMessage,
+    BadReply,
+    ControlFailed,
+    HoldfastError,
+    StartFailed,
+    remote_crash,
+    type_name,
+)
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.actor import Actor, Start
@@ -248,7 +257,7 @@ class Life:
             else:
                 future.set_exception(self.cell.node.codec.decode_error(answer.kind, answer.name, answer.body))
         except Exception as error:
-            name = message_name(kind) if isinstance(kind, type) else kind.key if isinstance(kind, Effect) else "send"
+            name = type_name(kind) if isinstance(kind, type) else kind.key if isinstance(kind, Effect) else "send"
             future.set_exception(BadReply(name, str(error)))
 
     def _result(self, answer: Answer, awaited: Awaited) -> object:
