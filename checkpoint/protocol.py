@@ -27,6 +27,8 @@ REPLY, REFUSAL, ERROR, CRASH, LATER, NOTHING = "reply", "refusal", "error", "cra
 # What else a turn can wait for: a moment, or (MESSAGE) a message. If it may have waited for long, the kind of the
 # outcome begins with TIMED, and its body has the Unix time at which it came in front.
 MOMENT, TIMED = "moment", "timed "
+# In place of a receiver, of a wait whose `seconds` begin with it; else they are Unix time.
+SINCE_THEN = "since then"
 
 
 class Out(msgspec.Struct, array_like=True, gc=False):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ...actors.errors import DIVERGES, ReplayDiverged
 from ..inputs import NO_POSITIONS, OVERHEAD, Input, Turn
 from ..life.replay_guard import StateDiverged
+from ..long_waits import due_entry
 from ..protocol import DROPPED, FAILED, MESSAGE, OK, PIPE, START, STASHED, TICK, Answer, Out, TurnEnd, answer_digest
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ class InputLedger:
         begun: the input of the turn after `turn`, if it has released outputs.
         released: digests of those outputs.
         outcomes: of the asks that these turns have made, by (turn, output).
+        dues: until when outputs of the turn in hand wait, in Unix time.
         pipes_done: the background work of these turns that has its result, by turn.
         journal_bytes: what is counted against the journal's limit.
         newest: the snapshot that the next life begins with.
@@ -50,6 +52,7 @@ class InputLedger:
     begun: int = -1
     released: list[int] = dataclasses.field(default_factory=list)
     outcomes: dict[tuple[int, int], Answer] = dataclasses.field(default_factory=dict)
+    dues: dict[tuple[int, int], float] = dataclasses.field(default_factory=dict)
     pipes_done: dict[int, set[int]] = dataclasses.field(default_factory=dict)
     journal_bytes: int = 0
     newest: Meta | None = None
@@ -188,6 +191,7 @@ class InputLedger:
         """End a turn, with the outputs that it has released."""
         turn = self.turns[number] = Turn(source, status, self.released, state, reply)
         self.released, self.begun = [], -1
+        self.dues.clear()
         self.turn = source.turn = number
         source.deliveries = 0
         if status != STASHED:
@@ -260,6 +264,7 @@ class InputLedger:
         source = self.open.get(self.begun)
         if source is None or not self.released:
             self.released, self.begun = [], -1
+            self.dues.clear()
             return None
         return source
 
@@ -330,6 +335,7 @@ class InputLedger:
         entries += [turn.entry(number) for number, turn in self.turns.items()]
         if self.released:
             entries.append(self.released_entry(self.turn + 1))
+        entries += [due_entry(*place, when) for place, when in self.dues.items()]
         # What was put aside once may have ended in a turn that was given up.
         ended = {turn.input.id for turn in self.turns.values() if turn.status != STASHED}
         return entries + [("drop", key) for key in dict.fromkeys(self.ended_in_the_stash()) if key not in ended]
@@ -359,6 +365,10 @@ class InputLedger:
                 if turn > self.turn:
                     self.released[more[0] if more else 0 :] = digests
                     self.begun = key
+            case ("due", turn, k, when):
+                self.positions_of(turn).append(position)
+                if turn > self.turn:
+                    self.dues[turn, k] = when
             case ("got", turn, k, kind, name, body):
                 self.positions_of(turn).append(position)
                 self.outcomes[turn, k] = Answer(kind, name, body)

@@ -54,6 +54,7 @@ class Outputs:
             case "effect":
                 batch.after.append(lambda: home.calls.order(turn, out.k))
             case "sleep" | "wait":
+                home.long_waits.fix(turn, out, batch)
                 batch.after.append(lambda: home.long_waits.begin(turn, key, out))
             case "publish":
                 self._publish(turn, out, batch)

@@ -116,7 +116,7 @@ class Life:
         self.last_k = 0
         self.asks: dict[tuple[int, int], tuple[asyncio.Future[Any], Awaited]] = {}
         self.pipes = 0
-        self.moment = 0.0  # until which the turn in hand has waited
+        self.moment = 0.0  # until which the handler of the turn in hand has waited
         self.resting = 0  # how many moments and messages it waits for
         self.stash: list[Fed] = []
         self.returned: dict[int, Fed] = {}
@@ -250,7 +250,8 @@ class Life:
             return
         try:
             answer, when = untimed(record.answer)
-            self.moment = max(self.moment, when)
+            if when:
+                future.when = when  # type: ignore[attr-defined]  # only what has a time is `Pending`
             if answer.kind in (REPLY, MESSAGE, MOMENT):
                 future.set_result(self._result(answer, kind))
             else:
