@@ -69,9 +69,10 @@ class Worker(hf.Actor):
 
     def effect(self, n: int, step: str, how: str) -> asyncio.Future[str]:
         line = f"{self.worker} {n} {step} {self.ctx.message_id}"
-        function = note if how == "t" else note_async
         is_process = WORKERS[self.worker] == "process"
-        return self.ctx.effect(function, self.world, line, is_process, key=step, at_most_once=how == "o")
+        if how == "t":
+            return self.ctx.effect(note, self.world, line, is_process, key=step)
+        return self.ctx.effect(note_async, self.world, line, is_process, key=step, at_most_once=how == "o")
 
     async def outcome(self, effect: asyncio.Future[str]) -> str:
         try:

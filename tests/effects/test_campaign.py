@@ -41,9 +41,9 @@ def judge(worker: int, accepted: set[int], seen: Seen, world: Iterable[str]) -> 
     lines = [line.split() for line in world]
     made = Counter((int(n), step) for of, n, step, _ in lines if int(of) == worker)
     keys: dict[int, set[str]] = {}
-    for of, n, _, key in lines:
+    for of, number, _, key in lines:
         if int(of) == worker:
-            keys.setdefault(int(n), set()).add(key)
+            keys.setdefault(int(number), set()).add(key)
     numbers = [n for n, _ in seen]
     wrong = [f"{n} is lost" for n in sorted(accepted - set(numbers))]
     wrong += [f"{n} is there {count} times" for n, count in Counter(numbers).items() if count > 1]

@@ -296,7 +296,7 @@ async def test_an_effect_waits_until_all_before_it_is_safe(tmp_path: Path) -> No
         ref = await system.start(hf.child("careful", hf.start(Careful), recovery=hf.hybrid(interval=1000.0)))
         asked = ref.ask(Begin(), IN_TIME)
         async with asyncio.timeout(IN_TIME):
-            while not goes_on._waiters:  # type: ignore[attr-defined]  # that its turn has come so far
+            while not goes_on._waiters:  # Its turn has not come so far.
                 await asyncio.sleep(0.001)
         engine.let_sync.clear()  # From here on nothing becomes safe.
         goes_on.set()
@@ -430,7 +430,10 @@ class Exploding(Clerk):
     @hf.on(Explode)
     async def explode(self, message: Explode) -> str:
         try:
-            value = await self.ctx.effect(explode_async if message.is_async else explode, message.name)
+            if message.is_async:
+                value = await self.ctx.effect(explode_async, message.name)
+            else:
+                value = await self.ctx.effect(explode, message.name)
         except hf.HoldfastError as error:
             return str(error)
         return f"{len(value)} bytes"
