@@ -14,7 +14,21 @@ from ...actors.errors import DIVERGES, ReplayDiverged
 from ..inputs import NO_POSITIONS, OVERHEAD, Input, Turn
 from ..life.replay_guard import StateDiverged
 from ..long_waits import due_entry
-from ..protocol import DROPPED, FAILED, MESSAGE, OK, PIPE, START, STASHED, TICK, Answer, Out, TurnEnd, answer_digest
+from ..protocol import (
+    DROPPED,
+    FAILED,
+    MESSAGE,
+    OK,
+    PIPE,
+    START,
+    STASHED,
+    TICK,
+    TIMED,
+    Answer,
+    Out,
+    TurnEnd,
+    answer_digest,
+)
 
 if TYPE_CHECKING:
     from ..journal import Entry
@@ -34,6 +48,7 @@ class InputLedger:
         begun: the input of the turn after `turn`, if it has released outputs.
         released: digests of those outputs.
         outcomes: of the asks that these turns have made, by (turn, output).
+        lasts: whether that turn has had effects or long waits: it goes on in the next life at its address.
         dues: until when outputs of the turn in hand wait, in Unix time.
         pipes_done: the background work of these turns that has its result, by turn.
         journal_bytes: what is counted against the journal's limit.
@@ -52,6 +67,7 @@ class InputLedger:
     begun: int = -1
     released: list[int] = dataclasses.field(default_factory=list)
     outcomes: dict[tuple[int, int], Answer] = dataclasses.field(default_factory=dict)
+    lasts: bool = False
     dues: dict[tuple[int, int], float] = dataclasses.field(default_factory=dict)
     pipes_done: dict[int, set[int]] = dataclasses.field(default_factory=dict)
     journal_bytes: int = 0
@@ -191,6 +207,7 @@ class InputLedger:
         """End a turn, with the outputs that it has released."""
         turn = self.turns[number] = Turn(source, status, self.released, state, reply)
         self.released, self.begun = [], -1
+        self.lasts = False
         self.dues.clear()
         self.turn = source.turn = number
         source.deliveries = 0
@@ -263,7 +280,7 @@ class InputLedger:
         """Let the turn in hand begin anew, unless it has released something: then its input is returned."""
         source = self.open.get(self.begun)
         if source is None or not self.released:
-            self.released, self.begun = [], -1
+            self.released, self.begun, self.lasts = [], -1, False
             self.dues.clear()
             return None
         return source
@@ -368,10 +385,11 @@ class InputLedger:
             case ("due", turn, k, when):
                 self.positions_of(turn).append(position)
                 if turn > self.turn:
-                    self.dues[turn, k] = when
+                    self.dues[turn, k], self.lasts = when, True
             case ("got", turn, k, kind, name, body):
                 self.positions_of(turn).append(position)
                 self.outcomes[turn, k] = Answer(kind, name, body)
+                self.lasts = self.lasts or (turn > self.turn and kind.startswith(TIMED))
             case ("drop", key):
                 self.drop([position])
                 if key in self.open:

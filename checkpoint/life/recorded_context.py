@@ -88,7 +88,7 @@ class Pending(asyncio.Future[Any]):
 
     def __init__(self, life: Life) -> None:
         super().__init__(loop=life.cell.node.loop)
-        self._life, self.when = life, 0.0
+        self._life, self.when, self.is_out = life, 0.0, False
 
     def __await__(self) -> Generator[Any, None, Any]:
         try:
@@ -323,8 +323,11 @@ class RecordedContext(ActorContext):
         names = {message_name(kind): kind for kind in kinds}
         return self._rest("wait", "|".join(names), timeout or 0.0, names)
 
-    def perform(self, turn: int, k: int, effect: Effect, outcome: asyncio.Future[Any]) -> None:
+    def perform(self, turn: int, k: int, effect: Effect, outcome: Pending) -> None:
         """Perform an effect of the turn in hand, in a task of its own, and have the home journal what it comes to."""
+        if outcome.is_out:
+            return  # Whoever led before has been told so, too.
+        outcome.is_out = True
         task = self._beside(self._carried_out(turn, k, effect), "effect")
         outcome.add_done_callback(lambda _: task.cancel())  # The handler does not wait for it any more.
 

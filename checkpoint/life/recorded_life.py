@@ -71,7 +71,7 @@ from ..turn_word import WAITS
 from .determinism_guard import DeterminismGuard
 from .life_state import HookTimers, LifeStage, RestoredState, SnapshotState
 from .readonly_guard import check_readonly
-from .recorded_context import RecordedContext
+from .recorded_context import Pending, RecordedContext
 from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
 from .replay_guard import digest_of
 
@@ -274,7 +274,7 @@ class Life:
         """An effect of the turn in hand has no outcome yet."""
         outcome, effect = self.asks.get((turn, k), (None, None))
         ctx = self.cell.ctx
-        if outcome is not None and isinstance(effect, Effect) and isinstance(ctx, RecordedContext):
+        if isinstance(outcome, Pending) and isinstance(effect, Effect) and isinstance(ctx, RecordedContext):
             ctx.perform(turn, k, effect, outcome)
 
     # -- turns ------------------------------------------------------------------------------------------------------
@@ -339,18 +339,20 @@ class Life:
             if self.returned:
                 self.handle_returned()
 
-    def leave_turn(self, reason: ExitReason) -> bool:
-        """End in the middle of a turn that rests, for that may be for days: the next life's goes on. False: none does.
+    def stop(self, reason: ExitReason) -> None:
+        """End in good order: behind the turn in hand, or in the middle of one that rests, for that may be for days.
 
-        There is no snapshot of such a moment, and `on_stop` is not called in it.
+        The next life goes on with that. There is no snapshot of such a moment, and `on_stop` is not called in it.
         """
+        if self.cell.state is not RUNNING:
+            return
         turn = None if self.cell.more is None else self.cell.more.turn
         if not self.resting or turn is None or turn.then is not None:
-            return False
+            self.cell.urge(StopRecorded(self, reason))
+            return
         self.feed, self.outs = None, []  # What its handler says while it is cancelled does not count.
         turn.then = functools.partial(lifecycle.finish, self.cell, reason, is_orderly=False)
         turn.runner.task.cancel()
-        return True
 
     def ignore(self, why: str) -> None:
         """The actor does not want to be started: turn 0 stays open for the next start."""
@@ -642,8 +644,8 @@ class LifePlace(lifecycle.HerePlace):
         self.life = life
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
-        if cell.state is RUNNING and self.life is not None and not self.life.leave_turn(reason):
-            cell.urge(StopRecorded(self.life, reason))
+        if self.life is not None:
+            self.life.stop(reason)
 
 
 class FedHome(lifecycle.MailboxHome):
