@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 
 from ..errors import ActorStopped, AskDeadlock, HoldfastError, remote_crash
 from ..exit_reasons import NORMAL, ExitReason
+from ..seconds import check_seconds
 from . import links, mailbox
-from .envelope import Ask, Chain, Envelope, Item, ReplyHandle, chain_of, message_in
+from .envelope import NO_DEADLINE, Ask, Chain, Envelope, Item, ReplyHandle, chain_of, message_in
 from .links import Monitor
 from .message import Message, require_message
 from .timers import Timer
@@ -134,7 +135,7 @@ class ActorContext:
         if waits_for(self, cell, chain):
             future.set_exception(AskDeadlock(cell.path, tuple(path for path, _ in chain)))
             return future
-        ask = Ask(message, self._cell, chain, timeout, node.loop.time() + timeout, future, cell)
+        ask = Ask(message, self._cell, chain, timeout, NO_DEADLINE, future, cell)
         node.deadlines.add(ask)
         try:
             cell.admit(cell, ask)
@@ -247,14 +248,19 @@ class ActorContext:
     # -- later ------------------------------------------------------------------------------------------------------
 
     def tell_after(self, delay: float, message: Message[Any]) -> Timer:
-        """Have a message come to this actor itself after `delay` seconds; the timer ends with this life."""
-        self._alive()
-        return Timer(self._cell, message, delay, None)
+        """Have a message come to this actor itself after `delay` seconds, >= 0; the timer ends with this life."""
+        timer: Timer = self._timer(message, check_seconds(self.path, "delay", delay, or_zero=True), None)
+        return timer
 
     def every(self, interval: float, message: Message[Any]) -> Timer:
-        """Have a message come every `interval` seconds; ticks that fall due while one waits are left out."""
+        """Have a message come every `interval` seconds, > 0; ticks that fall due while one waits are left out."""
+        timer: Timer = self._timer(message, check_seconds(self.path, "interval", interval), interval)
+        return timer
+
+    def _timer(self, message: Message[Any], delay: float, interval: float | None) -> Any:
+        """A handle on a timer that is set now."""
         self._alive()
-        return Timer(self._cell, message, interval, interval)
+        return Timer(self._cell, message, delay, interval)
 
     def pipe_to_self(
         self,

@@ -25,6 +25,7 @@ from ...actors.kernel.message import Message, Refusal
 from ...actors.process.fork.launch import outside_environment
 from ...actors.process.program.external_program import KeptProgram, ProgramFailed
 from ...actors.process.resource_limits import Limits
+from ...actors.seconds import check_seconds
 from ..backoff import Backoff
 from ..rules import Rule
 from ..spec import ChildSpec, Restart, Shutdown, child
@@ -360,8 +361,7 @@ def program(
     words = _command_in("program", "the command", command)
     name = os.path.basename(words[0]) if id is None else id
     where = f"program {name!r}"
-    if not _is_number(ready_timeout) or not 0 < ready_timeout < float("inf"):
-        raise SpecError(where, f"ready_timeout must be a finite number of seconds > 0, not {ready_timeout!r}")
+    check_seconds(where, "ready_timeout", ready_timeout)
     if not isinstance(stdin, bool):
         raise SpecError(where, f"stdin must be True or False, not {stdin!r}")
     if limits is not None and not isinstance(limits, Limits):
@@ -443,10 +443,6 @@ def _changes_in(where: str, env: Any) -> dict[str, str | None]:
 def _is_text(value: object) -> TypeGuard[str]:
     """Whether the kernel takes it: it has no text with a NUL in it."""
     return isinstance(value, str) and "\0" not in value
-
-
-def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _environment(changes: Mapping[str, str | None]) -> dict[str, str]:
