@@ -63,7 +63,7 @@ class ProgramInput(Message[None]):
     end: bool = False
 
 
-class InputRefused(Refusal):
+class InputRefused(Refusal, text="the program takes no input: {why}"):
     """The program takes no input; `why` says whether it never does, no more, or not now."""
 
     why: str
