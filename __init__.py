@@ -41,6 +41,7 @@ from holdfast.actors.exit_reasons import (
     OutOfMemory,
     Shutdown,
     Signal,
+    TrustBreach,
 )
 from holdfast.actors.kernel.actor import Actor, Start, on, start, subscribe
 from holdfast.actors.kernel.bindings import Binding
@@ -118,6 +119,7 @@ __all__ = [
     "TransactionFailed",
     "TransactionRefused",
     "TreeFailed",
+    "TrustBreach",
     "UnknownMessage",
     "WhichChildren",
     "__version__",
