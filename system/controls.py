@@ -85,7 +85,8 @@ class Controls:
     async def get_state(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Any:
         """A copy of an actor's state: what its `get_state()` gives, else a dict of its key variables.
 
-        What cannot be copied (a ref, a socket) stands in it as `Opaque`.
+        What cannot be copied (a ref, a socket) stands in it as `Opaque`. Of a supervisor it has its flags, its restarts
+        within the period, and each child's class, state, restart type and restarts, beside what its class adds.
         """
         return await self._order(ref, GetState(), timeout)
 
