@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 from ..actors.errors import HoldfastError, SpecError, StartFailed, StartIgnored
 from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
-from ..actors.exit_reasons import SHUTDOWN, ExitReason, crash, unpack_exit
+from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, crash, unpack_exit
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Start, on
 from ..actors.kernel.cell import DOWN, GONE, Cell
@@ -420,7 +420,8 @@ class Supervisor(Inquiries):
         node, flags = self.ctx._cell.node, self._flags
         window = admit_restart(self._restarts, node.loop.time(), intensity=flags.intensity, period=flags.period)
         if window is None:
-            self._give_up(one, reason, SHUTDOWN)
+            why = f"restart intensity reached; the last to end was {self._path_of(one)}: {reason}"
+            self._give_up(one, reason, Shutdown(why))
             return
         self._restarts = window
         if one.spec.is_supervisor:  # Perhaps it has ended because of somebody below it: that one comes back as it says.
