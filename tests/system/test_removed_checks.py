@@ -21,6 +21,7 @@ AT_ODDS = "tests/migration/test_moves_at_odds.py"
 SUPERVISORS = "tests/migration/test_moved_supervisors.py"
 KINDS = "tests/migration/test_moved_kinds.py"
 JOURNALS = "tests/supervision/test_dynamic_journal.py"
+LINES = "tests/supervision/test_program_lines.py"
 
 CHECKS = {
     "the states are in the store together": Check(
@@ -879,6 +880,13 @@ CHECKS = {
         ":",
         KINDS,
         "test_what_was_noted_is_true and template",
+    ),
+    "a program waits for whoever gets its lines": Check(
+        "supervision/services/program_lines.py",
+        "            self._hold()\n",
+        "            pass\n",
+        LINES,
+        "test_a_program_that_prints_faster",
     ),
 }
 
