@@ -112,6 +112,7 @@ class ChildSpec(Generic[A_co]):
     start_timeout: StartTimeout | None = None  # None becomes what the kind of child has by default
     autostart: bool = True  # whether its supervisor starts it with the others, or only by order
     late: frozenset[str] = frozenset()  # ports that transactions have bound: whom they lead to may be started later
+    register: str | None = None  # the name that each life has beside its address
 
     def __post_init__(self) -> None:
         where = f"child {self.id!r}"
@@ -135,6 +136,9 @@ class ChildSpec(Generic[A_co]):
             raise SpecError(where, f"start_timeout must be seconds > 0 or 'infinity', not {self.start_timeout!r}")
         if not isinstance(self.autostart, bool):
             raise SpecError(where, f"autostart must be True or False, not {self.autostart!r}")
+        name = self.register
+        if name is not None and (not isinstance(name, str) or not name or name.startswith("/")):
+            raise SpecError(where, f"register must be text that does not begin with '/', or left out, not {name!r}")
         if not isinstance(self.significant, bool):
             raise SpecError(where, f"significant must be True or False, not {self.significant!r}")
         if self.significant and self.restart == "permanent":
@@ -239,6 +243,7 @@ def child(
     mechanism: Protects | tuple[Protects, ...] | None = None,
     start_timeout: StartTimeout | None = None,
     autostart: bool = True,
+    register: str | None = None,
 ) -> ChildSpec[A]:
     """Describe one child of a supervisor: how it starts, lives, comes back, and is stopped.
 
@@ -264,6 +269,8 @@ def child(
             but not longer without having handled one more input again; pauses that a paced replay repeats do not count.
         autostart: whether its supervisor starts it with the others. If not, it is known and stopped, at each start of
             its supervisor, until it is started by order (`RestartChild`, or `start` in a transaction).
+        register: a name that each of its lives has, as `system.register` gives it to one; nobody has it between two.
+            If it is taken, the start fails. Not below a supervisor with a process of its own.
 
     Raises:
         MechanismRefused: the class does not have what the mechanism needs.
@@ -289,6 +296,7 @@ def child(
         mechanism,
         start_timeout=start_timeout,
         autostart=autostart,
+        register=register,
     )
 
 
