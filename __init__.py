@@ -43,6 +43,7 @@ from holdfast.actors.exit_reasons import (
     OutOfMemory,
     Shutdown,
     Signal,
+    TrustBreach,
 )
 from holdfast.actors.kernel.actor import Actor, Start, on, start, subscribe
 from holdfast.actors.kernel.bindings import Binding
@@ -120,6 +121,7 @@ __all__ = [
     "TransactionFailed",
     "TransactionRefused",
     "TreeFailed",
+    "TrustBreach",
     "UnknownMessage",
     "WhichChildren",
     "__version__",

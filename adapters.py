@@ -20,6 +20,7 @@ from .actors.errors import HoldfastError, type_name
 from .actors.kernel.actor import Actor, on, subscribe
 from .actors.kernel.message import Message
 from .actors.kernel.ref import ActorRef
+from .actors.seconds import check_seconds
 
 __all__ = ["Bus", "Calls", "Wrapped", "calls", "wrap"]
 
@@ -118,7 +119,7 @@ class Bus:
     def every(self, seconds: float, callback: Callable[[], Any]) -> None:
         """Have `callback` called every so many seconds; only while the program is made."""
         self._registering()
-        self.timers.append((seconds, callback))
+        self.timers.append((check_seconds(self._actor.ctx.path, "seconds", seconds), callback))
 
     def publish(self, topic: str, message: Message[Any]) -> None:
         """Send to all subscribers of a topic, when the callback has returned."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import functools
-import math
 import random
 from collections.abc import Awaitable, Callable
 from typing import Any
 
 from .backoff import Backoff
 from .errors import EffectFailed, HoldfastError, SpecError, error_text, type_name
+from .seconds import check_seconds
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -122,10 +122,8 @@ def effect_of(
     """
     if not callable(function):
         raise SpecError("effect", f"takes a function and its arguments, not {function!r}")
-    if timeout is not None and (
-        not isinstance(timeout, int | float) or isinstance(timeout, bool) or not 0 < timeout < math.inf
-    ):
-        raise SpecError("effect", f"timeout must be a number of seconds > 0, or None, not {timeout!r}")
+    if timeout is not None:
+        check_seconds("effect", "timeout", timeout)
     if retry is not None and not isinstance(retry, Retry):
         raise SpecError("effect", f"retry must be a Retry, or None, not {retry!r}")
     if at_most_once and retry is not None and retry.attempts > 1:

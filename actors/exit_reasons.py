@@ -122,6 +122,15 @@ class Hung(ExitReason, frozen=True):
         return f"hung for {self.seconds:g} s"
 
 
+class TrustBreach(ExitReason, frozen=True):
+    """The OS process was ended because it said what it may not, or what cannot be."""
+
+    problem: str
+
+    def __str__(self) -> str:
+        return f"breach of trust: {self.problem}"
+
+
 NORMAL = Normal()
 SHUTDOWN = Shutdown()
 KILLED = Killed()
@@ -169,6 +178,8 @@ def pack_exit(reason: ExitReason) -> dict[str, object]:
             return {"exit": "OutOfMemory", "text": text}
         case Hung(seconds=seconds):
             return {"exit": "Hung", "seconds": seconds}
+        case TrustBreach(problem=problem):
+            return {"exit": "TrustBreach", "text": problem}
         case _:
             return {"exit": type(reason).__name__}
 
@@ -199,5 +210,7 @@ def unpack_exit(data: object) -> ExitReason:
             return OutOfMemory(wire.text)
         case "Hung":
             return Hung(wire.seconds)
+        case "TrustBreach":
+            return TrustBreach(wire.text)
         case other:
             raise msgspec.ValidationError(f"unknown exit reason {other!r}")

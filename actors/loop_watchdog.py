@@ -12,10 +12,11 @@ import types
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
-from .errors import SpecError, type_name
+from .errors import type_name
 from .events import LoopLagged, TurnSlow
 from .kernel import loop as run_loop
 from .kernel.envelope import message_in
+from .seconds import check_seconds
 
 if TYPE_CHECKING:
     from .kernel.node import Node
@@ -31,8 +32,8 @@ RUNNER = run_loop.Runner._run.__code__
 def check_limits(lag: float | None, turns: float | None) -> None:
     """Refuse limits that are neither None nor a number > 0. Raises SpecError."""
     for name, limit in (("watch_lag", lag), ("watch_turns", turns)):
-        if limit is not None and not (isinstance(limit, (int, float)) and 0 < limit < float("inf")):
-            raise SpecError("ActorSystem", f"{name} must be seconds > 0, not {limit!r}")
+        if limit is not None:
+            check_seconds("ActorSystem", name, limit)
 
 
 class LoopWatch:

@@ -10,6 +10,7 @@ import msgspec
 
 from ..actors.errors import SpecError, type_name
 from ..actors.kernel.actor import Actor
+from ..actors.seconds import check_seconds
 from .compression import check_compress
 from .recovery_settings import (
     NOTHING_MEANWHILE,
@@ -58,8 +59,8 @@ class Method:
     def __post_init__(self) -> None:
         """Raises SpecError: naming the method, the setting, and what it may be."""
         where = self.name
-        if self.snapshots and (not _number(self.interval) or not 0 < self.interval < float("inf")):
-            raise SpecError(where, f"interval must be seconds > 0, not {self.interval!r}")
+        if self.snapshots:
+            check_seconds(where, "interval", self.interval)
         if self.pacing not in ("fast", "original") and (
             not _number(self.pacing) or not 0 < float(self.pacing) < float("inf")
         ):

@@ -12,6 +12,7 @@ from ..actors.errors import SpecError, type_name
 from ..actors.kernel.codec import encode_special, unencodable
 from ..actors.kernel.message import Message, message_name
 from ..actors.overflow import Overflow, check
+from ..actors.seconds import check_seconds
 
 Phase = Literal["safe_state", "isolate", "restart", "restore", "replay", "release"]
 PHASES: tuple[Phase, ...] = get_args(Phase)
@@ -184,15 +185,7 @@ def recovery_hooks(
                 raise SpecError("recovery_hooks", f"{which} must name phases ({known}), not {phase!r}")
             if not callable(hook):
                 raise SpecError("recovery_hooks", f"{which}[{phase!r}] must be a function, not {hook!r}")
-    check_seconds("recovery_hooks", "timeout", timeout)
-    return RecoveryHooks(before or {}, after or {}, float(timeout))
-
-
-def check_seconds(where: str, name: str, value: object) -> float:
-    """Seconds > 0 and finite. Raises SpecError."""
-    if not isinstance(value, (int, float)) or isinstance(value, bool) or not 0 < value < float("inf"):
-        raise SpecError(where, f"{name} must be seconds > 0, not {value!r}")
-    return float(value)
+    return RecoveryHooks(before or {}, after or {}, float(check_seconds("recovery_hooks", "timeout", timeout)))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -228,5 +221,5 @@ def meanwhile(
     if hooks is not None and not isinstance(hooks, RecoveryHooks):
         raise SpecError(where, f"hooks must come from recovery_hooks(...), not be {hooks!r}")
     for_all, by_topic = as_held(where, held)
-    timeout = check_seconds(where, "safe_state_timeout", safe_state_timeout)
+    timeout = float(check_seconds(where, "safe_state_timeout", safe_state_timeout))
     return Meanwhile(as_safe_state(where, safe_state), timeout, for_all, by_topic, hooks)

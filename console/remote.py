@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import math
 import os
 import socket
 import threading
@@ -20,6 +19,7 @@ from ..actors.control.tracing import Statistics
 from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.actor import Actor, Start
 from ..actors.process.wire.frame_buffer import LENGTH
+from ..actors.seconds import check_seconds
 from ..ftm.group.protected import ProtectionStatus
 from ..supervision.spec import NAMELESS, ChildSpec, Isolation, Strategy, child
 from ..system.transaction.operation import Step
@@ -230,6 +230,7 @@ class RemoteSystem:
     async def _control(self, verb: Any, ref: RemoteTarget, timeout: float, *args: Any, changes: bool = False) -> Any:
         if changes and self._dry_run:
             raise SpecError(verb, "in a dry run no order is given to an actor: put it into a transaction")
+        check_seconds(text_of(ref), "timeout", timeout)
         packed = [pack_arg(arg, verb) for arg in args]
         return await self.call(ControlActor(verb, text_of(ref), packed, timeout, self._script), timeout)
 
@@ -241,8 +242,7 @@ class RemoteSystem:
 
     async def transact(self, change: RemoteChange, *, dry_run: bool, timeout: float) -> None:
         """Have the collected operations carried out."""
-        if not 0 < timeout < math.inf:
-            raise SpecError("transaction", f"timeout must be seconds > 0, not {timeout!r}")
+        check_seconds("transaction", "timeout", timeout)
         request = Transact(change._operations, dry_run, timeout, self._script)
         answer = await self.call(request, timeout)
         change._take(answer)

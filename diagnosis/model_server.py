@@ -71,7 +71,7 @@ class ValidateModel(Message[tuple[Finding, ...]]):
     changes: tuple[Change, ...] = ()
 
 
-class ModelRefused(Refusal):
+class ModelRefused(Refusal, text="the model stays as it is: {problems:; }"):
     """The model stays as it is; `problems` says why, one line each."""
 
     problems: tuple[str, ...]

@@ -9,6 +9,7 @@ from .services.jobs import TaskSupervisor
 from .services.partition import CountPartitions, PartitionSupervisor, ResizePartitions, Route, partition_of, partitions
 from .services.pool import PoolInfo, PoolStatus, PoolSupervisor, ResizePool, pool, pool_of
 from .services.program import Program, ProgramInfo, ProgramInput, ProgramStatus, program
+from .services.program_lines import ProgramLine
 from .services.registrar import KeyFreed, KeyRegistered, RegistryActor
 from .services.registry import Registry, RegistryEntry, registry
 from .services.tasks import Tasks, tasks
@@ -35,6 +36,7 @@ __all__ = [
     "Program",
     "ProgramInfo",
     "ProgramInput",
+    "ProgramLine",
     "ProgramStatus",
     "Registry",
     "RegistryActor",

@@ -16,51 +16,59 @@ from ..actors.process.wire.start_codec import pack_data, unpack_data
 # -- refusals -------------------------------------------------------------------------------------------------------
 
 
-class AlreadyStarted(Refusal):
+class AlreadyStarted(
+    Refusal, text="child {id!r} runs already, at {ref.path}: use that one, or give the new one another id"
+):
     """A child of this id runs already; `ref` is it."""
 
     id: str
     ref: ActorRef[Any]
 
 
-class AlreadyPresent(Refusal):
+class AlreadyPresent(
+    Refusal, text="child {id!r} is known already: start it with RestartChild if it does not run, or delete it first"
+):
     """A child of this id is known, but does not run now: restart or delete it."""
 
     id: str
 
 
-class ChildBusy(Refusal):
+class ChildBusy(Refusal, text="child {id!r} is {state}: stop it first, with TerminateChild"):
     """The child is "running", "restarting" or "recovering": terminate it first."""
 
     id: str
     state: str
 
 
-class ChildParked(Refusal):
+class ChildParked(
+    Refusal, text="child {id!r} was stopped by order and is left alone: start it by order, with RestartChild"
+):
     """The child was stopped by order: repair leaves it alone until it is started by order again."""
 
     id: str
 
 
-class NoSuchChild(Refusal):
+class NoSuchChild(Refusal, text="there is no child {id!r}: WhichChildren lists those that there are"):
     """The supervisor has no child of this id."""
 
     id: str
 
 
-class MaxChildren(Refusal):
+class MaxChildren(
+    Refusal, text="there are as many children as there may be ({max_children}): stop one, or raise max_children"
+):
     """A dynamic supervisor has as many children as it may have; those that are being restarted count."""
 
     max_children: int
 
 
-class NotSupported(Refusal):
+class NotSupported(Refusal, text="{why}"):
     """A supervisor of this kind does not do that; `why` says what to do instead."""
 
     why: str
 
 
-class NoPartitions(Refusal):
+class NoPartitions(Refusal, text="{supervisor} has no partitions to route to: give it some with ResizePartitions"):
     """A partition supervisor was resized to nothing: there is nobody to route to."""
 
     supervisor: str

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from ..actors.errors import NoSuchActor, StartFailed
+from ..actors.errors import NoSuchActor, StartFailed, type_name
 from ..actors.exit_reasons import ExitReason
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.envelope import Item
@@ -50,6 +50,11 @@ class Child:
     def info(self, above: str) -> ChildInfo:
         """Describe the child as `WhichChildren` tells of it."""
         return ChildInfo(self.spec.id, self.state, f"{above}/{self.spec.id}", self.spec.is_supervisor)
+
+    def overview(self) -> dict[str, Any]:
+        """Describe the child as `get_state` of its supervisor shows it; restarts count at its present address."""
+        kind, lives = type_name(self.spec.start.kind), 0 if self.cell is None else self.cell.life
+        return {"kind": kind, "state": self.state, "restart": self.spec.restart, "restarts": max(0, lives - 1)}
 
 
 def complete(own: Cell, spec: ChildSpec) -> ChildSpec:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 from ..actors.errors import HoldfastError
@@ -9,12 +10,24 @@ from ..actors.kernel.actor import Actor, on
 from ..actors.kernel.envelope import ReplyHandle
 from .admin import Boxed, ChildCounts, ChildInfo, CountChildren, GetChildSpec, NoSuchChild, WhichChildren
 from .children import Child
+from .intensity import recent_restarts
+from .spec import Flags
 
 
 class Inquiries(Actor):
     """Base of supervisors: they have children, and answer what is asked about them."""
 
     _children: dict[str, Child]
+    _flags: Flags
+    _restarts: tuple[float, ...]
+
+    def _overview(self) -> dict[str, Any]:
+        """Flags, restarts within the period, and children; nothing before our start has come so far."""
+        if "_children" not in self.__dict__:
+            return {}
+        recent = recent_restarts(self._restarts, self.ctx._cell.node.loop.time(), self._flags.period)
+        children = {one.spec.id: one.overview() for one in self._children.values()}
+        return {**dataclasses.asdict(self._flags), "restarts": len(recent), "children": children}
 
     @on(WhichChildren, readonly=True)
     def _which_children(self, message: WhichChildren) -> list[ChildInfo]:

@@ -6,7 +6,7 @@ import asyncio
 import dataclasses
 import inspect
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Generic, Literal, Protocol, TypeGuard, get_args
+from typing import Any, Generic, Literal, Protocol, get_args
 
 from typing_extensions import TypeVar
 
@@ -20,6 +20,7 @@ from ..actors.kernel.lifecycle import GRACE
 from ..actors.kernel.mailbox import Bounded
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.start_codec import pack_recipe
+from ..actors.seconds import check_seconds, is_seconds
 from ..actors.values import UnsavableValue
 from .decisions import decide, is_as_told
 from .patience import end_within
@@ -82,8 +83,7 @@ class Flags:
             raise SpecError("supervisor", f"max_children must be a whole number >= 0 or None, not {most!r}")
         if not isinstance(self.intensity, int) or isinstance(self.intensity, bool) or self.intensity < 0:
             raise SpecError("supervisor", f"intensity must be a whole number >= 0, not {self.intensity!r}")
-        if not _number(self.period) or not 0 < self.period < float("inf"):
-            raise SpecError("supervisor", f"period must be a finite number of seconds > 0, not {self.period!r}")
+        check_seconds("supervisor", "period", self.period)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -112,6 +112,7 @@ class ChildSpec(Generic[A_co]):
     start_timeout: StartTimeout | None = None  # None becomes what the kind of child has by default
     autostart: bool = True  # whether its supervisor starts it with the others, or only by order
     late: frozenset[str] = frozenset()  # ports that transactions have bound: whom they lead to may be started later
+    register: str | None = None  # the name that each life has beside its address
 
     def __post_init__(self) -> None:
         where = f"child {self.id!r}"
@@ -128,18 +129,16 @@ class ChildSpec(Generic[A_co]):
             raise SpecError(where, f"start({type_name(self.start.kind)}, ...): {error}") from error
         _choose(where, "restart", self.restart, Restart)
         _choose(where, "isolation", self.isolation, Isolation)
-        if self.shutdown not in ("brutal_kill", "infinity") and not (
-            _number(self.shutdown) and 0 <= self.shutdown < float("inf")
-        ):
-            raise SpecError(where, f"shutdown must be seconds >= 0, 'brutal_kill' or 'infinity', not {self.shutdown!r}")
+        check_shutdown(where, self.shutdown)
         if self.start_timeout is None:
             object.__setattr__(self, "start_timeout", "infinity" if self.is_supervisor else START_TIMEOUT)
-        if self.start_timeout != "infinity" and not (
-            _number(self.start_timeout) and 0 < self.start_timeout < float("inf")
-        ):
+        if self.start_timeout != "infinity" and not is_seconds(self.start_timeout):
             raise SpecError(where, f"start_timeout must be seconds > 0 or 'infinity', not {self.start_timeout!r}")
         if not isinstance(self.autostart, bool):
             raise SpecError(where, f"autostart must be True or False, not {self.autostart!r}")
+        name = self.register
+        if name is not None and (not isinstance(name, str) or not name or name.startswith("/")):
+            raise SpecError(where, f"register must be text that does not begin with '/', or left out, not {name!r}")
         if not isinstance(self.significant, bool):
             raise SpecError(where, f"significant must be True or False, not {self.significant!r}")
         if self.significant and self.restart == "permanent":
@@ -244,6 +243,7 @@ def child(
     mechanism: Protects | tuple[Protects, ...] | None = None,
     start_timeout: StartTimeout | None = None,
     autostart: bool = True,
+    register: str | None = None,
 ) -> ChildSpec[A]:
     """Describe one child of a supervisor: how it starts, lives, comes back, and is stopped.
 
@@ -269,6 +269,8 @@ def child(
             but not longer without having handled one more input again; pauses that a paced replay repeats do not count.
         autostart: whether its supervisor starts it with the others. If not, it is known and stopped, at each start of
             its supervisor, until it is started by order (`RestartChild`, or `start` in a transaction).
+        register: a name that each of its lives has, as `system.register` gives it to one; nobody has it between two.
+            If it is taken, the start fails. Not below a supervisor with a process of its own.
 
     Raises:
         MechanismRefused: the class does not have what the mechanism needs.
@@ -294,6 +296,7 @@ def child(
         mechanism,
         start_timeout=start_timeout,
         autostart=autostart,
+        register=register,
     )
 
 
@@ -401,13 +404,15 @@ def check_mechanism(where: str, mechanism: Any, kind: type[Actor], *, is_supervi
         raise SpecError(where, "a supervisor cannot be protected by a mechanism: protect its children")
 
 
+def check_shutdown(where: str, shutdown: object) -> None:
+    """Refuse what does not say how long to wait before something that ends is killed. Raises SpecError."""
+    if shutdown not in ("brutal_kill", "infinity") and not is_seconds(shutdown, or_zero=True):
+        raise SpecError(where, f"shutdown must be seconds >= 0, 'brutal_kill' or 'infinity', not {shutdown!r}")
+
+
 def _of_kind(where: str, name: str, value: object, kind: type, form: str) -> None:
     if value is not None and not isinstance(value, kind):
         raise SpecError(where, f"{name} must be {form} or left out, not {value!r}")
-
-
-def _number(value: object) -> TypeGuard[float]:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _choose(where: str, name: str, value: object, choices: Any) -> None:

@@ -10,9 +10,9 @@ import asyncio
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, ClassVar
 
-from ..actors.errors import HoldfastError, SpecError, StartFailed, StartIgnored
+from ..actors.errors import HoldfastError, NameTaken, SpecError, StartFailed, StartIgnored
 from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
-from ..actors.exit_reasons import SHUTDOWN, ExitReason, crash, unpack_exit
+from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, crash, unpack_exit
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Start, on
 from ..actors.kernel.cell import DOWN, GONE, Cell
@@ -277,6 +277,7 @@ class Supervisor(Inquiries):
         if cell is None or cell.state is GONE:
             cell = one.cell = new_cell(self.ctx._cell, one)
             one.ignored_life = 0  # A new address counts its lives anew.
+        self._name(one, cell)
         seconds = one.spec.start_timeout or "infinity"
         if isinstance(seconds, str):
             return cell.host.start(cell)
@@ -285,6 +286,17 @@ class Supervisor(Inquiries):
             return cell.host.start(cell)  # `__init__` may block already.
         finally:
             void()
+
+    def _name(self, one: Child, cell: Cell) -> None:
+        """Give a child that is about to start the name that its spec says. Raises StartFailed: another one has it."""
+        name = one.spec.register
+        if name is not None:
+            try:
+                cell.node.register(name, cell, is_starting=True)
+            except NameTaken as taken:
+                holder = cell.node.names[name].path
+                why = f"{holder} is registered as {name!r} already; free the name, or say another one"
+                raise StartFailed(cell.path, why) from taken
 
     def _is_up(self, one: Child) -> None:
         one.state = UP
@@ -420,7 +432,8 @@ class Supervisor(Inquiries):
         node, flags = self.ctx._cell.node, self._flags
         window = admit_restart(self._restarts, node.loop.time(), intensity=flags.intensity, period=flags.period)
         if window is None:
-            self._give_up(one, reason, SHUTDOWN)
+            why = f"restart intensity reached; the last to end was {self._path_of(one)}: {reason}"
+            self._give_up(one, reason, Shutdown(why))
             return
         self._restarts = window
         if one.spec.is_supervisor:  # Perhaps it has ended because of somebody below it: that one comes back as it says.

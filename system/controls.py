@@ -33,6 +33,7 @@ from ..actors.process.process_host import WorkerPlace
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.peer import OutsideHost
 from ..actors.process.wire.start_codec import unpack_recipe
+from ..actors.seconds import check_seconds
 from ..checkpoint.home.recorded_home import switch_of
 from ..checkpoint.home.switch import Switch
 from ..checkpoint.places.far_parent import SlotPlace
@@ -54,8 +55,9 @@ A = TypeVar("A", bound=Actor)
 class Controls:
     """Control of live actors: tasks, processes, actors of a subtree in a process, recorded or not.
 
-    Each call raises ActorStopped if nobody lives there, and AskTimeout if the actor does not come to it within
-    `timeout` seconds: it is carried out between two turns. While an actor is restarted, its next life is waited for.
+    Each call raises ActorStopped if nobody lives there, AskTimeout if the actor does not come to it within `timeout`
+    seconds (it is carried out between two turns), and SpecError if that is no finite number > 0. While an actor is
+    restarted, its next life is waited for.
     """
 
     _moves: Moves
@@ -83,7 +85,8 @@ class Controls:
     async def get_state(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Any:
         """A copy of an actor's state: what its `get_state()` gives, else a dict of its key variables.
 
-        What cannot be copied (a ref, a socket) stands in it as `Opaque`.
+        What cannot be copied (a ref, a socket) stands in it as `Opaque`. Of a supervisor it has its flags, its restarts
+        within the period, and each child's class, state, restart type and restarts, beside what its class adds.
         """
         return await self._order(ref, GetState(), timeout)
 
@@ -260,6 +263,7 @@ class Controls:
         Returns:
             The reason with which it ended.
         """
+        check_seconds(ref.path, "timeout", timeout)
         cell = self._living(ref)
         gone = cell.ended()
         cell.request_stop(reason)
@@ -287,6 +291,7 @@ class Controls:
             SpecError: its method keeps no snapshots. CheckpointFailed: it could not be saved, or has stopped.
             AskTimeout: it was not within `timeout` seconds.
         """
+        check_seconds(ref.path, "timeout", timeout)
         switch = switch_of(self._living(ref))
         if switch is None or not switch.method.snapshots:
             raise SpecError(ref.path, "keeps no snapshots: give it recovery=hybrid(...)")

@@ -23,6 +23,7 @@ from ..actors.ordered import Ordered
 from ..actors.process.process_host import WorkerPlace
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.peer import OutsideHost
+from ..actors.seconds import check_seconds
 from ..checkpoint.home.journal_home import JournalHome
 from ..checkpoint.places.far_parent import FarParent
 from ..checkpoint.places.recorded_moves import ToRecordedHere, ToRecordedWorker, leaving
@@ -437,8 +438,7 @@ def check_isolation(isolation: object, limits: object, timeout: object) -> None:
         raise SpecError("set_isolation", f"isolation must be 'task' or 'process', not {isolation!r}")
     if limits is not None and (not isinstance(limits, Limits) or isolation != "process"):
         raise SpecError("set_isolation", f"limits must be Limits(...), of a process, or left out, not {limits!r}")
-    if not isinstance(timeout, (int, float)) or isinstance(timeout, bool) or not 0 < timeout < float("inf"):
-        raise SpecError("set_isolation", f"timeout must be a number of seconds > 0, not {timeout!r}")
+    check_seconds("set_isolation", "timeout", timeout)
 
 
 async def to_its_end(actor: str, change: asyncio.Future[T]) -> T:

@@ -12,6 +12,7 @@ from ..actors.errors import ActorStopped, AskTimeout, HoldfastError
 from ..actors.kernel.blocking_handlers import LOOK_AGAIN, wait_on_loop
 from ..actors.kernel.message import Message
 from ..actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
+from ..actors.seconds import check_seconds
 
 if TYPE_CHECKING:
     from ..actors.kernel.node import Node
@@ -68,8 +69,9 @@ class ThreadPortal:
             timeout: seconds until the deadline, > 0.
 
         Raises:
-            Refusal, AskTimeout, ActorStopped, AskFailed, RemoteCrash: as `ActorRef.ask`.
+            SpecError, Refusal, AskTimeout, ActorStopped, AskFailed, RemoteCrash: as `ActorRef.ask`.
         """
+        check_seconds(ref.path, "timeout", timeout)
         outcome: concurrent.futures.Future[R] = self._begin(ref, _ask, ref, message, timeout)
         return self._wait(ref, outcome, timeout)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.ref import ActorRef
+from ..actors.seconds import check_seconds
 from ..checkpoint.home.homes import Homes
 from ..checkpoint.home.quarantine import QuarantinedMessage
 from ..supervision.admin import RestartChild, TerminateChild, WhichChildren
@@ -90,6 +91,7 @@ class Recorded:
             NoSuchGroup: there is none of that name. HoldfastError: an actor could not be stopped or started by its
                 supervisor (the others are started all the same), or the store refused.
         """
+        check_seconds("restore_group", "timeout", timeout)
         groups = self._homes.groups
         members = groups.members(name)
         living: list[tuple[ActorRef[Supervisor], str]] = []

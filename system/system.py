@@ -12,7 +12,7 @@ from typing import Any, TypeVar, cast, overload
 from ..actors.control.drain import drain as drain_queue
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, TreeFailed
 from ..actors.events import EventStream, RecoveryTableUnused
-from ..actors.exit_reasons import SHUTDOWN, ExitReason, pack_exit
+from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, pack_exit
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.address_host import AddressHost
@@ -315,11 +315,13 @@ class ActorSystem(Recorded, Controls):
         """The root supervisor is gone: if nobody asked for that, the body must hear of it."""
         if self._body is None or done.cancelled():
             return
-        last, why = self._node.gave_up, "restart intensity reached"
-        if last is None or done.result() != SHUTDOWN:
-            why = f"its root has ended, {done.result()}"
-        if last is not None:
-            why += f"; the last to end was {last.address}/{last.child}: {last.reason}"
+        reason, last = done.result(), self._node.gave_up
+        if isinstance(reason, Shutdown) and reason.detail:
+            why = reason.detail
+        else:
+            why = f"its root has ended, {reason}"
+            if last is not None:
+                why += f"; the last to end was {last.address}/{last.child}: {last.reason}"
         self._failure = TreeFailed(self.name, why)
         self._body.cancel()
 
@@ -507,6 +509,8 @@ class ActorSystem(Recorded, Controls):
     def pid_of(self, ref: ActorRef[Any]) -> int:
         """Return the pid of the OS process that an actor lives in now: its own, or this one.
 
+        A protected actor lives in the process of the replica that leads.
+
         Raises:
             NoSuchActor: it lives nowhere at the moment.
         """
@@ -518,7 +522,7 @@ class ActorSystem(Recorded, Controls):
             worker = place.process(cell)
             if worker is not None:
                 return int(worker.pid)
-            if isinstance(place, WorkerPlace):
+            if place.owns_processes:
                 raise NoSuchActor(ref.path)
             cell = cell.parent
         return os.getpid()

@@ -21,6 +21,7 @@ from ..actors.kernel.timers import Timer
 from ..actors.process.process_host import Outlet
 from ..actors.process.wire import frames
 from ..actors.process.worker_pool import Worker
+from ..actors.seconds import check_seconds
 from ..checkpoint.home.recorded_home import switch_of
 from .clock import VirtualClockLoop
 
@@ -86,13 +87,14 @@ async def idle(system: ActorSystem, *, timeout: float = TIMEOUT) -> None:
     Args:
         system: a running one. Its actors in processes of their own are asked for a round trip each; of a subtree in a
             process only the turns of its supervisor are known, and what an actor there tells itself is not.
-        timeout: seconds on the loop's clock, > 0. Turns that wait for time or for the outside are not waited for here,
-            but those in other processes are: nobody sees from here what they wait for.
+        timeout: seconds on the loop's clock, finite and > 0. Turns that wait for time or for the outside are not waited
+            for here, but those in other processes are: nobody sees from here what they wait for.
 
     Raises:
         NotIdle: it went on all that time, or without end at one moment of virtual time; one task at a time may wait
-            for this.
+            for this. SpecError: `timeout` is no such number.
     """
+    check_seconds("idle", "timeout", timeout)
     node = system._node
     try:
         async with patience(timeout, node):

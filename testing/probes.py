@@ -20,6 +20,7 @@ from ..actors.kernel.envelope import Ask, Envelope, Handler, Item, ReplyHandle, 
 from ..actors.kernel.links import Monitor
 from ..actors.kernel.message import Message, Refusal, reply_type
 from ..actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef, current
+from ..actors.seconds import check_seconds
 from ..system.system import ActorSystem
 from .barrier import NotIdle, idle, patience
 from .guard.declared import wrong_value
@@ -206,7 +207,7 @@ class Probe:
         while len(came) < len(what):
             missing = [_name(one) for one in _unmatched(what, came)]
             name = f"all of {', '.join(map(_name, what))} (still {', '.join(missing)})"
-            heard = await self._next(name, deadline - loop.time(), seconds)
+            heard = await self._next(name, max(0.0, deadline - loop.time()), seconds)
             if not isinstance(heard, Received) or len(_unmatched(what, [*came, heard])) == len(missing):
                 raise self._unexpected(name, heard)
             came.append(heard)
@@ -221,7 +222,7 @@ class Probe:
             Unexpected: the block has taken longer.
         """
         loop = asyncio.get_running_loop()
-        own = loop.time() + seconds
+        own = loop.time() + check_seconds(self.path, "within", seconds, or_zero=True)
         outer, self._deadline = self._deadline, min(self._deadline, own)
         try:
             yield
@@ -231,7 +232,9 @@ class Probe:
             self._deadline = outer
 
     def _seconds(self, timeout: float | None) -> float:
-        """How long an expectation waits."""
+        """How long an expectation waits. Raises SpecError: the time-out is no finite number >= 0."""
+        if timeout is not None:
+            check_seconds(self.path, "timeout", timeout, or_zero=True)
         if self._deadline == math.inf:
             return TIMEOUT if timeout is None else timeout
         left = max(0.0, self._deadline - asyncio.get_running_loop().time())
@@ -301,7 +304,7 @@ class Probe:
         timeout = self._seconds(timeout)
         deadline = asyncio.get_running_loop().time() + timeout
         while True:
-            heard = await self._next(name, deadline - asyncio.get_running_loop().time(), timeout)
+            heard = await self._next(name, max(0.0, deadline - asyncio.get_running_loop().time()), timeout)
             if isinstance(heard, Received):
                 found = isinstance(heard.message, wanted) if isinstance(wanted, type) else wanted(heard.message)
                 if found:
@@ -318,6 +321,7 @@ class Probe:
         if within is None:
             await idle(self._system)
         elif not self._inbox:
+            check_seconds(self.path, "within", within, or_zero=True)
             self._wake.clear()
             try:
                 async with patience(within, self._system._node):
@@ -365,7 +369,7 @@ class Probe:
             )
         self._expects = asyncio.current_task()
         try:
-            async with patience(max(seconds, 0.0), self._system._node):
+            async with patience(seconds, self._system._node):
                 while not self._inbox:
                     self._alive()
                     self._wake.clear()

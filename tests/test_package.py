@@ -128,6 +128,19 @@ def test_no_module_imports_pickle() -> None:
     assert not [one for one in found if one[1].split(".")[0] in {"pickle", "_pickle", "cloudpickle", "dill"}]
 
 
+def test_every_refusal_says_a_sentence() -> None:
+    """One without a text of its own shows its fields only."""
+    found = {
+        node.name: {word.arg for word in node.keywords}
+        | {one.name for one in node.body if isinstance(one, ast.FunctionDef)}
+        for path in SOURCES
+        for node in ast.walk(ast.parse((ROOT / path).read_text("utf-8")))
+        if isinstance(node, ast.ClassDef) and any(ast.unparse(base) == "Refusal" for base in node.bases)
+    }
+    assert {"ChildBusy", "KeyTaken", "NoRoute", "InputRefused", "RequestDropped"} <= found.keys()
+    assert not [name for name, has in found.items() if not has & {"text", "__str__"}]
+
+
 def test_modules_import_their_own_package_relatively() -> None:
     folders = {path.parts[0] for path in SOURCES if len(path.parts) > 1}
     # `import actors` would find the folder while the checkout is on sys.path, and load a second copy.

@@ -64,8 +64,11 @@ def copied(state: Any, otherwise: Callable[[Any], Any]) -> Any:
 
 
 def state_to_show(actor: Actor) -> Any:
-    """A copy that can be sent anywhere."""
-    return copied(live_state(actor), lambda value: Opaque(portable(repr(value))))
+    """A copy that can be sent anywhere; without `get_state`, what control shows beside the attributes is in it."""
+    state = live_state(actor)
+    if state_getter(actor) is None:
+        state = {**actor._overview(), **state}
+    return copied(state, lambda value: Opaque(portable(repr(value))))
 
 
 def state_to_change(actor: Actor) -> Any:

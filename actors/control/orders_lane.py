@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import ActorStopped, ControlFailed, HoldfastError, error_text, type_name
 from ..kernel.cell import Cell
-from ..kernel.envelope import Ask, Item
+from ..kernel.envelope import NO_DEADLINE, Ask, Item
 from ..kernel.message import Message
 from ..process.wire import frames
 from ..process.wire.frames import BadFrame
@@ -105,7 +105,8 @@ def order(cell: Cell, wanted: Order, timeout: float) -> asyncio.Future[Any]:
         knows. AskFailed: the actor's process ended meanwhile. ControlFailed: it could not be carried out.
 
     Raises (at once):
-        SpecError: the actor lives in another process, and the order cannot be sent there.
+        SpecError: `timeout` is no finite number of seconds > 0, or the actor lives in another process, and the order
+        cannot be sent there.
     """
     node = cell.node
     future: asyncio.Future[Any] = node.loop.create_future()
@@ -113,7 +114,7 @@ def order(cell: Cell, wanted: Order, timeout: float) -> asyncio.Future[Any]:
     if living.is_dead:
         future.set_exception(ActorStopped(cell.path, "nobody lives there"))
         return future
-    ask = OrderAsk(ORDERED, None, (), timeout, node.loop.time() + timeout, future, living)
+    ask = OrderAsk(ORDERED, None, (), timeout, NO_DEADLINE, future, living)
     node.deadlines.add(ask)
     try:
         living.host.control(living, QueuedOrder(ask, wanted))
@@ -168,7 +169,7 @@ def ask_status(peer: Peer, cell: Cell, timeout: float) -> asyncio.Future[Any]:
     """The status that the process of an actor gives of it."""
     node = cell.node
     future: asyncio.Future[Any] = node.loop.create_future()
-    ask = OrderAsk(ORDERED, None, (), timeout, node.loop.time() + timeout, future, cell)
+    ask = OrderAsk(ORDERED, None, (), timeout, NO_DEADLINE, future, cell)
     node.deadlines.add(ask)
     _send(peer, cell.path, ask, "status", encode_value({}))
     return future

@@ -215,6 +215,10 @@ class Actor:
         """Whose attributes the key variables are."""
         return self
 
+    def _overview(self) -> dict[str, Any]:
+        """What control shows beside the attributes, and nobody can replace."""
+        return {}
+
     def _outside(self) -> Iterable[Coroutine[Any, Any, Any]]:
         """What it does outside its turns, and waits."""
         return ()

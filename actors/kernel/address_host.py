@@ -69,6 +69,8 @@ class Place:
 
     is_here: bool
     """Whether that is this process."""
+    owns_processes: bool = False
+    """Whether each life has a process of its own, or several."""
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         """Begin a life. None: it is up already. Raises, or fails the future, with StartFailed."""

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, TypeVarTuple, cast, ov
 from ..effects import Effect, Retry, effect_of
 from ..errors import ActorStopped, AskDeadlock, HoldfastError, SpecError, remote_crash
 from ..exit_reasons import NORMAL, ExitReason
+from ..seconds import check_seconds
 from . import links, mailbox
 from .blocking_handlers import is_async
-from .envelope import Ask, Chain, Envelope, Item, ReplyHandle, chain_of, message_in
+from .envelope import NO_DEADLINE, Ask, Chain, Envelope, Item, ReplyHandle, chain_of, message_in
 from .links import Monitor
 from .message import Message, reply_type, require_message
 from .timers import Timer
@@ -139,7 +140,7 @@ class ActorContext:
         if waits_for(self, cell, chain):
             future.set_exception(AskDeadlock(cell.path, tuple(path for path, _ in chain)))
             return future
-        ask = Ask(message, self._cell, chain, timeout, node.loop.time() + timeout, future, cell)
+        ask = Ask(message, self._cell, chain, timeout, NO_DEADLINE, future, cell)
         node.deadlines.add(ask)
         try:
             cell.admit(cell, ask)
@@ -252,14 +253,19 @@ class ActorContext:
     # -- later ------------------------------------------------------------------------------------------------------
 
     def tell_after(self, delay: float, message: Message[Any]) -> Timer:
-        """Have a message come to this actor itself after `delay` seconds; the timer ends with this life."""
-        self._alive()
-        return Timer(self._cell, message, delay, None)
+        """Have a message come to this actor itself after `delay` seconds, >= 0; the timer ends with this life."""
+        timer: Timer = self._timer(message, check_seconds(self.path, "delay", delay, or_zero=True), None)
+        return timer
 
     def every(self, interval: float, message: Message[Any]) -> Timer:
-        """Have a message come every `interval` seconds; ticks that fall due while one waits are left out."""
+        """Have a message come every `interval` seconds, > 0; ticks that fall due while one waits are left out."""
+        timer: Timer = self._timer(message, check_seconds(self.path, "interval", interval), interval)
+        return timer
+
+    def _timer(self, message: Message[Any], delay: float, interval: float | None) -> Any:
+        """A handle on a timer that is set now."""
         self._alive()
-        return Timer(self._cell, message, interval, interval)
+        return Timer(self._cell, message, delay, interval)
 
     def pipe_to_self(
         self,
@@ -414,8 +420,7 @@ class ActorContext:
     def sleep(self, seconds: float) -> asyncio.Future[None]:
         """Have the turn in hand wait for so many seconds from this call on; see `sleep_until`."""
         self._alive()
-        if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds < math.inf:
-            raise SpecError("sleep", f"takes a number of seconds >= 0, not {seconds!r}")
+        check_seconds(self.path, "sleep", seconds, or_zero=True)
         return self._slept(float(seconds), is_moment=False)
 
     def _slept(self, seconds: float, *, is_moment: bool) -> asyncio.Future[None]:
@@ -447,10 +452,8 @@ class ActorContext:
             raise SpecError("wait_for", f"takes classes of messages, not {kinds!r}")
         if answered := [kind.__name__ for kind in kinds if reply_type(kind) is not None]:
             raise SpecError("wait_for", f"takes messages whose reply is None, and {', '.join(answered)} has another")
-        if timeout is not None and (
-            not isinstance(timeout, int | float) or isinstance(timeout, bool) or not 0 < timeout < math.inf
-        ):
-            raise SpecError("wait_for", f"timeout must be a number of seconds > 0, or None, not {timeout!r}")
+        if timeout is not None:
+            check_seconds(self.path, "timeout of wait_for", timeout)
         return cast("asyncio.Future[M]", self._signal(kinds, timeout))
 
     def _signal(self, kinds: tuple[type[Message[Any]], ...], timeout: float | None) -> asyncio.Future[Message[Any]]:

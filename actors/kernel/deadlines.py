@@ -6,7 +6,7 @@ import asyncio
 from collections import deque
 from typing import TYPE_CHECKING
 
-from ..errors import SpecError
+from ..seconds import check_seconds
 
 if TYPE_CHECKING:
     from .envelope import Ask
@@ -20,12 +20,19 @@ class Deadlines:
         self._queues: dict[float, _Queue] = {}
 
     def add(self, ask: Ask) -> None:
-        """See to it that the ask has an outcome at its deadline."""
-        queue = self._queues.get(ask.timeout)
+        """Set the deadline of an ask by its time-out, and see to it that it has an outcome then.
+
+        Raises:
+            SpecError: the time-out is no finite number of seconds > 0.
+        """
+        timeout = ask.timeout
+        queue = self._queues.get(timeout) if type(timeout) is float else None
         if queue is None:
-            if not ask.timeout > 0:
-                raise SpecError("ask", f"timeout must be a number of seconds > 0, not {ask.timeout!r}")
-            queue = self._queues[ask.timeout] = _Queue(self._loop, self._queues, ask.timeout)
+            timeout = float(check_seconds(ask.to.path, "timeout", timeout))
+            queue = self._queues.get(timeout)
+        if queue is None:
+            queue = self._queues[timeout] = _Queue(self._loop, self._queues, timeout)
+        ask.deadline = self._loop.time() + timeout
         asks = queue.asks
         while asks and asks[0].future.done():
             asks.popleft()

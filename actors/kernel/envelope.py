@@ -173,6 +173,10 @@ class Envelope(Item, msgspec.Struct, eq=False):
 Coroutine_ = types.CoroutineType
 
 
+NO_DEADLINE = 0.0
+"""Of an ask that has none yet: `Deadlines.add` sets it."""
+
+
 class Ask(Item, msgspec.Struct, eq=False):
     """A message that somebody waits for: exactly one outcome reaches `future`."""
 

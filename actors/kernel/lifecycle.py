@@ -522,9 +522,7 @@ def _undo(cell: Cell) -> None:
         own.tasks.clear()
         for topic in list(own.topics):
             cell.node.topics.unsubscribe(topic, cell)
-        for name in own.names:
-            cell.node.names.pop(name, None)
-        own.names.clear()
+        _free_names(cell)
         more.ties.watching.clear()
     more.suspended, more.trap_exits = 0, False
     queue = cell.queue
@@ -543,6 +541,15 @@ def _undo(cell: Cell) -> None:
         more.stash.clear()
 
 
+def _free_names(cell: Cell) -> None:
+    """Nobody has the names any more that the life at the cell had."""
+    names = cell.extra().belongings.names
+    for name in names:
+        if cell.node.names.get(name) is cell:  # Else the life has moved, and its names with it.
+            del cell.node.names[name]
+    names.clear()
+
+
 def retire(cell: Cell, why: object) -> None:
     """The address is given up: its name is free, and what is queued will not be handled."""
     if cell.state is GONE:
@@ -559,6 +566,8 @@ def retire(cell: Cell, why: object) -> None:
     queue, cell.queue = cell.queue, None
     more = cell.more
     if more is not None:
+        if more.has_more:
+            _free_names(cell)  # Of a life that was about to begin: another one's end has freed them already.
         if more.bound is not None:
             waiting, more.bound.waiting = more.bound.waiting, deque()
             for ask in waiting:

@@ -135,12 +135,13 @@ def _resolve(declared: Any, kind: type) -> Any:
 class Refusal(HoldfastError):
     """A typed "no": raised in a handler it is the reply, and the actor lives on.
 
-    Fields are declared as in a dataclass.
+    Fields are declared as in a dataclass, and what it says as `text`, as every `HoldfastError` has it. One without a
+    text shows its fields.
 
-    >>> class Overdrawn(Refusal):
+    >>> class Overdrawn(Refusal, text="{missing} are missing: pay in first"):
     ...     missing: int
-    >>> Overdrawn(missing=5).missing
-    5
+    >>> Overdrawn(missing=5).missing, str(Overdrawn(5))
+    (5, '5 are missing: pay in first')
     """
 
     _schema: typing.ClassVar[type[msgspec.Struct] | None] = None
@@ -169,7 +170,10 @@ class Refusal(HoldfastError):
     __hash__ = HoldfastError.__hash__
 
 
-class UnknownRefusal(Refusal):
+class UnknownRefusal(
+    Refusal,
+    text="refused with {type_name}, whose class is not loaded here: import its module; its fields are {fields!r}",
+):
     """A refusal whose class is not loaded in this process; `fields` are as they came."""
 
     type_name: str

@@ -311,8 +311,13 @@ class Node(RunLoop):
             raise WrongActor(path, type_name(kind), type_name(found))
         return ActorRef(cell)
 
-    def register(self, name: str, cell: Cell) -> None:
+    def register(self, name: str, cell: Cell, *, is_starting: bool = False) -> None:
         """Give an actor a name beside its path; it is free again before anybody hears of the actor's end.
+
+        Args:
+            name: the name.
+            cell: the actor.
+            is_starting: a life of it is about to begin, and has the name from its very start.
 
         Raises:
             NameTaken: another living actor has it.
@@ -322,7 +327,7 @@ class Node(RunLoop):
             return
         if holder is not None:
             raise NameTaken(name)
-        if cell.state is not RUNNING:
+        if cell.state is not RUNNING and not is_starting:
             raise ActorStopped(cell.path)
         self.names[name] = cell
         cell.extra().belongings.names.append(name)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal
 from typing_extensions import TypeVar
 
 from ..errors import ActorRestarting, SpecError
-from .envelope import Ask
+from .envelope import NO_DEADLINE, Ask
 from .message import Message
 
 if TYPE_CHECKING:
@@ -92,13 +92,17 @@ class ActorRef(Generic[A_co]):
 
         Args:
             message: what is asked; its class declares the reply's type.
-            timeout: seconds until the deadline, > 0; it travels with the message and runs on during recovery.
+            timeout: seconds until the deadline, finite and > 0; it travels with the message, and runs on during
+                recovery.
             restarting: "fail" sends nothing to an actor that is between two lives, or being recovered: the awaitable
                 raises ActorRestarting. (Of actors in another process than the root an actor process knows too little:
                 it waits. A recorded actor always waits, for its replay to do the same.)
 
         Returns:
             A future of the reply. Cancelling it ends the wait, never the turn.
+
+        Raises:
+            SpecError: the time-out is no such number. UnknownMessage, BadMessage, WrongThread: as `tell`.
 
         Raises (by the awaitable):
             Refusal: the handler's typed "no".
@@ -115,7 +119,7 @@ class ActorRef(Generic[A_co]):
         node = cell.node
         node.check_thread(cell.path)
         future: asyncio.Future[R] = node.loop.create_future()
-        ask = Ask(message, None, (), timeout, node.loop.time() + timeout, future, cell)
+        ask = Ask(message, None, (), timeout, NO_DEADLINE, future, cell)
         node.deadlines.add(ask)
         try:
             cell.admit(cell, ask)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-from ..errors import SpecError
 from .envelope import Item
 from .message import Message
 
@@ -19,8 +18,6 @@ class Timer:
     __slots__ = ("_cell", "_due", "_handle", "_interval", "_queued", "message")
 
     def __init__(self, cell: Cell, message: Message[Any], delay: float, interval: float | None) -> None:
-        if not delay >= 0 or (interval is not None and not interval > 0):
-            raise SpecError(cell.path, f"a timer takes seconds > 0, not {delay!r}")
         cell.require(message)
         self._cell = cell
         self.message = message

@@ -128,8 +128,6 @@ class Inner:
         more.reason = reason
         for topic in list(more.belongings.topics):
             self._node.topics.unsubscribe(topic, cell)
-        for name in list(more.belongings.names):
-            self._node.unregister(name)
         lifecycle.retire(cell, reason)
         links.announce(cell, reason, recovering=False)
         lifecycle.tell_enders(more, reason)

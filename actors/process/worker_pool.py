@@ -14,7 +14,7 @@ from ..control.orders import ObserveTurns
 from ..control.orders_lane import order, send_call
 from ..errors import AskFailed, ProcessUnavailable, StartFailed, StartIgnored
 from ..events import TRACED, LogLine, ProcessDied, ProcessStarted, TrustBreached
-from ..exit_reasons import KILLED, Exited, ExitReason, Hung, pack_exit, unpack_exit
+from ..exit_reasons import KILLED, ExitReason, Hung, TrustBreach, pack_exit, unpack_exit
 from ..kernel.cell import Cell
 from ..migration.words import NO_ATTEMPT, say
 from ..streams import check_can_watch
@@ -338,7 +338,7 @@ class Worker(Peer):
         if self.end.killed_for is None and self.end.status is None:
             path = self.cell.path if self.cell is not None else f"process {self.pid}"
             self.node.emit(TrustBreached(path, self.pid, error.problem))
-        self.kill(Exited(70))  # EX_SOFTWARE
+        self.kill(TrustBreach(error.problem))
 
     def on_exit(self, status: int) -> None:
         """The fork server has reaped it."""

@@ -107,7 +107,7 @@ class Rejoin:
         source = home.ledger.open.get(key)
         ask.chain = ((home.path, key), *(source.chain if source is not None else ()))
         ask.to, ask.asked = ask.to or home.node.cell_at(out.to), out.name
-        ask.timeout, ask.deadline = out.seconds, home.node.loop.time() + out.seconds
+        ask.timeout = out.seconds
         home.calls.asks[turn, out.k] = ask
         home.node.deadlines.add(ask)
         return True

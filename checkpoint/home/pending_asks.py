@@ -10,7 +10,7 @@ from ...actors.errors import AskTimeout, BadMessage, BadReply, EffectInDoubt, Ho
 from ...actors.events import EffectRepeated
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
-from ...actors.kernel.envelope import Ask, ReplyHandle
+from ...actors.kernel.envelope import NO_DEADLINE, Ask, ReplyHandle
 from ...actors.process.wire.peer import RelayedAsk
 from ..inputs import Batch, Input
 from ..protocol import REPLY, Answer, Out, Outcome, Perform, Performed, timed
@@ -55,8 +55,7 @@ class SwitchAsk(RelayedAsk, eq=False):
     @classmethod
     def made(cls, switch: Switch, turn: int, out: Out, chain: Any, to: Cell) -> SwitchAsk:
         """The ask that was output (turn, k)."""
-        deadline = switch.node.loop.time() + out.seconds
-        ask = cls(Parcel(out.name, out.body), switch.cell, chain, out.seconds, deadline, None, to)
+        ask = cls(Parcel(out.name, out.body), switch.cell, chain, out.seconds, NO_DEADLINE, None, to)
         ask.future, ask.switch, ask.asker, ask.turn, ask.k, ask.asked = ask, switch, switch.path, turn, out.k, out.name
         return ask
 

@@ -30,6 +30,7 @@ from ...actors.kernel.envelope import Ask, Item, ReplyHandle
 from ...actors.kernel.links import Monitor
 from ...actors.kernel.message import Message, message_name, require_message
 from ...actors.kernel.ref import ActorRef, current
+from ...actors.seconds import check_seconds
 from ...actors.values import encode_value
 from ..protocol import REPLY, SINCE_THEN, Answer, Feed, Performed, PipeDone
 from .recorded_inbox import INIT, STARTED, Fed
@@ -194,7 +195,7 @@ class RecordedContext(ActorContext):
             self._outside()
             return super()._ask(cell, message, timeout)
         life = self.recorded
-        k = self._put("ask", cell, message, seconds=timeout)
+        k = self._put("ask", cell, message, seconds=check_seconds(cell.path, "timeout", timeout))
         future: asyncio.Future[R] = self._cell.node.loop.create_future()
         life.asks[life.turn, k] = future, type(message)
         life.release()
@@ -231,20 +232,14 @@ class RecordedContext(ActorContext):
 
     # -- later ------------------------------------------------------------------------------------------------------
 
-    def _timer(self, message: Message[Any], delay: float, interval: float) -> Any:
+    def _timer(self, message: Message[Any], delay: float, interval: float | None) -> Any:
         self._cell.require(message)
-        life = self.acting()
+        life, interval = self.acting(), interval or 0.0
         name, body = message_name(type(message)), self._cell.node.codec.encode_alike(message, self.path)
         in_turn = life.feed is not None
         key = f"{life.turn}.{life.last_k + 1}" if in_turn else life.timer_of_hook(name, body, interval)
         life.put("timer", key, name, body, seconds=delay, interval=interval)
         return RecordedTimer(key)
-
-    def tell_after(self, delay: float, message: Message[Any]) -> Any:
-        return self._timer(message, delay, 0.0)
-
-    def every(self, interval: float, message: Message[Any]) -> Any:
-        return self._timer(message, interval, interval)
 
     def pipe_to_self(
         self,

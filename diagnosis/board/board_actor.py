@@ -34,7 +34,7 @@ class GetSpecification(Message[Specification]):
     """What is the board? Refused with BoardFailed."""
 
 
-class BoardFailed(Refusal):
+class BoardFailed(Refusal, text="the board has not done it ({kind}): {why}"):
     """The board could not be reached, did not answer, or refused; `kind` is the class of the error."""
 
     kind: str

@@ -55,7 +55,7 @@ class MuteBoard(Message, tag=True):
 Fault: TypeAlias = StuckChannel | WrongCurrent | DropConnections | DelayReplies | MuteBoard
 
 
-class NoSuchChannel(Refusal):
+class NoSuchChannel(Refusal, text="the board has no channel {channel}: channels are 0 to 9"):
     """Channels are 0 to 9."""
 
     channel: int

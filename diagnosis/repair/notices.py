@@ -107,7 +107,9 @@ class Deny(RuntimeOrder[None]):
     why: str = "a person said no"
 
 
-class NobodyWaits(Refusal):
+class NobodyWaits(
+    Refusal, text="no action waits for approval under the number {number}: it was decided, or its case is over"
+):
     """No action waits under this number."""
 
     number: int

@@ -23,7 +23,9 @@ from ...checkpoint.protocol import (
 from .state_images import Image, Patch
 
 
-class StaleLeader(Refusal):
+class StaleLeader(
+    Refusal, text="{path} has seen epoch {seen}, and whoever speaks leads in {got} only: it has been replaced"
+):
     """Whoever says this has been replaced: a higher epoch has been seen here."""
 
     path: str
@@ -31,7 +33,9 @@ class StaleLeader(Refusal):
     got: int
 
 
-class ConfigMismatch(Refusal):
+class ConfigMismatch(
+    Refusal, text="{path} has the mechanisms of change {here}, and whoever speaks those of {there}: they do not fit"
+):
     """The two replicas have different stacks of mechanisms: what one says makes no sense to the other."""
 
     path: str
@@ -39,7 +43,9 @@ class ConfigMismatch(Refusal):
     there: int
 
 
-class NotFollowing(Refusal):
+class NotFollowing(
+    Refusal, text="{path} follows in epoch {seen}, if at all, and this is of epoch {got}: it is not for this life"
+):
     """This life has not been told that it follows in this epoch: what was meant for the one before is not for it."""
 
     path: str
@@ -47,18 +53,14 @@ class NotFollowing(Refusal):
     got: int
 
 
-class CannotJoin(Refusal):
+class CannotJoin(Refusal, text="{path} cannot be brought to the state of the leader: {why}"):
     """This replica cannot be brought to the state of the one that leads."""
 
     path: str
     why: str
 
 
-class RequestDropped(
-    Refusal,
-    text="a brick of {path} has neither passed request {number} on nor ended it (may_have_run={may_have_run}): "
-    "mend the brick",
-):
+class RequestDropped(Refusal):
     """A brick of the mechanism has neither passed this request on nor ended it.
 
     `may_have_run`: a turn was handled whose outcome was lost in the bricks too, and that may be this one.
@@ -68,9 +70,15 @@ class RequestDropped(
     number: int
     may_have_run: bool = False
 
+    def __str__(self) -> str:
+        known = "it may have been handled" if self.may_have_run else "it was not handled: ask again"
+        return (
+            f"a brick of {self.path} has neither passed request {self.number} on nor ended it: mend the brick; {known}"
+        )
+
 
 class ReplyEvicted(
-    Refusal, text="{path} has handled request {number}, but does not keep its reply any more: do not ask again blindly"
+    Refusal, text="request {number} to {path} was handled, but its reply is not kept any more: ask for what it has done"
 ):
     """The request was handled, but its reply is not kept any more: the reply log is bounded."""
 
@@ -100,7 +108,7 @@ def is_marker(number: int) -> bool:
     return FORWARDED < number < -1
 
 
-class CannotLead(Refusal):
+class CannotLead(Refusal, text="{path} does not have the state of the last leader: another replica has to lead"):
     """This replica does not have the state of the last leader (any more): another one has to lead, or none."""
 
     path: str

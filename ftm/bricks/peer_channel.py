@@ -53,7 +53,7 @@ class Recall(Message[bytes]):
     number: int
 
 
-class NotHere(Refusal):
+class NotHere(Refusal, text="{path} does not have this letter, or not all of it: it has to be sent again"):
     """This letter has not come, or not all of it."""
 
     path: str

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ...actors.kernel.codec import Codec
 
 
-class Refused(Refusal):
+class Refused(Refusal, text="{path} does not accept this: {reason}"):
     """A frame, or a part of a hand-shake, was not accepted. Whoever says so may be anybody: it is only a hint."""
 
     path: str

@@ -52,6 +52,7 @@ from .transient_homes import UNKEPT, TransientHome, is_unkept
 
 if TYPE_CHECKING:
     from ...actors.control.orders_lane import QueuedOrder
+    from ...actors.process.worker_pool import Worker
     from ...checkpoint.home.switch import Switch
     from ...checkpoint.protocol import Live, TurnEnd
     from ..bricks.sealed_frames import SecuredLink
@@ -76,6 +77,7 @@ class GroupPlace(Place):
     """Replicas, each in a process of its own."""
 
     is_here = False
+    owns_processes = True
 
     def __init__(self, home: JournalHome, parent: Parent, mechanism: Any) -> None:
         self.home, self.parent = home, parent
@@ -98,6 +100,12 @@ class GroupPlace(Place):
     def is_ending(self) -> bool:
         """Whether the replicas have been told to end, or are to be."""
         return self._ending is not None or self._stop_wanted is not None
+
+    def process(self, cell: Cell) -> Worker | None:
+        """The process of the replica that leads."""
+        group = self.group
+        leader = None if group is None else group.membership.primary
+        return None if group is None or leader is None else group.replicas.worker_of(leader)
 
     def handed_to(self, parent: Parent) -> None:
         """The replicas stay: another supervisor hears of the end of the life."""

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from ...actors.errors import ActorStopped, AskFailed, AskTimeout, HoldfastError, NoSuchActor
-from ...actors.exit_reasons import KILLED, Crash, Exited, ExitReason, Hung, OutOfMemory, Shutdown, Signal
+from ...actors.exit_reasons import KILLED, Crash, Exited, ExitReason, Hung, OutOfMemory, Shutdown, Signal, TrustBreach
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.message import Message, message_name
@@ -50,7 +50,7 @@ AGAIN_AFTER: Final = 0.05
 def fault_of(reason: ExitReason) -> str:
     """Why the end of a replica may be the fault of its own code; "" if somebody else has ended it."""
     match reason:
-        case Crash() | Hung() | OutOfMemory() | Exited():
+        case Crash() | Hung() | OutOfMemory() | Exited() | TrustBreach():
             why = str(reason)
         case Signal() if reason.number not in FROM_OUTSIDE:
             why = str(reason)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 from ...actors.errors import SpecError
+from ...actors.seconds import check_seconds, is_seconds
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -30,16 +30,10 @@ class Detection:
     watch_turns: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("interval", "threshold", "spread", "hopeless"):
-            value = getattr(self, name)
-            if not _number(value) or not 0 < value < math.inf:
-                raise SpecError("Detection", f"{name} must be a finite number > 0, not {value!r}")
-        turns = self.watch_turns
-        if turns is not None and (not _number(turns) or not 0 < turns < math.inf):
-            raise SpecError("Detection", f"watch_turns must be seconds > 0 or None, not {turns!r}")
-        if not _number(self.pause) or not 0 <= self.pause < math.inf:
-            raise SpecError("Detection", f"pause must be seconds >= 0, not {self.pause!r}")
-
-
-def _number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+        for name in ("interval", "spread", "hopeless"):
+            check_seconds("Detection", name, getattr(self, name))
+        if not is_seconds(self.threshold):  # It counts something else, but is as positive and finite.
+            raise SpecError("Detection", f"threshold must be a finite number > 0, not {self.threshold!r}")
+        if self.watch_turns is not None:
+            check_seconds("Detection", "watch_turns", self.watch_turns)
+        check_seconds("Detection", "pause", self.pause, or_zero=True)

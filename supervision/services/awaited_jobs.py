@@ -16,7 +16,8 @@ from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.kernel.context import ActorContext
 from ...actors.kernel.links import link
 from ...actors.kernel.ref import ActorRef
-from ..spec import Shutdown
+from ...actors.seconds import check_seconds
+from ..spec import Shutdown, check_shutdown
 from .jobs import BeginJob
 
 T = TypeVar("T")
@@ -72,7 +73,13 @@ class Job(Generic[R]):
         return self._future.done()
 
     async def outcome(self, timeout: float | None = None) -> Ok[None, R] | Failed[None] | None:
-        """Wait for the end of the job, as often as you like; None after `timeout` seconds, and the job goes on."""
+        """Wait for the end of the job, as often as you like; None after `timeout` seconds, and the job goes on.
+
+        Raises:
+            SpecError: `timeout` is neither a finite number >= 0 nor left out.
+        """
+        if timeout is not None:
+            check_seconds(self.path, "timeout", timeout, or_zero=True)
         await asyncio.wait((self._future,), timeout=timeout)
         if not self._future.done():
             return None
@@ -91,7 +98,13 @@ class Job(Generic[R]):
         self._end("brutal_kill")
 
     async def stop(self, shutdown: Shutdown | None = None) -> Ok[None, R] | Failed[None]:
-        """End it and wait for that; it may have been quicker, then its result is not lost."""
+        """End it and wait for that; it may have been quicker, then its result is not lost.
+
+        Raises:
+            SpecError: `shutdown` is neither seconds >= 0 nor "brutal_kill" nor "infinity".
+        """
+        if shutdown is not None:
+            check_shutdown(self.path, shutdown)
         self._end(self._shutdown if shutdown is None else shutdown)
         outcome = await self.outcome()
         assert outcome is not None

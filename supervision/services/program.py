@@ -23,11 +23,14 @@ from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.actor import Actor, on, start
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.message import Message, Refusal
+from ...actors.kernel.ref import ActorRef
 from ...actors.process.fork.launch import outside_environment
 from ...actors.process.program.external_program import KeptProgram, ProgramFailed
 from ...actors.process.resource_limits import Limits
+from ...actors.seconds import check_seconds
 from ..rules import Rule
 from ..spec import ChildSpec, Restart, Shutdown, child
+from .program_lines import LineSender, receiver_in
 from .readiness import ReadySign, Sign, by_name, reached
 
 Stop: TypeAlias = int | Sequence[str] | Callable[[int], Awaitable[object] | object]
@@ -62,7 +65,7 @@ class ProgramInput(Message[None]):
     end: bool = False
 
 
-class InputRefused(Refusal):
+class InputRefused(Refusal, text="the program takes no input: {why}"):
     """The program takes no input; `why` says whether it never does, no more, or not now."""
 
     why: str
@@ -81,6 +84,7 @@ class ProgramPlan:
     cwd: str | None
     limits: Limits | None
     stdin: bool
+    lines_to: str | None
 
 
 class Program(Actor):
@@ -95,6 +99,7 @@ class Program(Actor):
         self._lines: deque[str] = deque(maxlen=LINES)
         self._parts: dict[str, str] = {}  # of lines that have no end yet, by stream
         self._sign: Sign | None = None
+        self._sender: LineSender | None = None
         self._since = 0.0
 
     # -- start ------------------------------------------------------------------------------------------------------
@@ -109,6 +114,9 @@ class Program(Actor):
         if isinstance(before, KeptProgram) and not before.ended.done():
             why = f"that of an earlier life still runs, and cannot be ended from here ({before.denied.result()})"
             raise ProgramFailed(order.command[0], why)
+        if order.lines_to is not None:
+            self._sender = LineSender(cell, order.lines_to, self._hold, self._go_on)
+            self._sender.check()
         self._sign = None if order.ready is None else Sign(order.ready)
         kept = self._kept = self._keep(order.command, stdin=order.stdin)
         self._since = self._now()
@@ -184,8 +192,18 @@ class Program(Actor):
         node = self.ctx._cell.node
         if node.events.has_listeners:
             node.emit(LogLine(self.ctx.path, stream, text))
+        if self._sender is not None:
+            self._sender.send(stream, text)
         if self._sign is not None:
             self._sign.line(text)
+
+    def _hold(self) -> None:
+        if self._kept is not None:
+            self._kept.hold_output()
+
+    def _go_on(self) -> None:
+        if self._kept is not None:
+            self._kept.let_output_go_on()
 
     def _part(self, stream: str, text: str, whole: str) -> None:
         """A line that has no end yet; it comes again. What came before of a very long one is there in `whole`."""
@@ -323,6 +341,7 @@ def program(
     env: Mapping[str, str | None] | None = None,
     cwd: str | Path | None = None,
     stdin: bool = False,
+    lines_to: ActorRef[Any] | str | None = None,
     restart: Restart = "permanent",
     shutdown: Shutdown = 5.0,
     backoff: Backoff | None = None,
@@ -350,6 +369,8 @@ def program(
         env: variables besides those of this process; None takes one away.
         cwd: its working directory.
         stdin: whether it reads what `ProgramInput` brings; else its standard input is empty.
+        lines_to: who gets each line of its output as a `ProgramLine`: a ref, an address or a registered name. A hundred
+            that are not handled have the program wait. What nobody can take is a dead letter.
         restart, backoff, significant, rules: as in `child`.
         shutdown: seconds it may take to end before it is ended by SIGKILL, "brutal_kill" or "infinity".
         limits: of the program itself; `hung_after` does not apply.
@@ -360,8 +381,7 @@ def program(
     words = _command_in("program", "the command", command)
     name = os.path.basename(words[0]) if id is None else id
     where = f"program {name!r}"
-    if not _is_number(ready_timeout) or not 0 < ready_timeout < float("inf"):
-        raise SpecError(where, f"ready_timeout must be a finite number of seconds > 0, not {ready_timeout!r}")
+    check_seconds(where, "ready_timeout", ready_timeout)
     if not isinstance(stdin, bool):
         raise SpecError(where, f"stdin must be True or False, not {stdin!r}")
     if limits is not None and not isinstance(limits, Limits):
@@ -381,6 +401,7 @@ def program(
         directory,
         limits,
         stdin,
+        receiver_in(where, lines_to),
     )
     # The actor does the counting, for a kill of the actor must not come before that of the program.
     own = child(
@@ -443,10 +464,6 @@ def _changes_in(where: str, env: Any) -> dict[str, str | None]:
 def _is_text(value: object) -> TypeGuard[str]:
     """Whether the kernel takes it: it has no text with a NUL in it."""
     return isinstance(value, str) and "\0" not in value
-
-
-def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _environment(changes: Mapping[str, str | None]) -> dict[str, str]:

@@ -16,6 +16,7 @@ from typing import Any, Literal, cast
 
 from ...actors.errors import SpecError
 from ...actors.kernel.blocking_handlers import HandlerThreads, is_async
+from ...actors.seconds import is_seconds
 from ...actors.streams import Address, connect
 
 FIRST_LOOK, LAST_LOOK = 0.01, 0.2
@@ -49,7 +50,7 @@ class ReadySign:
                 return cls("port", (host, port))
             case bool():
                 pass
-            case int() | float() if 0 <= ready < float("inf"):
+            case int() | float() if is_seconds(ready, or_zero=True):
                 return cls("seconds", float(ready))
             case _ if callable(ready):
                 return cls("call", by_name(ready))

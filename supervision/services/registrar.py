@@ -28,17 +28,20 @@ from ...actors.process.wire.peer import OutsideHost
 Keys = Literal["unique", "duplicate"]
 
 
-class KeyTaken(Refusal):
+class KeyTaken(Refusal, text="{holder.path} holds this key: take another one, or wait for its end"):
     """A living actor holds this unique key. `Registry` says it as `AlreadyRegistered`, which names the key."""
 
     holder: ActorRef[Any]
 
 
-class NotAnActor(Refusal):
+class NotAnActor(Refusal, text="only an actor can hold a key, for its end frees it: call this from a handler"):
     """Only an actor can hold a key, for it is freed with its holder's end: call this from a handler."""
 
 
-class NotUnique(Refusal):
+class NotUnique(
+    Refusal,
+    text="{order} is for unique keys, and this registry may have many entries for one: nobody knows which is meant",
+):
     """The registry allows many entries for one key: `order` would not know which is meant."""
 
     order: str

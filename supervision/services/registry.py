@@ -48,7 +48,7 @@ D = TypeVar("D")
 T = TypeVar("T")
 
 
-class AlreadyRegistered(Refusal):
+class AlreadyRegistered(Refusal, text="key {key!r} is held by {holder.path}: take another one, or wait for its end"):
     """A living actor holds this key: `holder` is it, perhaps the asker itself."""
 
     key: Any

@@ -25,7 +25,7 @@ Key: TypeAlias = str | Callable[[Any], Any]
 """What a message is hashed by: the name of one of its fields, or a function of it."""
 
 
-class NoRoute(Refusal):
+class NoRoute(Refusal, text="no worker can be found for the message, for its key cannot be had: {why}"):
     """No worker can be found for a message, because its key cannot be had; `why` says what is wrong with it."""
 
     why: str

@@ -18,6 +18,7 @@ from ...actors.control.orders import pack_function
 from ...actors.errors import AskTimeout, SpecError
 from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.ref import ActorRef, current
+from ...actors.seconds import check_seconds
 from ..admin import StartChild, WhichChildren
 from ..spec import NAMELESS, ChildSpec, Flags, Isolation, Restart, Shutdown
 from .awaited_jobs import FOREVER, Failed, Job, Ok, follow, followed, returned, seen
@@ -124,6 +125,7 @@ class Tasks:
             AskFailed: the job was ended, or killed, or its process has died. AskTimeout: it took longer than `timeout`
             seconds, and was ended for that.
         """
+        self._check(timeout)
         job = self._begin(function, args, linked, isolation, shutdown)
         try:
             await asyncio.wait((job._future,), timeout=timeout)
@@ -242,6 +244,7 @@ class Tasks:
             raise SpecError("stream", f"max_concurrency must be a whole number >= 1, not {max_concurrency!r}")
         if on_timeout not in get_args(OnTimeout):
             raise SpecError("stream", f"on_timeout must be one of {', '.join(get_args(OnTimeout))}, not {on_timeout!r}")
+        self._check(timeout)
 
         def begin(item: Any) -> Job[Any]:
             return self._begin(function, (item,), linked, isolation, shutdown)
@@ -256,6 +259,7 @@ class Tasks:
         on_timeout: Literal["leave", "kill_task"] = "leave",
     ) -> list[Ok[None, R] | Failed[None] | None]:
         """Wait for the ends of several jobs, in their order; None for those not over after `timeout` seconds."""
+        self._check(timeout)
         every = list(jobs)
         if every:
             await asyncio.wait([job._future for job in every], timeout=timeout)
@@ -271,6 +275,11 @@ class Tasks:
         return [cast("ActorRef[Actor]", node.cell_at(info.path).ref) for info in await self.ref.ask(WhichChildren())]
 
     # -- how --------------------------------------------------------------------------------------------------------
+
+    def _check(self, timeout: float | None) -> None:
+        """Refuse what is no time limit of jobs. Raises SpecError."""
+        if timeout is not None:
+            check_seconds(self.ref.path, "timeout", timeout, or_zero=True)
 
     def _begin(
         self,

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ...actors.errors import ActorStopped, StartFailed
+from ...actors.errors import ActorStopped, NameTaken, StartFailed
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.ref import ActorRef
@@ -189,9 +189,17 @@ def check_child(above: DraftPlace, spec: ChildSpec) -> None:
 
 
 def _planned(draft: Draft, above: DraftPlace, spec: ChildSpec) -> DraftPlace:
-    """The place of a child to be, and of those that come with it."""
+    """The place of a child to be, and of those that come with it.
+
+    Raises:
+        NameTaken: its name is somebody's now (it is started before the others change), or another one's to be.
+    """
+    name = spec.register
+    if name is not None and (name in draft.node.names or any(name in other.names for other in draft.root.walk())):
+        raise NameTaken(name)
     place = above.children[spec.id] = DraftPlace(spec.id, above, None, spec)
     place.is_planned, place.is_stopped = True, False
+    place.names += [] if name is None else [name]
     for port, path in spec.bindings.items():
         place.bindings[port] = draft.find(path)
     flags, children = (*spec.start.args, None, None)[:2] if spec.is_supervisor else (None, None)

@@ -7,8 +7,9 @@ from collections.abc import Callable, Coroutine
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from ...actors.errors import HoldfastError, SpecError, error_text, type_name
+from ...actors.errors import HoldfastError, error_text, type_name
 from ...actors.kernel.ref import current
+from ...actors.seconds import check_seconds
 from ...supervision.arbiter import on_errand
 from .arrangement import Arrangement
 from .change import Change
@@ -39,8 +40,7 @@ class Transaction:
     """`async with system.transaction() as change:` carries out what the body collects, when the body ends."""
 
     def __init__(self, system: ActorSystem, shared: Transactions, *, dry_run: bool, timeout: float) -> None:
-        if not timeout > 0:
-            raise SpecError("transaction", f"timeout must be seconds > 0, not {timeout!r}")
+        check_seconds("transaction", "timeout", timeout)
         self._system, self._shared = system, shared
         self._dry_run, self._timeout = dry_run, timeout
         self._change = Change(system)

@@ -163,16 +163,6 @@ async def test_deadlines_of_different_lengths_each_end_at_their_time(system: hf.
     gate.set()
 
 
-@pytest.mark.parametrize("timeout", [0, -1.0, float("nan")])
-async def test_a_timeout_must_be_positive(system: hf.ActorSystem, timeout: float) -> None:
-    with pytest.raises(hf.SpecError, match="timeout"):
-        system.spawn(hf.start(Worker)).ask(Quick(), timeout=timeout)
-
-
-async def test_an_ask_may_wait_for_ever(system: hf.ActorSystem) -> None:
-    assert await system.spawn(hf.start(Worker)).ask(Quick("x"), timeout=float("inf")) == "x"
-
-
 async def test_asking_an_actor_that_has_stopped_fails_at_once(system: hf.ActorSystem) -> None:
     worker = system.spawn(hf.start(Worker))
     await system.stop(worker)

@@ -305,7 +305,7 @@ async def test_the_phases_of_a_recovery_with_safe_state(isolation: str) -> None:
     [
         ({"safe_state": 3}, "an address, a list of them"),
         ({"safe_state": []}, "takes addresses"),
-        ({"safe_state_timeout": 0}, "safe_state_timeout must be seconds > 0"),
+        ({"safe_state_timeout": 0}, "safe_state_timeout must be a finite number of seconds > 0"),
         ({"held": 3}, "held must be"),
         ({"held": {"scan": hf.checkpoint.held(1)}}, "must name topics"),
         ({"held": {"/scan": 1}}, "must be held"),

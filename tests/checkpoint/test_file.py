@@ -198,7 +198,7 @@ def test_every_setting_of_a_method_can_stand_in_the_file() -> None:
         ('["/a"]\nmethod = "replay_only"\ninterval = 1', r"line 3, \[/a\]: replay_only has no setting 'interval'"),
         ('["/a"]\n\ninterval = "1"', r"line 3, \[/a\]: interval: Expected `float`, got `str`"),
         ('["/a"]\ninterval = true', r"line 2, \[/a\]: interval: Expected `float`, got `bool`"),
-        ('["/a"]\ninterval = -1', r"line 2, \[/a\]: .*interval must be seconds > 0, not -1"),
+        ('["/a"]\ninterval = -1', r"line 2, \[/a\]: .*interval must be a finite number of seconds > 0, not -1"),
         ('["/a"]\npacing = "slow"', r"line 2, \[/a\]: .*pacing must be 'fast', 'original' or a factor"),
         ('["/a"]\ndurability = "disk"', r"line 2, \[/a\]: .*durability must be one of 'memory', 'os', 'fsync'"),
         ('["/a"]\nkeep = 0', r"line 2, \[/a\]: .*keep must be a whole number from 1 to 100"),

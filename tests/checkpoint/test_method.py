@@ -20,12 +20,12 @@ class Gambler(hf.Actor):
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        ({"interval": 0}, "interval must be seconds > 0, not 0"),
-        ({"interval": -1.0}, "interval must be seconds > 0"),
-        ({"interval": float("nan")}, "interval must be seconds > 0"),
-        ({"interval": float("inf")}, "interval must be seconds > 0"),
-        ({"interval": True}, "interval must be seconds > 0"),
-        ({"interval": "2"}, "interval must be seconds > 0, not '2'"),
+        ({"interval": 0}, "interval must be a finite number of seconds > 0, not 0"),
+        ({"interval": -1.0}, "interval must be a finite number of seconds > 0"),
+        ({"interval": float("nan")}, "interval must be a finite number of seconds > 0"),
+        ({"interval": float("inf")}, "interval must be a finite number of seconds > 0"),
+        ({"interval": True}, "interval must be a finite number of seconds > 0"),
+        ({"interval": "2"}, "interval must be a finite number of seconds > 0, not '2'"),
         ({"pacing": "slow"}, "pacing must be 'fast', 'original' or a factor > 0, not 'slow'"),
         ({"max_deliveries": 0}, "max_deliveries must be a whole number >= 1, not 0"),
         ({"max_deliveries": True}, "max_deliveries must be a whole number >= 1"),

@@ -132,3 +132,54 @@ async def test_nothing_is_left_in_the_actor_when_nobody_looks_any_more(system: h
         assert (cell.admit, cell.table, type(cell.ctx)) != before[:3]
     assert (cell.admit, type(cell.ctx), set(vars(cell.actor))) == (before[0], *before[2:])
     assert cell.table is before[1]
+
+
+class Foreman(hf.Supervisor):
+    """One with attributes of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shift = "late"
+
+    def init(self) -> hf.Plan:
+        kids = [hf.child("one", hf.start(Account)), hf.child("idle", hf.start(Account), autostart=False)]
+        return hf.Plan(kids, strategy="rest_for_one", intensity=7, period=60.0)
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_the_state_of_a_supervisor_is_what_it_supervises(system: hf.ActorSystem, isolation: Any) -> None:
+    """Its flags, how much of its intensity is used, and its children."""
+    top = await system.start(hf.child("top", hf.start(Foreman), isolation=isolation))
+    one = system.ref("/app/top/one", Account)
+    one.tell(Crash())
+    assert await one.ask(Total()) == 0
+    kid = {"kind": "tests.control.players.Account", "restart": "permanent"}
+    expected = {
+        "strategy": "rest_for_one",
+        "intensity": 7,
+        "period": 60.0,
+        "auto_shutdown": "never",
+        "max_children": None,
+        "journal": False,
+        "restarts": 1,
+        "children": {
+            "one": {**kid, "state": "running", "restarts": 1},
+            "idle": {**kid, "state": "stopped", "restarts": 0},
+        },
+        "shift": "late",
+    }
+    assert await system.get_state(top) == expected
+    assert await system.replace_state(top, early) == {**expected, "shift": "early"}
+
+
+def early(state: dict[str, Any]) -> dict[str, Any]:
+    """What can be replaced are its attributes."""
+    assert state == {"shift": "late"}
+    return {"shift": "early"}
+
+
+async def test_the_state_of_a_dynamic_supervisor_has_its_children(system: hf.ActorSystem) -> None:
+    pool = await system.start(hf.dynamic("pool", max_children=3))
+    await pool.ask(hf.StartChild(hf.child("one", hf.start(Account))))
+    state = await system.get_state(pool)
+    assert (state["max_children"], list(state["children"])) == (3, ["one"])

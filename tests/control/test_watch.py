@@ -112,6 +112,6 @@ async def test_nobody_watches_unless_asked_to() -> None:
 @pytest.mark.parametrize("limit", [0, -1.0])
 async def test_a_limit_must_be_more_than_nothing(name: str, limit: float) -> None:
     options: dict[str, float] = {name: limit}
-    with pytest.raises(hf.SpecError, match=f"{name} must be seconds > 0"):
+    with pytest.raises(hf.SpecError, match=f"{name} must be a finite number of seconds > 0"):
         async with hf.ActorSystem("app", log=False, **options):  # type: ignore[arg-type]
             pass

@@ -104,7 +104,7 @@ async def test_a_request_that_a_brick_lets_fall_fails_and_is_told(system: hf.Act
 
 
 def test_a_reply_that_is_not_kept_says_what_not_to_do() -> None:
-    assert str(ReplyEvicted("/app/alice", 3)).endswith("does not keep its reply any more: do not ask again blindly")
+    assert str(ReplyEvicted("/app/alice", 3)).endswith("is not kept any more: ask for what it has done")
 
 
 @pytest.mark.parametrize("below", [hf.ftm.PBR(), hf.ftm.LFR()], ids=["pbr", "lfr"])

@@ -89,3 +89,14 @@ async def test_the_command_line_shows_it(system: hf.ActorSystem, tmp_path: Path)
         shown = await asyncio.to_thread(lambda: CliRunner().invoke(commands, command))
     assert "protection: pbr, whole since" in shown.output, shown.output
     assert "epoch 1 (r1 leads, r2 follows)" in shown.output
+
+
+async def test_a_protected_actor_lives_in_the_process_of_the_one_that_leads(system: hf.ActorSystem) -> None:
+    """Whoever kills that by its pid does not kill the whole program."""
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.ftm.PBR(), recovery=hf.hybrid()))
+    leader = (await system.protection(ref)).leader
+    assert leader is not None
+    assert system.pid_of(ref) == system.pid_of(system.ref(f"{ref.path}/ftm/{leader}", hf.Actor)) != os.getpid()
+    async with system.transaction() as change:
+        change.protect(ref, None)
+    assert system.pid_of(ref) == os.getpid()

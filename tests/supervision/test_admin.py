@@ -117,17 +117,18 @@ async def test_what_does_not_fit_is_refused_by_type_and_changes_nothing() -> Non
     async with hf.ActorSystem(log=False) as system:
         top = await begin(system, kid("up"), kid("down"))
         await top.ask(TerminateChild("down"))
-        refusals: list[tuple[hf.Message[Any], hf.Refusal]] = [
-            (StartChild(kid("up")), AlreadyStarted("up", system.ref("/app/top/up", Kid))),
-            (StartChild(kid("down")), AlreadyPresent("down")),
-            (RestartChild("up"), ChildBusy("up", "running")),
-            (DeleteChild("up"), ChildBusy("up", "running")),
-            (TerminateChild("nobody"), NoSuchChild("nobody")),
-            (RestartChild("nobody"), NoSuchChild("nobody")),
-            (DeleteChild("nobody"), NoSuchChild("nobody")),
+        up = AlreadyStarted("up", system.ref("/app/top/up", Kid))
+        refusals: list[tuple[hf.Message[Any], hf.Refusal, str]] = [
+            (StartChild(kid("up")), up, "child 'up' runs already, at /app/top/up: use that one"),
+            (StartChild(kid("down")), AlreadyPresent("down"), "child 'down' is known already: start it"),
+            (RestartChild("up"), ChildBusy("up", "running"), "child 'up' is running: stop it first"),
+            (DeleteChild("up"), ChildBusy("up", "running"), "child 'up' is running: stop it first"),
+            (TerminateChild("nobody"), NoSuchChild("nobody"), "there is no child 'nobody': WhichChildren"),
+            (RestartChild("nobody"), NoSuchChild("nobody"), "there is no child 'nobody'"),
+            (DeleteChild("nobody"), NoSuchChild("nobody"), "there is no child 'nobody'"),
         ]
-        for message, refusal in refusals:
-            with pytest.raises(type(refusal)) as caught:
+        for message, refusal, text in refusals:
+            with pytest.raises(type(refusal), match=text) as caught:
                 await top.ask(message)
             assert caught.value == refusal
         assert await states(top) == {"up": "running", "down": "stopped"}

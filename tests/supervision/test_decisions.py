@@ -15,6 +15,7 @@ ABNORMAL: list[hf.ExitReason] = [
     hf.Exited(0),
     hf.OutOfMemory(),
     hf.Hung(3.0),
+    hf.TrustBreach("a message of somebody else"),
 ]
 
 

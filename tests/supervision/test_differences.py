@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.testing import probe
 from tests.supervision.family import Boom, Family, Life, Plan, kid, refused
 
 TEXT = (Path(__file__).parents[2] / "docs" / "differs-from-otp.md").read_text("utf-8")
@@ -153,6 +154,18 @@ async def one_default_intensity(system: hf.ActorSystem) -> None:
     ref.tell(Boom())
     await system._node.settled()
     assert system.tree() == ["/app"]
+
+
+@entry("the exit reason of a supervisor that gives up")
+async def giving_up_names_the_crash(system: hf.ActorSystem) -> None:
+    plan = Plan()
+    top = await system.start(hf.supervisor("top", intensity=0, restart="temporary", children=[kid(plan, "a")]))
+    watcher = probe(system)
+    watcher.monitor(top)
+    system.ref("/app/top/a", hf.Actor).tell(Boom())
+    reason = (await watcher.expect_down(top)).reason
+    assert reason.is_clean
+    assert "the last to end was /app/top/a: ValueError: boom" in str(reason)
 
 
 @entry("a reference")

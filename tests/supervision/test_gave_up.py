@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Any
 
 import pytest
 
@@ -11,8 +12,13 @@ from holdfast.testing import Faults
 from tests.supervision.family import Kid, Plan
 
 
+class Crash(hf.Message): ...
+
+
 class Idle(hf.Actor):
-    pass
+    @hf.on(Crash)
+    def crash(self, message: Crash) -> None:
+        raise ValueError("no")
 
 
 async def gave_up(stream: hf.events.EventStream) -> hf.events.SupervisorGaveUp:
@@ -34,6 +40,26 @@ async def test_the_process_that_cannot_be_had_is_named() -> None:
     assert (event.address, event.child) == ("/app/top", "worker")
     assert "/app/top/worker could not be started" in str(event.reason)
     assert "injected fault at 'process start'" in str(event.reason)
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_the_crash_far_below_is_named_at_the_end_of_the_system(isolation: Any) -> None:
+    """Each supervisor on the way up says of whom it has given up, and why."""
+    below = hf.supervisor("mid", intensity=0, children=[hf.child("kid", hf.start(Idle))])
+    top = hf.supervisor("top", intensity=0, children=[below], isolation=isolation)
+    why = (
+        r"the tree of app gave up: restart intensity reached; the last to end was /app/top: shutdown \(.*"
+        r"/app/top/mid: shutdown \(.*/app/top/mid/kid: ValueError: no\)\)"
+    )
+
+    async def body() -> None:
+        async with hf.ActorSystem("app", log=False, intensity=0) as system:
+            await system.start(top)
+            system.ref("/app/top/mid/kid", Idle).tell(Crash())
+            await asyncio.Event().wait()
+
+    with pytest.raises(hf.TreeFailed, match=why):
+        await body()
 
 
 async def test_so_it_is_at_the_end_of_the_system() -> None:

@@ -347,13 +347,14 @@ def nest(plan: Plan, restart: Any) -> hf.ChildSpec:
 
 @pytest.mark.parametrize(("restart", "state"), [("permanent", "running"), ("transient", "stopped")])
 async def test_giving_up_is_a_clean_end_so_only_permanent_escalates(restart: str, state: str) -> None:
-    """otp.md 1.6: the supervisor that gives up ends with SHUTDOWN."""
+    """otp.md 1.6: the supervisor that gives up ends with a Shutdown."""
     plan = Plan()
     async with hf.ActorSystem(log=False) as system:
         await system.start(nest(plan, restart))
         watcher = system.spawn(hf.start(Watcher, system.ref("/app/outer/inner", hf.Supervisor)))
         system.ref("/app/outer/inner/fragile", Fragile).tell(Boom())
-        assert await watcher.ask(Down()) == "shutdown"
+        why = "restart intensity reached; the last to end was /app/outer/inner/fragile: ValueError: boom"
+        assert await watcher.ask(Down()) == f"shutdown ({why})"
         while (found := await states(system, "/app/outer")) == {"inner": "restarting"}:
             pass
         assert found == {"inner": state}

@@ -21,6 +21,8 @@ AT_ODDS = "tests/migration/test_moves_at_odds.py"
 SUPERVISORS = "tests/migration/test_moved_supervisors.py"
 KINDS = "tests/migration/test_moved_kinds.py"
 JOURNALS = "tests/supervision/test_dynamic_journal.py"
+LINES = "tests/supervision/test_program_lines.py"
+NAMED = "tests/control/test_named_children.py"
 
 CHECKS = {
     "the states are in the store together": Check(
@@ -789,9 +791,9 @@ CHECKS = {
         "test_all_below_it and to and process",
     ),
     "the name of an actor below another one in a process is free when it ends": Check(
-        "actors/process/stand_ins.py",
-        "            self._node.unregister(name)\n",
-        "            pass\n",
+        "actors/kernel/lifecycle.py",
+        "            _free_names(cell)  # Of a life",
+        "            pass  # Of a life",
         SUPERVISORS,
         "test_who_is_tied_to_it",
     ),
@@ -879,6 +881,27 @@ CHECKS = {
         ":",
         KINDS,
         "test_what_was_noted_is_true and template",
+    ),
+    "a program waits for whoever gets its lines": Check(
+        "supervision/services/program_lines.py",
+        "            self._hold()\n",
+        "            pass\n",
+        LINES,
+        "test_a_program_that_prints_faster",
+    ),
+    "nobody has a name by its spec where nobody would know of it": Check(
+        "supervision/supervisor_changes.py",
+        "        if spec.register is not None:\n",
+        "        if False:\n",
+        NAMED,
+        "test_below_a_supervisor_in_a_process",
+    ),
+    "a child that is added has a name that is free now": Check(
+        "system/transaction/structure.py",
+        "        raise NameTaken(name)\n",
+        "        pass\n",
+        NAMED,
+        "test_transactions_know",
     ),
 }
 

@@ -153,6 +153,16 @@ class KeptProgram:
         with contextlib.suppress(OSError):  # It has ended, or was sent more signals than it can take in.
             self._control.send(packet)
 
+    def hold_output(self) -> None:
+        """Hand on nothing of what it prints, so that it waits, until `let_output_go_on`, or until it has ended."""
+        for output in self._outputs:
+            output.hold()
+
+    def let_output_go_on(self) -> None:
+        """Hand on what it prints again."""
+        for output in self._outputs:
+            output.go_on()
+
     async def wait(self) -> ExitReason:
         """Wait until nothing of it is left."""
         return await asyncio.shield(self.ended)

@@ -23,8 +23,8 @@ LAST_READS = 16
 class OutputReader:
     """Reads a pipe and hands on each line, a slice at a time: whoever prints without end does not hold up the others.
 
-    While lines wait nothing more is read, so the writer waits. A pipe that the system cannot watch is looked into now
-    and then.
+    While lines wait nothing more is read, so the writer waits; so it does between `hold` and `go_on`. A pipe that the
+    system cannot watch is looked into now and then.
 
     Args:
         on_line: called with each line, or piece of a very long one.
@@ -42,9 +42,10 @@ class OutputReader:
         self._rest = b""
         self._before = b""  # the last piece, if it was not the end of its line
         self._lines: deque[tuple[bytes, bytes]] = deque()  # with what came before of the same line
-        self._is_closed, self._is_paused = False, True
+        self._is_closed, self._is_paused, self._is_held = False, True, False
         self._then: Callable[[], None] | None = None
         self._slice: asyncio.Handle | None = None
+        self._look: asyncio.TimerHandle | None = None
         self._watch()
 
     def _read(self) -> None:
@@ -76,7 +77,7 @@ class OutputReader:
         """Hand on as many lines as the others can wait for, then let them have their turn."""
         self._slice = None
         until = time.perf_counter() + SLICE_SECONDS
-        while self._lines:
+        while self._lines and (not self._is_held or self._is_closed):
             line, before = self._lines.popleft()
             if before and self._on_part is not None:  # Nobody has seen the two together.
                 self._on_part(_text(line), _text(before + line))
@@ -85,6 +86,8 @@ class OutputReader:
                 self._pause()
                 self._slice = self._loop.call_soon(self._hand_on)
                 return
+        if self._is_held and not self._is_closed:
+            return
         if self._on_part is not None and not self._is_closed:
             self._on_part(_text(self._rest), _text(self._before + self._rest))
         if self._is_closed:
@@ -96,19 +99,33 @@ class OutputReader:
 
     def _watch(self) -> None:
         """Read, or read again: when there is something, or now and then while the system cannot watch the pipe."""
-        if self._is_closed or not self._is_paused:
+        if self._is_closed or self._is_held or not self._is_paused:
             return
         try:
             check_can_watch(self._fd)
         except OSError:
-            self._loop.call_later(UNWATCHED_SECONDS, self._read_unwatched)
+            if self._look is None:
+                self._look = self._loop.call_later(UNWATCHED_SECONDS, self._read_unwatched)
             return
         self._is_paused = False
         self._loop.add_reader(self._fd, self._read)
 
     def _read_unwatched(self) -> None:
-        if not self._is_closed and self._slice is None:
+        self._look = None
+        if not self._is_closed and not self._is_held and self._slice is None:
             self._read()
+
+    def hold(self) -> None:
+        """Hand on no line, and read nothing, until `go_on` or `close`."""
+        self._is_held = True
+        self._pause()
+
+    def go_on(self) -> None:
+        """Hand on lines again."""
+        if self._is_held:
+            self._is_held = False
+            if self._slice is None and not self._is_closed:
+                self._hand_on()
 
     def _pause(self) -> None:
         """Read no more for now."""

@@ -50,6 +50,7 @@ class World:
         assert breach.problem
         died = await next_event(events, hf.events.ProcessDied)
         assert (died.address, died.pid) == ("/app/sup/evil", breach.pid)
+        assert died.reason == hf.TrustBreach(breach.problem)
         await next_event(events, hf.events.ActorStarted, lambda event: event.address == "/app/sup/evil")
         return breach
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
+
 import msgspec
 import pytest
 
 import holdfast as hf
 from holdfast.actors.process.wire import frames as f
+from holdfast.testing import probe
 from tests.actors.process.hostile.conftest import World
 from tests.actors.process.hostile.forging import BREACHES, EVIL, HARMLESS, SUP, VICTIM, command, frame, note, raw, tell
 from tests.actors.process.hostile.players import Add, BeDeaf, Evil, Ping, SetPage, Victim, Write, WriteLater
@@ -42,6 +45,22 @@ async def test_the_event_says_what_was_tried(world: World) -> None:
     with world.system.events() as events:
         await world.write(tell([], sender=SUP))
         assert (await world.breached(events)).problem == f"a message of {SUP}, and the process is that of {EVIL}"
+
+
+async def test_askers_monitors_rules_and_the_log_get_the_reason(caplog: pytest.LogCaptureFixture) -> None:
+    said = f"breach of trust: 'kill' to {VICTIM}, which /app/evil has neither started nor is bound to"
+    rules = [hf.rule(hf.TrustBreach, "stop")]
+    async with hf.ActorSystem("app", log=True) as system:
+        evil = await system.start(hf.child("evil", hf.start(Evil), isolation="process", rules=rules))
+        watcher = probe(system)
+        watcher.monitor(evil)
+        with pytest.raises(hf.AskFailed, match=re.escape(said)):
+            await evil.ask(Write(command(VICTIM, "kill")), timeout=60)
+        down = await watcher.expect_down(evil, hf.TrustBreach)
+        assert str(down.reason) == said
+        with pytest.raises(hf.ActorStopped):
+            await evil.ask(Ping())
+    assert [one.getMessage() for one in caplog.records if said in one.getMessage()]
 
 
 @pytest.mark.parametrize("place", [0, 1])
