@@ -91,6 +91,22 @@ class Packs:
         except (OSError, ValueError, struct.error) as error:
             raise DamagedStore(self.path, address, None, f"snapshot file {name}: {error}") from error
 
+    def state(self, address: str, places: Sequence[tuple[int, int, int]]) -> bytes:
+        """Put together what lies in these blocks: pack, offset, length.
+
+        Raises:
+            DamagedStore: one is missing or damaged.
+        """
+        blocks: dict[tuple[int, int], bytes] = {}
+        for number in dict.fromkeys(number for number, _, _ in places):
+            name = self.file(address, number)
+            wanted = {(offset, length) for pack, offset, length in places if pack == number}
+            try:
+                blocks.update(((number, offset), block) for offset, block in _blocks(name, wanted))
+            except (OSError, ValueError, struct.error) as error:
+                raise DamagedStore(self.path, address, None, f"snapshot file {name}: {error}") from error
+        return b"".join(blocks[number, offset] for number, offset, _ in places)
+
     def names(self, address: str) -> set[int]:
         """The packs of an address."""
         try:

@@ -89,22 +89,22 @@ def look(path: str | os.PathLike[str], work: Callable[[StoreView], T]) -> T:
     """
     where = os.path.realpath(path)
     for attempt in range(1, _LOOKS + 1):
-        before = _stamp(where)
+        before = stamp(where)
         try:
             with open_view(where) as view:
                 done = work(view)
         except Changed:
             continue
         except HoldfastError:
-            if attempt == _LOOKS or _stamp(where) == before:
+            if attempt == _LOOKS or stamp(where) == before:
                 raise
             continue
-        if view.has_wal or _stamp(where) == before:
+        if view.has_wal or stamp(where) == before:
             return done
     raise StoreFailed(where, f"it has changed {_LOOKS} times while it was read; try again")
 
 
-def _stamp(path: str) -> tuple[int, ...]:
+def stamp(path: str) -> tuple[int, ...]:
     """What changes when somebody opens or closes a store."""
     try:
         info = os.stat(path)

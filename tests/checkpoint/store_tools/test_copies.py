@@ -31,15 +31,13 @@ from tests.checkpoint.store_tools.writing import (
     environment,
     everything,
     filled,
+    killed_at_each_step,
     left_by_a_kill,
     run,
     written,
 )
 
 SEED = int(os.environ.get("HOLDFAST_SEED", "1"))
-SHIM = Path(__file__).parents[1] / "sqlite" / "disk.c"
-EVERY = 1 if "HOLDFAST_CUTS" in os.environ else 5
-"""Each step in a campaign, else each fifth."""
 
 
 def remove_store(path: Path) -> None:
@@ -227,66 +225,27 @@ def test_restore_refuses_a_damaged_backup_and_leaves_it_as_it_is(tmp_path: Path)
     assert everything(backup.parent) == before
 
 
-KILLED_COPIER = """
-import ctypes, os, sys, traceback
-from holdfast.checkpoint.store_tools import back_up_store
-shim, source, dest = ctypes.CDLL(sys.argv[1]), sys.argv[2], sys.argv[3]
-steps_left = ctypes.c_long.in_dll(shim, "steps_left")
-for steps in range(1, 100_000, int(sys.argv[4])):
-    pid = os.fork()
-    if not pid:
-        steps_left.value = steps
-        try:
-            back_up_store(source, dest)
-        except BaseException:
-            traceback.print_exc()
-            os._exit(1)
-        os._exit(0)
-    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-    print(steps, code, flush=True)
-    if sys.stdin.readline() != "on\\n" or code >= 0:
-        break
-"""
-
-
 def test_a_kill_at_each_step_leaves_no_half_copy(tmp_path: Path) -> None:
-    compiler = shutil.which("cc")
-    if compiler is None:
-        pytest.skip("no C compiler")
-    shim, folder = tmp_path / "disk.so", tmp_path / "dest"
-    subprocess.run([compiler, "-shared", "-fPIC", "-O1", "-o", str(shim), str(SHIM), "-ldl"], check=True)
+    folder = tmp_path / "dest"
     folder.mkdir()
     path, dest = filled(tmp_path / "origin" / "app.db"), folder / "copy.db"
     before = everything(path.parent)
-    env = {**environment(), "LD_PRELOAD": str(shim), "DISK_ROOT": str(folder), "DISK_LOG": os.devnull, "DISK_FAIL": "0"}
-    command = [sys.executable, "-c", KILLED_COPIER, str(shim), str(path), str(dest), str(EVERY)]
-    copier = subprocess.Popen(command, env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert copier.stdin is not None
-    assert copier.stdout is not None
-    whole = half = 0
-    try:
-        while line := copier.stdout.readline():
-            steps, code = map(int, line.split())
-            assert code in (0, -signal.SIGKILL), f"step {steps}"
-            assert everything(path.parent) == before
-            if dest.exists():
-                whole += 1
-                assert verify_store(dest).is_good, f"killed at step {steps}"
-                assert verify_store(dest).entries == 11
-                SqliteJournal(dest).close()
-            elif left_at(dest):
-                half += 1
-                with pytest.raises(NotCopied, match="ended in its middle"):
-                    back_up_store(path, dest)
-                with contextlib.suppress(ForeignStore):  # It is refused, unless there is nothing in it yet.
-                    assert reopened(dest).entries == []
-            remove_store(dest)
-            copier.stdin.write("on\n")
-            copier.stdin.flush()
-    finally:
-        copier.stdin.close()
-        copier.stdout.close()
-        copier.wait(30)
+    whole = half = code = 0
+    for steps, code in killed_at_each_step(tmp_path, folder, f"back_up_store({str(path)!r}, {str(dest)!r})"):
+        assert code in (0, -signal.SIGKILL), f"step {steps}"
+        assert everything(path.parent) == before
+        if dest.exists():
+            whole += 1
+            assert verify_store(dest).is_good, f"killed at step {steps}"
+            assert verify_store(dest).entries == 11
+            SqliteJournal(dest).close()
+        elif left_at(dest):
+            half += 1
+            with pytest.raises(NotCopied, match="ended in its middle"):
+                back_up_store(path, dest)
+            with contextlib.suppress(ForeignStore):  # It is refused, unless there is nothing in it yet.
+                assert reopened(dest).entries == []
+        remove_store(dest)
     assert code == 0
     assert whole >= 1
     assert half > 5

@@ -9,7 +9,6 @@ import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -20,6 +19,7 @@ from tests.checkpoint.sqlite.stores import A, B, edit, end, flip, inputs, made
 from tests.checkpoint.store_tools.writing import (
     acknowledged,
     begin_writing,
+    contents,
     everything,
     filled,
     left_by_a_kill,
@@ -28,17 +28,6 @@ from tests.checkpoint.store_tools.writing import (
 
 SEED = int(os.environ.get("HOLDFAST_SEED", "1"))
 FLIPS = 40
-
-
-def contents(path: Path) -> Any:
-    """All that a recovery reads."""
-    with closing(SqliteJournal(path)) as journal:
-        blocks = []
-        for number in sorted(journal.packs(B)):
-            segment = journal.read_blocks(B, number, [(0, 10_000)])
-            blocks.append(bytes(segment.block(0, 10_000)))
-            segment.close()
-        return journal.load(A), journal.load(A, older=1), journal.load(B), journal.noted("key"), blocks
 
 
 def damages(path: Path) -> list[Damage]:

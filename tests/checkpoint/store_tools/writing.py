@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import msgspec
+import pytest
 from typer.testing import CliRunner
 
 from holdfast.checkpoint.snapshot.snapshot_record import IMAGES, Meta
 from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.console.commands import commands
 from tests.checkpoint.sqlite.stores import A, B, inputs
+
+SHIM = Path(__file__).parents[1] / "sqlite" / "disk.c"
+EVERY = 1 if "HOLDFAST_CUTS" in os.environ else 5
+"""Each step in a campaign, else each fifth."""
 
 WRITER = """
 import os, random, sys
@@ -88,6 +97,15 @@ def left_by_a_kill(path: Path) -> Path:
     path.parent.mkdir(exist_ok=True)
     subprocess.run([sys.executable, "-c", KILLED, str(path)], env=environment(), check=True, timeout=60)
     return path
+
+
+def contents(path: Path) -> Any:
+    """All that a recovery reads."""
+    with closing(SqliteJournal(path)) as journal:
+        segment = journal.read_blocks(B, 7, [(0, 10_000)])
+        blocks = bytes(segment.block(0, 10_000))
+        segment.close()
+        return journal.load(A), journal.load(A, older=1), journal.load(B), journal.noted("key"), blocks
 
 
 def everything(folder: Path) -> dict[str, tuple[bytes, int, int]]:
@@ -171,3 +189,49 @@ def count_numbers(path: Path) -> int:
     number, size, place = newest
     assert number < max(known) or place == size - 1, "half of a batch is there"
     return len(found)
+
+
+KILLED_AT = """
+import ctypes, os, sys, traceback
+from holdfast.checkpoint.store_tools import back_up_store, compact_store
+shim, work = ctypes.CDLL(sys.argv[1]), sys.argv[2]
+steps_left = ctypes.c_long.in_dll(shim, "steps_left")
+for steps in range(1, 100_000, int(sys.argv[3])):
+    pid = os.fork()
+    if not pid:
+        steps_left.value = steps
+        try:
+            eval(work)
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)
+        os._exit(0)
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    print(steps, code, flush=True)
+    if sys.stdin.readline() != "on\\n" or code >= 0:
+        break
+"""
+"""Does some work in forks: the first is killed at the first operation on the files of a folder, and so on."""
+
+
+def killed_at_each_step(tmp_path: Path, folder: Path, work: str) -> Iterator[tuple[int, int]]:
+    """Have some work done again and again, killed later each time; gives the step and the exit status of each.
+
+    The last one is not killed.
+    """
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler")
+    shim = tmp_path / "disk.so"
+    subprocess.run([compiler, "-shared", "-fPIC", "-O1", "-o", str(shim), str(SHIM), "-ldl"], check=True)
+    env = {**environment(), "LD_PRELOAD": str(shim), "DISK_ROOT": str(folder), "DISK_LOG": os.devnull, "DISK_FAIL": "0"}
+    command = [sys.executable, "-c", KILLED_AT, str(shim), work, str(EVERY)]
+    with subprocess.Popen(command, env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdin is not None
+        assert server.stdout is not None
+        while line := server.stdout.readline():
+            steps, code = map(int, line.split())
+            yield steps, code
+            with contextlib.suppress(BrokenPipeError):
+                server.stdin.write("on\n")
+                server.stdin.flush()
