@@ -165,6 +165,17 @@ class FrontLog:
         self.size += size
         self.rows += rows
 
+    def lost(self) -> str:
+        """Which of the files is not in its place any more, in words; "" if all are."""
+        for file in self._files:
+            try:
+                found = os.stat(file.name).st_ino
+            except FileNotFoundError:
+                return f"{file.name} was deleted or moved while the store was open"
+            if found != os.fstat(file.fd).st_ino:
+                return f"{file.name} was replaced while the store was open"
+        return ""
+
     @property
     def is_due(self) -> bool:
         """Whether the next transaction is to begin another generation."""

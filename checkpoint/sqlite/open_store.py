@@ -409,7 +409,7 @@ class Store:
         return True
 
     def _lost(self) -> str:
-        problem = self.parts.lost()
+        problem = self.parts.lost() or self.log.lost()
         return problem and f"{problem}: nothing is acknowledged any more; put the store back, and start again"
 
     def translate(self, error: sqlite3.Error | OSError) -> HoldfastError:
