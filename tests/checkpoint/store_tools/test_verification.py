@@ -15,6 +15,8 @@ import pytest
 from holdfast.checkpoint.journal import DamagedStore, ForeignStore, StoreFailed
 from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.store_tools import Damage, verify_store
+from holdfast.checkpoint.store_tools.store_view import StoreView, look
+from holdfast.checkpoint.store_tools.verification import StoreCheck
 from tests.checkpoint.sqlite.stores import A, B, edit, end, flip, inputs, made
 from tests.checkpoint.store_tools.writing import (
     acknowledged,
@@ -23,6 +25,7 @@ from tests.checkpoint.store_tools.writing import (
     everything,
     filled,
     left_by_a_kill,
+    meta,
     run,
 )
 
@@ -192,6 +195,43 @@ def test_a_running_system_is_no_damage(tmp_path: Path) -> None:
             end(writer)
         found = verify_store(tmp_path / f"{seed}.db")
         assert found.is_good, f"seed {seed}, after the kill: {found.damages}"
+
+
+def test_files_that_a_running_system_needs_no_more_are_no_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = filled(tmp_path / "app.db")
+    with closing(SqliteJournal(path)) as journal:
+        check_pages = StoreCheck._check_pages
+
+        def overtaken(check: StoreCheck) -> None:
+            check_pages(check)
+            for turn in (5, 6):
+                journal.cut(A, meta(b"newest", turn), [], turn=turn)
+                journal.cut(B, meta(b"newest", turn), [], turn=turn)
+            journal.forget_blocks(B, [7])
+
+        monkeypatch.setattr(StoreCheck, "_check_pages", overtaken)
+        assert verify_store(path).is_good
+        assert made(f"{path}-snapshots") == []
+        assert journal.packs(B) == set()
+        assert verify_store(path).is_good
+
+
+def test_a_closed_store_that_is_opened_under_a_look_is_looked_at_again(tmp_path: Path) -> None:
+    path = filled(tmp_path / "app.db")
+    seen: list[int] = []
+
+    def work(view: StoreView) -> int:
+        if not seen:
+            with closing(SqliteJournal(path)) as journal:
+                journal.append(inputs(1, start=7))
+        seen.append(view.last)
+        return view.last
+
+    assert look(path, work) == seen[1]
+    assert len(seen) == 2
+    assert seen[1] > seen[0]
 
 
 def test_a_lock_of_the_owner_outlives_a_look_from_its_own_process(tmp_path: Path) -> None:
