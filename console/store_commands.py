@@ -1,4 +1,4 @@
-"""The commands for a store on the disk: `holdfast store verify | stats | backup | restore | export | compact`."""
+"""The `holdfast store` commands, for a store on the disk: verify, stats, backup, restore, export and compact."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import base64
 import datetime
 import math
 import os
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import msgpack
@@ -20,8 +20,8 @@ from ...actors.kernel.codec import ARRAY, PACKED, REF
 from ...actors.values import Description, describe_value
 from ..addresses import KEY
 from ..journal import DamagedStore, Entry, StoreFailed
-from ..protocol import START
-from ..schema import Shape, as_shape
+from ..protocol import START, Answer
+from ..schema import Shape, as_shape, shape_name
 from ..snapshot.snapshot_record import Meta, decode_meta
 from ..snapshot.state_image import is_image, read_image
 from ..sqlite.entry_chains import Chain, StoreScan
@@ -128,18 +128,15 @@ class _Export:
 
     def _entries(self, chains: Mapping[int, Chain], addresses: Mapping[int, str]) -> Iterator[Record]:
         view = self._view
-        stored = view.db.execute("SELECT position, address, chain, kind, data, crc FROM entries ORDER BY position")
-        rows: tuple[Iterable[tuple[Any, ...]], ...] = stored, view.rows
-        for some in rows:
-            for position, key, *rest in some:
-                if key not in chains:
-                    continue  # It is of an address that is being erased, or was told as damaged.
-                try:
-                    entry = checked_entry(view.path, chains[key], position, key, *rest)
-                except DamagedStore as error:
-                    yield _damage(error, addresses[key])
-                    continue
-                yield {**self._entry(key, entry), "address": addresses[key], "position": position}
+        for position, key, *rest in view.entries():
+            if key not in chains:
+                continue  # It is of an address that is being erased, or was told as damaged.
+            try:
+                entry = checked_entry(view.path, chains[key], position, key, *rest)
+            except DamagedStore as error:
+                yield _damage(error, addresses[key])
+                continue
+            yield {**self._entry(key, entry), "address": addresses[key], "position": position}
 
     def _entry(self, key: int, entry: Entry) -> Record:
         match entry:
@@ -158,16 +155,16 @@ class _Export:
                 }
             case ("shape", str() as name, shape):
                 self._shapes.setdefault(key, {})[name] = as_shape(shape)
+                return _named_values("shape", entry[1:])
+            case ("got", _, _, str() as kind, str() as name, bytes() as body):
+                value = self._message(key, shape_name(Answer(kind, name)), body)
+                return {**_named_values("got", entry[1:]), "value": value}
+            case ("op", _, _, _, str() as name, bytes() as body, *_):
+                return {**_named_values("op", entry[1:]), "value": self._message(key, name, body)}
+            case (kind, *values):
+                return _named_values(str(kind), values)
             case _:
-                pass
-        what, *values = entry
-        kind = str(what)
-        names = _NAMES.get(kind, ())
-        named = dict(zip(names, map(as_plain, values), strict=False))
-        if kind in ("got", "op") and isinstance(entry[5], bytes):
-            named["value"] = self._message(key, str(named["type"]), entry[5])
-        more = {"values": [as_plain(value) for value in values[len(names) :]]} if len(values) > len(names) else {}
-        return {"record": kind, **named, **more}
+                return {"record": "unknown", "values": as_plain(entry)}
 
     def _message(self, key: int, name: str, body: bytes) -> Any:
         """The content of a message: its fields by name, if the store has these."""
@@ -177,6 +174,14 @@ class _Export:
             return as_plain(body)
         shape = self._shapes.get(key, {}).get(name, ())
         return _named(value, "", {place: fields for place, is_by_position, fields in shape if is_by_position})
+
+
+def _named_values(kind: str, values: Sequence[Any]) -> Record:
+    names = _NAMES.get(kind, ())
+    record = {"record": kind, **dict(zip(names, map(as_plain, values), strict=False))}
+    if len(values) > len(names):
+        record["values"] = [as_plain(value) for value in values[len(names) :]]
+    return record
 
 
 def _special(code: int, data: bytes) -> Any:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
-from collections.abc import Callable, Generator
-from typing import Final, TypeVar
+from collections.abc import Callable, Generator, Iterator
+from typing import Any, Final, TypeVar
 from urllib.parse import quote
 
 from ...actors.errors import HoldfastError
@@ -73,6 +73,11 @@ class StoreView:
             DamagedStore: not all of it is there.
         """
         refuse_missing(self.path, self.mark, self.last)
+
+    def entries(self) -> Iterator[tuple[Any, ...]]:
+        """All rows of the journal, oldest first, as they are: whatever is wrong with them is for the caller to find."""
+        yield from self.db.execute("SELECT position, address, chain, kind, data, crc FROM entries ORDER BY position")
+        yield from self.rows
 
     def is_kept(self, snapshot: int) -> bool:
         """Whether the store has this snapshot now: else its files were removed because it needs them no more."""

@@ -166,17 +166,15 @@ class StoreCheck:
 
     def _check_entries(self, chains: dict[int, Chain]) -> None:
         view = self._view
-        stored = view.db.execute("SELECT position, address, chain, kind, data, crc FROM entries ORDER BY position")
-        for rows in (stored, view.rows):
-            for position, address, *rest in rows:
-                chain = chains.get(address)
-                if chain is None:
-                    continue  # It was told that it belongs to none.
-                self._found.entries += 1
-                try:
-                    checked_entry(view.path, chain, position, address, *rest)
-                except DamagedStore as error:
-                    self._tell(error)
+        for position, address, *rest in view.entries():
+            chain = chains.get(address)
+            if chain is None:
+                continue  # It was told that it belongs to none.
+            self._found.entries += 1
+            try:
+                checked_entry(view.path, chain, position, address, *rest)
+            except DamagedStore as error:
+                self._tell(error)
 
     def _check_snapshots(self, chain: Chain) -> None:
         if chain.path is None:  # It is being erased.

@@ -81,6 +81,42 @@ async def shop(path: Path, size: int, orders: int = 5) -> None:
         await system.backup(path)
 
 
+class Receipt(hf.Message):
+    total: int
+    words: str
+
+
+class Buy(hf.Message[Receipt]):
+    first: int
+    second: str
+
+
+class Till(hf.Actor):
+    @hf.on(Buy)
+    def buy(self, message: Buy) -> Receipt:
+        return Receipt(message.first * 2, message.second)
+
+
+class Buyer(hf.Actor):
+    def __init__(self, till: hf.ActorRef[Till]) -> None:
+        self._till = till
+
+    @hf.on(Order)
+    async def order(self, order: Order) -> int:
+        return (await self._till.ask(Buy(order.number, "please"))).total
+
+
+async def test_replies_have_the_names_of_their_own_fields(tmp_path: Path) -> None:
+    path = tmp_path / "app.db"
+    async with hf.ActorSystem("app", store=f"sqlite:{path}", log=False) as system:
+        till = await system.start(hf.child("till", hf.start(Till)))
+        buyer = await system.start(hf.child("buyer", hf.start(Buyer, till), recovery=hf.hybrid()))
+        assert await buyer.ask(Order(4)) == 8
+        (got,) = of(list(export_store(path)), "got")
+    assert got["value"] == {"total": 8, "words": "please"}
+    assert (got["outcome"], got["type"]) == ("reply", f"{__name__}:Buy")
+
+
 def of(records: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
     return [record for record in records if record["record"] == kind]
 

@@ -279,7 +279,7 @@ async def test_a_root_that_is_killed_during_backups_is_restored_from_each(tmp_pa
     for life in range(2):
         path = tmp_path / f"{life}.db"
         root = subprocess.Popen([sys.executable, "-c", ROOT, str(path)], env=environment(), stdout=subprocess.PIPE)
-        copies = []
+        copies: list[tuple[int, Path]] = []
         try:
             for number in range(2):
                 before = acknowledged(root, draw.randrange(20, 80))
@@ -292,7 +292,7 @@ async def test_a_root_that_is_killed_during_backups_is_restored_from_each(tmp_pa
                 copies.append((before, dest))
         finally:
             last = int((end(root).split() or [b"0"])[-1] or 0)
-        copies.append((max(last, before), tmp_path / f"{life}-crashed.db"))
+        copies.append((max(last, copies[-1][0]), tmp_path / f"{life}-crashed.db"))
         back_up_store(path, copies[-1][1])
         for number, (before, dest) in enumerate(copies):
             assert verify_store(dest).is_good, f"seed {SEED}"
