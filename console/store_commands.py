@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import time
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from ..actors.errors import HoldfastError
-from ..checkpoint.journal import DamagedStore, ForeignStore, StoreInUse
+from ..checkpoint.journal import DamagedStore, StoreInUse
 from ..checkpoint.store_tools import (
     StoreCopy,
     StoreStats,
@@ -61,7 +62,7 @@ def stats(path: StorePath, as_json: Json = False) -> None:
     """
     try:
         found = store_stats(path)
-    except (DamagedStore, ForeignStore) as error:
+    except DamagedStore as error:
         raise _ended("stats", error, DAMAGED) from error
     except HoldfastError as error:
         raise _ended("stats", error, UNREADABLE) from error
@@ -137,10 +138,14 @@ def export(path: StorePath) -> None:
         for record in export_store(path):
             is_damaged = is_damaged or record["record"] == "damage"
             typer.echo(json.dumps(record))
-    except (DamagedStore, ForeignStore) as error:
+    except DamagedStore as error:
         raise _ended("export", error, DAMAGED) from error
     except HoldfastError as error:
         raise _ended("export", error, UNREADABLE) from error
+    except OSError as error:
+        if error.errno == errno.EPIPE:  # Whoever reads it has enough, as `head` has.
+            raise
+        raise _ended("export", HoldfastError(f"the output cannot be written: {error}"), UNREADABLE) from error
     if is_damaged:
         raise typer.Exit(DAMAGED)
 
@@ -153,7 +158,7 @@ def compact(path: StorePath, as_json: Json = False) -> None:
     """
     try:
         done = compact_store(path)
-    except (DamagedStore, ForeignStore, StoreInUse) as error:
+    except (DamagedStore, StoreInUse) as error:
         raise _ended("compact", error, DAMAGED) from error
     except HoldfastError as error:
         raise _ended("compact", error, UNREADABLE) from error
@@ -195,7 +200,7 @@ def _copy(command: str, make: Callable[[], StoreCopy], *, check: bool, as_json: 
     try:
         copy = make()
         found = verify_store(copy.path) if check else None
-    except (DamagedStore, ForeignStore) as error:
+    except DamagedStore as error:
         raise _ended(command, error, DAMAGED) from error
     except HoldfastError as error:
         raise _ended(command, error, UNREADABLE) from error

@@ -10,7 +10,7 @@ from typing import Final
 import msgspec
 
 from ...actors.errors import HoldfastError
-from ..journal import DamagedStore, ForeignStore
+from ..journal import DamagedStore
 from ..snapshot.shared_blocks import by_segment
 from ..snapshot.snapshot_record import FORMAT, IMAGES, Meta
 from ..sqlite.entry_chains import Chain, StoreScan
@@ -102,15 +102,14 @@ def verify_store(path: str | os.PathLike[str]) -> Verification:
     running system removes meanwhile, because a newer snapshot has taken their place, are no damage.
 
     Raises:
-        StoreFailed: there is no store, or it cannot be read.
+        StoreFailed: there is no store, or it cannot be read. ForeignStore: a part of it is missing or another store's,
+            or this user may not read it: nothing was verified.
     """
     where = os.path.realpath(path)
     try:
         return look(where, lambda view: StoreCheck(view).result())
     except DamagedStore as error:  # It is so damaged that nothing more of it can be read.
         return Verification(where, damages=[Damage(error.reason, _RESTORE, where, error.address, error.position)])
-    except ForeignStore as error:
-        return Verification(where, damages=[Damage(error.problem, error.remedy, error.part)])
 
 
 class StoreCheck:

@@ -249,6 +249,11 @@ def test_the_commands(tmp_path: Path) -> None:
     assert (status, [one["address"] for one in data["addresses"]]) == (0, ["/app/bank/alice", "/app/bank/bob"])
     status, said, _ = run("export", path)
     assert (status, {"snapshot", "in"} <= {json.loads(line)["record"] for line in said.splitlines()}) == (0, True)
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "holdfast.console.cli", "store", "export", str(path)]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    assert done.returncode != 0
+    assert done.stderr.startswith("holdfast store export: the output cannot be written: [Errno 28] No space left")
     edit(path, "UPDATE entries SET crc = 0 WHERE position = 6")
     assert run("stats", path)[0] == 1
     status, said, _ = run("export", path)

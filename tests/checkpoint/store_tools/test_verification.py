@@ -15,7 +15,7 @@ import pytest
 from holdfast.checkpoint.journal import DamagedStore, ForeignStore, StoreFailed
 from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.store_tools import Damage, verify_store
-from holdfast.checkpoint.store_tools.store_view import StoreView, look
+from holdfast.checkpoint.store_tools.store_view import StoreView, look, open_view
 from holdfast.checkpoint.store_tools.verification import StoreCheck
 from tests.checkpoint.sqlite.stores import A, B, edit, end, flip, inputs, made
 from tests.checkpoint.store_tools.writing import (
@@ -234,6 +234,22 @@ def test_a_closed_store_that_is_opened_under_a_look_is_looked_at_again(tmp_path:
     assert seen[1] > seen[0]
 
 
+def test_a_store_that_is_closed_under_a_look_is_complete(tmp_path: Path) -> None:
+    """Its WAL is left where it is: SQLite removes it only with the last who has the database open."""
+    path = left_by_a_kill(tmp_path / "app.db")
+    with closing(SqliteJournal(path)) as journal:
+        journal.append(inputs(1, start=2))
+        with open_view(os.path.realpath(path)) as view:
+            journal.append(inputs(1, start=3))
+            journal.close()
+            assert view.last == 3
+    assert Path(f"{path}-wal").exists()
+    found = verify_store(path)
+    assert (found.is_good, found.entries, found.pid) == (True, 4, 0)
+    with closing(SqliteJournal(path)) as journal:
+        assert len(journal.load(A).entries) == 4
+
+
 def test_a_lock_of_the_owner_outlives_a_look_from_its_own_process(tmp_path: Path) -> None:
     """To close a file gives back the locks of another kind that its process has on it."""
     path = filled(tmp_path / "app.db")
@@ -259,8 +275,11 @@ def test_the_command(tmp_path: Path) -> None:
     status, said, _ = run("verify", path, "--json")
     data = json.loads(said)
     assert (status, data["is_good"], data["damages"][0]["position"]) == (1, False, 6)
+    os.chmod(path, 0o666)
+    status, said, complaint = run("verify", path)
+    assert (status, said, "chmod go-w" in complaint) == (2, "", True)
     os.unlink(path)
-    status, said, _ = run("verify", path)
-    assert (status, "the database is gone" in said) == (1, True)
+    status, said, complaint = run("verify", path)
+    assert (status, said, "the database is gone" in complaint) == (2, "", True)
     status, said, complaint = run("verify", tmp_path / "nothing.db")
     assert (status, said, "there is no database" in complaint) == (2, "", True)
