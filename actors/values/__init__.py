@@ -20,13 +20,13 @@ from collections.abc import Callable
 from ..errors import DamagedValue, UnsavableValue
 from .budget import LargeInts, TooMany, check_containers
 from .forms import FORMAT, HEAD
-from .value_describer import Describer, Description
+from .value_describer import Describer, ValueDescription
 from .value_reader import Decoder, unpack
 from .value_writer import pieces, walked_pieces
 
 __all__ = [
     "DamagedValue",
-    "Description",
+    "ValueDescription",
     "UnsavableValue",
     "decode_value",
     "describe_value",
@@ -103,7 +103,7 @@ def decode_value(data: bytes | memoryview, *, imports: bool = True) -> object:
 
 
 def describe_value(data: bytes | memoryview) -> object:
-    """Read what `encode_value` wrote without importing anything of users: each instance of theirs is a `Description`.
+    """Read what `encode_value` wrote without importing anything: each instance of a class is a `ValueDescription`.
 
     Raises:
         DamagedValue: whatever is wrong with the bytes, or numpy is needed and not there.

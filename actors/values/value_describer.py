@@ -10,7 +10,7 @@ from .forms import ENUM
 from .value_reader import Decoder
 
 
-class Description(NamedTuple):
+class ValueDescription(NamedTuple):
     """An instance of a class that is not imported: its name as "module:Class", and its fields.
 
     A member of an enum has one field, which is "".
@@ -28,8 +28,8 @@ class Describer(Decoder):
 
     def make_enum(self, parts: list[Any]) -> object:
         kind, member = parts
-        return Description(str(kind), (("", member),))
+        return ValueDescription(str(kind), (("", member),))
 
     def make_record(self, mark: ExtType, parts: list[Any]) -> object:
         assert mark is not ENUM
-        return Description(str(parts[0]), tuple(zip(map(str, parts[1::2]), parts[2::2], strict=True)))
+        return ValueDescription(str(parts[0]), tuple(zip(map(str, parts[1::2]), parts[2::2], strict=True)))

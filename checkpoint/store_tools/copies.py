@@ -27,7 +27,7 @@ from ..sqlite.open_store import INSERT
 from ..sqlite.ownership import StoreRow, write_store_row
 from ..sqlite.snapshot_files import for_us, no_link, sync, write_durably
 from ..sqlite.store_parts import COPY_NOTE, NAME, NOTE, copy_notes, mark_of, part_names
-from .store_view import Changed, StoreView, look
+from .store_view import Overtaken, StoreView, look
 from .verification import verify_store
 
 _PIECE: Final = 1 << 20
@@ -134,7 +134,7 @@ class _CopyUnderWay:
         """Copy all of a view, but do not put the database in place.
 
         Raises:
-            Changed: the store has gone on before the files of its snapshots were opened.
+            Overtaken: the store has gone on before the files of its snapshots were opened.
         """
         self.undo()
         view.refuse_missing()
@@ -181,7 +181,7 @@ class _CopyUnderWay:
                         stack.push(one.pop_all())
                 except FileNotFoundError:
                     if not view.is_kept(number):
-                        raise Changed from None
+                        raise Overtaken from None
         return list(found.values())
 
     def _needs(self, view: StoreView, number: int, address: str | None) -> list[tuple[str, str]]:
@@ -197,7 +197,7 @@ class _CopyUnderWay:
             meta = msgspec.msgpack.decode(data if file is None else view.files.read(str(file)), type=Meta)
         except FileNotFoundError:
             if not view.is_kept(number):
-                raise Changed from None
+                raise Overtaken from None
             return needs
         except (msgspec.MsgspecError, OSError, ValueError, TypeError):
             return needs  # It is damaged, and will be in the copy.

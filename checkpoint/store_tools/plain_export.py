@@ -17,7 +17,7 @@ import msgpack
 
 from ...actors.errors import DamagedValue, HoldfastError, type_name
 from ...actors.kernel.codec import ARRAY, PACKED, REF
-from ...actors.values import Description, describe_value
+from ...actors.values import ValueDescription, describe_value
 from ..addresses import KEY
 from ..journal import DamagedStore, Entry, StoreFailed
 from ..protocol import START, Answer
@@ -186,8 +186,8 @@ def _named_values(kind: str, values: Sequence[Any]) -> Record:
 
 def _special(code: int, data: bytes) -> Any:
     if code == REF:
-        return Description("holdfast:ActorRef", (("path", data.decode(errors="replace")),))
-    return Description(
+        return ValueDescription("holdfast:ActorRef", (("path", data.decode(errors="replace")),))
+    return ValueDescription(
         {ARRAY: "numpy:ndarray", PACKED: "holdfast:Packed"}.get(code, f"extension {code}"), (("", data),)
     )
 
@@ -246,11 +246,11 @@ def as_plain(value: Any) -> Any:
             return value if math.isfinite(value) else {"float": repr(value)}
         case bytes() | bytearray() | memoryview():
             return {"base64": base64.b64encode(value).decode()}
-        case Description("holdfast:ActorRef", ((_, path),)):
+        case ValueDescription("holdfast:ActorRef", ((_, path),)):
             return {"ref": path}
-        case Description(kind, (("", content),)):
+        case ValueDescription(kind, (("", content),)):
             return {"type": kind, "value": as_plain(content)}
-        case Description(kind, fields):
+        case ValueDescription(kind, fields):
             return {"type": kind, "fields": {name: as_plain(one) for name, one in fields}}
         case list() | tuple():
             return [as_plain(one) for one in value]

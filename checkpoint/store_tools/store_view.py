@@ -28,7 +28,7 @@ _LOOKS: Final = 10
 """How often a store is looked at again that changes under the eyes of the reader."""
 
 
-class Changed(Exception):
+class Overtaken(Exception):
     """What was looked at is not there any more, because the store has gone on: look again."""
 
 
@@ -98,7 +98,7 @@ def look(path: str | os.PathLike[str], work: Callable[[StoreView], T]) -> T:
         try:
             with open_view(where) as view:
                 done = work(view)
-        except Changed:
+        except Overtaken:
             continue
         except HoldfastError:
             if attempt == _LOOKS or stamp(where) == before:

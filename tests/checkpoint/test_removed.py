@@ -137,7 +137,7 @@ CHECKS = {
     ),
     "a backup has all snapshots of its instant": Check(
         "checkpoint/store_tools/copies.py",
-        "                    if not view.is_kept(number):\n                        raise Changed from None\n",
+        "                    if not view.is_kept(number):\n                        raise Overtaken from None\n",
         "                    pass\n",
         "tests/checkpoint/store_tools/test_copies.py",
         "test_a_snapshot_that_goes_before_it_is_opened",
