@@ -149,6 +149,13 @@ CHECKS = {
         "tests/checkpoint/store_tools/test_copies.py",
         "test_a_copy_is_a_store_of_its_own",
     ),
+    "a backup is on the disk when it is made": Check(
+        "checkpoint/store_tools/copies.py",
+        "                    os.fsync(out.fileno())\n",
+        "",
+        "tests/checkpoint/store_tools/test_copies.py",
+        "test_a_copy_is_on_the_disk",
+    ),
     "a damaged backup is not restored": Check(
         "checkpoint/store_tools/copies.py",
         "    if not found.is_good:",

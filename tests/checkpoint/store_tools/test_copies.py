@@ -23,11 +23,13 @@ from holdfast.checkpoint.sqlite.store_parts import part_names
 from holdfast.checkpoint.store_tools import NotCopied, StoreCopy, back_up_store, restore_store, verify_store
 from holdfast.checkpoint.store_tools.store_view import StoreView
 from tests.checkpoint.players import Doer, Note, Seen
+from tests.checkpoint.sqlite.disk import operations
 from tests.checkpoint.sqlite.stores import A, B, edit, end, flip, inputs, numbers, reopened
 from tests.checkpoint.store_tools.writing import (
     acknowledged,
     begin_writing,
     count_numbers,
+    disk_shim,
     environment,
     everything,
     filled,
@@ -65,8 +67,8 @@ def test_a_copy_of_a_store_that_is_written_to_is_of_one_instant(tmp_path: Path, 
             back_up_store(path, dest)
             least[dest] = before
     finally:
-        end(writer)
-    least[copies / "crashed.db"] = acknowledged(writer) if writer.stdout is None else 0
+        said = end(writer)
+    least[copies / "crashed.db"] = int((said.split() or [b"0"])[-1])
     back_up_store(path, copies / "crashed.db")
     counts = []
     for dest, before in least.items():
@@ -249,6 +251,36 @@ def test_a_kill_at_each_step_leaves_no_half_copy(tmp_path: Path) -> None:
     assert code == 0
     assert whole >= 1
     assert half > 5
+
+
+def test_a_copy_is_on_the_disk_when_it_is_made(tmp_path: Path) -> None:
+    """All that was written to a file is synced, and the folders that name the files are, too."""
+    folder, log = tmp_path / "dest", tmp_path / "log"
+    folder.mkdir()
+    path, dest = filled(tmp_path / "origin" / "app.db"), folder / "copy.db"
+    env = {**environment(), "LD_PRELOAD": str(disk_shim(tmp_path)), "DISK_ROOT": str(folder), "DISK_LOG": str(log)}
+    script = "import sys; from holdfast.checkpoint.store_tools import back_up_store; back_up_store(*sys.argv[1:])"
+    command = [sys.executable, "-c", script, str(path), str(dest)]
+    subprocess.run(command, env={**env, "DISK_FAIL": "0"}, timeout=60, check=True)
+    unsynced: dict[str, int] = {}
+    names: dict[str, int] = {}  # when a name was last made or removed in a folder
+    synced: dict[str, int] = {}
+    for number, op in enumerate(operations(log, folder)):
+        if op.kind in "wt":
+            unsynced[op.path] = number
+        elif op.kind == "s":
+            unsynced.pop(op.path, None)
+            synced[op.path.removeprefix(str(folder))] = number
+        elif op.kind == "u":
+            unsynced.pop(op.path, None)
+            names[os.path.dirname(op.path)] = number
+        else:
+            names[os.path.dirname(op.path)] = number
+    assert not unsynced
+    parts = {str(one.relative_to(folder)) for one in folder.rglob("*") if one.is_dir()}
+    assert len(parts) == 3  # of snapshots, of packs, and of the packs of one address
+    assert parts | {""} <= synced.keys()
+    assert all(synced[part] >= names.get(part, 0) for part in parts)
 
 
 ROOT = """

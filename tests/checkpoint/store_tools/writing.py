@@ -214,16 +214,22 @@ for steps in range(1, 100_000, int(sys.argv[3])):
 """Does some work in forks: the first is killed at the first operation on the files of a folder, and so on."""
 
 
+def disk_shim(folder: Path) -> Path:
+    """What notes the operations on files, and kills at them."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler")
+    shim = folder / "disk.so"
+    subprocess.run([compiler, "-shared", "-fPIC", "-O1", "-o", str(shim), str(SHIM), "-ldl"], check=True)
+    return shim
+
+
 def killed_at_each_step(tmp_path: Path, folder: Path, work: str) -> Iterator[tuple[int, int]]:
     """Have some work done again and again, killed later each time; gives the step and the exit status of each.
 
     The last one is not killed.
     """
-    compiler = shutil.which("cc")
-    if compiler is None:
-        pytest.skip("no C compiler")
-    shim = tmp_path / "disk.so"
-    subprocess.run([compiler, "-shared", "-fPIC", "-O1", "-o", str(shim), str(SHIM), "-ldl"], check=True)
+    shim = disk_shim(tmp_path)
     env = {**environment(), "LD_PRELOAD": str(shim), "DISK_ROOT": str(folder), "DISK_LOG": os.devnull, "DISK_FAIL": "0"}
     command = [sys.executable, "-c", KILLED_AT, str(shim), work, str(EVERY)]
     with subprocess.Popen(command, env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
