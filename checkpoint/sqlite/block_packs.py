@@ -16,7 +16,7 @@ from collections.abc import Collection, Generator, Iterator, Sequence
 from hashlib import blake2b
 from typing import Final
 
-from ..compression import PLAIN, compressor, decompress
+from ..compression import PLAIN, LibraryMissing, compressor, decompress
 from ..journal import DamagedStore, StoreFailed
 from ..snapshot.shared_blocks import PAGE, Segment, memory_file
 from .snapshot_files import no_link, refuse_shared, write_durably
@@ -82,12 +82,14 @@ class Packs:
         """Verify the blocks at these (offset, length).
 
         Raises:
-            DamagedStore: one is missing or damaged.
+            DamagedStore: one is missing or damaged. StoreFailed: the library that it was compressed with is missing.
         """
         name = self.file(address, number)
         try:
             for _ in _blocks(name, set(places)):
                 pass
+        except LibraryMissing as error:
+            raise StoreFailed(self.path, str(error)) from error
         except (OSError, ValueError, struct.error) as error:
             raise DamagedStore(self.path, address, None, f"snapshot file {name}: {error}") from error
 
@@ -95,7 +97,7 @@ class Packs:
         """Put together what lies in these blocks: pack, offset, length.
 
         Raises:
-            DamagedStore: one is missing or damaged.
+            DamagedStore, StoreFailed: as `check`.
         """
         blocks: dict[tuple[int, int], bytes] = {}
         for number in dict.fromkeys(number for number, _, _ in places):
@@ -103,6 +105,8 @@ class Packs:
             wanted = {(offset, length) for pack, offset, length in places if pack == number}
             try:
                 blocks.update(((number, offset), block) for offset, block in _blocks(name, wanted))
+            except LibraryMissing as error:
+                raise StoreFailed(self.path, str(error)) from error
             except (OSError, ValueError, struct.error) as error:
                 raise DamagedStore(self.path, address, None, f"snapshot file {name}: {error}") from error
         return b"".join(blocks[number, offset] for number, offset, _ in places)

@@ -19,6 +19,7 @@ from ...actors.errors import DamagedValue, HoldfastError, type_name
 from ...actors.kernel.codec import ARRAY, PACKED, REF
 from ...actors.values import ValueDescription, describe_value
 from ..addresses import KEY
+from ..compression import LibraryMissing
 from ..journal import DamagedStore, Entry, StoreFailed
 from ..protocol import START, Answer
 from ..schema import Shape, as_shape, shape_name
@@ -100,7 +101,11 @@ class _Export:
         try:
             meta = decode_meta(self._reader.read_snapshot(chain, number)[0])
             data = self._view.packs.state(chain.path or "", meta.blocks) if meta.blocks else meta.state
+        except StoreFailed:
+            raise
         except HoldfastError as error:
+            if isinstance(error.__cause__, LibraryMissing):
+                raise StoreFailed(self._view.path, str(error.__cause__)) from error
             if self._view.is_kept(number):  # Else the running system has a newer one now.
                 yield _damage(error, address)
             return

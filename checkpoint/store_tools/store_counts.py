@@ -74,7 +74,7 @@ class StoreStats:
         copied_at: when it was copied, in Unix time.
         version: of the format; 2 while there may be something in the log.
         epoch: how often it was opened.
-        pid: of the process that has it open; 0 if there is none.
+        pid: of the process that has it open; 0 if there is none to be seen.
         last: the newest position.
         notes: small facts, such as group snapshots and moves.
         addresses: sorted.

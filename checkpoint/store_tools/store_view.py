@@ -44,7 +44,7 @@ class StoreView:
         last: the newest position.
         rows: those that are in the log and not in the database yet.
         mark: what the mark said before all else was read.
-        pid: of the process that has it open; 0 if there is none.
+        pid: of the process that has it open; 0 if there is none to be seen.
         version: of the format.
         has_wal: whether the transaction holds the database still; else it counts that nobody has opened it meanwhile.
     """

@@ -61,7 +61,7 @@ class Verification:
     Attributes:
         path: of the store.
         identity: of the store; "" if it is not known.
-        pid: of the process that had it open; 0 if there was none.
+        pid: of the process that had it open; 0 if there was none to be seen.
         last: the newest position at the instant that was looked at.
         entries: how many were read.
         snapshots: how many were read.

@@ -259,6 +259,6 @@ def test_the_commands(tmp_path: Path) -> None:
     status, said, _ = run("export", path)
     assert (status, of([json.loads(line) for line in said.splitlines()], "damage")[0]["position"]) == (1, 6)
     edit(path, "DELETE FROM store")
-    for command in ("stats", "export"):
-        assert run(command, path)[0] == 1
-        assert run(command, tmp_path / "nothing.db")[0] == 2
+    for name in ("stats", "export"):
+        assert run(name, path)[0] == 1
+        assert run(name, tmp_path / "nothing.db")[0] == 2

@@ -12,11 +12,13 @@ from pathlib import Path
 
 import pytest
 
+from holdfast.checkpoint import compression
 from holdfast.checkpoint.journal import DamagedStore, ForeignStore, StoreFailed
 from holdfast.checkpoint.sqlite import SqliteJournal
-from holdfast.checkpoint.store_tools import Damage, verify_store
+from holdfast.checkpoint.store_tools import Damage, export_store, verify_store
 from holdfast.checkpoint.store_tools.store_view import StoreView, look, open_view
 from holdfast.checkpoint.store_tools.verification import StoreCheck
+from holdfast.errors import SpecError
 from tests.checkpoint.sqlite.stores import A, B, edit, end, flip, inputs, made
 from tests.checkpoint.store_tools.writing import (
     acknowledged,
@@ -232,6 +234,25 @@ def test_a_closed_store_that_is_opened_under_a_look_is_looked_at_again(tmp_path:
     assert look(path, work) == seen[1]
     assert len(seen) == 2
     assert seen[1] > seen[0]
+
+
+def test_what_cannot_be_decompressed_here_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("zstandard", reason="nothing can be compressed")
+    path, state = tmp_path / "app.db", b"state" * 1000
+    with closing(SqliteJournal(path)) as journal:
+        journal.append(inputs(1))
+        journal.keep_blocks(A, 7, [(0, memoryview(state))], True)
+        journal.cut(A, meta(b"", 1, [(7, 0, len(state))]), [], turn=1)
+    assert verify_store(path).is_good
+
+    def missing(where: str) -> None:
+        raise SpecError(where, "needs the library zstandard")
+
+    monkeypatch.setattr(compression, "_library", missing)
+    with pytest.raises(StoreFailed, match="library zstandard"):
+        verify_store(path)
+    with pytest.raises(StoreFailed, match="library zstandard"):
+        list(export_store(path))
 
 
 def test_a_store_that_is_closed_under_a_look_is_complete(tmp_path: Path) -> None:
