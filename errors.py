@@ -64,7 +64,7 @@ from .supervision.admin import (
 )
 from .supervision.arbiter import GrantLost, InOtherHands
 from .supervision.services.program import InputRefused
-from .supervision.services.registrar import KeyTaken, NotAnActor, NotUnique
+from .supervision.services.registrar import NotAnActor, NotUnique
 from .supervision.services.registry import AlreadyRegistered
 from .supervision.services.router import NoRoute
 from .system.script import UntrustedFile
@@ -97,7 +97,6 @@ __all__ = [
     "Ignore",
     "InOtherHands",
     "InputRefused",
-    "KeyTaken",
     "MailboxFull",
     "MaxChildren",
     "MechanismRefused",

@@ -87,14 +87,22 @@ class Effect:
                     return await work
             except HoldfastError:
                 raise
-            except Exception as error:
-                kind, text = type_name(type(error)), error_text(error)
+            except BaseException as error:  # Whatever a function can raise; it ends neither the program nor its actor.
+                if isinstance(error, asyncio.CancelledError) and _is_cancelled():
+                    raise
+                text = error_text(error)
                 if self.timeout is not None and limit.expired() and isinstance(error, TimeoutError):
                     text = f"it took longer than {self.timeout:g} s"
                 if attempt >= self.retry.attempts or not isinstance(error, self.retry.on):
-                    raise EffectFailed(self.key, attempt, kind, text) from error
+                    raise EffectFailed(self.key, attempt, type_name(type(error)), text) from error
             numbers = numbers or random.Random(seed)
             await asyncio.sleep(self.retry.backoff.delay(attempt - 1, numbers))
+
+
+def _is_cancelled() -> bool:
+    """Whether somebody wants this task to end, and it is not the function itself that says so."""
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0
 
 
 def effect_of(

@@ -433,7 +433,7 @@ def error_text(error: BaseException) -> str:
     """What an exception says; a user's `__str__` may itself raise, the report must not."""
     try:
         return portable(str(error))
-    except Exception as broken:
+    except BaseException as broken:
         return f"<its text cannot be shown: {type_name(type(broken))}>"
 
 

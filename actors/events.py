@@ -204,7 +204,7 @@ class SafeStateOverdue(Event, frozen=True, eq=False):
 
 
 class HeldMessages(Event, frozen=True, eq=False):
-    """While an actor was recovered, messages came: `held` wait for it, `dropped` and `refused` by its held policy."""
+    """Messages came while an actor was recovered whose method has `held=`: how many wait, and what became of more."""
 
     held: int
     dropped: int
@@ -341,7 +341,7 @@ class TurnSlow(Event, frozen=True, eq=False):
 
 
 class LoopLagged(Event, frozen=True, eq=False):
-    """The event loop of a node (`address`) came `seconds` late to what was due."""
+    """The event loop of the root process came `seconds` late to what was due; `address` is the root's."""
 
     seconds: float
 

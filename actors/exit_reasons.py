@@ -9,7 +9,7 @@ import signal
 
 import msgspec
 
-from .errors import error_text, format_error, type_name
+from .errors import StartFailed, error_text, format_error, type_name
 
 
 class ExitReason(msgspec.Struct, frozen=True):
@@ -133,6 +133,13 @@ def crash(error: BaseException) -> ExitReason:
     if isinstance(error, MemoryError):
         return OutOfMemory(error_text(error))
     return Crash(type_name(type(error)), error_text(error), "", error)
+
+
+def start_failed(actor: str, reason: ExitReason) -> StartFailed:
+    """The error of a start that ended for `reason`; its cause is what was raised, if that was in this process."""
+    failed = StartFailed(actor, str(reason))
+    failed.__cause__ = reason.error if isinstance(reason, Crash) else None
+    return failed
 
 
 class _Wire(msgspec.Struct, frozen=True):

@@ -77,7 +77,7 @@ class LoopWatch:
     def _came(self, due: float, lag: float) -> None:
         late = monotonic() - due
         if late > lag:
-            self._node.emit(LoopLagged(self._node.name, late))
+            self._node.emit(LoopLagged(f"/{self._node.name}", late))
         self._arm(lag)
 
     # -- the turns (in the watching thread) -------------------------------------------------------------------------

@@ -68,8 +68,8 @@ class Flow(hf.Actor):
 async def _spent(durability: str | None, count: int) -> tuple[float, float]:
     """Microseconds for each call of the function by itself, and as an effect."""
     with tempfile.TemporaryDirectory() as folder:
-        store: Any = None if durability is None else f"sqlite:{folder}/app.db"
-        async with hf.ActorSystem("bench", store=store, durability=durability or "memory", log=False) as system:
+        options: dict[str, Any] = {"store": f"sqlite:{folder}/app.db", "durability": durability} if durability else {}
+        async with hf.ActorSystem("bench", log=False, **options) as system:
             ref = await system.start(hf.child("worker", hf.start(Worker), recovery=RECOVERY))
             spent: list[float] = []
             for message in (Plain(count), Effects(count)):

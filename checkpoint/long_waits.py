@@ -3,28 +3,36 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import msgspec
 
 from ..actors.errors import WaitTimeout
 from .inputs import Batch, Input
-from .protocol import MESSAGE, MOMENT, REPLY, Answer, Out
+from .protocol import MESSAGE, MOMENT, REPLY, SINCE_THEN, Answer, Out, timed
 
 if TYPE_CHECKING:
     from .home.switch import Switch
+    from .journal import Entry
 
 LONGEST: Final = 3600.0
 """Seconds after which a longer wait looks at the wall clock again: that may have been set, or the machine has slept."""
 HAD: Final = Answer(REPLY, "", msgspec.msgpack.encode(None))
 """What the sender of a message gets that a turn has waited for."""
 
-Place = tuple[int, int]
+Place: TypeAlias = tuple[int, int]
 """A turn, and the number of its output."""
+
+
+def due_entry(turn: int, k: int, when: float) -> Entry:
+    """What the journal has of until when output (turn, k) waits, in Unix time."""
+    return "due", turn, k, when
 
 
 class LongWaits:
     """What the turn in hand at one home waits for. It ends with the life; the next one's turn waits again."""
+
+    __slots__ = ("_clocks", "_home", "wanted")
 
     def __init__(self, home: Switch) -> None:
         self._home = home
@@ -35,6 +43,13 @@ class LongWaits:
     def is_busy(self) -> bool:
         """Whether the turn in hand waits for a moment or a message."""
         return bool(self._clocks or self.wanted)
+
+    def fix(self, turn: int, out: Out, batch: Batch) -> None:
+        """Until when a turn waits is fixed when it first wants to, for all of its lives."""
+        if out.to == SINCE_THEN and (out.seconds or out.verb == "sleep"):
+            home = self._home
+            when = home.ledger.dues[turn, out.k] = home.node.clock.wall() + out.seconds
+            home.note(turn, due_entry(turn, out.k, when), batch)
 
     def begin(self, turn: int, key: int, out: Out) -> None:
         """The turn with input `key` waits: until a moment, or for a message, for which there may be a time limit."""
@@ -48,8 +63,8 @@ class LongWaits:
                 self._take(place, source)
                 return
             self.wanted[place] = names
-        if out.seconds:
-            self._look(place, out.seconds)
+        if out.verb == "sleep" or out.seconds:
+            self._look(place, self._home.ledger.dues.get(place, out.seconds))
 
     def _suits(self, source: Input, names: tuple[str, ...], running: int) -> bool:
         """Whether an input is a message that a turn waits for, and nobody has begun it."""
@@ -68,9 +83,9 @@ class LongWaits:
         """The message is no input any more, but an outcome of the turn, in one append."""
         home, batch = self._home, Batch()
         self._forget(place)
-        said = msgspec.msgpack.encode((home.node.clock.wall(), source.body))
         home.end_without_turn(source, HAD if source.ask is not None else Answer(), batch)
-        home.calls.outcome(*place, Answer(MESSAGE, source.name, said), batch, taken=source.id)
+        outcome = timed(Answer(MESSAGE, source.name, source.body), home.node.clock.wall())
+        home.calls.outcome(*place, outcome, batch, taken=source.id)
         batch.commit(home.journal)
 
     def _look(self, place: Place, when: float) -> None:
@@ -83,10 +98,10 @@ class LongWaits:
         names = self.wanted.get(place)
         self._forget(place)
         if names is None:
-            answer = Answer(MOMENT, "", msgspec.msgpack.encode(now))
+            answer = Answer(MOMENT)
         else:
             answer = Answer(*home.node.codec.encode_error(WaitTimeout(home.path, " or ".join(names))))
-        home.calls.outcome(*place, answer, None)
+        home.calls.outcome(*place, timed(answer, now), None)
 
     def _forget(self, place: Place) -> None:
         clock = self._clocks.pop(place, None)

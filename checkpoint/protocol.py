@@ -24,8 +24,11 @@ AWAITED = ("ask", "send", "publish", "effect", "sleep", "wait")
 OK, FAILED, DROPPED, STASHED = "ok", "failed", "dropped", "stashed"
 # How an ask can be answered; LATER keeps it open, NOTHING means that nobody asked.
 REPLY, REFUSAL, ERROR, CRASH, LATER, NOTHING = "reply", "refusal", "error", "crash", "later", ""
-# What else a turn can wait for: a moment, or (MESSAGE) a message; the time at which it came is part of both.
-MOMENT = "moment"
+# What else a turn can wait for: a moment, or (MESSAGE) a message. If it may have waited for long, the kind of the
+# outcome begins with TIMED, and its body has the Unix time at which it came in front.
+MOMENT, TIMED = "moment", "timed "
+# In place of a receiver, of a wait whose `seconds` begin with it; else they are Unix time.
+SINCE_THEN = "since then"
 
 
 class Out(msgspec.Struct, array_like=True, gc=False):
@@ -51,6 +54,23 @@ class Answer(msgspec.Struct, array_like=True, gc=False):
     kind: str = NOTHING
     name: str = ""
     body: bytes = b""
+
+
+def timed(answer: Answer, when: float) -> Answer:
+    """The same outcome, with the time at which it came."""
+    return Answer(TIMED + answer.kind, answer.name, msgspec.msgpack.encode((when, answer.body)))
+
+
+def untimed(answer: Answer) -> tuple[Answer, float]:
+    """The outcome itself, and when it came; 0.0 if that is not known.
+
+    >>> untimed(timed(Answer("reply", "", b"x"), 3.0))
+    (Answer(kind='reply', name='', body=b'x'), 3.0)
+    """
+    if not answer.kind.startswith(TIMED):
+        return answer, 0.0
+    when, body = msgspec.msgpack.decode(answer.body, type=tuple[float, bytes])
+    return Answer(answer.kind.removeprefix(TIMED), answer.name, body), when
 
 
 def answer_digest(answer: Answer) -> int:
@@ -91,12 +111,16 @@ class Feed(msgspec.Struct, array_like=True, tag=1, gc=False):
 
 
 class Outcome(msgspec.Struct, array_like=True, tag=2):
-    """The outcome of what was output (turn, k). The input `taken` is the message that it waited for, and not fed."""
+    """The outcome of what was output (turn, k), whose digest is `asked` (0: not known).
+
+    The input `taken` is the message that it waited for, and is not fed.
+    """
 
     turn: int
     k: int
     answer: Answer
     taken: int = -1
+    asked: int = 0
 
 
 class Perform(msgspec.Struct, array_like=True, tag=22):

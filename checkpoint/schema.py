@@ -18,7 +18,7 @@ from ..actors.kernel.actor import Actor
 from ..actors.kernel.message import Message, find_refusal, message_name, reply_type
 from ..actors.persistence import UNFIT
 from ..actors.process.wire.start_codec import loaded
-from .protocol import MESSAGE, PIPE, REPLY, START, TICK, Answer
+from .protocol import MESSAGE, PIPE, REPLY, START, TICK, TIMED, Answer
 
 if TYPE_CHECKING:
     from ..actors.kernel.cell import Cell
@@ -210,11 +210,12 @@ class Shapes:
 
 def shape_name(answer: Answer) -> str:
     """Under which name the fields of an ask's outcome are kept; "" if they are not."""
-    if answer.kind == "refusal":
+    kind = answer.kind.removeprefix(TIMED)
+    if kind == "refusal":
         return REFUSAL + answer.name
-    if answer.kind == MESSAGE:
+    if kind == MESSAGE:
         return answer.name
-    return REPLY_TO + answer.name if answer.kind == REPLY and answer.name else ""
+    return REPLY_TO + answer.name if kind == REPLY and answer.name else ""
 
 
 def as_shape(data: Any) -> Shape:

@@ -9,12 +9,14 @@ from __future__ import annotations
 import asyncio
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
+from typing import Any, Protocol
 
 import msgspec
 
 from ..actors.kernel.actor import Actor, Start, on
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import Node, cell_kind
+from ..actors.kernel.ref import ActorRef
 from ..supervision.spec import ChildSpec
 from .assembly import observer
 from .literals import ok
@@ -32,6 +34,19 @@ OURS = frozenset({DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, RO
 
 BASE = (f"{__package__}.", f"{(__package__ or '').rpartition('.')[0]}.checkpoint.")
 """Packages whose actors look after the system and are no part of it."""
+
+
+class WatchedSystem(Protocol):
+    """The system that is watched: an `ActorSystem`."""
+
+    @property
+    def _node(self) -> Node:
+        """The node of the process in which diagnosis itself lives."""
+        ...
+
+    async def start(self, spec: ChildSpec) -> ActorRef[Any]:
+        """Start a child of its root supervisor."""
+        ...
 
 
 class Wired(msgspec.Struct, frozen=True, kw_only=True):
@@ -65,16 +80,17 @@ class Generated(msgspec.Struct, frozen=True):
 
 
 async def generate(
-    node: Node, *, seconds: float = 3.0, topics: Iterable[str] = (), leave_out: Collection[str] = ()
+    system: WatchedSystem, *, seconds: float = 3.0, topics: Iterable[str] = (), leave_out: Collection[str] = ()
 ) -> Generated:
     """Look at a running system for a while and write down what it is made of.
 
     Args:
-        node: `system._node`.
+        system: an `ActorSystem`.
         seconds: how long to listen for publishers; one that publishes more rarely is not found.
         topics: to listen to besides those that have subscribers.
         leave_out: addresses; they and all below them are no part of the model. Diagnosis itself never is.
     """
+    node = system._node
     heard: dict[str, set[str]] = {}
     wanted = [topic for topic in dict.fromkeys((*node.topics.names(), *topics)) if topic not in OURS]
     cell = node.spawn(Start(TopicListener, (tuple(wanted), heard)))

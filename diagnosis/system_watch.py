@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 
@@ -14,7 +14,7 @@ from ..supervision.spec import ChildSpec
 from .assembly import observer, tree
 from .diagnoser import DiagnoserActor
 from .engine import Diagnosis
-from .generate import Generated, child_name, generate, observers_for
+from .generate import Generated, WatchedSystem, child_name, generate, observers_for
 from .literals import ok
 from .messages import DIAGNOSER, Explained, GetDiagnosis, GetExplanation, GetObserved
 from .model import Declaration, Expectation, History, System
@@ -24,19 +24,6 @@ from .repair import Policy, RepairAction, repairer, restart_child, restart_subtr
 
 LimitsOf = Mapping[str, Mapping[Property, Limits]]
 """What is good, for each property of some components."""
-
-
-class WatchedSystem(Protocol):
-    """The system that is watched: an `ActorSystem`."""
-
-    @property
-    def _node(self) -> Node:
-        """The node of the process in which diagnosis itself lives."""
-        ...
-
-    async def start(self, spec: ChildSpec) -> ActorRef[Any]:
-        """Start a child of its root supervisor."""
-        ...
 
 
 class Watch:
@@ -114,7 +101,7 @@ async def watch(
     Raises:
         ModelError: something is wrong with the model. StartFailed, AlreadyStarted: see `ActorSystem.start`.
     """
-    generated = await generate(system._node, seconds=seconds) if model is None else None
+    generated = await generate(system, seconds=seconds) if model is None else None
     watchers = [*observers]
     if generated is not None:
         declaration = generated.declaration

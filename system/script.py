@@ -25,8 +25,8 @@ LARGEST = 4 * 1024 * 1024
 """Bytes a script may have."""
 
 
-class UntrustedFile(HoldfastError, text="{path} is not loaded: {problem}"):
-    """A file, or a folder above it, could have been written by somebody else: it is not loaded."""
+class UntrustedFile(HoldfastError, text="{path} is not used: {problem}"):
+    """A file, or a folder above it, could have been written by somebody else: it is not used."""
 
     path: str
     problem: str

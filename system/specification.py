@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import msgspec
 
-from ..actors.errors import HoldfastError, SpecError
+from ..actors.errors import HoldfastError, SpecError, UnsavableValue
 from ..actors.events import Event
 from ..actors.kernel.actor import Start
 from ..actors.process.wire.start_codec import pack_data, unpack_data
@@ -273,6 +273,8 @@ class Specifications:
         """A spec as bytes, or why it cannot be stored."""
         try:
             return (None if spec is None else self._packer.pack(spec)), ""
+        except UnsavableValue as error:  # Its own text is for the state of an actor.
+            return None, f"{error.where}: {error.problem} cannot be stored; give the actor what it is made from"
         except HoldfastError as error:
             return None, str(error)
 

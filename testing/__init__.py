@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .histories.checker import ImpureModel, Linearization, NotLinearizable, TooHard, Violation, linearizable
     from .histories.history import UNKNOWN, History, Model, Operation
     from .machines.machine import ActorMachine
-    from .probes import Down, Exit, Probe, Received, Unexpected, probe
+    from .probes import Down, Exit, Probe, Unexpected, probe
     from .simulation import Simulation, simulate
 
 _HOME = {
@@ -37,7 +37,6 @@ _HOME = {
     "POINTS": "faults",
     "Point": "faults",
     "Probe": "probes",
-    "Received": "probes",
     "Simulation": "simulation",
     "Strike": "faults",
     "Strikes": "faults",
@@ -72,7 +71,6 @@ __all__ = [
     "POINTS",
     "Point",
     "Probe",
-    "Received",
     "Simulation",
     "Strike",
     "Strikes",

@@ -775,6 +775,8 @@ def run_schedule(
     except BaseException as error:
         error.__simulation__ = simulation  # type: ignore[attr-defined]
         raise
+    finally:
+        simulation.remove()  # Also if the loop has given up in the end of the run: the next one has a world of its own.
     return simulation
 
 

@@ -1,9 +1,11 @@
 """What the documents show is true: every docstring example and every Python block in a Markdown file.
 
 A block of a Markdown file is a part of a program that is made of all blocks of that file, in order. A block that opens
-with a comment holding a path is a quotation instead: it must stand word for word in that file.
+with a comment holding a path is a quotation instead: it must stand word for word in that file. A program comes to each
+`except` of an error of holdfast that it shows.
 """
 
+import ast
 import doctest
 import importlib
 import os
@@ -77,6 +79,32 @@ def program(blocks: list[Block]) -> str:
     return "\n".join(lines) + "\n" if lines else ""
 
 
+class Branch(NamedTuple):
+    line: int  # of `except`, counted from 1
+    row: int  # where the first statement of the branch begins, counted from 0
+    column: int  # in characters
+
+
+def error_branches(text: str) -> Iterator[Branch]:
+    """Each `except hf...` of a program, unless a statement with a body of its own comes first in it."""
+    for node in ast.walk(ast.parse(text)):
+        if not isinstance(node, ast.ExceptHandler) or node.type is None or "hf." not in ast.unparse(node.type):
+            continue
+        first = node.body[0]
+        if not any(isinstance(inner, ast.stmt) for inner in ast.iter_child_nodes(first)):
+            line = text.splitlines()[first.lineno - 1]
+            yield Branch(node.lineno, first.lineno - 1, len(line.encode()[: first.col_offset].decode()))
+
+
+def marking(text: str, folder: Path) -> str:
+    """The program, which leaves a file in `folder` for each `except hf...` that it comes to, named after the line."""
+    lines = text.splitlines()
+    for line, row, column in error_branches(text):
+        mark = f"__import__('pathlib').Path({str(folder / str(line))!r}).touch(); "
+        lines[row] = lines[row][:column] + mark + lines[row][column:]
+    return "\n".join(lines) + "\n"
+
+
 def run(path: Path) -> tuple[int, str]:
     """Run a script in a session of its own, killed at the time limit, and return its exit code and output."""
     with subprocess.Popen(
@@ -124,10 +152,13 @@ def test_blocks_run(document: Path, tmp_path: Path) -> None:
     text = program(list(python_blocks(document.read_text("utf-8"))))
     if not text:
         return
-    script = tmp_path / f"{document.stem.lower()}.py"
-    script.write_text(text, "utf-8")
+    script, met = tmp_path / f"{document.stem.lower()}.py", tmp_path / "met"
+    met.mkdir()
+    script.write_text(marking(text, met), "utf-8")
     code, output = run(script)
     assert code == 0, output
+    unmet = {branch.line for branch in error_branches(text)} - {int(one.name) for one in met.iterdir()}
+    assert not unmet, "the errors of these lines were not met"
 
 
 def test_blocks_keep_their_lines() -> None:
@@ -140,6 +171,15 @@ def test_blocks_keep_their_lines() -> None:
         (15, None),
     ]
     assert program(blocks).splitlines() == ["", "", "", "x = 1", *[""] * 10, "print(x)"]
+
+
+def test_an_error_that_is_not_met_is_noticed(tmp_path: Path) -> None:
+    text = (
+        "try:\n    raise hf.SendError\nexcept hf.SendError as é:\n    x = 'é'; y = x\nexcept hf.AskFailed:\n    pass\n"
+    )
+    assert [branch.line for branch in error_branches(text)] == [3, 5]
+    exec(compile(marking(text, tmp_path), "script", "exec"), {"hf": holdfast})
+    assert [one.name for one in tmp_path.iterdir()] == ["3"]
 
 
 @pytest.mark.parametrize("language", ["py", "python3", "pycon", "python no-run"])

@@ -102,6 +102,10 @@ class HandlerThreads(concurrent.futures.Executor):
 def _answer(done: concurrent.futures.Future[Any], work: Callable[[], Any]) -> None:
     try:
         value = work()
+    except StopIteration as error:  # No future takes it; a coroutine that raises it is told the same.
+        stopped = RuntimeError("a function in a thread has raised StopIteration")
+        stopped.__cause__ = error
+        done.set_exception(stopped)
     except BaseException as error:  # Whoever waits for it gets it.
         done.set_exception(error)
     else:

@@ -169,7 +169,7 @@ class Codec:
         try:
             return self.decode(kind, body)
         except msgspec.DecodeError as error:
-            raise BadMessage(cell.path, name.replace(":", "."), str(error)) from error
+            raise BadMessage(cell.path, name.replace(":", "."), misfit(kind, error)) from error
 
     def opened(self, cell: Cell, message: object) -> object:
         """A message for a cell, decoded if it is still packed; as it is if the cell's class does not know its type."""
@@ -349,6 +349,21 @@ def unencodable(value: object, error: BaseException) -> str:
         except Exception as inner:
             return f"field {name!r}: {inner}"
     return str(error)
+
+
+def misfit(kind: type[msgspec.Struct], error: msgspec.DecodeError) -> str:
+    """Why a payload is no such message; its fields, which are sent by place, are named.
+
+    >>> class Deposit(Message):
+    ...     euros: int
+    ...     notes: list[str] = []
+    >>> misfit(Deposit, msgspec.ValidationError("Expected `str`, got `int` - at `$[1][...]`"))
+    'Expected `str`, got `int` - at `notes[...]`'
+    """
+    text = str(error)
+    for place, name in enumerate(kind.__struct_fields__):
+        text = text.replace(f"`$[{place}]", f"`{name}")
+    return text
 
 
 def too_large(value: object, size: int) -> str:

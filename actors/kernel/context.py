@@ -394,8 +394,8 @@ class ActorContext:
     def sleep_until(self, when: float) -> asyncio.Future[None]:
         """Have the turn in hand wait until a moment, be it days away.
 
-        In an actor with recovery the wait outlives its process, and with a durable store the program: the handler is
-        run again from its start, and gets the outcomes that it had. No other message is handled meanwhile.
+        In an actor whose recovery replays, the wait outlives its process, and with a durable store the program: the
+        handler is run again from its start, and gets the outcomes that it had. No other message is handled meanwhile.
 
         Args:
             when: Unix time in seconds; a moment that has passed ends the wait at once.
@@ -409,18 +409,19 @@ class ActorContext:
         self._alive()
         if not isinstance(when, int | float) or isinstance(when, bool) or not math.isfinite(when):
             raise SpecError("sleep_until", f"takes Unix time in seconds, not {when!r}")
-        return self._slept(float(when))
+        return self._slept(float(when), is_moment=True)
 
     def sleep(self, seconds: float) -> asyncio.Future[None]:
-        """Have the turn in hand wait for so many seconds from `now()` on; see `sleep_until`."""
+        """Have the turn in hand wait for so many seconds from this call on; see `sleep_until`."""
         self._alive()
         if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds < math.inf:
             raise SpecError("sleep", f"takes a number of seconds >= 0, not {seconds!r}")
-        return self._slept(self.now() + seconds)
+        return self._slept(float(seconds), is_moment=False)
 
-    def _slept(self, until: float) -> asyncio.Future[None]:
-        """Wait until a moment: without recovery, in this life."""
-        return self._beside(asyncio.sleep(until - self._cell.node.clock.wall()), "sleep")
+    def _slept(self, seconds: float, *, is_moment: bool) -> asyncio.Future[None]:
+        """Wait until a moment, or for so many seconds: without recovery, in this life."""
+        left = seconds - self._cell.node.clock.wall() if is_moment else seconds
+        return self._beside(asyncio.sleep(left), "sleep")
 
     def wait_for(self, *kinds: type[M], timeout: float | None = None) -> asyncio.Future[M]:
         """Have the turn in hand wait for a message of one of these classes: a signal. It needs recovery.
@@ -430,7 +431,7 @@ class ActorContext:
 
         Args:
             kinds: classes of messages whose reply is None.
-            timeout: seconds from `now()` on; left out, it waits for as long as it takes.
+            timeout: seconds from this call on; left out, it waits for as long as it takes.
 
         Returns:
             A future of the message.

@@ -332,7 +332,7 @@ def crash(cell: Cell, item: Any, error: BaseException) -> None:
     if is_item:
         item.fail(remote_crash(error))
     if isinstance(item, FirstTurn):
-        start_fails(cell, item, StartFailed(cell.path, str(reason)))
+        start_fails(cell, item, exit_reasons.start_failed(cell.path, reason))
         if isinstance(error, StartFailed) and cell.actor is not None and cell.actor._supervises:
             finish(cell, SHUTDOWN)  # A child did not start, which is no crash of ours (OTP).
             return
@@ -484,7 +484,7 @@ def ended(cell: Cell, reason: ExitReason) -> None:
         starting, more.starting = more.starting, None
         error, more.start_error = more.start_error, None
         if starting is not None and not starting.done():
-            starting.set_exception(error or StartFailed(cell.path, str(reason)))
+            starting.set_exception(error or exit_reasons.start_failed(cell.path, reason))
             starting.exception()  # Seen: a supervisor may have given up this start meanwhile.
         _undo(cell)
     if cell.spec is not None and cell.parent is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..control.orders_lane import QueuedOrder
 from ..errors import CannotMove, StartFailed, error_text
-from ..exit_reasons import ExitReason
+from ..exit_reasons import ExitReason, start_failed
 from ..kernel import lifecycle, mailbox
 from ..kernel.cell import RUNNING, Cell, Host
 from ..kernel.context import ActorContext
@@ -141,7 +141,7 @@ class Arrival:
 
     def _ended_early(self, up: asyncio.Future[None], reason: ExitReason) -> None:
         if not up.done():
-            up.set_exception(StartFailed(self.cell.path, str(reason)))
+            up.set_exception(start_failed(self.cell.path, reason))
             up.exception()  # Seen: whoever waits may have given up.
 
     async def is_up(self, move: Move, up: asyncio.Future[None]) -> None:
@@ -152,7 +152,7 @@ class Arrival:
         """
         await move.within(up, move.timeout, lambda: "its new life was not up")
         if self.other.state is not RUNNING:
-            raise StartFailed(self.cell.path, str(self.other.extra().reason))
+            raise start_failed(self.cell.path, self.other.extra().reason)
 
     def take_over(
         self, queue: Iterable[Any], stash: Iterable[Any], bound: Bound | None, *, suspended: bool

@@ -68,7 +68,11 @@ def drop_all(home: Switch, why: str, *, keep_tells: bool = False, keep_ticks: bo
             continue
         if source.ask is None and source.kind == MESSAGE:
             lose(home, source, why)
-        if source.id == ledger.begun and ledger.released:
+        if source.id == ledger.begun and ledger.released and ledger.lasts and keep_tells:
+            ask, source.ask = source.ask, None  # It goes on in the next life: what it has done is not left half done.
+            if ask is not None:
+                ask.fail(ended)
+        elif source.id == ledger.begun and ledger.released:
             end_begun(home, source, ended, batch)
         else:
             home.end_without_turn(source, _failure(home, ended if source.was_cut else stopped), batch)

@@ -13,7 +13,22 @@ from typing import TYPE_CHECKING, Any
 from ...actors.errors import DIVERGES, ReplayDiverged
 from ..inputs import NO_POSITIONS, OVERHEAD, Input, Turn
 from ..life.replay_guard import StateDiverged
-from ..protocol import DROPPED, FAILED, MESSAGE, OK, PIPE, START, STASHED, TICK, Answer, Out, TurnEnd, answer_digest
+from ..long_waits import due_entry
+from ..protocol import (
+    DROPPED,
+    FAILED,
+    MESSAGE,
+    OK,
+    PIPE,
+    START,
+    STASHED,
+    TICK,
+    TIMED,
+    Answer,
+    Out,
+    TurnEnd,
+    answer_digest,
+)
 
 if TYPE_CHECKING:
     from ..journal import Entry
@@ -33,6 +48,8 @@ class InputLedger:
         begun: the input of the turn after `turn`, if it has released outputs.
         released: digests of those outputs.
         outcomes: of the asks that these turns have made, by (turn, output).
+        lasts: whether that turn has had effects or long waits: it goes on in the next life at its address.
+        dues: until when outputs of the turn in hand wait, in Unix time.
         pipes_done: the background work of these turns that has its result, by turn.
         journal_bytes: what is counted against the journal's limit.
         newest: the snapshot that the next life begins with.
@@ -50,6 +67,8 @@ class InputLedger:
     begun: int = -1
     released: list[int] = dataclasses.field(default_factory=list)
     outcomes: dict[tuple[int, int], Answer] = dataclasses.field(default_factory=dict)
+    lasts: bool = False
+    dues: dict[tuple[int, int], float] = dataclasses.field(default_factory=dict)
     pipes_done: dict[int, set[int]] = dataclasses.field(default_factory=dict)
     journal_bytes: int = 0
     newest: Meta | None = None
@@ -188,6 +207,8 @@ class InputLedger:
         """End a turn, with the outputs that it has released."""
         turn = self.turns[number] = Turn(source, status, self.released, state, reply)
         self.released, self.begun = [], -1
+        self.lasts = False
+        self.dues.clear()
         self.turn = source.turn = number
         source.deliveries = 0
         if status != STASHED:
@@ -221,6 +242,12 @@ class InputLedger:
             cause = f"the reply to {past.input.name} is not what it was before the crash; {DIVERGES}"
             raise ReplayDiverged(self.path, number, seen + 1, cause)
 
+    def digest_of(self, turn: int, k: int) -> int:
+        """The digest of what was output (turn, k) before; 0: that is not known any more."""
+        past = self.turns.get(turn)
+        digests = self.released if turn > self.turn else past.digests if past is not None else []
+        return digests[k - 1] if k <= len(digests) else 0
+
     def note_outcome(self, turn: int, k: int, answer: Answer) -> bool:
         """Keep the outcome of the ask that was output (turn, k); False if no replay will want it."""
         if turn <= self.state_turn:
@@ -253,7 +280,8 @@ class InputLedger:
         """Let the turn in hand begin anew, unless it has released something: then its input is returned."""
         source = self.open.get(self.begun)
         if source is None or not self.released:
-            self.released, self.begun = [], -1
+            self.released, self.begun, self.lasts = [], -1, False
+            self.dues.clear()
             return None
         return source
 
@@ -324,6 +352,7 @@ class InputLedger:
         entries += [turn.entry(number) for number, turn in self.turns.items()]
         if self.released:
             entries.append(self.released_entry(self.turn + 1))
+        entries += [due_entry(*place, when) for place, when in self.dues.items()]
         # What was put aside once may have ended in a turn that was given up.
         ended = {turn.input.id for turn in self.turns.values() if turn.status != STASHED}
         return entries + [("drop", key) for key in dict.fromkeys(self.ended_in_the_stash()) if key not in ended]
@@ -353,9 +382,14 @@ class InputLedger:
                 if turn > self.turn:
                     self.released[more[0] if more else 0 :] = digests
                     self.begun = key
+            case ("due", turn, k, when):
+                self.positions_of(turn).append(position)
+                if turn > self.turn:
+                    self.dues[turn, k], self.lasts = when, True
             case ("got", turn, k, kind, name, body):
                 self.positions_of(turn).append(position)
                 self.outcomes[turn, k] = Answer(kind, name, body)
+                self.lasts = self.lasts or (turn > self.turn and kind.startswith(TIMED))
             case ("drop", key):
                 self.drop([position])
                 if key in self.open:

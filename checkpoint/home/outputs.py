@@ -17,7 +17,7 @@ from ...actors.kernel.envelope import Envelope
 from ..durable_links import UNDONE_BY, connect
 from ..inputs import Batch
 from ..life.recorded_inbox import STARTED
-from ..protocol import MESSAGE, PIPE, Answer, Hooked, Out, PipeDone
+from ..protocol import MESSAGE, PIPE, Answer, Hooked, LifePort, Out, PipeDone
 from .held_messages import Inlet, inlet
 from .pending_asks import SwitchAsk, answer_ask, origin_of
 from .recorded_home import switch_of
@@ -51,10 +51,11 @@ class Outputs:
                 self._send(node.cell_at(out.to), out, batch, functools.partial(home.calls.sent, turn, out.k))
             case "ask":
                 self._ask(turn, key, out, batch)
-            case "effect":
-                batch.after.append(lambda: home.calls.order(turn, out.k))
-            case "sleep" | "wait":
-                batch.after.append(lambda: home.long_waits.begin(turn, key, out))
+            case "effect" | "sleep" | "wait":
+                home.ledger.lasts = True
+                home.long_waits.fix(turn, out, batch)
+                port = home.life.port
+                batch.after.append(lambda: self._begin(turn, key, out, port))
             case "publish":
                 self._publish(turn, out, batch)
             case "reply":
@@ -87,6 +88,16 @@ class Outputs:
                 pass
             case verb:
                 raise HoldfastError(f"{home.path}: unknown output {verb!r}")
+
+    def _begin(self, turn: int, key: int, out: Out, port: LifePort | None) -> None:
+        """What a turn waits for begins, if its life is still there: the next one's says for itself what it wants."""
+        home = self._home
+        if home.life.port is not port or (turn, out.k) in home.ledger.outcomes:
+            return
+        if out.verb == "effect":
+            home.calls.order(turn, out.k)
+        else:
+            home.long_waits.begin(turn, key, out)
 
     def hooked(self, record: Hooked) -> None:
         """What a hook does that outlives it; it is done once, though a hook runs at each life."""

@@ -13,7 +13,7 @@ from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, ReplyHandle
 from ...actors.process.wire.peer import RelayedAsk
 from ..inputs import Batch, Input
-from ..protocol import REPLY, Answer, Out, Outcome, Perform, Performed
+from ..protocol import REPLY, Answer, Out, Outcome, Perform, Performed, timed
 from ..schema import shape_name
 from .input_ledger import outcome_entry
 
@@ -131,8 +131,7 @@ class PendingCalls:
 
     Attributes:
         asks: asks of its own turns, by (turn, output).
-        sends: sends and publications of its own turns whose receivers have no room yet.
-        effects: effects of its own turns that were ordered, and have no outcome.
+        sends: sends and publications of its own turns whose receivers have no room yet, and effects that are out.
         later: asks of others that are to be answered later, by input.
         owed: the same as read back from the store: asker and origin.
     """
@@ -141,7 +140,6 @@ class PendingCalls:
         self._home = home
         self.asks: dict[tuple[int, int], SwitchAsk] = {}
         self.sends: set[tuple[int, int]] = set()
-        self.effects: set[tuple[int, int]] = set()
         self.later: dict[int, Ask] = {}
         self.owed: dict[int, tuple[str, str]] = {}
 
@@ -193,7 +191,8 @@ class PendingCalls:
         if turn <= home.ledger.turn:
             return  # Its turn has ended without waiting for it, and does so again.
         if out.name:
-            self.outcome(turn, out.k, Answer(*home.node.codec.encode_error(EffectInDoubt(home.path, out.to))), None)
+            doubt = Answer(*home.node.codec.encode_error(EffectInDoubt(home.path, out.to)))
+            self.outcome(turn, out.k, timed(doubt, home.node.clock.wall()), None)
             return
         source = home.ledger.open.get(key)
         home.node.emit(EffectRepeated(home.path, out.to, "" if source is None else source.name))
@@ -202,14 +201,14 @@ class PendingCalls:
     def order(self, turn: int, k: int) -> None:
         """Have the present life perform an effect: all that precedes it is safe."""
         if self._home.life.port is not None:
-            self.effects.add((turn, k))
+            self.sends.add((turn, k))
             self._home.life.port.to_life(Perform(turn, k))
 
     def performed(self, record: Performed) -> None:
         """An effect that was ordered has come to something."""
-        if (record.turn, record.k) in self.effects:
-            self.effects.remove((record.turn, record.k))
-            self.outcome(record.turn, record.k, record.answer, None)
+        if (record.turn, record.k) in self.sends:
+            self.sends.remove((record.turn, record.k))
+            self.outcome(record.turn, record.k, timed(record.answer, self._home.node.clock.wall()), None)
 
     def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None, taken: int = -1) -> None:
         """An ask of ours has its outcome: journal it, then tell the turn that waits. `taken`: the input that it was."""
@@ -229,7 +228,6 @@ class PendingCalls:
             ask.is_over, ask.future = True, OVER
         self.asks.clear()
         self.sends.clear()
-        self.effects.clear()
         self._home.long_waits.abandon()
 
     def sent(self, turn: int, k: int, error: HoldfastError | None) -> None:
@@ -245,4 +243,4 @@ class PendingCalls:
 
     def _tell(self, turn: int, k: int, answer: Answer, taken: int = -1) -> None:
         if self._home.life.port is not None:
-            self._home.life.port.to_life(Outcome(turn, k, answer, taken))
+            self._home.life.port.to_life(Outcome(turn, k, answer, taken, self._home.ledger.digest_of(turn, k)))

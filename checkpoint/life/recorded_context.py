@@ -6,13 +6,22 @@ import asyncio
 import dataclasses
 import hashlib
 import random
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Generator
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
 from ...actors.effects import Effect
-from ...actors.errors import ControlFailed, HoldfastError, remote_crash
+from ...actors.errors import (
+    BadMessage,
+    BadReply,
+    ControlFailed,
+    EffectFailed,
+    HoldfastError,
+    error_text,
+    remote_crash,
+    type_name,
+)
 from ...actors.exit_reasons import NORMAL, ExitReason
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import Cell
@@ -22,7 +31,7 @@ from ...actors.kernel.links import Monitor
 from ...actors.kernel.message import Message, message_name, require_message
 from ...actors.kernel.ref import ActorRef, current
 from ...actors.values import encode_value
-from ..protocol import REPLY, Answer, Feed, Performed, PipeDone
+from ..protocol import REPLY, SINCE_THEN, Answer, Feed, Performed, PipeDone
 from .recorded_inbox import INIT, STARTED, Fed
 
 if TYPE_CHECKING:
@@ -69,6 +78,23 @@ class RecordedTimer:
     def cancel(self) -> None:
         """The message does not come any more, not even one that is queued already."""
         _own_life("cancels its timers").cancel_timer(self.id)
+
+
+class Pending(asyncio.Future[Any]):
+    """What a turn waits for. The clock of the turn moves on when its handler has awaited it.
+
+    Not when it has come: in a replay all comes at once, and `now()` has to say again what it said.
+    """
+
+    def __init__(self, life: Life) -> None:
+        super().__init__(loop=life.cell.node.loop)
+        self._life, self.when, self.is_out = life, 0.0, False
+
+    def __await__(self) -> Generator[Any, None, Any]:
+        try:
+            return (yield from super().__await__())
+        finally:
+            self._life.moment = max(self._life.moment, self.when)
 
 
 class RecordedContext(ActorContext):
@@ -271,33 +297,37 @@ class RecordedContext(ActorContext):
         """An output of the turn in hand, and a future of what comes of it; the turn need not wait for that."""
         life = self.recorded
         k = life.put(verb, to, name, seconds=until)
-        outcome: asyncio.Future[Any] = self._cell.node.loop.create_future()
+        outcome = Pending(life)
         life.asks[life.turn, k] = outcome, kind
         life.release()
         return outcome
 
-    def _rest(self, verb: str, name: str, until: float, kinds: dict[str, type[Message[Any]]]) -> asyncio.Future[Any]:
+    def _rest(
+        self, verb: str, name: str, seconds: float, kinds: dict[str, type[Message[Any]]], since: str = SINCE_THEN
+    ) -> asyncio.Future[Any]:
         """Wait for what the home waits for: nothing of it is out."""
-        life, outcome = self.recorded, self._awaited(verb, "", name, until, kinds)
-        resting = life.resting
-        resting.add(outcome)
-        outcome.add_done_callback(resting.discard)
+        life, outcome = self.recorded, self._awaited(verb, since, name, seconds, kinds)
+        life.resting += 1
+        outcome.add_done_callback(life.rested)
         return outcome
 
-    def _slept(self, until: float) -> asyncio.Future[None]:
+    def _slept(self, seconds: float, *, is_moment: bool) -> asyncio.Future[None]:
         if self._in_turn():
-            return self._rest("sleep", "", until, {})
+            return self._rest("sleep", "", seconds, {}, "" if is_moment else SINCE_THEN)
         self._outside()
-        return super()._slept(until)
+        return super()._slept(seconds, is_moment=is_moment)
 
     def _signal(self, kinds: tuple[type[Message[Any]], ...], timeout: float | None) -> asyncio.Future[Message[Any]]:
         if not self._in_turn():
             raise HoldfastError(f"{self.path}: only a turn can wait for a message")
         names = {message_name(kind): kind for kind in kinds}
-        return self._rest("wait", "|".join(names), 0.0 if timeout is None else self.now() + timeout, names)
+        return self._rest("wait", "|".join(names), timeout or 0.0, names)
 
-    def perform(self, turn: int, k: int, effect: Effect, outcome: asyncio.Future[Any]) -> None:
+    def perform(self, turn: int, k: int, effect: Effect, outcome: Pending) -> None:
         """Perform an effect of the turn in hand, in a task of its own, and have the home journal what it comes to."""
+        if outcome.is_out:
+            return  # Whoever led before has been told so, too.
+        outcome.is_out = True
         task = self._beside(self._carried_out(turn, k, effect), "effect")
         outcome.add_done_callback(lambda _: task.cancel())  # The handler does not wait for it any more.
 
@@ -305,12 +335,26 @@ class RecordedContext(ActorContext):
         node, life = self._cell.node, self.recorded
         try:
             value = await effect.perform(node.threads.run, node.numbers.next_seed())
-            said = msgspec.msgpack.encode((node.clock.wall(), encode_value(value, where=f"the result of {effect.key}")))
-            answer = Answer(REPLY, "", said)
+            answer = Answer(REPLY, "", encode_value(value, where=f"the result of {effect.key}"))
         except Exception as error:
-            answer = life.answer_error(error)
-        if not self._closed and (turn, k) in life.asks:
+            answer = self._kept(effect, error)
+        if self._closed or (turn, k) not in life.asks:
+            return
+        try:
             life.port.to_home(Performed(turn, k, answer))
+        except BadMessage as error:
+            why = f"what it has returned is too large to leave its process: {error.problem}; return where it is instead"
+            life.port.to_home(Performed(turn, k, self._kept(effect, BadReply(effect.key, why))))
+
+    def _kept(self, effect: Effect, error: Exception) -> Answer:
+        """An error as the outcome of an effect, or why it cannot be one."""
+        text = error_text(error)
+        try:
+            if isinstance(error, HoldfastError):
+                return self.recorded.answer_error(error)
+        except Exception as problem:  # It has fields of the user's own, of whatever types.
+            text = f"what it has raised cannot be kept: {error_text(problem)}"
+        return self.recorded.answer_error(EffectFailed(effect.key, 1, type_name(type(error)), text))
 
     # -- stash, links, subscriptions --------------------------------------------------------------------------------
 

@@ -7,16 +7,24 @@ already. Only time and randomness come from the input instead of the world.
 from __future__ import annotations
 
 import asyncio
+import functools
 import hashlib
 import time
 import types
 from collections.abc import Callable, Coroutine, Generator
 from typing import Any, Final, NoReturn, Protocol, TypeAlias, TypeVar
 
-import msgspec
-
 from ...actors.effects import Effect
-from ...actors.errors import ActorStopped, BadMessage, BadReply, ControlFailed, HoldfastError, StartFailed, remote_crash
+from ...actors.errors import (
+    ActorStopped,
+    BadMessage,
+    BadReply,
+    ControlFailed,
+    HoldfastError,
+    StartFailed,
+    remote_crash,
+    type_name,
+)
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.actor import Actor, Start
@@ -55,6 +63,7 @@ from ..protocol import (
     TurnEnd,
     Unsaved,
     pieces,
+    untimed,
 )
 from ..snapshot.image_writer import Imaging
 from ..snapshot.key_variables import StateMismatch, check_keys, restore_state, save_state, variables
@@ -62,7 +71,7 @@ from ..turn_word import WAITS
 from .determinism_guard import DeterminismGuard
 from .life_state import HookTimers, LifeStage, RestoredState, SnapshotState
 from .readonly_guard import check_readonly
-from .recorded_context import RecordedContext
+from .recorded_context import Pending, RecordedContext
 from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
 from .replay_guard import digest_of
 
@@ -107,8 +116,8 @@ class Life:
         self.last_k = 0
         self.asks: dict[tuple[int, int], tuple[asyncio.Future[Any], Awaited]] = {}
         self.pipes = 0
-        self.moment = 0.0  # until which the turn in hand has waited
-        self.resting: set[asyncio.Future[Any]] = set()  # the moments and messages that it waits for
+        self.moment = 0.0  # until which the handler of the turn in hand has waited
+        self.resting = 0  # how many moments and messages it waits for
         self.stash: list[Fed] = []
         self.returned: dict[int, Fed] = {}
         self.is_live = False
@@ -239,36 +248,33 @@ class Life:
         future, kind = waiting
         if future.done():
             return
-        answer = record.answer
         try:
+            answer, when = untimed(record.answer)
+            if when:
+                future.when = when  # type: ignore[attr-defined]  # only what has a time is `Pending`
             if answer.kind in (REPLY, MESSAGE, MOMENT):
                 future.set_result(self._result(answer, kind))
             else:
                 future.set_exception(self.cell.node.codec.decode_error(answer.kind, answer.name, answer.body))
         except Exception as error:
-            name = message_name(kind) if isinstance(kind, type) else kind.key if isinstance(kind, Effect) else "send"
+            name = type_name(kind) if isinstance(kind, type) else kind.key if isinstance(kind, Effect) else "send"
             future.set_exception(BadReply(name, str(error)))
 
     def _result(self, answer: Answer, awaited: Awaited) -> object:
-        """What a turn gets that has waited; its clock moves on to when that came, if it may have waited for long."""
-        codec = self.cell.node.codec
-        if awaited is None:
-            return None  # a `send` that was accepted
-        if isinstance(awaited, type):
-            return codec.decode_reply(awaited, answer.body)
-        if answer.kind == MOMENT:
-            self.moment = msgspec.msgpack.decode(answer.body, type=float)
+        """What a turn gets that has waited."""
+        if awaited is None or answer.kind == MOMENT:
             return None
-        self.moment, body = msgspec.msgpack.decode(answer.body, type=tuple[float, bytes])
+        if isinstance(awaited, type):
+            return self.cell.node.codec.decode_reply(awaited, answer.body)
         if isinstance(awaited, Effect):
-            return decode_value(body)
-        return codec.decode(awaited[answer.name], body)
+            return decode_value(answer.body)
+        return self.cell.node.codec.decode(awaited[answer.name], answer.body)
 
     def _perform(self, turn: int, k: int) -> None:
         """An effect of the turn in hand has no outcome yet."""
         outcome, effect = self.asks.get((turn, k), (None, None))
         ctx = self.cell.ctx
-        if outcome is not None and isinstance(effect, Effect) and isinstance(ctx, RecordedContext):
+        if isinstance(outcome, Pending) and isinstance(effect, Effect) and isinstance(ctx, RecordedContext):
             ctx.perform(turn, k, effect, outcome)
 
     # -- turns ------------------------------------------------------------------------------------------------------
@@ -281,9 +287,7 @@ class Life:
             self.turn += 1
         if self.returned:
             self.returned.pop(feed.id, None)  # It has come again: its feed may have been here before it was put back.
-        self.feed, self.outs, self.last_k, self.moment = feed, [], 0, 0.0
-        if self.resting:
-            self.resting = set()
+        self.feed, self.outs, self.last_k, self.moment, self.resting = feed, [], 0, 0.0, 0
         if self.page is not None:
             self.page[0] = feed.id + 1
 
@@ -335,6 +339,21 @@ class Life:
             if self.returned:
                 self.handle_returned()
 
+    def stop(self, reason: ExitReason) -> None:
+        """End in good order: behind the turn in hand, or in the middle of one that rests, for that may be for days.
+
+        The next life goes on with that. There is no snapshot of such a moment, and `on_stop` is not called in it.
+        """
+        if self.cell.state is not RUNNING:
+            return
+        turn = None if self.cell.more is None else self.cell.more.turn
+        if not self.resting or turn is None or turn.then is not None:
+            self.cell.urge(StopRecorded(self, reason))
+            return
+        self.feed, self.outs = None, []  # What its handler says while it is cancelled does not count.
+        turn.then = functools.partial(lifecycle.finish, self.cell, reason, is_orderly=False)
+        turn.runner.task.cancel()
+
     def ignore(self, why: str) -> None:
         """The actor does not want to be started: turn 0 stays open for the next start."""
         self.feed, self.outs, self.stage.ignored_why = None, [], why
@@ -383,6 +402,10 @@ class Life:
         else:
             self.outs.append(out)
         return k
+
+    def rested(self, _: asyncio.Future[Any]) -> None:
+        """Something has come that a turn has waited for, perhaps an earlier one."""
+        self.resting = max(0, self.resting - 1)
 
     def enter(self, hook: str) -> None:
         """A hook begins that is no turn."""
@@ -621,8 +644,8 @@ class LifePlace(lifecycle.HerePlace):
         self.life = life
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
-        if cell.state is RUNNING and self.life is not None:
-            cell.urge(StopRecorded(self.life, reason))
+        if self.life is not None:
+            self.life.stop(reason)
 
 
 class FedHome(lifecycle.MailboxHome):

@@ -12,7 +12,7 @@ import msgspec
 from ...actors.errors import ControlFailed, StartFailed, StartIgnored
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.address_host import AddressHost
-from ...actors.kernel.cell import DOWN, RUNNING, Cell
+from ...actors.kernel.cell import DOWN, Cell
 from ...actors.kernel.lifecycle import HERE, NEAR
 from ...actors.persistence import child_key
 from ...actors.process.wire import frames
@@ -27,7 +27,6 @@ from ..protocol import (
     ToLife,
 )
 from .child_stub import ChildPlace, RootHome
-from .recorded_inbox import StopRecorded
 from .recorded_life import FED, Life, LifePlace
 
 if TYPE_CHECKING:
@@ -292,8 +291,8 @@ class ChildHere(ChildPlace):
             self.fail(StartFailed(cell.path, str(cell.extra().reason)))
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
-        if cell.state is RUNNING and self.home.life is not None:
-            cell.urge(StopRecorded(self.home.life, reason))
+        if self.home.life is not None:
+            self.home.life.stop(reason)
 
     def kill(self, cell: Cell) -> None:
         if not self.gave_up_start(cell):

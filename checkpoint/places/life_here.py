@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Callable
 
 from ...actors.errors import StartFailed, StartIgnored
+from ...actors.exit_reasons import start_failed
 from ...actors.kernel import lifecycle
 from ...actors.kernel.address_host import AddressHost
 from ...actors.kernel.cell import DOWN, GONE, Cell
@@ -80,7 +81,10 @@ class LifeHere(LifePlace):
                 cell.kill()
                 await cell.ended()
                 raise
-            raise StartFailed(cell.path, error.reason if error.reason != ENDED else str(cell.extra().reason)) from error
+            if error.reason != ENDED:
+                raise
+            failed = start_failed(cell.path, cell.extra().reason)
+            raise failed from failed.__cause__
         self.home.clock = None
 
     def is_up(self, cell: Cell) -> bool:

@@ -54,7 +54,11 @@ class CannotJoin(Refusal):
     why: str
 
 
-class RequestDropped(Refusal):
+class RequestDropped(
+    Refusal,
+    text="a brick of {path} has neither passed request {number} on nor ended it (may_have_run={may_have_run}): "
+    "mend the brick",
+):
     """A brick of the mechanism has neither passed this request on nor ended it.
 
     `may_have_run`: a turn was handled whose outcome was lost in the bricks too, and that may be this one.
@@ -65,7 +69,9 @@ class RequestDropped(Refusal):
     may_have_run: bool = False
 
 
-class ReplyEvicted(Refusal):
+class ReplyEvicted(
+    Refusal, text="{path} has handled request {number}, but does not keep its reply any more: do not ask again blindly"
+):
     """The request was handled, but its reply is not kept any more: the reply log is bounded."""
 
     path: str

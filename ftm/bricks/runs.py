@@ -7,7 +7,6 @@ replica that leads takes it over.
 from __future__ import annotations
 
 import asyncio
-import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
     from .standing import Standing
     from .state_images import Image
 
-_NUMBERS: Final = itertools.count(1)
 MOST_INPUTS: Final = 4096
 """Requests that are remembered: more than can be inside a replica."""
 
@@ -240,7 +238,7 @@ class Shadow(Server):
         node, main = self.standing.node, self.standing.server.cell
         assert main is not None
         assert main.parent is not None
-        name = f"shadow-{next(_NUMBERS)}"
+        name = f"shadow-{node.numbers.next_turn()}"
         cell = node.cell_below(main.parent, name, AddressHost(FED, self, node.ports.here.parent))
         self.standing.server.shadows.add(self)
         cell.spec = child(name, self._recipe)
@@ -270,7 +268,8 @@ class Shadow(Server):
         sent, heard = self._sent.get(life.turn), self.traces.heard
         for out in life.outs:
             outcome = heard.get((life.turn, out.k))
-            is_alike = outcome is not None if sent is None else sent[out.k - 1 : out.k] == [out.digest()]
+            asked = 0 if outcome is None else outcome.asked  # By a turn that has failed, and of which no more is known.
+            is_alike = asked == out.digest() if sent is None else sent[out.k - 1 : out.k] == [out.digest()]
             if is_alike and outcome is not None:
                 life.to_life(outcome)
             elif out.verb in AWAITED and not is_alike:

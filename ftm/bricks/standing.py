@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ...actors.errors import HoldfastError
 from ...checkpoint.protocol import Feed, TurnEnd
+from ..alarms import ProtectionLost
 from .brick_messages import FORWARDED, ConfigMismatch, Logged, Request, StaleLeader
 from .reply_log import ReplyLog
 from .state_comparison import Looking
@@ -39,6 +40,7 @@ class OtherReplica:
         self.state: PeerState = "none"
         self.turn = -2  # the last turn whose state it has acknowledged, -2 if that is not known
         self.forwarded: list[asyncio.Task[bool]] = []  # batches on their way to it
+        self.missed_by = ""  # who has told that there is no other one, since there was one
         self._bricks: dict[str, Outbox] = {}  # by slot
         self._waiting: set[asyncio.Future[Any]] = set()
 
@@ -51,12 +53,18 @@ class OtherReplica:
         """The other replica is this one from now on; nobody waits any longer for another."""
         self.cell = None if path is None else self._node.cell_at(path)
         self.state, self.turn = state if path is not None else "none", turn
+        if self.state == "live":
+            self.caught_up()
         self._bricks.clear()
         self.forwarded = []
         waiting, self._waiting = self._waiting, set()
         for one in waiting:
             if not one.done():
                 one.set_exception(PeerLost("it was replaced, or is gone"))
+
+    def caught_up(self) -> None:
+        """It counts from now on."""
+        self.state, self.missed_by = "live", ""
 
     def brick(self, slot: str) -> Outbox | None:
         """The way to the same brick there, if that was found already."""
@@ -188,6 +196,12 @@ class Standing:
     def address(self) -> str:
         """The address of the protected actor, by which it knows itself on every replica."""
         return protected_at(self.path)
+
+    def go_on_alone(self) -> None:
+        """A reply leaves that no other replica could give again. Told once, until there is another one."""
+        if self.other.missed_by != self.path:
+            self.other.missed_by = self.path
+            self.node.emit(ProtectionLost(self.address, self.path, self.epoch))
 
     def part(self, name: str) -> Cell:
         """The cell of an actor of the mechanism in the root: of its proxy, of its detector."""

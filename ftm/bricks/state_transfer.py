@@ -134,7 +134,7 @@ class Transfer(SealedGate):
                 standing.other.replace(None, "none")
             raise CannotJoin(path=path, why=str(turn))
         if standing.other.path == path:
-            standing.other.state = "live"
+            standing.other.caught_up()
             await self._drain_bricks()  # What left while it joined may have gone home ahead of the state behind it.
         if standing.other.path != path:
             raise CannotJoin(path=path, why="another one has taken its place, or it was given up meanwhile")

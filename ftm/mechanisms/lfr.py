@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 from ...actors.errors import HoldfastError
 from ...actors.kernel.message import Message
 from ...checkpoint.protocol import Outcome, TurnEnd
-from ..alarms import Diverged, NondeterminismFound, ProtectionLost, StatesDiffer
+from ..alarms import Diverged, NondeterminismFound, StatesDiffer
 from ..bricks.brick_messages import FORWARDED, Done, Request, ServerState, Work
 from ..bricks.bricks import After, Before, Brick, Proceed
 from ..bricks.runs import Missing, Shadow, compared_body, digest_of_state
@@ -174,21 +174,14 @@ class Computing(Proceed, Sender):
 class Notifying(After, Sender):
     """After of the leader: outcomes leave when the follower has the requests, and it gets their digests."""
 
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self._was_alone = False
-
     async def after(self, done: Done) -> Done:
         """Wait for the follower to have the requests."""
         standing = self._standing
         if not done.ends:
             return done
         if standing.other.path is None:
-            if not self._was_alone:
-                self._was_alone = True
-                standing.node.emit(ProtectionLost(standing.address, standing.path, standing.epoch))
+            standing.go_on_alone()
             return done
-        self._was_alone = False
         if standing.other.state == "live":
             for task in list(standing.other.forwarded):
                 await task

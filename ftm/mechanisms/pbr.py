@@ -16,7 +16,6 @@ import dataclasses
 from typing import Any, ClassVar
 
 from ...actors.kernel.message import Message
-from ..alarms import ProtectionLost
 from ..bricks.brick_messages import Done, Logged, ServerState, StateDelta
 from ..bricks.bricks import FOREVER, After
 from ..bricks.standing import PeerLost
@@ -40,7 +39,6 @@ class Checkpointing(After):
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self._out: set[asyncio.Task[None]] = set()  # checkpoints that nobody waits for
-        self._was_alone: str | None = None
         self._unheard: list[Logged] = []  # outcomes that the backup may not have: each checkpoint says them again
         self._heard = 0  # how many have stood there before these
 
@@ -51,11 +49,8 @@ class Checkpointing(After):
         standing = self._standing
         if standing.other.path is None:
             self._forget_unheard(self._heard + len(self._unheard))  # Whoever joins is given all of them.
-            if self._was_alone != standing.path:
-                self._was_alone = standing.path
-                standing.node.emit(ProtectionLost(standing.address, standing.path, standing.epoch))
+            standing.go_on_alone()
             return done
-        self._was_alone = None
         captured = await self.state.ask(Capture(standing.other.turn), timeout=FOREVER)
         state = captured.state
         standing.other.turn = state.turn

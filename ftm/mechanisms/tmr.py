@@ -23,7 +23,7 @@ from typing import Any, ClassVar
 import msgspec
 
 from ...actors.errors import ActorStopped, HoldfastError
-from ..alarms import Masked, Outvoted, ProtectionLost
+from ..alarms import Masked, Outvoted
 from ..bricks.brick_messages import Done, NotFollowing, Request, ServerState, StaleLeader, Strayed, is_marker
 from ..bricks.runs import Deciding, Digests, Run, sent_by, turns_of, vote
 from ..bricks.shadow_runs import NEEDS_STATE, Compute, Computed, Helping, Settled
@@ -62,7 +62,6 @@ class Voting(Deciding):
         super().__init__(*args)
         self._point: ServerState | None = None
         self._digest = b""
-        self._was_alone = False
         self._digests = Digests()
         self._strayed: list[str] = []  # replicas that have not got the state behind what leaves next
 
@@ -100,11 +99,9 @@ class Voting(Deciding):
         runs: list[Run | None] = [Run(own.ends, None, digest), *others]
         present = sum(run is not None for run in runs)
         if present == 1:
-            if not self._was_alone:
-                standing.node.emit(ProtectionLost(standing.address, standing.path, standing.epoch))
-            self._was_alone = True
+            standing.go_on_alone()
             return own  # Nobody is left to vote with.
-        self._was_alone = False
+        standing.other.missed_by = ""
         decided = vote(mechanism.voter, runs)
         if isinstance(decided, Undecided):
             return NoMajority(standing.address, decided.why)

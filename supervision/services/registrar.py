@@ -29,7 +29,7 @@ Keys = Literal["unique", "duplicate"]
 
 
 class KeyTaken(Refusal):
-    """A living actor holds this unique key."""
+    """A living actor holds this unique key. `Registry` says it as `AlreadyRegistered`, which names the key."""
 
     holder: ActorRef[Any]
 

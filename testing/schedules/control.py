@@ -329,6 +329,7 @@ class Control:
             if ready is not cells:
                 ready.clear()
                 ready.extend(cells)
+        self._nodes.clear()
 
     # -- who is ready -------------------------------------------------------------------------------------------------
 

@@ -93,6 +93,8 @@ async def test_an_actor_that_cannot_start_says_why_and_leaves_nothing(
             await system.start(hf.child("broken", hf.start(Broken)))
     assert failed.value.actor == "/t/broken"
     assert type(error).__name__ in failed.value.reason
+    cause = failed.value.__cause__
+    assert cause is error or (cause is not None and cause.__cause__ is error)  # A refusal becomes a failed start first.
     assert system.tree() == ["/t"]
     await system.start(hf.child("broken", hf.start(Plain)))  # the name is free
 

@@ -215,8 +215,9 @@ async def test_a_state_that_could_not_be_put_back_is_refused_at_the_first_start(
     kind: type[hf.Actor], problem: str
 ) -> None:
     async with hf.ActorSystem("app", log=False) as system:
-        with pytest.raises(hf.StartFailed, match=problem):
+        with pytest.raises(hf.StartFailed, match=problem) as failed:
             await system.start(hf.child("it", hf.start(kind), recovery=hf.hybrid()))
+        assert isinstance(failed.value.__cause__, hf.errors.StateMismatch)
         if kind is not Fixed:  # No snapshot, nothing to put back.
             assert await system.start(hf.child("it", hf.start(kind), recovery=hf.replay_only()))
 

@@ -11,10 +11,24 @@ from tests.removing import Check, as_tests
 CHECKS = {
     "an effect leaves when all before it is safe": Check(
         "checkpoint/home/outputs.py",
-        "batch.after.append(lambda: home.calls.order(turn, out.k))",
-        "home.calls.order(turn, out.k)",
+        "batch.after.append(lambda: self._begin(turn, key, out, port))",
+        "self._begin(turn, key, out, port)",
         "tests/effects/test_effects.py",
         "test_an_effect_waits_until_all_before_it_is_safe",
+    ),
+    "what a life has wanted to wait for begins with that life only": Check(
+        "checkpoint/home/outputs.py",
+        "home.life.port is not port or (turn, out.k) in home.ledger.outcomes",
+        "False",
+        "tests/effects/test_long_waits.py",
+        "test_what_a_life_wanted_to_wait_for",
+    ),
+    "a workflow that was asked outlives the program": Check(
+        "checkpoint/home/disposal.py",
+        "ledger.released and ledger.lasts and keep_tells",
+        "False",
+        "tests/effects/test_long_waits.py",
+        "test_a_turn_that_was_asked_goes_on_too",
     ),
     "what is made at most once is not made again": Check(
         "checkpoint/home/pending_asks.py",

@@ -167,7 +167,7 @@ async def test_a_script_that_others_may_write_is_not_loaded(
     other = written(folder / "grow.py", GROW)
     folder.chmod(0o777)
     status, _, errors = await holdfast("apply", other, "--socket", path)
-    assert (status, f"{folder} is not loaded: others may write it" in errors) == (UNUSABLE, True)
+    assert (status, f"{folder} is not used: others may write it" in errors) == (UNUSABLE, True)
     assert picture(system) == before
 
 
@@ -183,7 +183,7 @@ def test_a_link_is_followed_to_what_is_checked(grow: Path, tmp_path: Path) -> No
     folder.chmod(0o777)
     link = tmp_path / "link.py"
     link.symlink_to(hidden)
-    with pytest.raises(UntrustedFile, match="shared is not loaded"):
+    with pytest.raises(UntrustedFile, match="shared is not used"):
         read_source(link)
 
 

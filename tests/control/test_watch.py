@@ -87,7 +87,7 @@ async def test_a_loop_that_comes_late_is_told_of(system: hf.ActorSystem) -> None
         await asyncio.sleep(0)
         time.sleep(LIMIT * 4)
         lagged = await event(stream, hf.events.LoopLagged)
-    assert lagged.address == "app"
+    assert lagged.address == "/app"
     assert lagged.seconds > LIMIT
 
 

@@ -104,9 +104,9 @@ class Clerk(hf.Actor):
             options["retry"] = hf.Retry(attempts=3, backoff=hf.Backoff(initial=0.001), on=(ConnectionError,))
         elif how == "slow":
             options |= {"timeout": 0.05, "retry": hf.Retry(attempts=2, backoff=hf.Backoff(initial=0.001))}
-        function = deed_in_thread if name.startswith("t") else deed
-        effect: asyncio.Future[str] = self.ctx.effect(function, file, word, key, **options)
-        return effect
+        if name.startswith("t"):
+            return self.ctx.effect(deed_in_thread, file, word, key, **options)
+        return self.ctx.effect(deed, file, word, key, **options)
 
     @hf.on(Done)
     def read(self, message: Done) -> list[str]:

@@ -11,7 +11,7 @@ __all__ = ["IN_TIME", "Call", "Count", "Go", "Look", "Patient", "patient"]
 
 
 class Go(hf.Message[str]):
-    """Wait, step by step: "s0.5" for seconds, "c" for a Call, "c0.1" for one within seconds; "e" is an effect."""
+    """Wait, step by step: "s0.5" for seconds, "u9" until then, "c" for a Call, "c0.1" with a limit; "e": an effect."""
 
     steps: list[str]
     file: str = ""
@@ -44,6 +44,9 @@ class Patient(hf.Actor):
                 await self.ctx.sleep(float(step[1:]))
                 assert self.ctx.now() >= begin + float(step[1:])
                 said.append("slept")
+            elif step.startswith("u"):
+                await self.ctx.sleep_until(float(step[1:]))
+                said.append("slept")
             elif step == "e":
                 said.append(f"effect {await self.ctx.effect(note, message.file, self.ctx.message_id)}")
             else:
@@ -52,6 +55,7 @@ class Patient(hf.Actor):
                     said.append(f"call {call.word}" if isinstance(call, Call) else "never")
                 except hf.errors.WaitTimeout as error:
                     said.append(str(error))
+                    assert self.ctx.now() >= begin + float(step[1:])
         self.seen.append(", ".join(said))
         return self.seen[-1]
 

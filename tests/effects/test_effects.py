@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import signal
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import pytest
 
 import holdfast as hf
 from tests.checkpoint.test_commits import Slow
-from tests.effects.clerk import IN_TIME, Clerk, Do, Done, clerk, deed, lines, words
+from tests.effects.clerk import IN_TIME, Clerk, Do, Done, No, clerk, deed, lines, words
 
 
 @pytest.fixture
@@ -294,7 +296,7 @@ async def test_an_effect_waits_until_all_before_it_is_safe(tmp_path: Path) -> No
         ref = await system.start(hf.child("careful", hf.start(Careful), recovery=hf.hybrid(interval=1000.0)))
         asked = ref.ask(Begin(), IN_TIME)
         async with asyncio.timeout(IN_TIME):
-            while not goes_on._waiters:  # type: ignore[attr-defined]  # that its turn has come so far
+            while not goes_on._waiters:  # Its turn has not come so far.
                 await asyncio.sleep(0.001)
         engine.let_sync.clear()  # From here on nothing becomes safe.
         goes_on.set()
@@ -303,6 +305,35 @@ async def test_an_effect_waits_until_all_before_it_is_safe(tmp_path: Path) -> No
         engine.let_sync.set()
         assert await asked == 1
         assert made == ["made"]
+
+
+class Hours(hf.Message[float]): ...
+
+
+class Late(hf.Actor):
+    @hf.on(Hours)
+    async def late(self, message: Hours) -> float:
+        begin = self.ctx.now()
+        for how in ("passes", "fails", "refuses"):
+            with contextlib.suppress(hf.HoldfastError):
+                await self.ctx.effect(an_hour, how)
+        await self.ctx.sleep(3600.0)
+        return self.ctx.now() - begin
+
+
+async def an_hour(how: str) -> None:
+    await asyncio.sleep(3600.0)
+    if how == "fails":
+        raise ConnectionError
+    if how == "refuses":
+        raise No("not today")
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_the_clock_of_a_turn_moves_on_whatever_its_effects_come_to() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("late", hf.start(Late), recovery=hf.hybrid(interval=1e6)))
+        assert await ref.ask(Hours(), 5 * 3600.0) == pytest.approx(4 * 3600.0, abs=1.0)
 
 
 class Leave(hf.Message[int]):
@@ -352,3 +383,75 @@ async def test_an_effect_ends_when_its_handler_does_not_wait_any_more() -> None:
         ref = await system.start(hf.child("hasty", hf.start(Hasty), recovery=hf.hybrid(interval=1000.0)))
         assert await ref.ask(Begin(), IN_TIME) == 1
         await asyncio.wait_for(ends.wait(), IN_TIME)
+
+
+class Rotten(BaseException):
+    def __str__(self) -> str:
+        raise KeyboardInterrupt
+
+
+class Locked(hf.Refusal):
+    what: object
+
+
+RAISED: dict[str, tuple[Any, str]] = {
+    "exit": (lambda: SystemExit(3), "SystemExit: 3"),
+    "interrupt": (lambda: KeyboardInterrupt(), "KeyboardInterrupt"),
+    "cancelled": (lambda: asyncio.CancelledError("inside"), "CancelledError: inside"),
+    "generator exit": (lambda: GeneratorExit(), "GeneratorExit"),
+    "base": (lambda: BaseException("base"), "BaseException: base"),
+    "group": (lambda: BaseExceptionGroup("two", [SystemExit(), ValueError()]), "BaseExceptionGroup: two"),
+    "no text": (lambda: Rotten(), "Rotten: <its text cannot be shown: KeyboardInterrupt>"),
+    "no refusal": (lambda: Locked(threading.Lock()), "what it has raised cannot be kept"),
+    "stop": (lambda: StopIteration(3), "StopIteration"),
+    "too large": (None, "too large to leave its process"),
+}
+
+
+def explode(name: str) -> bytes:
+    """Raise that, or return too much for one frame."""
+    made = RAISED[name][0]
+    if made is None:
+        return bytes(200_000_000)
+    raise made()
+
+
+async def explode_async(name: str) -> bytes:
+    """The same, awaited."""
+    return explode(name)
+
+
+class Explode(hf.Message[str]):
+    name: str
+    is_async: bool
+
+
+class Exploding(Clerk):
+    @hf.on(Explode)
+    async def explode(self, message: Explode) -> str:
+        try:
+            if message.is_async:
+                value = await self.ctx.effect(explode_async, message.name)
+            else:
+                value = await self.ctx.effect(explode, message.name)
+        except hf.HoldfastError as error:
+            return str(error)
+        return f"{len(value)} bytes"
+
+
+@pytest.mark.parametrize("is_async", [True, False])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("name", RAISED)
+async def test_whatever_an_effect_raises_is_its_outcome(name: str, isolation: Any, is_async: bool) -> None:
+    """The turn gets it, and neither hangs nor ends its actor; nor does the program end."""
+    async with hf.ActorSystem("app", log=False) as system:
+        spec = hf.child("clerk", hf.start(Exploding), isolation=isolation, recovery=hf.hybrid(interval=1000.0))
+        ref = await system.start(spec)
+        with system.events() as stream:
+            said = await ref.ask(Explode(name, is_async), IN_TIME)
+            if (name, isolation) == ("too large", "task"):
+                assert said == "200000000 bytes"
+            else:
+                assert RAISED[name][1] in said
+            assert await ref.ask(Done(), IN_TIME) == []
+            assert not [event for event in stream.take() if isinstance(event, hf.events.ActorCrashed)]

@@ -10,7 +10,8 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm import LFR, NVP, PBR, RB, TMR, TR
-from tests.effects.clerk import IN_TIME, Clerk, Do, Done, lines, words
+from tests.effects.clerk import IN_TIME, Clerk, Do, Done, deed, lines, words
+from tests.effects.patient import Go, Patient
 
 
 class Second(Clerk):
@@ -25,6 +26,31 @@ class Second(Clerk):
 
 class Third(Clerk):
     """A version that is no different."""
+
+
+class Failing(Clerk):
+    """It has an effect, and raises."""
+
+    @hf.on(Do)
+    async def do(self, message: Do) -> str:
+        await self.effect(message.file, message.words[0])
+        raise RuntimeError("after the effect")
+
+
+class Otherwise(Failing):
+    """It wants another effect than the one that was made."""
+
+    @hf.on(Do)
+    async def do(self, message: Do) -> str:
+        return await self.ctx.effect(deed, message.file, "other", self.ctx.message_id, key="other")
+
+
+class Likewise(Failing):
+    """It wants the same effect, and does not raise."""
+
+    @hf.on(Do)
+    async def do(self, message: Do) -> str:
+        return await self.effect(message.file, message.words[0])
 
 
 def is_second(reply: object) -> bool:
@@ -87,8 +113,43 @@ async def test_whoever_leads_next_goes_on_where_the_last_one_has_died(tmp_path: 
     assert len({line.split()[1] for line in lines(world)}) == 1
 
 
+@pytest.mark.parametrize("recovery", [hf.hybrid(), hf.fresh()])
+async def test_an_alternate_gets_the_outcome_of_its_own_effect_only(tmp_path: Path, recovery: Any) -> None:
+    """One that wants another effect than was made is no run; one that wants the same gets its outcome."""
+    world = str(tmp_path / "world")
+    for alternates, says in (((Likewise,), "a!"), ((Otherwise,), None), ((Otherwise, Likewise), "a!")):
+        async with hf.ActorSystem("app", log=False, intensity=99) as system:
+            stack = RB(alternates=alternates, test=(is_accepted,))
+            ref = await system.start(hf.child("clerk", hf.start(Failing), recovery=recovery, mechanism=stack))
+            for _ in range(2):
+                if says is None:
+                    with pytest.raises(hf.HoldfastError, match="has asked what the first run has not asked"):
+                        await ref.ask(Do(world, ["a"]), IN_TIME)
+                else:
+                    assert await ref.ask(Do(world, ["a"]), IN_TIME) == says
+            assert await ref.ask(Done(), IN_TIME) == []
+    assert words(world) == ["a"] * 6
+
+
+def is_accepted(reply: object) -> bool:
+    return reply is not None
+
+
 async def whole(system: hf.ActorSystem, ref: hf.ActorRef[Clerk]) -> None:
     """Wait until all replicas count."""
     async with asyncio.timeout(IN_TIME):
         while not (await system.protection(ref)).is_whole:
             await asyncio.sleep(0.01)
+
+
+WATCHED = hf.ftm.Detection(interval=0.02, watch_turns=0.2)
+
+
+@pytest.mark.parametrize("mechanism", [PBR(detection=WATCHED), TR(detection=WATCHED)])
+async def test_a_turn_that_rests_is_not_taken_for_one_that_hangs(mechanism: Any) -> None:
+    async with hf.ActorSystem("app", log=False, intensity=99) as system:
+        spec = hf.child("patient", hf.start(Patient), recovery=hf.hybrid(), mechanism=mechanism)
+        ref = await system.start(spec)
+        with system.events() as stream:
+            assert await ref.ask(Go(["s1.5"]), IN_TIME) == "slept"
+            assert not [event for event in stream.take() if isinstance(event, hf.events.TurnHung)]

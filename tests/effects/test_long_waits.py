@@ -13,6 +13,7 @@ import pytest
 import holdfast as hf
 from holdfast.checkpoint.home.recorded_home import switch_of
 from holdfast.testing import advance
+from tests.checkpoint.test_commits import Slow
 from tests.effects.clerk import lines
 from tests.effects.patient import IN_TIME, Call, Count, Go, Look, Never, Patient, patient
 
@@ -25,10 +26,10 @@ def running(tmp_path: Path, durability: str = "memory") -> hf.ActorSystem:
     return hf.ActorSystem("app", log=False, store=store, intensity=99)
 
 
-async def waits(system: hf.ActorSystem) -> None:
+async def waits(system: hf.ActorSystem, path: str = "/app/patient") -> None:
     """Wait until the turn of the patient waits, and its home knows."""
     async with asyncio.timeout(IN_TIME):
-        while not ((home := switch_of(system._node.cell_at("/app/patient"))) and home.long_waits.is_busy):
+        while not ((home := switch_of(system._node.cell_at(path))) and home.long_waits.is_busy):
             await asyncio.sleep(0.001)
 
 
@@ -36,9 +37,9 @@ async def end_of(system: hf.ActorSystem, isolation: str) -> None:
     """End the life in the middle of its turn, and wait until the next one is there."""
     with system.events() as stream:
         if isolation == "process":
-            os.kill(system.pid_of(system.ref("/app/patient", Patient)), signal.SIGKILL)
+            os.kill(system.pid_of(system.ref("/app/patient", hf.Actor)), signal.SIGKILL)
         else:
-            system.ref("/app/patient", Patient).kill()
+            system.ref("/app/patient", hf.Actor).kill()
         async with asyncio.timeout(IN_TIME):
             async for event in stream:
                 if isinstance(event, hf.events.Recovered):
@@ -68,7 +69,7 @@ async def test_days_pass_and_crashes_make_them_no_longer(tmp_path: Path) -> None
 async def test_a_moment_that_has_passed_ends_the_wait_at_once(tmp_path: Path, isolation: str) -> None:
     async with running(tmp_path) as system:
         ref = await system.start(patient(isolation))
-        assert await ref.ask(Go(["s0", "s0.0"]), IN_TIME) == "slept, slept"
+        assert await ref.ask(Go(["s0", "s0.0", "u0.0", "u-5"]), IN_TIME) == "slept, slept, slept, slept"
 
 
 @pytest.mark.parametrize("isolation", ["task", "process"])
@@ -160,13 +161,14 @@ async def test_a_turn_waits_on_whatever_ends(tmp_path: Path, isolation: str, dur
 
 @pytest.mark.parametrize("isolation", ["task", "process"])
 async def test_a_turn_goes_on_in_the_next_program(tmp_path: Path, isolation: str) -> None:
+    """An orderly stop does not wait for it, however long it may."""
     world = str(tmp_path / "world")
     async with running(tmp_path, "os") as system:
-        ref = await system.start(patient(isolation, shutdown=0.05))
+        ref = await system.start(patient(isolation, shutdown="infinity"))
         ref.tell(Go(["e", "c", "s0.3", "c"], world))
         await waits(system)
     async with running(tmp_path, "os") as system:
-        ref = await system.start(patient(isolation, shutdown=0.05))
+        ref = await system.start(patient(isolation, shutdown="infinity"))
         await ref.ask(Call("a"), IN_TIME)
         await waits(system)
     async with running(tmp_path, "os") as system:
@@ -174,6 +176,71 @@ async def test_a_turn_goes_on_in_the_next_program(tmp_path: Path, isolation: str
         ref.tell(Call("b"))
         assert await ref.ask(Look(), IN_TIME) == ["effect 1, call a, slept, call b"]
         assert len(lines(world)) == 1
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("below", ["root", "supervisor", "process"])
+async def test_a_turn_that_was_asked_goes_on_too(tmp_path: Path, isolation: Any, below: str) -> None:
+    """Its asker is told that it has ended; what it has done is not left half done. The stop waits nowhere."""
+    world = str(tmp_path / "world")
+    inner = patient(isolation, shutdown="infinity")
+    spec: Any = inner
+    if below != "root":
+        spec = hf.supervisor("team", children=[inner], isolation="task" if below == "supervisor" else "process")
+    path = "/app/patient" if below == "root" else "/app/team/patient"
+    async with running(tmp_path, "os") as system:
+        await system.start(spec)
+        asked = system.ref(path, Patient).ask(Go(["e", "c", "e"], world), IN_TIME)
+        await waits(system, path)
+    with pytest.raises(hf.AskFailed):
+        await asked
+    async with running(tmp_path, "os") as system:
+        await system.start(spec)
+        ref = system.ref(path, Patient)
+        await ref.ask(Call("a"), IN_TIME)
+        assert await ref.ask(Look(), IN_TIME) == ["effect 1, call a, effect 2"]
+        assert len(lines(world)) == 2
+
+
+class Begin(hf.Message[list[str]]): ...
+
+
+async def test_what_a_life_wanted_to_wait_for_begins_only_with_that_life(tmp_path: Path) -> None:
+    """It ends before its wish is safe; the next one's turn has the message meanwhile."""
+    engine, goes_on = Slow(tmp_path / "app.db"), asyncio.Event()
+    engine.let_sync.set()
+
+    class Gated(hf.Actor):
+        @hf.on(Begin)
+        async def begin(self, message: Begin) -> list[str]:
+            await goes_on.wait()
+            return [(await self.ctx.wait_for(Call)).word for _ in range(3)]
+
+        @hf.on(Call)
+        def call(self, message: Call) -> None: ...
+
+    options: dict[str, Any] = {"store": engine, "durability": "fsync", "log": False, "intensity": 99}
+    async with hf.ActorSystem("app", **options) as system:
+        ref = await system.start(hf.child("patient", hf.start(Gated), recovery=hf.hybrid(interval=1000.0)))
+        asked = ref.ask(Begin(), IN_TIME)
+        await ref.send(Call("a"))
+        async with asyncio.timeout(IN_TIME):
+            while not goes_on._waiters:  # Its turn has not come so far.
+                await asyncio.sleep(0.001)
+        engine.let_sync.clear()
+        goes_on.set()
+        await asyncio.sleep(0.01)
+        with system.events() as stream:
+            ref.kill()
+            async with asyncio.timeout(IN_TIME):
+                async for event in stream:
+                    if isinstance(event, hf.events.Recovered):
+                        break
+        engine.let_sync.set()
+        for word in "bc":
+            await ref.send(Call(word))
+        assert await asked == ["a", "b", "c"]
+        await end_of(system, "task")
 
 
 async def test_a_turn_that_is_over_waits_for_nothing(tmp_path: Path) -> None:

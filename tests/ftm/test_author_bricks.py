@@ -10,7 +10,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.alarms import RequestsDropped
-from holdfast.ftm.bricks.brick_messages import Done, RequestDropped, Work
+from holdfast.ftm.bricks.brick_messages import Done, ReplyEvicted, RequestDropped, Work
 from holdfast.ftm.bricks.bricks import After, Before
 from holdfast.ftm.model.mechanism import Mechanism, Role
 from tests.ftm.accounts import Add, Counter, Tags
@@ -95,12 +95,16 @@ async def test_a_request_that_a_brick_lets_fall_fails_and_is_told(system: hf.Act
     stack = hf.ftm.compose(Guarding(whole=whole), hf.ftm.PBR())
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=stack))
     with system.events() as events:
-        with pytest.raises(RequestDropped):
+        with pytest.raises(RequestDropped, match="has neither passed request 1 on nor ended it"):
             await ref.ask(Add(1, DROPPED), timeout=60)
         (told,) = [one for one in events.take() if isinstance(one, RequestsDropped)]
     assert (told.address, told.numbers.isdecimal()) == (ref.path, True)
     assert await ref.ask(Add(2)) == 1
     assert await ref.ask(Tags()) == [2]
+
+
+def test_a_reply_that_is_not_kept_says_what_not_to_do() -> None:
+    assert str(ReplyEvicted("/app/alice", 3)).endswith("does not keep its reply any more: do not ask again blindly")
 
 
 @pytest.mark.parametrize("below", [hf.ftm.PBR(), hf.ftm.LFR()], ids=["pbr", "lfr"])

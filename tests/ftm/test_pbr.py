@@ -27,7 +27,9 @@ from holdfast.ftm.bricks.letters import Letter
 from holdfast.ftm.bricks.replica_orders import Export, Finish, Install, Join, SetPeer
 from holdfast.ftm.bricks.reply_log import ReplyLog
 from holdfast.ftm.bricks.state_images import image_from
+from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
+from holdfast.ftm.mechanisms.tmr import TMR
 from tests.ftm.replicated import (
     Add,
     Back,
@@ -91,6 +93,23 @@ async def test_a_primary_whose_backup_is_gone_goes_on_alone_and_says_so(system: 
     assert await driver.ask(Add(2)) == 3
     assert [one.replica for one in events.take() if isinstance(one, ProtectionLost)] == [driver.path("r1")]
     events.close()
+
+
+@pytest.mark.parametrize("mechanism", [PBR(), LFR(), TMR()], ids=["pbr", "lfr", "tmr"])
+async def test_who_is_alone_again_says_so_again_though_no_request_came_in_between(
+    system: hf.ActorSystem, mechanism: Any
+) -> None:
+    driver = await pair(system, Total, mechanism)
+    with system.events() as events:
+        for n in range(3):
+            await driver.stop_replica("r2")
+            await driver.protocol("r1").ask(SetPeer(driver.epoch, None))
+            await driver.ask(Add(n))
+            await driver.ask(Add(n))
+            told = [one.replica for one in events.take() if isinstance(one, ProtectionLost)]
+            assert told == [driver.path("r1")]
+            await driver.add("r2")
+            await driver.join("r2")
 
 
 async def test_a_replica_that_joins_later_can_lead(system: hf.ActorSystem) -> None:

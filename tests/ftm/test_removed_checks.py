@@ -16,6 +16,13 @@ SPOILED = "tests/ftm/test_spoiled_states.py"
 RANDOM_HOOKS = "tests/ftm/test_random_hooks.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 CHECKS = {
+    "an alternate gets the outcome of no other effect": Check(
+        "ftm/bricks/runs.py",
+        "is_alike = asked == out.digest()",
+        "is_alike = asked != 0",
+        "tests/effects/test_effects_protected.py",
+        "test_an_alternate_gets_the_outcome_of_its_own",
+    ),
     "T36: a batch of an earlier epoch is refused": Check(
         "ftm/bricks/request_protocol.py",
         "        if work.epoch != standing.epoch or work.config",
@@ -29,6 +36,13 @@ CHECKS = {
         "        if False:\n",
         PBR,
         "test_lower_epochs",
+    ),
+    "who is alone again says so again": Check(
+        "ftm/bricks/standing.py",
+        '        self.state, self.missed_by = "live", ""\n',
+        '        self.state = "live"\n',
+        PBR,
+        "test_who_is_alone_again",
     ),
     "what was replayed is decided before `on_recovered` is called": Check(
         "ftm/bricks/bricks.py",
@@ -179,8 +193,8 @@ CHECKS = {
     ),
     "a run goes on where the first run has not waited for an ask either": Check(
         "ftm/bricks/runs.py",
-        "is_alike = outcome is not None if sent is None else sent[out.k - 1 : out.k] == [out.digest()]",
-        "is_alike = outcome is not None",
+        " if sent is None else sent[out.k - 1 : out.k] == [out.digest()]",
+        "",
         UNAWAITED,
         "test_its_turn_comes_to_the_same",
     ),

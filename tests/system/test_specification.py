@@ -258,7 +258,10 @@ async def test_what_cannot_be_stored_is_told_and_the_next_root_begins_as_the_pro
                 change.add("/app/left", hf.child("y", hf.start(Counter, odd)))
             (told,) = [event for event in stream.take() if isinstance(event, SpecificationNotKept)]
         assert told.address == "/app/left"
-        assert told.why
+        assert told.why == (
+            "child 'y'.fields['start'].args[0]: a value of type function cannot be stored; "
+            "give the actor what it is made from"
+        )
     async with program(tmp_path / "store") as system:
         assert system._node.find("/app/left/x") is None
         assert system._node.find("/app/left/y") is None

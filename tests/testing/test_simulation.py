@@ -1,6 +1,9 @@
 """Deterministic simulation: a seed gives the same run each time, another one another; a failure names its seed."""
 
 import asyncio
+import contextlib
+import random
+import time
 from typing import Any, cast
 
 import pytest
@@ -303,3 +306,25 @@ def test_the_loop_has_its_own_functions_back() -> None:
     trace_of(0)
     assert (loop.run_turns, loop.clock, loop.MOST) == before
     assert loop.run_turns.__name__ == "run_turns"
+
+
+class Endless(hf.Actor):
+    """Its end never comes, whoever cancels it, and no time passes meanwhile."""
+
+    async def on_stop(self, reason: hf.ExitReason) -> None:
+        while True:
+            with contextlib.suppress(asyncio.CancelledError):
+                await asyncio.sleep(0)
+
+
+def test_a_run_that_gives_up_at_its_end_leaves_the_world_as_it_was() -> None:
+    seeding, now, clock = random.seed, time.time(), time.time
+
+    async def whole(system: GuardedSystem) -> None:
+        system.spawn(hf.start(Endless), "endless")
+
+    for _ in range(2):
+        with pytest.raises(hf.HoldfastError):
+            run_schedule(whole, Walk(1), {"system"}, {}, ticks=300)
+        assert (random.seed, time.time) == (seeding, clock)
+        assert 0.0 <= time.time() - now < 60.0

@@ -181,7 +181,7 @@ class Peer:
         try:
             reply = self.codec.reply_decoder(type(ask.message))(frame.body)
         except Exception as error:  # msgspec's own, or what a hook raised: all say that it does not fit.
-            ask.fail(BadReply(message_name(type(ask.message)), str(error)))
+            ask.fail(BadReply(type_name(type(ask.message)), str(error)))
         else:
             ask.answer(reply)
 

@@ -26,8 +26,7 @@ async def test_a_field_of_the_wrong_type_fails_the_ask_by_name(system: hf.ActorS
         await one.ask(Add(wrong))
     assert refused.value.actor == "/app/one"
     assert refused.value.message.endswith("players.Add")
-    assert "Expected `int`, got `str`" in refused.value.problem
-    assert "$[0]" in refused.value.problem or "'n'" in refused.value.problem
+    assert refused.value.problem == "Expected `int`, got `str` - at `n`"
     assert await one.ask(Total()) == 0
 
 
@@ -133,7 +132,7 @@ async def test_a_reply_that_cannot_be_sent_fails_the_ask(system: hf.ActorSystem,
 
 async def test_a_reply_of_the_wrong_type_fails_the_ask(system: hf.ActorSystem) -> None:
     one = await start(system, Liar)
-    with pytest.raises(hf.errors.BadReply, match="Expected `int`, got `str`"):
+    with pytest.raises(hf.errors.BadReply, match=r"players\.Total: Expected `int`, got `str`"):
         await one.ask(Total())
 
 

@@ -89,7 +89,7 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
 
 
 async def diagnosed(system: hf.ActorSystem) -> hf.ActorRef[DiagnoserActor]:
-    found = await generate(system._node)
+    found = await generate(system)
     await system.start(tree(found.declaration, observers_for(found, window=1.0, manner=Manner(every=0.5))))
     await advance(10.0)
     return system.ref("/shop/diagnosis/diagnoser", DiagnoserActor)
@@ -100,7 +100,7 @@ def causes(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
 
 
 async def test_the_runtime_knows_who_publishes_subscribes_is_bound_and_is_supervised(system: hf.ActorSystem) -> None:
-    found = await generate(system._node)
+    found = await generate(system)
     assert found.addresses == {
         "desk/ledger": "/shop/desk/ledger",
         "desk/matcher": "/shop/desk/matcher",
@@ -121,7 +121,7 @@ async def test_the_runtime_knows_who_publishes_subscribes_is_bound_and_is_superv
 async def test_to_look_leaves_nothing_behind_and_a_second_look_finds_no_diagnosis(system: hf.ActorSystem) -> None:
     await diagnosed(system)
     before = set(system._node.root.children or ())  # type: ignore[union-attr]
-    again = await generate(system._node)
+    again = await generate(system)
     assert set(again.addresses) == {"desk/ledger", "desk/matcher", "gateway", "feed"}
     assert set(system._node.root.children or ()) == before  # type: ignore[union-attr]
 
@@ -135,12 +135,12 @@ async def test_who_looks_after_the_system_and_who_comes_and_goes_is_no_component
     await system.start(hf.child("recorded", hf.start(Ledger), recovery=hf.hybrid()))
     await system.start(hf.child("job", hf.start(Ledger), restart="temporary"))
     system.spawn(hf.start(Ledger), "unsupervised")
-    found = await generate(system._node, seconds=0.5, leave_out=["/shop/desk"])
+    found = await generate(system, seconds=0.5, leave_out=["/shop/desk"])
     assert set(found.addresses) == {"gateway", "feed", "recorded"}
 
 
 async def test_a_restart_is_no_fault(system: hf.ActorSystem) -> None:
-    found = await generate(system._node)
+    found = await generate(system)
     await system.start(tree(found.declaration, observers_for(found)))
     await advance(15.5)
     heard = probe(system)

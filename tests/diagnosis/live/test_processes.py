@@ -57,9 +57,9 @@ async def test_what_a_process_publishes_is_heard(system: hf.ActorSystem) -> None
 
 async def test_who_publishes_from_a_process_is_known(system: hf.ActorSystem) -> None:
     await system.start(hf.child("other", hf.start(Other), isolation="process"))
-    found = await generate(system._node, seconds=1.0)
+    found = await generate(system, seconds=1.0)
     for _ in range(20):  # on a busy machine a second may be too short to hear anybody
         if not found.wiring["heart"].publishes:
-            found = await generate(system._node, seconds=1.0)
+            found = await generate(system, seconds=1.0)
     assert found.wiring["heart"].publishes == ("/beat",)
     assert found.wiring["other"].subscribes == ("/beat",)
