@@ -40,7 +40,7 @@ from .actors.kernel.context import StashError
 from .actors.kernel.message import Refusal, UnknownRefusal
 from .actors.process.program.external_program import ProgramFailed
 from .checkpoint.home.quarantine import NotQuarantined
-from .checkpoint.journal import DamagedStore, ForeignStore, StaleEpoch, StoreFailed, StoreInUse
+from .checkpoint.journal import DamagedStore, ForeignStore, NotCopied, StaleEpoch, StoreFailed, StoreInUse
 from .checkpoint.life.determinism_guard import NotDeterministic
 from .checkpoint.life.readonly_guard import NotReadonly
 from .checkpoint.life.replay_guard import StateDiverged
@@ -109,6 +109,7 @@ __all__ = [
     "NoSuchGroup",
     "NotAccepted",
     "NotAnActor",
+    "NotCopied",
     "NotDeterministic",
     "NotGranted",
     "NotQuarantined",

@@ -48,11 +48,15 @@ def compressor(level: bool | int) -> Compress:
     return compress
 
 
+class LibraryMissing(ValueError):
+    """The bytes may be good, but nobody here can decompress them."""
+
+
 def decompress(codec: int, data: bytes, length: int) -> bytes:
     """What `compressor` made smaller.
 
     Raises:
-        ValueError: the bytes are damaged, or the library is not there.
+        ValueError: the bytes are damaged. LibraryMissing: the library is not there.
     """
     if codec == PLAIN:
         return data
@@ -61,7 +65,7 @@ def decompress(codec: int, data: bytes, length: int) -> bytes:
     try:
         library = _library("compress")
     except SpecError as error:
-        raise ValueError(str(error)) from error
+        raise LibraryMissing(str(error)) from error
     try:
         return bytes(library.ZstdDecompressor().decompress(data, max_output_size=length))
     except library.ZstdError as error:

@@ -22,10 +22,15 @@ class Called:
 
     An exception of a foreign kind becomes StoreFailed. If `append` or `sync` raised it, nobody knows what was written:
     from then on everything that writes is refused (T13), until the store is opened again.
+
+    Args:
+        engine: to be called.
+        file: the database of its store, if that is one of ours on the disk.
     """
 
-    def __init__(self, engine: Journal) -> None:
+    def __init__(self, engine: Journal, file: str | None = None) -> None:
         self._engine = engine
+        self.file = file
         self._name = str(getattr(engine, "path", type(engine).__qualname__))
         self._failure: StoreFailed | None = None
         self.keys: dict[str, str] = {}

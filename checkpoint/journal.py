@@ -18,6 +18,7 @@ __all__ = [
     "ForeignStore",
     "Journal",
     "MemoryJournal",
+    "NotCopied",
     "Primitive",
     "Saved",
     "StaleEpoch",
@@ -89,6 +90,15 @@ class ForeignStore(
 
     path: str
     part: str
+    problem: str
+    remedy: str
+
+
+class NotCopied(StoreError, text="store {path} was not copied to {dest}: {problem}; {remedy}"):
+    """A backup or a restore was refused or has failed: nothing of it was left behind, and nothing was overwritten."""
+
+    path: str
+    dest: str
     problem: str
     remedy: str
 
@@ -220,6 +230,11 @@ class StoreEngine(Journal, Protocol):
     """A journal with what only some engines have, and a default for those that have it not."""
 
     @property
+    def file(self) -> str | None:
+        """The database of the store, if that is one of holdfast's own on the disk."""
+        ...
+
+    @property
     def in_hand(self) -> InHand | None:
         """Which inputs are in hand, if the engine keeps that."""
         ...
@@ -258,6 +273,7 @@ class MemoryJournal:
 
     __slots__ = ("_last", "_notes", "durable", "epoch")
     in_hand = None
+    file = None
 
     def __init__(self) -> None:
         self.durable = False

@@ -29,7 +29,8 @@ def open_journal(store: str | Journal | None, *, takeover: bool = False) -> Stor
         raise SpecError("store", f"{store!r} must name a file in a folder that is there")
     from .sqlite import SqliteJournal  # only now: sqlite3 takes a while to import, and most tests need no store
 
-    return Called(SqliteJournal(path, takeover=takeover))
+    engine = SqliteJournal(path, takeover=takeover)
+    return Called(engine, engine.path)
 
 
 def check_system(journal: Journal, system: str) -> None:

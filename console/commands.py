@@ -11,6 +11,7 @@ from rich.console import Console
 
 from .. import HoldfastError, run
 from . import operate
+from .store_commands import store
 
 commands = typer.Typer(
     name="holdfast",
@@ -73,3 +74,4 @@ def demo(
 commands.command()(operate.apply)
 commands.command()(operate.tree)
 commands.command()(operate.status)
+commands.add_typer(store)

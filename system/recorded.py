@@ -1,9 +1,11 @@
-"""A system's methods for recorded actors: quarantine, and group snapshots."""
+"""A system's methods for recorded actors: quarantine, backups, and group snapshots."""
 
 from __future__ import annotations
 
+import asyncio
+import os
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.ref import ActorRef
@@ -12,6 +14,9 @@ from ..checkpoint.home.homes import Homes
 from ..checkpoint.home.quarantine import QuarantinedMessage
 from ..supervision.admin import RestartChild, TerminateChild, WhichChildren
 from ..supervision.supervisor import Supervisor
+
+if TYPE_CHECKING:
+    from ..checkpoint.store_tools import StoreCopy
 
 
 class Recorded:
@@ -46,6 +51,26 @@ class Recorded:
             NotQuarantined: it was tried again, dropped or erased meanwhile.
         """
         self._homes.quarantine.drop(message)
+
+    async def backup(self, path: str | os.PathLike[str]) -> StoreCopy:
+        """Copy the store of this system as it is now, while the system goes on; a thread does it.
+
+        All that was acknowledged before the call is in the copy, which is a store of its own: `holdfast store restore`
+        brings it back. Cancelling does not end the thread: the copy is then finished all the same.
+
+        Args:
+            path: the database of the copy. Neither it nor anything of a store may be there; its folder must be.
+
+        Raises:
+            SpecError: the system has no store of the form "sqlite:PATH". NotCopied: there is something at `path`, or no
+                room. StoreError: the store cannot be read, or is damaged.
+        """
+        from ..checkpoint.store_tools import back_up_store  # only now: sqlite3 takes a while to import
+
+        file = self._homes.journal.engine.file
+        if file is None:
+            raise SpecError("backup", "needs a system with a store on the disk: store='sqlite:PATH'")
+        return await asyncio.to_thread(back_up_store, file, path)
 
     async def checkpoint_group(self, actors: Sequence[ActorRef[Any] | str], *, name: str) -> None:
         """Keep one consistent cut of several recorded actors: their states, and the messages between them (R78).

@@ -7,21 +7,33 @@ the mark's code is that of the type, and the rest of the list are the value's pa
 The bytes: version, flag; with flag 0 a msgpack tree without marks; with flag 1 the length of the tree (8 bytes, big
 endian), the tree, and the raw buffers that its marks mention, in that order.
 
-`value_writer.py` lowers and packs, `value_reader.py` unpacks and makes again. What they both know of the types is in
-`forms.py` (the builtin ones), `classes.py` (those of users) and `arrays.py` (numpy's).
+`value_writer.py` lowers and packs, `value_reader.py` unpacks and makes again, `value_describer.py` says what would be
+made. What they know of the types is in `forms.py` (the builtin ones), `classes.py` (those of users) and `arrays.py`
+(numpy's).
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 
 from ..errors import DamagedValue, UnsavableValue
 from .budget import LargeInts, TooMany, check_containers
 from .forms import FORMAT, HEAD
+from .value_describer import Describer, ValueDescription
 from .value_reader import Decoder, unpack
 from .value_writer import pieces, walked_pieces
 
-__all__ = ["DamagedValue", "UnsavableValue", "decode_value", "encode_value", "state_digest", "walked_pieces"]
+__all__ = [
+    "DamagedValue",
+    "ValueDescription",
+    "UnsavableValue",
+    "decode_value",
+    "describe_value",
+    "encode_value",
+    "state_digest",
+    "walked_pieces",
+]
 
 
 def encode_value(value: object, *, where: str = "value") -> bytes:
@@ -87,6 +99,19 @@ def decode_value(data: bytes | memoryview, *, imports: bool = True) -> object:
     Traceback (most recent call last):
     holdfast.actors.errors.DamagedValue: a saved value cannot be read: it is cut short; use an older one
     """
+    return _read(data, lambda buffers: Decoder(buffers, imports=imports), is_checked=not imports)
+
+
+def describe_value(data: bytes | memoryview) -> object:
+    """Read what `encode_value` wrote without importing anything: each instance of a class is a `ValueDescription`.
+
+    Raises:
+        DamagedValue: whatever is wrong with the bytes, or numpy is needed and not there.
+    """
+    return _read(data, Describer, is_checked=False)
+
+
+def _read(data: bytes | memoryview, decoder: Callable[[memoryview], Decoder], *, is_checked: bool) -> object:
     view = memoryview(data).cast("B")
     if len(view) < 2:
         raise DamagedValue("it is cut short")
@@ -96,11 +121,11 @@ def decode_value(data: bytes | memoryview, *, imports: bool = True) -> object:
         is_plain = view[1] == 0
         begin, end = (2, len(view)) if is_plain else (HEAD.size, HEAD.size + HEAD.unpack_from(view)[2])
         tree = view[begin:end]
-        if not imports:
+        if is_checked:
             check_containers(tree)
         if is_plain:
             return unpack(tree, ext_hook=LargeInts().make)
-        return Decoder(view[end:], imports=imports).value(tree)
+        return decoder(view[end:]).value(tree)
     except TooMany as error:
         raise DamagedValue(str(error)) from error
     except (DamagedValue, MemoryError):  # Out of memory is no damage: the bytes may be good.

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final
 
 import msgspec
@@ -151,8 +151,10 @@ def is_image(data: bytes | memoryview) -> bool:
     return len(data) > 0 and data[0] == IMAGE
 
 
-def read_image(data: bytes | memoryview) -> tuple[int, str, object]:
-    """Schema version, form and state of an image.
+def read_image(
+    data: bytes | memoryview, read: Callable[[memoryview], object] = decode_value
+) -> tuple[int, str, object]:
+    """Schema version, form and state of an image; `read` makes the variables of their bytes.
 
     Raises:
         DamagedValue: whatever is wrong with the bytes.
@@ -168,7 +170,7 @@ def read_image(data: bytes | memoryview) -> tuple[int, str, object]:
         raise DamagedValue("its sections are not as long as its head says")
     state: dict[str, Any] = {}
     for names, size in head.sections:
-        value = decode_value(view[at : at + size])
+        value = read(view[at : at + size])
         at += size
         if not names:
             return head.version, head.form, value

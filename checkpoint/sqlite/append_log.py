@@ -17,7 +17,7 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import count
 from typing import Final, TypeAlias
@@ -101,10 +101,7 @@ class FrontLog:
         return [os.path.join(self.folder, name) for name in os.listdir(self.folder) if _NAME.fullmatch(name)]
 
     def read(self, names: Sequence[str]) -> Iterator[list[Row]]:
-        """Keep everybody else from writing to these files; then give what was appended as one, oldest first.
-
-        What is damaged ends its file: whether it was acknowledged, the mark knows.
-        """
+        """Keep everybody else from writing to these files; then give what was appended as one, oldest first."""
         for name in names:
             fd = os.open(name, os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
             try:
@@ -112,17 +109,16 @@ class FrontLog:
                 os.pwrite(fd, _SEAL.pack(1), 0)
             finally:
                 os.close(fd)
-        found: list[tuple[int, int, bytes]] = []
-        for name in names:
-            data = read_own(name)
-            start = _SEAL.size + _HEAD.size
-            if len(data) < start + _CRC.size:
-                continue
-            magic, epoch, generation = _HEAD.unpack_from(data, _SEAL.size)
-            if magic == _MAGIC and _CRC.unpack_from(data, start)[0] == zlib.crc32(data[_SEAL.size : start]):
-                found.append((epoch, generation, data))
-        for _, _, data in sorted(found, key=lambda one: one[:2]):
-            yield from _records(data)
+        yield from batches_in([read_own(name) for name in names])
+
+    def look(self) -> list[list[Row]]:
+        """What was appended as one, oldest first, while others may write; what goes meanwhile is in the database."""
+        contents: list[bytes] = []
+        with contextlib.suppress(FileNotFoundError):
+            for name in self.left():
+                with contextlib.suppress(FileNotFoundError):
+                    contents.append(read_own(name))
+        return list(batches_in(contents))
 
     def remove(self, names: Sequence[str]) -> None:
         """Remove these files for good."""
@@ -168,6 +164,17 @@ class FrontLog:
         self._at, self._crc, self._head = at + size, crc, b""
         self.size += size
         self.rows += rows
+
+    def lost(self) -> str:
+        """Which of the files is not in its place any more, in words; "" if all are."""
+        for file in self._files:
+            try:
+                found = os.stat(file.name).st_ino
+            except FileNotFoundError:
+                return f"{file.name} was deleted or moved while the store was open"
+            if found != os.fstat(file.fd).st_ino:
+                return f"{file.name} was replaced while the store was open"
+        return ""
 
     @property
     def is_due(self) -> bool:
@@ -251,6 +258,35 @@ class FrontLog:
             if remove:
                 with contextlib.suppress(OSError):  # The database says that they do not count.
                     os.unlink(file.name)
+
+
+def batches_in(files: Sequence[bytes]) -> Iterator[list[Row]]:
+    """What was appended as one, oldest first, from the contents of logs.
+
+    What is damaged ends its file: whether it was acknowledged, the mark knows.
+    """
+    found: list[tuple[int, int, bytes]] = []
+    start = _SEAL.size + _HEAD.size
+    for data in files:
+        if len(data) < start + _CRC.size:
+            continue
+        magic, epoch, generation = _HEAD.unpack_from(data, _SEAL.size)
+        if magic == _MAGIC and _CRC.unpack_from(data, start)[0] == zlib.crc32(data[_SEAL.size : start]):
+            found.append((epoch, generation, data))
+    for _, _, data in sorted(found, key=lambda one: one[:2]):
+        yield from _records(data)
+
+
+def following(batches: Iterable[list[Row]], last: int) -> list[Row]:
+    """The rows of these batches that go on behind the newest position of the database."""
+    rows: list[Row] = []
+    for batch in batches:
+        if batch[0][0] == last + 1:
+            rows += batch
+            last = batch[-1][0]
+        elif batch[-1][0] > last:
+            break  # A power loss has taken what was before it: the mark knows whether it may be missing.
+    return rows
 
 
 def _records(data: bytes) -> Iterator[list[Row]]:

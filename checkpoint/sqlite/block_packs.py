@@ -12,11 +12,11 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Collection, Generator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from hashlib import blake2b
 from typing import Final
 
-from ..compression import PLAIN, compressor, decompress
+from ..compression import PLAIN, LibraryMissing, compressor, decompress
 from ..journal import DamagedStore, StoreFailed
 from ..snapshot.shared_blocks import PAGE, Segment, memory_file
 from .snapshot_files import no_link, refuse_shared, write_durably
@@ -56,7 +56,7 @@ class Packs:
                     self._parts.mark(one)
                 if os.path.islink(one):
                     raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), one)
-            write_durably(self._file(address, number), parts)
+            write_durably(self.file(address, number), parts)
         except OSError as error:
             raise StoreFailed(self.path, f"snapshot not written: {error}; older one and journal stay") from error
 
@@ -66,32 +66,50 @@ class Packs:
         Raises:
             DamagedStore: one is missing or damaged.
         """
-        name = self._file(address, number)
-        wanted = set(places)
+        name = self.file(address, number)
         file = memory_file(number)
         try:
-            with open(name, "rb", opener=no_link) as pack:
-                refuse_shared(name, os.fstat(pack.fileno()))
-                if pack.read(len(_MAGIC)) != _MAGIC:
-                    raise ValueError("it is no pack")
-                while wanted and (head := pack.read(_HEAD.size)):
-                    offset, length, stored, codec, crc = _HEAD.unpack(head)
-                    data = pack.read(stored)
-                    if (offset, length) not in wanted:
-                        continue
-                    block = data if codec == PLAIN else decompress(codec, data, length)
-                    if len(block) != length or zlib.crc32(block, zlib.crc32(head[:-4])) != crc:
-                        raise ValueError(f"the checksum of the block at {offset} is wrong")
-                    os.pwrite(file, block, offset)
-                    wanted.discard((offset, length))
-            if wanted:
-                raise ValueError(f"the block at {min(wanted)[0]} is missing")
+            for offset, block in _blocks(name, set(places)):
+                os.pwrite(file, block, offset)
             end = max((offset + length for offset, length in places), default=0)
             os.ftruncate(file, -(-end // PAGE) * PAGE)
             return Segment(number, file)
         except (OSError, ValueError, struct.error) as error:
             os.close(file)
             raise DamagedStore(self.path, address, None, f"snapshot file {name}: {error}") from error
+
+    def check(self, address: str, number: int, places: Collection[tuple[int, int]]) -> None:
+        """Verify the blocks at these (offset, length).
+
+        Raises:
+            DamagedStore: one is missing or damaged. StoreFailed: the library that it was compressed with is missing.
+        """
+        name = self.file(address, number)
+        try:
+            for _ in _blocks(name, set(places)):
+                pass
+        except LibraryMissing as error:
+            raise StoreFailed(self.path, str(error)) from error
+        except (OSError, ValueError, struct.error) as error:
+            raise DamagedStore(self.path, address, None, f"snapshot file {name}: {error}") from error
+
+    def state(self, address: str, places: Sequence[tuple[int, int, int]]) -> bytes:
+        """Put together what lies in these blocks: pack, offset, length.
+
+        Raises:
+            DamagedStore, StoreFailed: as `check`.
+        """
+        blocks: dict[tuple[int, int], bytes] = {}
+        for number in dict.fromkeys(number for number, _, _ in places):
+            name = self.file(address, number)
+            wanted = {(offset, length) for pack, offset, length in places if pack == number}
+            try:
+                blocks.update(((number, offset), block) for offset, block in _blocks(name, wanted))
+            except LibraryMissing as error:
+                raise StoreFailed(self.path, str(error)) from error
+            except (OSError, ValueError, struct.error) as error:
+                raise DamagedStore(self.path, address, None, f"snapshot file {name}: {error}") from error
+        return b"".join(blocks[number, offset] for number, offset, _ in places)
 
     def names(self, address: str) -> set[int]:
         """The packs of an address."""
@@ -110,7 +128,7 @@ class Packs:
         with self._refusing():
             for number in numbers:
                 with contextlib.suppress(FileNotFoundError):
-                    os.unlink(self._file(address, number))
+                    os.unlink(self.file(address, number))
 
     def erase(self, address: str) -> None:
         """Remove all packs of an address, and what was left half made.
@@ -137,5 +155,30 @@ class Packs:
     def _folder(self, address: str) -> str:
         return os.path.join(self.folder, blake2b(address.encode(errors="surrogatepass"), digest_size=12).hexdigest())
 
-    def _file(self, address: str, number: int) -> str:
+    def file(self, address: str, number: int) -> str:
+        """Where a pack is."""
         return os.path.join(self._folder(address), f"{number:x}.pack")
+
+
+def _blocks(name: str, wanted: set[tuple[int, int]]) -> Iterator[tuple[int, bytes]]:
+    """The verified blocks of a pack that are wanted, as (offset, length), each with its offset.
+
+    Raises:
+        OSError, ValueError, struct.error: one is missing or damaged.
+    """
+    with open(name, "rb", opener=no_link) as pack:
+        refuse_shared(name, os.fstat(pack.fileno()))
+        if pack.read(len(_MAGIC)) != _MAGIC:
+            raise ValueError("it is no pack")
+        while wanted and (head := pack.read(_HEAD.size)):
+            offset, length, stored, codec, crc = _HEAD.unpack(head)
+            data = pack.read(stored)
+            if (offset, length) not in wanted:
+                continue
+            block = data if codec == PLAIN else decompress(codec, data, length)
+            if len(block) != length or zlib.crc32(block, zlib.crc32(head[:-4])) != crc:
+                raise ValueError(f"the checksum of the block at {offset} is wrong")
+            yield offset, block
+            wanted.discard((offset, length))
+    if wanted:
+        raise ValueError(f"the block at {min(wanted)[0]} is missing")

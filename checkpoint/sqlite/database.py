@@ -70,17 +70,21 @@ def connect(path: str) -> sqlite3.Connection:
         check_same_thread=False,
     )
     # A flipped bit may make a blob a text that is not UTF-8: leave it to the checksums.
-    db.text_factory = _text
+    db.text_factory = text_of
     db.execute("PRAGMA wal_autocheckpoint = 0")  # It would sync the disk within an append: see `Store._checkpoint`.
     return db
 
 
-def refuse_foreign(db: sqlite3.Connection, path: str) -> None:
-    """Refuse a file that is not ours."""
+def refuse_foreign(db: sqlite3.Connection, path: str, *, is_wal: bool = True) -> None:
+    """Refuse a file that is not ours; not `is_wal`: the connection takes it for one that nobody writes.
+
+    Raises:
+        DamagedStore: saying what it is instead.
+    """
     (application,) = db.execute("PRAGMA application_id").fetchone()
     (version,) = db.execute("PRAGMA user_version").fetchone()
     (mode,) = db.execute("PRAGMA journal_mode").fetchone()
-    if application != _APPLICATION or mode != "wal":
+    if application != _APPLICATION or (is_wal and mode != "wal"):
         raise DamagedStore(path, None, None, "this is not a holdfast store")
     if version not in (VERSION, VERSION_WITH_LOG):
         reason = f"its format is {version}, this holdfast reads {VERSION} and {VERSION_WITH_LOG}"
@@ -97,7 +101,8 @@ def refuse_broken(db: sqlite3.Connection, path: str) -> None:
         raise DamagedStore(path, None, None, str(verdict))
 
 
-def _text(data: bytes) -> str:
+def text_of(data: bytes) -> str:
+    """A text as SQLite has it, also where it is none: the checksums judge it."""
     return data.decode(errors="surrogateescape")
 
 

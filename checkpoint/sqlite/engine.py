@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sqlite3
 import zlib
@@ -297,6 +298,18 @@ class SqliteJournal:
                     raise DamagedStore(self.path, address, None, translated.reason) from error
                 raise translated from error
 
+    def snapshots(self, address: str) -> list[bytes]:
+        """All snapshots of an address that are kept, oldest first.
+
+        Raises:
+            DamagedStore: one of them cannot be read.
+        """
+        with self._store.read_lock, self._store.view(address) as view:
+            if view is None:
+                return []
+            chain, _, kept = view
+            return [self._reader.read_snapshot(chain, number)[0] for number in kept]
+
     def erase(self, address: str) -> None:
         """Forget everything about the address; see `Journal`."""
         with self._store.lock:
@@ -338,6 +351,29 @@ class SqliteJournal:
             pass  # Somebody else may own the store by now: then the packs are theirs.
         self._store.sync_rows()
         self._packs.remove(address, unneeded)
+
+    def compact(self) -> None:
+        """Give back the room of what is not needed: entries that the oldest snapshot contains, and free pages.
+
+        The database is written anew within one transaction, which takes as much room again for as long as it lasts.
+
+        Raises:
+            StoreFailed: there is no room; all is as it was.
+        """
+        store = self._store
+        with store.lock:
+            store.refresh()
+            for chain in store.contents.chains.values():
+                if chain.kept and chain.damage is None:
+                    with contextlib.suppress(DamagedStore):  # Then it stays as it is, to be looked at.
+                        self._remove_dropped(chain, chain.kept[0])
+            with store.transaction(note=True):
+                pass
+            try:
+                store.db.execute("VACUUM")
+                store.db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+            except sqlite3.Error as error:
+                raise store.translate(error) from error
 
     def _finish_erase(self, chain: Chain) -> None:
         while chain.positions:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sqlite3
 from array import array
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 from ..journal import DamagedStore
+from .append_log import Row
 from .row_codec import crc_of
-from .store_parts import NOTE
+from .store_parts import is_hidden
 
 MODULUS: Final = 1 << 62  # SQLite integers end at 2**63
 
@@ -58,18 +60,48 @@ class StoreContents:
     last: int  # newest position ever handed out
     live: int  # rows in `entries`
 
-
-class StoreScan:
-    """One look at the whole file."""
-
-    def __init__(self, db: sqlite3.Connection, path: str) -> None:
-        self._db, self._path = db, path
-
-    def contents(self) -> StoreContents:
-        """Find where each address has its entries, and verify that none is missing.
+    def take_in(self, rows: Sequence[Row], path: str) -> None:
+        """Take in what is in the log of the store at `path`.
 
         Raises:
-            DamagedStore: something is wrong that cannot be laid to one address; else its chain says so (`damage`).
+            DamagedStore: an entry belongs to no address.
+        """
+        chains = {chain.id: chain for chain in self.chains.values()}
+        for position, key, number, *_ in rows:
+            chain = chains.get(key)
+            if chain is None:
+                raise DamagedStore(path, None, position, "the entry belongs to no address")
+            if number != chain.last + 1 and chain.damage is None:
+                chain.damage = DamagedStore(path, chain.path, position, "entries are missing")
+            chain.last = number
+            chain.positions.append(position)
+        if rows:
+            self.last = rows[-1][0]
+            self.live += len(rows)
+
+
+def refuse(damage: DamagedStore) -> None:
+    """Have a scan end at the first damage that cannot be laid to one address."""
+    raise damage
+
+
+class StoreScan:
+    """One look at the whole file.
+
+    Args:
+        db: reads it.
+        path: of the store.
+        tell: is told what is damaged and cannot be laid to one address; what it does not raise is passed over.
+    """
+
+    def __init__(self, db: sqlite3.Connection, path: str, tell: Callable[[DamagedStore], None] = refuse) -> None:
+        self._db, self._path, self._tell = db, path, tell
+
+    def contents(self) -> StoreContents:
+        """Find where each address has its entries, and verify that none is missing: else its chain says so (`damage`).
+
+        Raises:
+            DamagedStore: as `tell`.
         """
         floor, live = self._db.execute("SELECT floor, live FROM store").fetchone()
         chains = self._addresses()
@@ -79,7 +111,7 @@ class StoreScan:
         last = max(last, floor)
         if total != live + last - floor and not any(chain.damage for chain in chains.values()):
             reason = f"there should be {live + last - floor} entries, there are {total}"
-            raise DamagedStore(self._path, None, None, reason)
+            self._tell(DamagedStore(self._path, None, None, reason))
         known = {chain.path: chain for chain in chains.values() if chain.path is not None}
         erased = [chain for chain in chains.values() if chain.path is None]
         return StoreContents(known, erased, self._notes(), last, total)
@@ -88,13 +120,15 @@ class StoreScan:
         chains: dict[int, Chain] = {}
         for *fields, crc in self._db.execute("SELECT id, path, removed, removed_sum, floor, kept, crc FROM addresses"):
             if crc_of(*fields) != crc:
-                raise DamagedStore(self._path, str(fields[1]), None, "the checksum of the row of the address is wrong")
+                problem = "the checksum of the row of the address is wrong"
+                self._tell(DamagedStore(self._path, str(fields[1]), None, problem))
+                continue
             number, path, removed, removed_sum, floor, kept = fields
             ids = [int(snapshot) for snapshot in kept.split(",") if snapshot]
             chains[number] = Chain(number, path, removed, removed_sum, floor, ids)
         for number, address in self._db.execute("SELECT id, address FROM snapshots"):
             if address not in chains:
-                raise DamagedStore(self._path, None, None, f"snapshot {number} belongs to no address")
+                self._tell(DamagedStore(self._path, None, None, f"snapshot {number} belongs to no address"))
         return chains
 
     def _entries(self, chains: dict[int, Chain]) -> tuple[int, int]:
@@ -105,7 +139,8 @@ class StoreScan:
         ):
             chain = chains.get(address)
             if chain is None or type(number) is not int:
-                raise DamagedStore(self._path, None, position, "the entry belongs to no address")
+                self._tell(DamagedStore(self._path, None, position, "the entry belongs to no address"))
+                continue
             if number <= chain.last and chain.damage is None:
                 chain.damage = DamagedStore(self._path, chain.path, position, "the entry is out of order")
             chain.last = number
@@ -118,8 +153,9 @@ class StoreScan:
         notes: dict[str, bytes] = {}
         for name, value, crc in self._db.execute("SELECT name, value, crc FROM notes ORDER BY key"):
             if crc != crc_of(name, value):
-                raise DamagedStore(self._path, None, None, f"the checksum of note {name!r} is wrong")
-            if name != NOTE:
+                self._tell(DamagedStore(self._path, None, None, f"the checksum of note {name!r} is wrong"))
+                continue
+            if not is_hidden(name):
                 notes[name] = value
         return notes
 
@@ -138,6 +174,6 @@ class StoreScan:
         for position, number in self._db.execute(
             "SELECT position, chain FROM entries WHERE address = ? ORDER BY position", (chain.id,)
         ):
-            if number >= absent:
+            if type(number) is int and number >= absent:
                 return int(position) if number > absent else None
         return None

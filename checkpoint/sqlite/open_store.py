@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 from ...actors.errors import HoldfastError
 from ..journal import DamagedStore, Entry, StaleEpoch, StoreFailed
-from .append_log import FrontLog, LogSealed, NoRoom, Row
+from .append_log import FrontLog, LogSealed, NoRoom, Row, following
 from .database import VERSION, VERSION_WITH_LOG, connect, create_database, result_code
 from .entry_chains import Chain, StoreContents, StoreScan, create_chain
 from .in_hand import InputsInHand
@@ -78,7 +78,7 @@ class Store:
     def __init__(self, path: str, *, fsync: bool) -> None:
         self.path = path
         self.files = SnapshotFiles(path)
-        self.parts = Parts(path, (self.files.folder, f"{path}-log", f"{path}-packs"))
+        self.parts = Parts(path)
         self.lock = threading.RLock()
         self._joint: Joint | None = None
         self.read_lock = threading.Lock()
@@ -149,21 +149,7 @@ class Store:
         if rows and rows[0][0] <= self.contents.last:  # It was only broken off when all was done.
             self.log.restart()
         elif rows:
-            self._take_in(rows)
-
-    def _take_in(self, rows: Sequence[Row]) -> None:
-        """Take into memory what is in the log."""
-        chains = {chain.id: chain for chain in self.contents.chains.values()}
-        for position, key, number, *_ in rows:
-            chain = chains.get(key)
-            if chain is None:
-                raise DamagedStore(self.path, None, position, "the entry belongs to no address")
-            if number != chain.last + 1 and chain.damage is None:
-                chain.damage = DamagedStore(self.path, chain.path, position, "entries are missing")
-            chain.last = number
-            chain.positions.append(position)
-        self.contents.last = rows[-1][0]
-        self.contents.live += len(rows)
+            self.contents.take_in(rows, self.path)
 
     def _begin_log(self) -> None:
         """Bring into the database what earlier owners have left in their logs, and begin one of our own."""
@@ -179,13 +165,8 @@ class Store:
         self.parts.adopt(self.db)
         # A store was closed, and its owner killed before it had removed these; or its WAL is missing: the mark knows.
         stale, left = (log.left(), []) if version == VERSION else ([], log.left())
-        rows: list[Row] = []
-        for batch in log.read(left):
-            if batch[0][0] == self.contents.last + 1:
-                self._take_in(batch)
-                rows += batch
-            elif batch[-1][0] > self.contents.last:
-                break  # A power loss has taken what was before it: the mark knows whether it may be missing.
+        rows = following(log.read(left), self.contents.last)
+        self.contents.take_in(rows, self.path)
         self._mark.check(self.contents.last, synced=self._fsync)
         if stale:
             log.remove(stale)
@@ -428,7 +409,7 @@ class Store:
         return True
 
     def _lost(self) -> str:
-        problem = self.parts.lost()
+        problem = self.parts.lost() or self.log.lost()
         return problem and f"{problem}: nothing is acknowledged any more; put the store back, and start again"
 
     def translate(self, error: sqlite3.Error | OSError) -> HoldfastError:

@@ -31,6 +31,26 @@ class StoreRow(NamedTuple):
     live: int
 
 
+def read_store_row(db: sqlite3.Connection, path: str) -> StoreRow:
+    """The row of the store as it is now.
+
+    Raises:
+        DamagedStore: it is missing or its checksum is wrong.
+    """
+    row = db.execute("SELECT epoch, pid, start, floor, live, crc FROM store").fetchone()
+    if row is None or row[5] != crc_of(*row[:5]):
+        raise DamagedStore(path, None, None, "the checksum of the store row is wrong")
+    return StoreRow(*row[:5])
+
+
+def write_store_row(db: sqlite3.Connection, row: StoreRow) -> None:
+    """Put the row in the place of the present one, within a transaction of the caller."""
+    fields = tuple(row)
+    db.execute(
+        "UPDATE store SET epoch = ?, pid = ?, start = ?, floor = ?, live = ?, crc = ?", (*fields, crc_of(*fields))
+    )
+
+
 class StoreClaim:
     """Our claim to be the owner of the store, made through one connection."""
 
@@ -108,17 +128,11 @@ class StoreClaim:
         Raises:
             DamagedStore: it is missing or its checksum is wrong.
         """
-        row = self._db.execute("SELECT epoch, pid, start, floor, live, crc FROM store").fetchone()
-        if row is None or row[5] != crc_of(*row[:5]):
-            raise DamagedStore(self.path, None, None, "the checksum of the store row is wrong")
-        return StoreRow(*row[:5])
+        return read_store_row(self._db, self.path)
 
     def write(self, floor: int, live: int) -> None:
         """Bring the row up to date, within a transaction of the caller."""
-        fields = (self.epoch, *self._owner, floor, live)
-        self._db.execute(
-            "UPDATE store SET epoch = ?, pid = ?, start = ?, floor = ?, live = ?, crc = ?", (*fields, crc_of(*fields))
-        )
+        write_store_row(self._db, StoreRow(self.epoch, *self._owner, floor, live))
 
     def release(self) -> None:
         """Strike ourselves out as the owner, leaving everything else as it is."""

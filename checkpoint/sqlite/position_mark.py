@@ -42,18 +42,7 @@ class PositionMark:
         """
         boot = boot_id().encode()
         self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-        found = os.pread(self._fd, _MARK.size + _SYNCED.size, 0)
-        if len(found) >= _MARK.size:
-            position, was_synced, marked_boot = _MARK.unpack_from(found)
-            if not was_synced and marked_boot != boot and len(found) == _MARK.size + _SYNCED.size:
-                (position,), was_synced = _SYNCED.unpack_from(found, _MARK.size), True
-            # After a power loss entries may be gone that were not synced. After anything else they may not.
-            if position > last and (was_synced or marked_boot == boot):
-                reason = (
-                    f"positions up to {position} were acknowledged, but they end at {last} "
-                    f"(remove {self.path} to go on without them)"
-                )
-                raise DamagedStore(self._store, None, last + 1, reason)
+        refuse_missing(self._store, os.pread(self._fd, _MARK.size + _SYNCED.size, 0), last)
         os.pwrite(self._fd, _MARK.pack(last, synced, boot) + _SYNCED.pack(last if synced else 0), 0)
         self._word = Word(self._fd)
 
@@ -80,3 +69,36 @@ class PositionMark:
         """Remove the file: the row of the store says all now."""
         with contextlib.suppress(FileNotFoundError):
             os.unlink(self.path)
+
+
+def read_mark(store: str) -> bytes:
+    """What the mark of a store says now, for `refuse_missing`; empty if there is none."""
+    try:
+        fd = os.open(f"{store}-mark", os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return b""
+    try:
+        return os.pread(fd, _MARK.size + _SYNCED.size, 0)
+    finally:
+        os.close(fd)
+
+
+def refuse_missing(store: str, mark: bytes, last: int) -> None:
+    """Compare what a mark says with the newest position found.
+
+    Raises:
+        DamagedStore: later positions were acknowledged, and no power loss explains that they are gone.
+    """
+    if len(mark) < _MARK.size:
+        return
+    boot = boot_id().encode()
+    position, was_synced, marked_boot = _MARK.unpack_from(mark)
+    if not was_synced and marked_boot != boot and len(mark) == _MARK.size + _SYNCED.size:
+        (position,), was_synced = _SYNCED.unpack_from(mark, _MARK.size), True
+    # After a power loss entries may be gone that were not synced. After anything else they may not.
+    if position > last and (was_synced or marked_boot == boot):
+        reason = (
+            f"positions up to {position} were acknowledged, but they end at {last} "
+            f"(remove {store}-mark to go on without them)"
+        )
+        raise DamagedStore(store, None, last + 1, reason)

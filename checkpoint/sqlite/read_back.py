@@ -31,8 +31,8 @@ class ChainReader:
         candidates = kept[: max(1, len(kept) - older)]
         for number in reversed(candidates):
             try:
-                snapshot, turn = self._read_snapshot(chain, number)
-                dropped = self._read_drops(chain, kept[: kept.index(number) + 1])
+                snapshot, turn = self.read_snapshot(chain, number)
+                dropped = self.read_drops(chain, kept[: kept.index(number) + 1])
                 break
             except DamagedStore as error:
                 reason = reason or error.reason
@@ -41,7 +41,12 @@ class ChainReader:
         entries = self._read_entries(chain, positions)
         return Saved(snapshot, turn, [pair for pair in entries if pair[0] not in dropped], reason)
 
-    def _read_snapshot(self, chain: Chain, number: int) -> tuple[bytes, int]:
+    def read_snapshot(self, chain: Chain, number: int) -> tuple[bytes, int]:
+        """A snapshot and its turn.
+
+        Raises:
+            DamagedStore: it is missing or damaged.
+        """
         row = self._db.execute(
             "SELECT turn, epoch, file, digest, data FROM snapshots WHERE id = ?", (number,)
         ).fetchone()
@@ -59,8 +64,12 @@ class ChainReader:
             raise DamagedStore(self.path, chain.path, None, f"the checksum of {where} is wrong")
         return data, turn
 
-    def _read_drops(self, chain: Chain, numbers: list[int]) -> set[int]:
-        """The positions that the newest of these snapshots contains, as far as they are not yet removed."""
+    def read_drops(self, chain: Chain, numbers: list[int]) -> set[int]:
+        """The positions that the newest of these snapshots contains, as far as they are not yet removed.
+
+        Raises:
+            DamagedStore: a list of them is damaged.
+        """
         dropped: set[int] = set()
         for number in numbers:
             row = self._db.execute("SELECT drops FROM snapshots WHERE id = ?", (number,)).fetchone()
@@ -84,17 +93,23 @@ class ChainReader:
             if len(rows) != len(chunk):
                 lost = min(set(chunk) - {row[0] for row in rows})
                 raise DamagedStore(self.path, chain.path, lost, "the entry is missing")
-            entries += [(row[0], self._read_entry(chain, *row)) for row in rows]
+            entries += [(row[0], checked_entry(self.path, chain, *row)) for row in rows]
         return entries
 
-    def _read_entry(
-        self, chain: Chain, position: int, address: int, number: int, kind: object, data: bytes, crc: int
-    ) -> Entry:
-        try:
-            if address == chain.id and crc == row_crc(position, address, number, data):
-                entry = decode_entry(data)
-                if entry[0] == kind:
-                    return entry
-        except (TypeError, ValueError, struct.error):
-            pass  # A flipped bit may also change the type of a column.
-        raise DamagedStore(self.path, chain.path, position, "the checksum of the entry is wrong")
+
+def checked_entry(
+    path: str, chain: Chain, position: int, address: int, number: int, kind: object, data: bytes, crc: int
+) -> Entry:
+    """The entry of a row, which is to be one of this chain.
+
+    Raises:
+        DamagedStore: it is damaged.
+    """
+    try:
+        if address == chain.id and crc == row_crc(position, address, number, data):
+            entry = decode_entry(data)
+            if entry[0] == kind:
+                return entry
+    except (TypeError, ValueError, struct.error):
+        pass  # A flipped bit may also change the type of a column.
+    raise DamagedStore(path, chain.path, position, "the checksum of the entry is wrong")

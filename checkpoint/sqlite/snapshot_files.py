@@ -92,7 +92,7 @@ def write_durably(path: str, parts: Sequence[bytes | memoryview]) -> None:
     with contextlib.suppress(FileNotFoundError):
         os.unlink(temporary)  # Whoever had begun it was killed.
     try:
-        with open(temporary, "xb", opener=_for_us) as file:
+        with open(temporary, "xb", opener=for_us) as file:
             file.writelines(parts)
             file.flush()
             os.fsync(file.fileno())
@@ -105,7 +105,7 @@ def write_durably(path: str, parts: Sequence[bytes | memoryview]) -> None:
         raise
 
 
-def _for_us(path: str, flags: int) -> int:
+def for_us(path: str, flags: int) -> int:
     """An opener (the descriptor is closed if `open` fails): nobody else may read the file."""
     return os.open(path, flags, 0o600)
 

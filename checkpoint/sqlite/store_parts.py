@@ -30,6 +30,8 @@ from .snapshot_files import write_durably
 
 NOTE: Final = "\0store"
 """The note with the identity. No user's note has such a name, and nobody is shown it."""
+COPY_NOTE: Final = "\0copy"
+"""The note of a copy: of which store it is, and of when. Nobody is shown it either."""
 NAME: Final = "store-id"
 _PENDING, _FINAL = b"~", b"="
 _HALF_MADE: Final = re.compile(r"new-\d+-\d+(-wal|-shm|-journal)?")
@@ -44,10 +46,41 @@ class StoreIdentity(NamedTuple):
     is_pending: bool
 
 
+def is_hidden(note: object) -> bool:
+    """Whether a note is the store's own."""
+    return note in (NOTE, COPY_NOTE)
+
+
 def new_note() -> tuple[str, bytes, int]:
     """The note that a new database begins with: name, value, checksum."""
     value = _PENDING + uuid.uuid4().bytes
     return NOTE, value, crc_of(NOTE, value)
+
+
+def copy_notes(identity: str, origin: str, when: float) -> list[tuple[str, bytes, int]]:
+    """The store's own notes in a copy that has an identity of its own; `when` is Unix time."""
+    values = ((NOTE, _FINAL + uuid.UUID(identity).bytes), (COPY_NOTE, f"{origin} {when:.3f}".encode()))
+    return [(name, value, crc_of(name, value)) for name, value in values]
+
+
+def origin_of(db: sqlite3.Connection) -> tuple[str, float] | None:
+    """Of which store a copy was made, and when; None if this is no copy."""
+    row = db.execute("SELECT value, crc FROM notes WHERE name = ?", (COPY_NOTE,)).fetchone()
+    if row is None or row[1] != crc_of(COPY_NOTE, row[0]):
+        return None
+    origin, _, when = row[0].decode().partition(" ")
+    return origin, float(when)
+
+
+def mark_of(identity: str) -> bytes:
+    """What a folder of the store has in its file `store-id`."""
+    return f"{_WORD}{identity}\n".encode()
+
+
+def part_names(path: str) -> list[str]:
+    """Whatever may lie beside a database, and the database itself."""
+    suffixes = ("", "-wal", "-shm", "-journal", "-mark", "-hands", "-snapshots", "-packs", "-log")
+    return [path + suffix for suffix in suffixes]
 
 
 class Parts:
@@ -55,12 +88,14 @@ class Parts:
 
     Args:
         path: the database.
-        folders: beside it; the first one is locked.
+
+    Attributes:
+        folders: those that lie beside it; the first one is locked.
     """
 
-    def __init__(self, path: str, folders: tuple[str, ...]) -> None:
+    def __init__(self, path: str) -> None:
         self.path = path
-        self.folders = folders
+        self.folders = tuple(path + suffix for suffix in ("-snapshots", "-log", "-packs"))
         self.id = ""
         self._lock = -1
         self._marking = threading.Lock()
@@ -140,7 +175,7 @@ class Parts:
         Raises:
             ForeignStore: there are some.
         """
-        beside = Parts(link, tuple(link + folder.removeprefix(self.path) for folder in self.folders))
+        beside = Parts(link)
         left = beside._left()
         if left:
             raise beside.refused(
@@ -223,10 +258,13 @@ class Parts:
             return
         try:
             fcntl.lockf(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # That one is given back when this process closes the file anywhere, as after each look at it; this is not.
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            info = os.fstat(fd)
-            os.close(fd)
-            raise StoreInUse(self.path, holder_of({_of_locks(info)}) or 0) from error
+            holder = holder_of({_of_locks(os.fstat(fd))}) or 0
+            if holder != os.getpid():  # Else it is an owner of before in this process, which the row has struck out.
+                os.close(fd)
+                raise StoreInUse(self.path, holder) from error
         except BaseException:
             os.close(fd)
             raise
@@ -253,7 +291,7 @@ class Parts:
         name = os.path.join(folder, NAME)
         with self._marking:
             if os.path.isdir(folder) and not os.path.exists(name):
-                write_durably(name, [f"{_WORD}{identity or self.id}\n".encode()])
+                write_durably(name, [mark_of(identity or self.id)])
 
     # ---- while it is open
 

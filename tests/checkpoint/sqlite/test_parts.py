@@ -271,6 +271,7 @@ def empty(path: Path) -> None:
 
 DELETE: dict[str, Callable[[Path], None]] = {
     "the database": lambda path: path.unlink(),
+    "a file of the log": lambda path: made(f"{path}-log")[0].unlink(),
     "the log": lambda path: shutil.rmtree(f"{path}-log"),
     "the snapshots": lambda path: shutil.rmtree(f"{path}-snapshots"),
     "its write-ahead log": lambda path: Path(f"{path}-wal").unlink(),

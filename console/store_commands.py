@@ -1,0 +1,239 @@
+"""The `holdfast store` commands, for a store on the disk: verify, stats, backup, restore, export and compact."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ..actors.errors import HoldfastError
+from ..checkpoint.journal import DamagedStore, StoreInUse
+from ..checkpoint.store_tools import (
+    StoreCopy,
+    StoreStats,
+    Verification,
+    back_up_store,
+    compact_store,
+    export_store,
+    restore_store,
+    store_stats,
+    verify_store,
+)
+
+DAMAGED = 1
+UNREADABLE = 2
+
+store = typer.Typer(
+    name="store", help="Look after a store: verify it, copy it, bring a copy back.", no_args_is_help=True
+)
+
+StorePath = Annotated[Path, typer.Argument(help="The database of a store: app.db, as in store='sqlite:app.db'.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+
+@store.command()
+def verify(path: StorePath, as_json: Json = False) -> None:
+    """Read every byte of a store that counts, and compare all checksums. Nothing is changed.
+
+    A running system may have the store open: then one instant of it is verified.
+
+    Exit status 0: all is good. 1: something is damaged. 2: there is no store, or it cannot be read.
+    """
+    try:
+        found = verify_store(path)
+    except HoldfastError as error:
+        raise _ended("verify", error, UNREADABLE) from error
+    _show_verification(found, as_json=as_json)
+    if not found.is_good:
+        raise typer.Exit(DAMAGED)
+
+
+@store.command()
+def stats(path: StorePath, as_json: Json = False) -> None:
+    """Print what is recorded of each address, how much room it takes, and what waits. Nothing is changed.
+
+    Exit status 0: done. 1: something is damaged. 2: there is no store, or it cannot be read.
+    """
+    try:
+        found = store_stats(path)
+    except DamagedStore as error:
+        raise _ended("stats", error, DAMAGED) from error
+    except HoldfastError as error:
+        raise _ended("stats", error, UNREADABLE) from error
+    if as_json:
+        typer.echo(json.dumps(dataclasses.asdict(found)))
+    else:
+        _show_stats(found)
+    if any(one.damage for one in found.addresses):
+        raise typer.Exit(DAMAGED)
+
+
+def _show_stats(found: StoreStats) -> None:
+    opened = f"open in process {found.pid}" if found.pid else "not open"
+    typer.echo(f"{found.path}: the store {found.identity or 'without identity'}, format {found.version}, {opened}")
+    if found.origin:
+        typer.echo(f"a copy of {found.origin}, made {_moment(found.copied_at)}")
+    typer.echo(f"opened {found.epoch} times; the newest position is {found.last}; {found.notes} notes")
+    typer.echo(", ".join(f"{name} {_bytes(size)}" for name, size in found.files.items()))
+    rows: list[tuple[str, ...]] = [
+        ("address", "class", "turns", "waiting", "entries", "bytes", "snapshots", "bytes", "newest")
+    ]
+    for one in found.addresses:
+        newest = _moment(one.snapshots[-1].time) if one.snapshots else "-"
+        size = sum(snapshot.size for snapshot in one.snapshots)
+        counts = one.turns, one.waiting, one.entries, _bytes(one.size), len(one.snapshots), _bytes(size)
+        rows.append((one.address, one.kind or "-", *map(str, counts), newest))
+    entries, size = sum(one.entries for one in found.addresses), sum(one.size for one in found.addresses)
+    kept = [snapshot.size for one in found.addresses for snapshot in one.snapshots]
+    waiting = sum(one.waiting for one in found.addresses)
+    totals = "", waiting, entries, _bytes(size), len(kept), _bytes(sum(kept)), ""
+    rows.append((f"{len(found.addresses)} addresses", "", *map(str, totals)))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (
+            text.ljust(width) if place < 2 else text.rjust(width)
+            for place, (text, width) in enumerate(zip(row, widths, strict=True))
+        )
+        typer.echo("  ".join(cells).rstrip())
+    for one in found.addresses:
+        if one.damage:
+            typer.echo(f"DAMAGED {one.address}: {one.damage}; `holdfast store verify` tells more")
+
+
+def _moment(when: float) -> str:
+    if not when:
+        return "-"
+    seconds = max(0, round(time.time() - when))
+    age = f"{seconds} s" if seconds < 120 else f"{seconds // 60} min" if seconds < 7200 else f"{seconds // 3600} h"
+    return f"{time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(when))} ({age} ago)"
+
+
+def _bytes(size: float) -> str:
+    """Write a number of bytes for people.
+
+    >>> _bytes(999), _bytes(2_500_000)
+    ('999 B', '2.5 MB')
+    """
+    for unit in ("B", "kB", "MB"):
+        if size < 1000:
+            return f"{size:.0f} B" if unit == "B" else f"{size:.1f} {unit}"
+        size /= 1000
+    return f"{size:.1f} GB"
+
+
+@store.command()
+def export(path: StorePath) -> None:
+    """Print everything that a store has, one JSON object a line. Nothing is changed, and no class is imported.
+
+    Exit status 0: done. 1: something is damaged; it is a line of its own. 2: there is no store, or it cannot be read.
+    """
+    is_damaged = False
+    try:
+        for record in export_store(path):
+            is_damaged = is_damaged or record["record"] == "damage"
+            typer.echo(json.dumps(record))
+    except DamagedStore as error:
+        raise _ended("export", error, DAMAGED) from error
+    except HoldfastError as error:
+        raise _ended("export", error, UNREADABLE) from error
+    except OSError as error:
+        if error.errno == errno.EPIPE:  # Whoever reads it has enough, as `head` has.
+            raise
+        raise _ended("export", HoldfastError(f"the output cannot be written: {error}"), UNREADABLE) from error
+    if is_damaged:
+        raise typer.Exit(DAMAGED)
+
+
+@store.command()
+def compact(path: StorePath, as_json: Json = False) -> None:
+    """Give back the room of what a store does not need. No system may have it open.
+
+    Exit status 0: done. 1: it is in use, or damaged. 2: there is no store, it cannot be read, or there is no room.
+    """
+    try:
+        done = compact_store(path)
+    except (DamagedStore, StoreInUse) as error:
+        raise _ended("compact", error, DAMAGED) from error
+    except HoldfastError as error:
+        raise _ended("compact", error, UNREADABLE) from error
+    if as_json:
+        typer.echo(json.dumps(dataclasses.asdict(done)))
+    else:
+        typer.echo(f"{done.path}: {_bytes(done.before)} before, {_bytes(done.after)} now")
+
+
+@store.command()
+def backup(
+    path: StorePath,
+    dest: Annotated[Path, typer.Argument(help="The database of the copy, which must not be there.")],
+    check: Annotated[bool, typer.Option("--verify/--no-verify", help="Verify the copy when it is made.")] = True,
+    as_json: Json = False,
+) -> None:
+    """Copy a store as it is at one instant, also while a system runs on it. The copy is a store of its own.
+
+    Exit status 0: the copy is there, and good. 1: the store is damaged; a copy that was made is damaged as it is.
+    2: there is no copy: there is no store, it cannot be read, or DEST cannot be written.
+    """
+    _copy("backup", lambda: back_up_store(path, dest), check=check, as_json=as_json)
+
+
+@store.command()
+def restore(
+    path: Annotated[Path, typer.Argument(metavar="BACKUP", help="The database of the backup; it stays as it is.")],
+    dest: Annotated[Path, typer.Argument(help="The database to be made, which must not be there.")],
+    as_json: Json = False,
+) -> None:
+    """Verify a backup, and copy it to where a system will open it. Nothing is ever overwritten.
+
+    Exit status 0: done. 1: the copy is damaged. 2: the backup is damaged or cannot be read, or DEST cannot be written.
+    """
+    _copy("restore", lambda: restore_store(path, dest), check=True, as_json=as_json)
+
+
+def _copy(command: str, make: Callable[[], StoreCopy], *, check: bool, as_json: bool) -> None:
+    try:
+        copy = make()
+        found = verify_store(copy.path) if check else None
+    except DamagedStore as error:
+        raise _ended(command, error, DAMAGED) from error
+    except HoldfastError as error:
+        raise _ended(command, error, UNREADABLE) from error
+    if as_json:
+        verified = None if found is None else _as_data(found)
+        typer.echo(json.dumps({**dataclasses.asdict(copy), "verified": verified}))
+    else:
+        typer.echo(f"{copy.path}: the store {copy.identity}, a copy of {copy.origin or 'one without identity'}")
+        typer.echo(f"up to position {copy.last}; {copy.files} snapshot files, {copy.size} bytes")
+        if found is not None:
+            _show_verification(found, as_json=False)
+    if found is not None and not found.is_good:
+        raise typer.Exit(DAMAGED)
+
+
+def _show_verification(found: Verification, *, as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps(_as_data(found)))
+        return
+    for damage in found.damages:
+        typer.echo(f"DAMAGED {damage}")
+    if found.untold:
+        typer.echo(f"DAMAGED and {found.untold} more")
+    read = f"{found.entries} entries, {found.snapshots} snapshots, {found.packs} packs"
+    opened = f"; as it was at one instant, for process {found.pid} has it open" if found.pid else ""
+    verdict = "good" if found.is_good else f"DAMAGED in {len(found.damages) + found.untold} places"
+    typer.echo(f"{found.path}: {verdict}: {read}, up to position {found.last}{opened}")
+
+
+def _as_data(found: Verification) -> dict[str, Any]:
+    return {"is_good": found.is_good, **dataclasses.asdict(found)}
+
+
+def _ended(command: str, error: HoldfastError, status: int) -> typer.Exit:
+    typer.echo(f"holdfast store {command}: {error}", err=True)
+    return typer.Exit(status)
