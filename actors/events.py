@@ -396,7 +396,11 @@ TRACED = (MessageIn, TurnBegan, TurnEnded, MessageOut)
 
 
 class EventStream:
-    """One listener's view: an async iterator over events, with a bound on how far it may fall behind."""
+    """One listener's view: an async iterator over events, with a bound on how far it may fall behind.
+
+    Attributes:
+        missed: how many events gave way to newer ones because nobody had read them in time.
+    """
 
     def __init__(self, hub: EventHub, most: int) -> None:
         self._hub = hub

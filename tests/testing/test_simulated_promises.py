@@ -138,3 +138,12 @@ def test_runs_with_recovery_are_exact_too() -> None:
     for seed in range(5):
         assert trace(seed) == trace(seed)
     assert trace(0) != trace(1)
+
+
+@simulate(seeds=3)
+async def test_runs_that_are_compared_are_repeated_by_their_seed(system: GuardedSystem) -> None:
+    """What they are called belongs to the system, and not to the process of the tests."""
+    ref = await system.start(hf.child("store", hf.start(Store), recovery=hf.hybrid(), mechanism=hf.ftm.TMR()))
+    for n in range(3):
+        await ref.ask(Put("test", n), timeout=3600.0)
+    assert [n for _, n in await ref.ask(All(), timeout=3600.0)] == [0, 1, 2]
