@@ -46,7 +46,7 @@ class LongWaits:
 
     def fix(self, turn: int, out: Out, batch: Batch) -> None:
         """Until when a turn waits is fixed when it first wants to, for all of its lives."""
-        if out.to == SINCE_THEN and (out.seconds or out.verb == "sleep"):
+        if (out.verb == "sleep" and out.to == SINCE_THEN) or (out.verb == "wait" and out.seconds):
             home = self._home
             when = home.ledger.dues[turn, out.k] = home.node.clock.wall() + out.seconds
             home.note(turn, due_entry(turn, out.k, when), batch)
