@@ -268,19 +268,21 @@ class WaitTimeout(HoldfastError, text="{actor} has waited for {message}, and its
 class ReplayDiverged(HoldfastError):
     """A replayed turn went another way than before the crash: another output or reply, or no end at all.
 
-    `cause` says what it did, where that is known; else its `output` differs, counted from 1.
+    `cause` says what it did, where that is known; else its `output` differs, counted from 1, which is `what` now.
     """
 
     actor: str
     turn: int
     output: int
     cause: str = ""
+    what: str = ""
 
     def __str__(self) -> str:
         where = f"replay of {self.actor} diverged at turn {self.turn}"
         if self.cause:
             return f"{where}: {self.cause}"
-        return f"{where}, output {self.output}: it is not what it was before the crash; {DIVERGES}"
+        now = f" ({self.what})" if self.what else ""
+        return f"{where}, output {self.output}{now}: it is not what it was before the crash; {DIVERGES}"
 
 
 DIVERGES = (

@@ -9,6 +9,7 @@ What there is many of is not seen by the garbage collector (`gc=False`): nothing
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterator
 from typing import Any, Protocol
 
 import msgspec
@@ -46,6 +47,21 @@ class Out(msgspec.Struct, array_like=True, gc=False):
         """A checksum by which a replayed output is compared with the one released before."""
         head = f"{self.verb}|{self.to}|{self.name}|{self.seconds}|{self.interval}".encode()
         return zlib.crc32(self.body, zlib.crc32(head))
+
+
+def shortened(body: bytes) -> Iterator[bytes]:
+    """A body as it was coded when its class had fewer fields: none of the last ones, one after another.
+
+    >>> [msgspec.msgpack.decode(one) for one in shortened(msgspec.msgpack.encode([1, "a"]))]
+    [[1], []]
+    """
+    fields = msgspec.msgpack.decode(body) if body else None
+    while isinstance(fields, list | dict) and fields:
+        if isinstance(fields, list):
+            fields.pop()
+        else:
+            fields.popitem()  # The last one.
+        yield msgspec.msgpack.encode(fields)
 
 
 class Answer(msgspec.Struct, array_like=True, gc=False):

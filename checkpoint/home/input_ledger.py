@@ -28,6 +28,7 @@ from ..protocol import (
     Out,
     TurnEnd,
     answer_digest,
+    shortened,
 )
 
 if TYPE_CHECKING:
@@ -169,14 +170,16 @@ class InputLedger:
 
     # -- turns ------------------------------------------------------------------------------------------------------
 
-    def compare_outputs(self, turn: int, key: int, outs: Sequence[Out], is_rebound: Callable[[Out, int], bool]) -> int:
+    def compare_outputs(
+        self, turn: int, key: int, outs: Sequence[Out], is_as_before: Callable[[Out, int], bool]
+    ) -> int:
         """How many of these outputs had left before; the others are taken down as released.
 
         Args:
             turn: that has sent them.
             key: its input.
             outs: in program order.
-            is_rebound: whether an output differs from the one of a digest only in where a binding leads.
+            is_as_before: whether an output is the one of a digest, but for what may have changed since.
 
         Raises:
             ReplayDiverged: they are not what had left.
@@ -195,10 +198,10 @@ class InputLedger:
         for out in outs:
             if out.k > count:
                 if is_ended:
-                    raise ReplayDiverged(self.path, turn, out.k)
+                    raise ReplayDiverged(self.path, turn, out.k, "", said_of(out))
                 known.append(out.digest())
-            elif known[out.k - 1] != out.digest() and not is_rebound(out, known[out.k - 1]):
-                raise ReplayDiverged(self.path, turn, out.k)
+            elif known[out.k - 1] != out.digest() and not is_as_before(out, known[out.k - 1]):
+                raise ReplayDiverged(self.path, turn, out.k, "", said_of(out))
             else:
                 again += 1
         return again
@@ -238,7 +241,7 @@ class InputLedger:
                 "ctx.now(), ctx.random and ctx.uuid(), and find the cause with hybrid(strict=True)"
             )
             raise StateDiverged(self.path, number, 0, cause)
-        if past.reply and past.reply != answer_digest(end.answer):
+        if past.reply and not is_same_reply(past.reply, end.answer):
             cause = f"the reply to {past.input.name} is not what it was before the crash; {DIVERGES}"
             raise ReplayDiverged(self.path, number, seen + 1, cause)
 
@@ -402,6 +405,21 @@ class InputLedger:
             case _:
                 return False
         return True
+
+
+def said_of(out: Out) -> str:
+    """What an output is, for people.
+
+    >>> said_of(Out(1, "tell", "/app/cart", "shop:Sold")), said_of(Out(1, "effect", "charge"))
+    ('tell of shop:Sold to /app/cart', 'effect charge')
+    """
+    return f"{out.verb} of {out.name} to {out.to}" if out.body else f"{out.verb} {out.to}".strip()
+
+
+def is_same_reply(digest: int, answer: Answer) -> bool:
+    """Whether a reply is the one of a digest; its class may have got more fields at the end since."""
+    older = (Answer(answer.kind, answer.name, body) for body in shortened(answer.body))
+    return digest == answer_digest(answer) or any(digest == answer_digest(one) for one in older)
 
 
 def outcome_entry(turn: int, k: int, answer: Answer) -> Entry:

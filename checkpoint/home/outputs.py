@@ -17,7 +17,7 @@ from ...actors.kernel.envelope import Envelope
 from ..durable_links import UNDONE_BY, connect
 from ..inputs import Batch
 from ..life.recorded_inbox import STARTED
-from ..protocol import MESSAGE, PIPE, Answer, Hooked, LifePort, Out, PipeDone
+from ..protocol import MESSAGE, PIPE, Answer, Hooked, LifePort, Out, PipeDone, shortened
 from .held_messages import Inlet, inlet
 from .pending_asks import SwitchAsk, answer_ask, origin_of
 from .recorded_home import switch_of
@@ -337,7 +337,11 @@ def _failure(done: asyncio.Future[None]) -> HoldfastError | None:
     return error if isinstance(error, HoldfastError) else None
 
 
-def went_elsewhere(home: Switch, out: Out, digest: int) -> bool:
-    """Whether a replayed output is the same but for its receiver, for its binding was changed since."""
-    others = home.node.led.get(home.path, {}).get(out.to, ())
-    return any(msgspec.structs.replace(out, to=path).digest() == digest for path in others)
+def is_as_before(home: Switch, out: Out, digest: int) -> bool:
+    """Whether a replayed output is the one of a digest but for what may have changed since.
+
+    Its binding leads elsewhere now, or its class has got more fields at the end.
+    """
+    others = (out.to, *home.node.led.get(home.path, {}).get(out.to, ()))
+    bodies = (out.body, *shortened(out.body))
+    return any(msgspec.structs.replace(out, to=to, body=body).digest() == digest for to in others for body in bodies)

@@ -66,7 +66,7 @@ from .disposal import lose, put_into_quarantine, undo_begun
 from .held_messages import Intake, let_go
 from .input_ledger import InputLedger
 from .journal_limit import Limit
-from .outputs import Outputs, went_elsewhere
+from .outputs import Outputs, is_as_before
 from .pending_asks import PendingCalls, SwitchAsk, answer_ask, origin_of
 from .present_life import PresentLife
 from .replay import PacedReplay
@@ -389,7 +389,7 @@ class Switch:
     def _take(self, turn: int, key: int, outs: list[Out], batch: Batch) -> None:
         """Let new outputs out; drop those that are out already."""
         ledger = self.ledger
-        again = ledger.compare_outputs(turn, key, outs, functools.partial(went_elsewhere, self))
+        again = ledger.compare_outputs(turn, key, outs, functools.partial(is_as_before, self))
         if turn <= ledger.turn:
             self.life.see_again(turn, outs[-1].k if outs else 0)
         for out in outs[:again]:

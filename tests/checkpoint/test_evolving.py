@@ -285,3 +285,71 @@ def test_structs_in_a_message_count_too() -> None:
     swapped = tuple((place, by_position, fields[::-1] if place else fields) for place, by_position, fields in shape)
     assert difference(shape, swapped) == "one: its fields were (x, y), now they are (y, x)"
     assert difference(shape, shape) == ""
+
+
+SENDS = """
+import holdfast as hf
+import msgspec
+
+
+class Note(hf.Message):
+    n: int
+
+
+class Sum(msgspec.Struct):
+    total: int
+
+
+class Packed(msgspec.Struct, array_like=True):
+    total: int
+
+
+class Add(hf.Message[Sum]):
+    n: int
+    b: int = 7
+
+
+class Get(hf.Message[list[int]]): ...
+
+
+class Sink(hf.Actor):
+    @hf.on(Note)
+    def note(self, message: Note) -> None: ...
+
+
+PLAIN = {"sink": Sink}
+
+
+class A(hf.Actor):
+    def __init__(self) -> None:
+        self.xs: list[int] = []
+
+    @hf.on(Add)
+    async def add(self, message: Add) -> Sum:
+        self.xs.append(message.n)
+        self.ctx.find("/app/sink", Sink).tell(Note(message.n))
+        await self.ctx.sleep(0.001)
+        return Sum(len(self.xs))
+
+    @hf.on(Get, readonly=True)
+    def read(self, message: Get) -> list[int]:
+        return self.xs
+"""
+
+
+@pytest.mark.parametrize("reply", ["Sum", "Packed"])
+def test_what_turns_have_sent_and_answered_may_get_more_fields(tmp_path: Path, reply: str) -> None:
+    code = SENDS.replace("hf.Message[Sum]", f"hf.Message[{reply}]").replace("return Sum(", f"return {reply}(")
+    assert run(tmp_path, code, "killed").returncode == -9
+    field = "    n: int\n\n\nclass Sum"
+    more = code.replace(field, field.replace("int\n", "int\n    why: str = ''\n    at: float = 0.0\n", 1))
+    more = more.replace("    total: int\n", "    total: int\n    mean: float = 0.5\n")
+    assert more.count("why") == 1
+    done = run(tmp_path, more, "read")
+    assert (done.stdout, done.stderr) == (str([1, 2, 3, 4, 5]), "")
+
+
+def test_another_value_in_what_was_sent_diverges_and_says_what_it_is(tmp_path: Path) -> None:
+    assert run(tmp_path, SENDS, "killed").returncode == -9
+    done = run(tmp_path, SENDS.replace("Note(message.n)", "Note(message.n + 1)"), "read")
+    assert "output 1 (tell of evolving:Note to /app/sink): it is not what it was before the crash" in done.stderr
