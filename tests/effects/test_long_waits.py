@@ -202,6 +202,40 @@ async def test_a_turn_that_was_asked_goes_on_too(tmp_path: Path, isolation: Any,
         assert len(lines(world)) == 2
 
 
+class Tell(hf.Message): ...
+
+
+class Teller(hf.Actor):
+    @hf.on(Tell)
+    async def tell_other(self, message: Tell) -> None:
+        await self.ctx.wait_for(Never)
+        self.ctx.find("/app/other", Patient).tell(Call("hello"))
+
+    @hf.on(Never)
+    def never(self, message: Never) -> None: ...
+
+
+async def test_what_is_told_to_somebody_who_is_not_started_yet_is_a_dead_letter(tmp_path: Path) -> None:
+    """A limit, in docs/guarantees.md: a program starts first whom others tell."""
+    teller = hf.child("patient", hf.start(Teller), recovery=hf.hybrid(interval=1000.0))
+    other = hf.child("other", hf.start(Patient), recovery=hf.hybrid(interval=1000.0))
+    async with running(tmp_path, "os") as system:
+        await system.start(other)
+        ref = await system.start(teller)
+        ref.tell(Tell())
+        await waits(system)
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(teller)
+        with system.events() as stream:
+            await ref.ask(Never(), IN_TIME)
+            async with asyncio.timeout(IN_TIME):
+                async for event in stream:
+                    if isinstance(event, hf.events.DeadLetter):
+                        assert event.address == "/app/other"
+                        break
+        assert await (await system.start(other)).ask(Look(), IN_TIME) == []
+
+
 class Begin(hf.Message[list[str]]): ...
 
 
