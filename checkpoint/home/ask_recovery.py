@@ -1,15 +1,18 @@
-"""Reconnects asks between recorded actors that were under way when the root ended.
+"""Reconnects what was under way between recorded actors when the root ended: asks, and messages to who is not up yet.
 
 The receiver's journal says of such an input whose turn asks, (turn, k). So the receiver, whose home may be open first,
 answers to whoever that is: to the asker's home if that is open, else into the asker's journal, where it finds it.
 What the receiver never had (its mailbox was full, say) ends at its deadline: it may have been forwarded, so it is not
 asked again.
+
+Whom a turn tells something may not have been started by the new program yet. The message is kept for it in its journal,
+and becomes an input when its home is opened.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...actors.kernel.codec import Parcel
 from ..inputs import Batch, Input
@@ -54,12 +57,43 @@ class RejoinedAsk(SwitchAsk, eq=False):
                 own.commit(homes.journal)
 
 
+class Kept(NamedTuple):
+    """A message for an address whose home is not open yet; `positions`: where in the journal it stands."""
+
+    name: str
+    body: bytes
+    sender: str
+    positions: list[int]
+
+
 class Rejoin:
     """All asks of a root that were under way when the one before it ended."""
 
     def __init__(self, homes: Homes) -> None:
         self._homes = homes
         self._asks: dict[tuple[str, int, int], RejoinedAsk] = {}
+        self._kept: dict[str, dict[str, Kept]] = {}  # by address, and by who has told it in which output
+
+    def keep(self, home: Switch, origin: str, out: Out, sender: str, batch: Batch) -> bool:
+        """Keep what a turn of `home` tells to an address that this program has not opened yet; False if it has."""
+        if not self._homes.is_unopened(out.to):
+            return False
+        kept = self._kept.setdefault(out.to, {})[origin] = Kept(out.name, out.body, sender, [])
+        if home.journal.durable:
+            batch.add(out.to, ("kept", origin, *kept[:3]), kept.positions)
+        return True
+
+    def read(self, home: Switch, position: int, origin: str, name: str, body: bytes, sender: str) -> None:
+        """Take a message that was kept up again, from the journal of its receiver."""
+        self._kept.setdefault(home.path, {}).setdefault(origin, Kept(name, body, sender, [])).positions.append(position)
+
+    def _hand_over(self, home: Switch) -> None:
+        """What was kept for an address becomes inputs, each once: the journal may have it as one already."""
+        known = {source.origin for source in home.ledger.handled_and_open()}
+        for origin, kept in self._kept.pop(home.path, {}).items():
+            home.ledger.drop(kept.positions)
+            if origin not in known:
+                home.forward(home.record(MESSAGE, kept.name, kept.body, kept.sender, origin=origin))
 
     def loaded(self, home: Switch) -> None:
         """A home was taken up from what is stored: what it owes an answer."""
@@ -69,6 +103,7 @@ class Rejoin:
         for key, (asker, origin) in home.calls.owed.items():
             home.calls.later[key] = self._of(asker, *_numbers(origin))
         home.calls.owed.clear()
+        self._hand_over(home)
 
     def _owed(self, home: Switch, source: Input) -> None:
         assert source.sender is not None
@@ -93,6 +128,7 @@ class Rejoin:
         for ask in self._asks.values():
             ask.asker = paths.get(ask.asker, ask.asker)
         self._asks = {(ask.asker, ask.turn, ask.k): ask for ask in self._asks.values()}
+        self._kept = {paths.get(path, path): kept for path, kept in self._kept.items()}
 
     def forget(self, ask: RejoinedAsk) -> None:
         """Wait no longer for an ask that has its outcome."""
@@ -111,6 +147,14 @@ class Rejoin:
         home.calls.asks[turn, out.k] = ask
         home.node.deadlines.add(ask)
         return True
+
+
+def origin_kept(home: Switch, turn: int, key: int, out: Out) -> str:
+    """How a journal names what was told to an address that is not open: no other output has the name.
+
+    What a hook (without input, `key` is -1) tells has no number of its own.
+    """
+    return f"kept {home.path}|{turn}.{out.k}" + ("" if key >= 0 else f" {home.node.numbers.next_seed():x}")
 
 
 def _numbers(origin: str) -> tuple[int, int]:

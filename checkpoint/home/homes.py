@@ -246,6 +246,10 @@ class Homes:
         """Whether anything was ever recorded at this address, and not erased since."""
         return path in self._switches or path in self._stored
 
+    def is_unopened(self, path: str) -> bool:
+        """Whether something is recorded at this address, and nobody has been started there since the root began."""
+        return path in self._stored and path not in self._switches
+
     def known(self, above: str) -> list[str]:
         """The addresses below one, at which anything was recorded."""
         prefix = f"{above}/"

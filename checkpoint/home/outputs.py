@@ -18,6 +18,7 @@ from ..durable_links import UNDONE_BY, connect
 from ..inputs import Batch
 from ..life.recorded_inbox import STARTED
 from ..protocol import MESSAGE, PIPE, Answer, Hooked, LifePort, Out, PipeDone, shortened
+from .ask_recovery import origin_kept
 from .held_messages import Inlet, inlet
 from .pending_asks import SwitchAsk, answer_ask, origin_of
 from .recorded_home import switch_of
@@ -45,7 +46,7 @@ class Outputs:
         assert cell is not None
         match out.verb:
             case "tell":
-                self._deliver(node.cell_at(out.to), out, batch)
+                self._deliver(node.cell_at(out.to), out, batch, origin_kept(home, turn, key, out))
             case "send":
                 home.calls.sends.add((turn, out.k))
                 self._send(node.cell_at(out.to), out, batch, functools.partial(home.calls.sent, turn, out.k))
@@ -70,7 +71,7 @@ class Outputs:
                 elif ask is not None:
                     batch.after.append(lambda: answer_ask(home, ask, Answer(kind, name, out.body)))
             case "forward":
-                self._forward(key, out, batch)
+                self._forward(turn, key, out, batch)
             case "timer" | "cancel":
                 out = home.timers.known_as(out)
                 self._keep(turn, out, batch)
@@ -143,8 +144,8 @@ class Outputs:
         entry = ("op", turn, out.verb, out.to, out.name, out.body, out.seconds, out.interval, now)
         self._home.note(turn, entry, batch)
 
-    def _deliver(self, target: Cell, out: Out, batch: Batch, sender: str | None = None) -> None:
-        """A message to another actor; to a recorded one it is journaled in the same append."""
+    def _deliver(self, target: Cell, out: Out, batch: Batch, origin: str, sender: str | None = None) -> None:
+        """A message to another actor; to a recorded one, up or not, it is journaled in the same append."""
         home = self._home
         switch = switch_of(target)
         cell = home.cell if sender is None else home.node.cell_at(sender)
@@ -159,6 +160,8 @@ class Outputs:
                     batch.after.append(lambda: switch.admitted(source))
             except MailboxFull as error:  # Its turn has gone on: there is nobody to raise this to.
                 home.node.dead_letter(target, Parcel(out.name, out.body), str(error))
+            return
+        if target.is_dead and home.homes.rejoin.keep(home, origin, out, cell.path, batch):
             return
 
         def send() -> None:
@@ -295,13 +298,14 @@ class Outputs:
         except HoldfastError as error:
             ask.fail(error)
 
-    def _forward(self, key: int, out: Out, batch: Batch) -> None:
+    def _forward(self, turn: int, key: int, out: Out, batch: Batch) -> None:
         home = self._home
         source = home.ledger.open.get(key)
         ask = source.ask if source is not None else None
         target = home.node.cell_at(out.to)
         if source is None or ask is None:
-            self._deliver(target, out, batch, None if source is None else source.sender)
+            sender = None if source is None else source.sender
+            self._deliver(target, out, batch, origin_kept(home, turn, key, out), sender)
             return
         source.ask = None  # From now on it is the receiver's to answer.
 

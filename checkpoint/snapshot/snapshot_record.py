@@ -266,6 +266,8 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
         case ("shape", name, shape):
             ledger.drop([position])  # The next snapshot keeps it.
             home.shapes.read(name, as_shape(shape))
+        case ("kept", origin, name, body, sender):
+            home.homes.rejoin.read(home, position, origin, name, body, sender)
         case ("tie", turn, verb, path):
             ledger.positions_of(turn).append(position)
             home.ties.turn(verb, path)

@@ -34,6 +34,8 @@ _NAMES: Final[dict[str, tuple[str, ...]]] = {
     "out": ("turn", "input", "outputs", "since"),
     "end": ("turn", "input", "status", "outputs", "state", "reply"),
     "got": ("turn", "output", "outcome", "type", "value"),
+    "due": ("turn", "output", "time"),
+    "kept": ("origin", "type", "value", "sender"),
     "drop": ("input",),
     "tried": ("input", "deliveries"),
     "tie": ("turn", "verb", "other"),

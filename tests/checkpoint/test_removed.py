@@ -30,6 +30,20 @@ CHECKS = {
         "tests/effects/test_long_waits.py",
         "test_a_turn_that_was_asked_goes_on_too",
     ),
+    "what was kept for somebody who was not up becomes an input once": Check(
+        "checkpoint/home/ask_recovery.py",
+        "            if origin not in known:\n",
+        "            if True:\n",
+        "tests/effects/test_long_waits.py",
+        "test_what_is_told_to_somebody_who_is_not_started",
+    ),
+    "what was kept for somebody who was not up is in the journal": Check(
+        "checkpoint/home/ask_recovery.py",
+        "        if home.journal.durable:\n            batch.add(out.to",
+        "        if False:\n            batch.add(out.to",
+        "tests/effects/test_long_waits.py",
+        "test_what_is_told_to_somebody_who_is_not_started",
+    ),
     "what is made at most once is not made again": Check(
         "checkpoint/home/pending_asks.py",
         "        if out.name:\n",

@@ -215,10 +215,14 @@ class Teller(hf.Actor):
     def never(self, message: Never) -> None: ...
 
 
-async def test_what_is_told_to_somebody_who_is_not_started_yet_is_a_dead_letter(tmp_path: Path) -> None:
-    """A limit, in docs/guarantees.md: a program starts first whom others tell."""
+@pytest.mark.parametrize("ends", [0, 1])
+@pytest.mark.parametrize("method", [hf.hybrid(interval=1000.0), hf.replay_only()])
+async def test_what_is_told_to_somebody_who_is_not_started_yet_waits_for_that(
+    tmp_path: Path, method: Any, ends: int
+) -> None:
+    """Over the end of one more program, too; and it comes once, also if no snapshot cuts the journal."""
     teller = hf.child("patient", hf.start(Teller), recovery=hf.hybrid(interval=1000.0))
-    other = hf.child("other", hf.start(Patient), recovery=hf.hybrid(interval=1000.0))
+    other = hf.child("other", hf.start(Patient), recovery=method)
     async with running(tmp_path, "os") as system:
         await system.start(other)
         ref = await system.start(teller)
@@ -226,14 +230,18 @@ async def test_what_is_told_to_somebody_who_is_not_started_yet_is_a_dead_letter(
         await waits(system)
     async with running(tmp_path, "os") as system:
         ref = await system.start(teller)
-        with system.events() as stream:
-            await ref.ask(Never(), IN_TIME)
-            async with asyncio.timeout(IN_TIME):
-                async for event in stream:
-                    if isinstance(event, hf.events.DeadLetter):
-                        assert event.address == "/app/other"
-                        break
-        assert await (await system.start(other)).ask(Look(), IN_TIME) == []
+        await ref.ask(Never(), IN_TIME)
+        await ref.ask(Never(), IN_TIME)  # Behind the turn that has told.
+        if not ends:
+            found = await system.start(other)
+            assert await found.ask(Look(), IN_TIME) == ["no turn has waited for hello"]
+        assert system.dead_letters == 0
+    for _ in range(2):
+        async with running(tmp_path, "os") as system:
+            found = await system.start(other)
+            assert await found.ask(Look(), IN_TIME) == ["no turn has waited for hello"]
+            found.kill()
+            assert await found.ask(Look(), IN_TIME) == ["no turn has waited for hello"]
 
 
 class Begin(hf.Message[list[str]]): ...
