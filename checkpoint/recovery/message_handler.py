@@ -6,6 +6,8 @@ on with what it finds. If it does not come in time, the journal does its work it
 
 from __future__ import annotations
 
+from typing import Any
+
 from ...actors.kernel.actor import on
 from ...actors.kernel.message import Message
 from .part import RecoveryPart
@@ -27,6 +29,9 @@ class MessageHandler(RecoveryPart):
         # Not `ref.tell`: that would speak in the name of whoever has submitted something.
         self._homes.journal.wake_handler = lambda: cell.admit(cell, FLUSH)
         self._homes.journal.come()
+
+    def on_undelivered(self, message: Message[Any]) -> None:
+        """Tell nobody: nothing is lost, for the journal writes by itself what it still has."""
 
     @on(WriteSubmitted)
     def flush(self, message: WriteSubmitted) -> None:
