@@ -6,8 +6,7 @@ on with what it finds. If it does not come in time, the journal does its work it
 
 from __future__ import annotations
 
-from typing import Any
-
+from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.actor import on
 from ...actors.kernel.message import Message
 from .part import RecoveryPart
@@ -30,8 +29,9 @@ class MessageHandler(RecoveryPart):
         self._homes.journal.wake_handler = lambda: cell.admit(cell, FLUSH)
         self._homes.journal.come()
 
-    def on_undelivered(self, message: Message[Any]) -> None:
-        """Tell nobody: nothing is lost, for the journal writes by itself what it still has."""
+    def on_stop(self, reason: ExitReason) -> None:
+        """Be woken no more: what is submitted from now on, the journal writes by itself."""
+        self._homes.journal.wake_handler = None
 
     @on(WriteSubmitted)
     def flush(self, message: WriteSubmitted) -> None:

@@ -15,7 +15,6 @@ import holdfast as hf
 from holdfast.checkpoint.group_commit import Commits
 from holdfast.checkpoint.journal import Entry, StoreFailed
 from holdfast.checkpoint.protocol import SnapshotNow
-from holdfast.checkpoint.recovery.message_handler import FLUSH
 from holdfast.checkpoint.sqlite import SqliteJournal
 from tests.checkpoint.players import Do, Doer, Note, Seen, Sink, start, until
 
@@ -460,12 +459,15 @@ async def test_durability_without_a_store_is_refused() -> None:
             await system.start(hf.child("doer", hf.start(Doer), recovery=hf.hybrid(durability="os")))
 
 
-async def test_what_wakes_the_journal_at_the_end_is_no_dead_letter(engine: Any) -> None:
-    """The log of an orderly end looked as if something had been lost."""
+async def test_a_handler_that_has_ended_in_good_order_is_woken_no_more(engine: Any) -> None:
+    """What woke it was a dead letter, and the log of an orderly end looked as if something had been lost."""
     engine.let_sync.set()
     async with hf.ActorSystem("app", log=False, store=engine) as system:
-        await start(system, "task", "doer", hf.start(Doer), recovery=hf.hybrid())
-        handler: Any = system._node.cell_at("/app/recovery/messages")
-        before = system.dead_letters
-    handler.admit(handler, FLUSH)
-    assert handler.node.numbers.dead_letters == before
+        doer = await start(system, "task", "doer", hf.start(Doer), recovery=hf.hybrid())
+        await doer.send(Note("a"))
+        handler = system._node.cell_at("/app/recovery/messages").actor
+        assert handler is not None
+        handler.on_stop(hf.SHUTDOWN)
+        await doer.send(Note("b"))
+        assert await doer.ask(Seen(), timeout=30.0) == ["a", "b"]
+        assert system._homes.journal.wake_handler is None
