@@ -465,8 +465,9 @@ async def test_a_handler_that_has_ended_in_good_order_is_woken_no_more(engine: A
     async with hf.ActorSystem("app", log=False, store=engine) as system:
         doer = await start(system, "task", "doer", hf.start(Doer), recovery=hf.hybrid())
         await doer.send(Note("a"))
-        handler = system._node.cell_at("/app/recovery/messages").actor
-        assert handler is not None
+        async with asyncio.timeout(20.0):
+            while (handler := system._node.cell_at("/app/recovery/messages").actor) is None:
+                await asyncio.sleep(0.001)
         handler.on_stop(hf.SHUTDOWN)
         await doer.send(Note("b"))
         assert await doer.ask(Seen(), timeout=30.0) == ["a", "b"]
