@@ -44,7 +44,7 @@ async def main() -> None:
             print(said.split())  # ['/app', '/app/bank', '/app/bank/auditor', '/app/bank/alice']
 
             said, status = await holdfast("apply", str(SCRIPT), *target)  # Twice is refused; nothing changes.
-            print(status, "AlreadyPresent" in said)  # 1 True
+            print(status, "is known already" in said)  # 1 True
 
 
 if __name__ == "__main__":

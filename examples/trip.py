@@ -57,7 +57,7 @@ class Agency(hf.Actor):
         except (Sold, hf.errors.EffectFailed) as problem:
             for company in reversed(booked):
                 await self.ctx.effect(cancel, company, key, key=f"cancel {company}", retry=hf.Retry(attempts=100))
-            return f"all is taken back: {problem}"
+            return f"all is taken back, for {problem}"
         self.sold += 1
         return ", ".join(booked.values())
 
@@ -72,7 +72,7 @@ async def main() -> None:
         agency = await system.start(hf.child("agency", hf.start(Agency), recovery=hf.hybrid(), isolation="process"))
         print(await agency.ask(Trip("Sylt")))  # train to Sylt, ferry to Sylt, hotel to Sylt
         print(bookings())  # [1, 1, 1]
-        print(await agency.ask(Trip("Atlantis")))  # all is taken back: the hotel has none left
+        print(await agency.ask(Trip("Atlantis")))  # all is taken back, for the hotel has none left
         print(bookings())  # [1, 1, 1]
 
 

@@ -290,9 +290,9 @@ CHECKS = {
         "test_what_a_stale_owner_writes",
     ),
     "log: what is behind a gap is cut": Check(
-        "checkpoint/sqlite/open_store.py",
-        "            if batch[0][0] == self.contents.last + 1:\n",
-        "            if True:\n",
+        "checkpoint/sqlite/append_log.py",
+        "        if batch[0][0] == last + 1:\n",
+        "        if True:\n",
         "tests/checkpoint/sqlite/test_log.py",
         "test_after_a_power_loss",
     ),
