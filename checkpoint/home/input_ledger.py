@@ -413,7 +413,7 @@ def said_of(out: Out) -> str:
     >>> said_of(Out(1, "tell", "/app/cart", "shop:Sold")), said_of(Out(1, "effect", "charge"))
     ('tell of shop:Sold to /app/cart', 'effect charge')
     """
-    return f"{out.verb} of {out.name} to {out.to}" if out.body else f"{out.verb} {out.to}".strip()
+    return f"{out.verb} of {out.name} to {out.to}" if ":" in out.name else f"{out.verb} {out.to}".strip()
 
 
 def is_same_reply(digest: int, answer: Answer) -> bool:
