@@ -21,7 +21,7 @@ from ...actors.values import ValueDescription, describe_value
 from ..addresses import KEY
 from ..compression import LibraryMissing
 from ..journal import DamagedStore, Entry, StoreFailed
-from ..protocol import START, Answer
+from ..protocol import REPLY, START, Answer, untimed
 from ..schema import Shape, as_shape, shape_name
 from ..snapshot.snapshot_record import Meta, decode_meta
 from ..snapshot.state_image import is_image, read_image
@@ -164,8 +164,12 @@ class _Export:
                 self._shapes.setdefault(key, {})[name] = as_shape(shape)
                 return _named_values("shape", entry[1:])
             case ("got", _, _, str() as kind, str() as name, bytes() as body):
-                value = self._message(key, shape_name(Answer(kind, name)), body)
-                return {**_named_values("got", entry[1:]), "value": value}
+                answer, when = untimed(Answer(kind, name, body))
+                value = self._message(key, shape_name(answer), answer.body) if answer.body else None
+                if when and answer.kind == REPLY:
+                    value = _result(answer.body)
+                came = {"time": when} if when else {}
+                return {**_named_values("got", entry[1:]), "outcome": answer.kind, "value": value, **came}
             case ("op", _, _, _, str() as name, bytes() as body, *_):
                 return {**_named_values("op", entry[1:]), "value": self._message(key, name, body)}
             case (kind, *values):
@@ -224,6 +228,14 @@ def _state(data: bytes) -> Record:
         return {"encoded": as_plain(data), "problem": "it is no state of an actor"}
     version, form, state = read
     return {"schema_version": version, "variables" if form == "keys" else "state": as_plain(state)}
+
+
+def _result(data: bytes) -> Any:
+    """What an effect has returned."""
+    try:
+        return as_plain(describe_value(data))
+    except DamagedValue as error:
+        return {"encoded": as_plain(data), "problem": str(error)}
 
 
 def _damage(error: HoldfastError, address: str | None = None) -> Record:

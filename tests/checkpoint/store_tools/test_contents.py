@@ -24,6 +24,7 @@ from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.store_tools import export_store, store_stats
 from tests.checkpoint.sqlite.stores import edit, end, inputs
 from tests.checkpoint.store_tools.writing import acknowledged, begin_writing, environment, everything, filled, run
+from tests.effects.patient import IN_TIME, Call, Go, patient
 
 SEED = int(os.environ.get("HOLDFAST_SEED", "1"))
 
@@ -262,3 +263,20 @@ def test_the_commands(tmp_path: Path) -> None:
     for name in ("stats", "export"):
         assert run(name, path)[0] == 1
         assert run(name, tmp_path / "nothing.db")[0] == 2
+
+
+async def test_what_effects_and_waits_have_come_to_is_exported_with_its_time(tmp_path: Path) -> None:
+    path = tmp_path / "app.db"
+    async with hf.ActorSystem("app", store=f"sqlite:{path}", log=False) as system:
+        ref = await system.start(patient(recovery=hf.replay_only()))
+        asked = ref.ask(Go(["e", "s0", "c"], str(tmp_path / "world")), IN_TIME)
+        await ref.ask(Call("hello"), IN_TIME)
+        await asked
+    got = [one for one in export_store(path) if one["record"] == "got"]
+    assert [(one["outcome"], one["value"]) for one in got] == [
+        ("reply", 1),
+        ("moment", None),
+        ("message", {"word": "hello"}),
+    ]
+    assert all(one["time"] > 1e9 for one in got)
+    assert [one["record"] for one in export_store(path) if one["record"] == "due"] == ["due"]
