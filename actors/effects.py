@@ -45,7 +45,7 @@ ONCE = Retry(attempts=1)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Effect:
+class EffectCall:
     """One effect of a turn: the function, and how it is attempted.
 
     Attributes:
@@ -114,7 +114,7 @@ def effect_of(
     *,
     at_most_once: bool,
     is_async: bool,
-) -> Effect:
+) -> EffectCall:
     """The effect that a handler wants.
 
     Raises:
@@ -130,7 +130,7 @@ def effect_of(
         raise SpecError("effect", "what is performed at most once is not attempted again: leave `retry` out")
     if not isinstance(key, str):
         raise SpecError("effect", f"key must be a str, not {key!r}")
-    return Effect(function, args, key or name_of(function), timeout, retry or ONCE, is_async)
+    return EffectCall(function, args, key or name_of(function), timeout, retry or ONCE, is_async)
 
 
 def name_of(function: Callable[..., Any]) -> str:
@@ -141,5 +141,7 @@ def name_of(function: Callable[..., Any]) -> str:
     """
     while isinstance(function, functools.partial):
         function = function.func
-    name: str = getattr(function, "__qualname__", "") or type(function).__qualname__
-    return name
+    try:
+        return function.__qualname__
+    except AttributeError:  # It is an object that can be called.
+        return type(function).__qualname__

@@ -93,7 +93,7 @@ def flows(count: int) -> list[hf.ChildSpec[Any]]:
 async def _all_wait(system: hf.ActorSystem, count: int) -> None:
     """Until the home of each knows that its turn waits."""
     switches = system._homes._switches
-    while not all(switches[f"/bench/flows/f{number}"].long_waits.is_busy for number in range(count)):
+    while not all(switches[f"/bench/flows/f{number}"].calls.rests.is_busy for number in range(count)):
         await asyncio.sleep(0.001)
 
 

@@ -89,7 +89,7 @@ class LongWaits:
         batch.commit(home.journal)
 
     def _look(self, place: Place, when: float) -> None:
-        """Is it time?"""
+        """End the wait of this place, if it is time; else look again later."""
         home = self._home
         now = home.node.clock.wall()
         if now < when:
@@ -110,6 +110,6 @@ class LongWaits:
             clock.cancel()
 
     def abandon(self) -> None:
-        """The life is over."""
+        """Wait for nothing any more, since the life is over."""
         for place in {*self._clocks, *self.wanted}:
             self._forget(place)

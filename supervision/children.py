@@ -178,7 +178,7 @@ class StartLimit:
         return f"it {what} within {self.seconds:g} s (start_timeout)"
 
 
-class Retry(Item):
+class RestartAgain(Item):
     """A restart that is due: after a failed attempt, or a back-off. Other requests are served before it."""
 
     __slots__ = ("child", "number", "reason")

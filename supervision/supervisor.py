@@ -41,7 +41,7 @@ from .children import (
     STOPPING,
     UP,
     Child,
-    Retry,
+    RestartAgain,
     StartLimit,
     StartRow,
     begin_start,
@@ -415,7 +415,7 @@ class Supervisor(Inquiries):
         one.attempts += 1
         one.state, one.due = RESTARTING, reason
         one.retry += 1
-        loop.call_later(delay, self._post, Retry(one, one.retry, reason))
+        loop.call_later(delay, self._post, RestartAgain(one, one.retry, reason))
 
     def _post(self, item: Item) -> None:
         if not self.ctx._closed:
@@ -506,7 +506,7 @@ class Supervisor(Inquiries):
             self._later(one, reason)
             return
         one.retry += 1
-        self.ctx._cell.push(Retry(one, one.retry, reason))  # Through our own mailbox: we answer in between.
+        self.ctx._cell.push(RestartAgain(one, one.retry, reason))  # Through our own mailbox: we answer in between.
 
     # -- stopping ---------------------------------------------------------------------------------------------------
 
@@ -771,7 +771,7 @@ class Supervisor(Inquiries):
             if one.state == RESTARTING and one.due is not None and one.hurried != attempt:
                 one.hurried = attempt
                 one.retry += 1
-                self.ctx._cell.push(Retry(one, one.retry, one.due))
+                self.ctx._cell.push(RestartAgain(one, one.retry, one.due))
 
     def _why_occupied(self) -> str:
         return why_occupied(self)

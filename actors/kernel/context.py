@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable, Coroutine
 from contextvars import ContextVar, copy_context
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, TypeVarTuple, cast, overload
 
-from ..effects import Effect, Retry, effect_of
+from ..effects import EffectCall, Retry, effect_of
 from ..errors import ActorStopped, AskDeadlock, HoldfastError, SpecError, remote_crash
 from ..exit_reasons import NORMAL, ExitReason
 from ..seconds import check_seconds
@@ -392,7 +392,7 @@ class ActorContext:
         effect = effect_of(function, args, key, timeout, retry, at_most_once=at_most_once, is_async=is_async(function))
         return self._performed(effect, at_most_once)
 
-    def _performed(self, effect: Effect, at_most_once: bool) -> asyncio.Future[object]:
+    def _performed(self, effect: EffectCall, at_most_once: bool) -> asyncio.Future[object]:
         """The outcome of an effect: without recovery, whatever it comes to now."""
         node = self._cell.node
         return self._beside(effect.perform(node.threads.run, node.numbers.next_seed()), "effect")

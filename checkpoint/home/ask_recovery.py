@@ -57,7 +57,7 @@ class RejoinedAsk(SwitchAsk, eq=False):
                 own.commit(homes.journal)
 
 
-class Kept(NamedTuple):
+class KeptMessage(NamedTuple):
     """A message for an address whose home is not open yet; `positions`: where in the journal it stands."""
 
     name: str
@@ -72,20 +72,22 @@ class Rejoin:
     def __init__(self, homes: Homes) -> None:
         self._homes = homes
         self._asks: dict[tuple[str, int, int], RejoinedAsk] = {}
-        self._kept: dict[str, dict[str, Kept]] = {}  # by address, and by who has told it in which output
+        self._kept: dict[str, dict[str, KeptMessage]] = {}  # by address, and by who has told it in which output
 
     def keep(self, home: Switch, origin: str, out: Out, sender: str, batch: Batch) -> bool:
         """Keep what a turn of `home` tells to an address that this program has not opened yet; False if it has."""
         if not self._homes.is_unopened(out.to):
             return False
-        kept = self._kept.setdefault(out.to, {})[origin] = Kept(out.name, out.body, sender, [])
+        kept = self._kept.setdefault(out.to, {})[origin] = KeptMessage(out.name, out.body, sender, [])
         if home.journal.durable:
             batch.add(out.to, ("kept", origin, *kept[:3]), kept.positions)
         return True
 
     def read(self, home: Switch, position: int, origin: str, name: str, body: bytes, sender: str) -> None:
         """Take a message that was kept up again, from the journal of its receiver."""
-        self._kept.setdefault(home.path, {}).setdefault(origin, Kept(name, body, sender, [])).positions.append(position)
+        self._kept.setdefault(home.path, {}).setdefault(origin, KeptMessage(name, body, sender, [])).positions.append(
+            position
+        )
 
     def _hand_over(self, home: Switch) -> None:
         """What was kept for an address becomes inputs, each once: the journal may have it as one already."""

@@ -54,7 +54,7 @@ class Outputs:
                 self._ask(turn, key, out, batch)
             case "effect" | "sleep" | "wait":
                 home.ledger.lasts = True
-                home.long_waits.fix(turn, out, batch)
+                home.calls.rests.fix(turn, out, batch)
                 port = home.life.port
                 batch.after.append(lambda: self._begin(turn, key, out, port))
             case "publish":
@@ -98,7 +98,7 @@ class Outputs:
         if out.verb == "effect":
             home.calls.order(turn, out.k)
         else:
-            home.long_waits.begin(turn, key, out)
+            home.calls.rests.begin(turn, key, out)
 
     def hooked(self, record: Hooked) -> None:
         """What a hook does that outlives it; it is done once, though a hook runs at each life."""

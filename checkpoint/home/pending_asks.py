@@ -13,6 +13,7 @@ from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import NO_DEADLINE, Ask, ReplyHandle
 from ...actors.process.wire.peer import RelayedAsk
 from ..inputs import Batch, Input
+from ..long_waits import LongWaits
 from ..protocol import REPLY, Answer, Out, Outcome, Perform, Performed, timed
 from ..schema import shape_name
 from .input_ledger import outcome_entry
@@ -131,6 +132,7 @@ class PendingCalls:
     Attributes:
         asks: asks of its own turns, by (turn, output).
         sends: sends and publications of its own turns whose receivers have no room yet, and effects that are out.
+        rests: moments and messages that its own turns wait for.
         later: asks of others that are to be answered later, by input.
         owed: the same as read back from the store: asker and origin.
     """
@@ -139,6 +141,7 @@ class PendingCalls:
         self._home = home
         self.asks: dict[tuple[int, int], SwitchAsk] = {}
         self.sends: set[tuple[int, int]] = set()
+        self.rests = LongWaits(home)
         self.later: dict[int, Ask] = {}
         self.owed: dict[int, tuple[str, str]] = {}
 
@@ -174,7 +177,7 @@ class PendingCalls:
             return
         if answer is None and out.verb in ("sleep", "wait"):
             if turn > home.ledger.turn:  # Else it has ended without waiting for it, and does so again.
-                home.long_waits.begin(turn, key, out)
+                self.rests.begin(turn, key, out)
             return
         if answer is None and out.verb in ("send", "publish"):
             answer = None if (turn, k) in self.sends else ACCEPTED
@@ -227,7 +230,7 @@ class PendingCalls:
             ask.is_over, ask.future = True, OVER
         self.asks.clear()
         self.sends.clear()
-        self._home.long_waits.abandon()
+        self.rests.abandon()
 
     def sent(self, turn: int, k: int, error: HoldfastError | None) -> None:
         """A `send` or `publish` of ours was accepted, or not.

@@ -23,7 +23,6 @@ from ..durable_links import DurableTies
 from ..durable_timers import Timers
 from ..inputs import Batch, HomeJournal, Input, Turn
 from ..journal import Saved
-from ..long_waits import LongWaits
 from ..method import Method
 from ..protocol import (
     AWAITED,
@@ -90,7 +89,6 @@ class Switch:
         self.intake = Intake()
         self.calls = PendingCalls(self)
         self.timers = Timers(self)
-        self.long_waits = LongWaits(self)
         self.topics: dict[str, None] = {}
         self.ties = DurableTies(self)
         self.outputs = Outputs(self)
@@ -232,7 +230,7 @@ class Switch:
         if source.held:
             return
         life, bound = self.life, self.intake.bound
-        if self.long_waits.wanted and self.long_waits.takes(source):
+        if self.calls.rests.wanted and self.calls.rests.takes(source):
             return
         if life.is_released and life.port is not None and (bound is None or bound.may_feed(source)):
             if source.ask is not None and life.port.begins:
@@ -330,7 +328,7 @@ class Switch:
     def died(self, running: int, ordered: bool) -> None:
         """The life is over. `running` is the input in hand, -1 if none; `ordered`: it was not its doing."""
         self.life.die()
-        self.long_waits.abandon()
+        self.calls.rests.abandon()
         self.replay.cancel()
         if self.intake.bound is not None:
             self.intake.bound.restart()

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ..durable_timers import said_by
 
 if TYPE_CHECKING:
+    from ...actors.effects import EffectCall
     from ...actors.exit_reasons import ExitReason
     from ...actors.kernel.envelope import Item
+    from ...actors.kernel.message import Message
     from ..protocol import Clock, Restore
+
+Awaited: TypeAlias = "type[Message[Any]] | EffectCall | dict[str, type[Message[Any]]] | None"
+"""What a turn waits for: the reply to a message of that class, an effect, a message of one of these types (none: a
+moment), or that a `send` is accepted."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -100,6 +107,29 @@ class SnapshotState:
     variables: list[str] = dataclasses.field(default_factory=list)
     begun_with: tuple[int, bytes] = (-1, b"")
     is_due: bool = False
+
+
+@dataclasses.dataclass(slots=True)
+class TurnWaits:
+    """What turns of a life wait for.
+
+    Attributes:
+        outcomes: futures of what comes of outputs, by (turn, output), each with what it has to be.
+        moment: until when the handler of the turn in hand has waited, in Unix time.
+        resting: how many moments and messages the turn in hand waits for.
+    """
+
+    outcomes: dict[tuple[int, int], tuple[asyncio.Future[Any], Awaited]] = dataclasses.field(default_factory=dict)
+    moment: float = 0.0
+    resting: int = 0
+
+    def begin(self) -> None:
+        """Have waited for nothing, since another turn begins."""
+        self.moment, self.resting = 0.0, 0
+
+    def rested(self, _: asyncio.Future[Any]) -> None:
+        """Something has come that a turn has waited for, perhaps an earlier one."""
+        self.resting = max(0, self.resting - 1)
 
 
 @dataclasses.dataclass(slots=True)

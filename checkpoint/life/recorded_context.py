@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
-from ...actors.effects import Effect
+from ...actors.effects import EffectCall
 from ...actors.errors import (
     BadMessage,
     BadReply,
@@ -36,7 +36,8 @@ from ..protocol import REPLY, SINCE_THEN, Answer, Feed, Performed, PipeDone
 from .recorded_inbox import INIT, STARTED, Fed
 
 if TYPE_CHECKING:
-    from .recorded_life import Awaited, Life
+    from .life_state import Awaited
+    from .recorded_life import Life
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -95,7 +96,8 @@ class Pending(asyncio.Future[Any]):
         try:
             return (yield from super().__await__())
         finally:
-            self._life.moment = max(self._life.moment, self.when)
+            waits = self._life.waits
+            waits.moment = max(waits.moment, self.when)
 
 
 class RecordedContext(ActorContext):
@@ -137,7 +139,7 @@ class RecordedContext(ActorContext):
 
     def now(self) -> float:
         life = self.recorded
-        return self._cell.node.clock.wall() if life.feed is None else max(life.feed.time, life.moment)
+        return self._cell.node.clock.wall() if life.feed is None else max(life.feed.time, life.waits.moment)
 
     @property
     def random(self) -> random.Random:
@@ -180,7 +182,7 @@ class RecordedContext(ActorContext):
         """Have output `k` leave, and wait until it is accepted."""
         life = self.recorded
         accepted: asyncio.Future[None] = self._cell.node.loop.create_future()
-        life.asks[life.turn, k] = accepted, None
+        life.waits.outcomes[life.turn, k] = accepted, None
         life.release()
         await accepted
 
@@ -197,7 +199,7 @@ class RecordedContext(ActorContext):
         life = self.recorded
         k = self._put("ask", cell, message, seconds=check_seconds(cell.path, "timeout", timeout))
         future: asyncio.Future[R] = self._cell.node.loop.create_future()
-        life.asks[life.turn, k] = future, type(message)
+        life.waits.outcomes[life.turn, k] = future, type(message)
         life.release()
         return future
 
@@ -282,7 +284,7 @@ class RecordedContext(ActorContext):
         said = f"{self.path}|{feed.id}|{feed.time}"
         return hashlib.blake2b(said.encode(), digest_size=16).hexdigest()
 
-    def _performed(self, effect: Effect, at_most_once: bool) -> asyncio.Future[object]:
+    def _performed(self, effect: EffectCall, at_most_once: bool) -> asyncio.Future[object]:
         if not self._in_turn():
             self._outside()
             return super()._performed(effect, at_most_once)
@@ -293,7 +295,7 @@ class RecordedContext(ActorContext):
         life = self.recorded
         k = life.put(verb, to, name, seconds=until)
         outcome = Pending(life)
-        life.asks[life.turn, k] = outcome, kind
+        life.waits.outcomes[life.turn, k] = outcome, kind
         life.release()
         return outcome
 
@@ -302,8 +304,8 @@ class RecordedContext(ActorContext):
     ) -> asyncio.Future[Any]:
         """Wait for what the home waits for: nothing of it is out."""
         life, outcome = self.recorded, self._awaited(verb, since, name, seconds, kinds)
-        life.resting += 1
-        outcome.add_done_callback(life.rested)
+        life.waits.resting += 1
+        outcome.add_done_callback(life.waits.rested)
         return outcome
 
     def _slept(self, seconds: float, *, is_moment: bool) -> asyncio.Future[None]:
@@ -318,7 +320,7 @@ class RecordedContext(ActorContext):
         names = {message_name(kind): kind for kind in kinds}
         return self._rest("wait", "|".join(names), timeout or 0.0, names)
 
-    def perform(self, turn: int, k: int, effect: Effect, outcome: Pending) -> None:
+    def perform(self, turn: int, k: int, effect: EffectCall, outcome: Pending) -> None:
         """Perform an effect of the turn in hand, in a task of its own, and have the home journal what it comes to."""
         if outcome.is_out:
             return  # Whoever led before has been told so, too.
@@ -326,14 +328,14 @@ class RecordedContext(ActorContext):
         task = self._beside(self._carried_out(turn, k, effect), "effect")
         outcome.add_done_callback(lambda _: task.cancel())  # The handler does not wait for it any more.
 
-    async def _carried_out(self, turn: int, k: int, effect: Effect) -> None:
+    async def _carried_out(self, turn: int, k: int, effect: EffectCall) -> None:
         node, life = self._cell.node, self.recorded
         try:
             value = await effect.perform(node.threads.run, node.numbers.next_seed())
             answer = Answer(REPLY, "", encode_value(value, where=f"the result of {effect.key}"))
         except Exception as error:
             answer = self._kept(effect, error)
-        if self._closed or (turn, k) not in life.asks:
+        if self._closed or (turn, k) not in life.waits.outcomes:
             return
         try:
             life.port.to_home(Performed(turn, k, answer))
@@ -341,7 +343,7 @@ class RecordedContext(ActorContext):
             why = f"what it has returned is too large to leave its process: {error.problem}; return where it is instead"
             life.port.to_home(Performed(turn, k, self._kept(effect, BadReply(effect.key, why))))
 
-    def _kept(self, effect: Effect, error: Exception) -> Answer:
+    def _kept(self, effect: EffectCall, error: Exception) -> Answer:
         """An error as the outcome of an effect, or why it cannot be one."""
         text = error_text(error)
         try:

@@ -6,15 +6,14 @@ already. Only time and randomness come from the input instead of the world.
 
 from __future__ import annotations
 
-import asyncio
 import functools
 import hashlib
 import time
 import types
 from collections.abc import Callable, Coroutine, Generator
-from typing import Any, Final, NoReturn, Protocol, TypeAlias, TypeVar
+from typing import Any, Final, NoReturn, Protocol, TypeVar
 
-from ...actors.effects import Effect
+from ...actors.effects import EffectCall
 from ...actors.errors import (
     ActorStopped,
     BadMessage,
@@ -30,7 +29,7 @@ from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.envelope import Item
-from ...actors.kernel.message import Message, message_name
+from ...actors.kernel.message import message_name
 from ...actors.persistence import UNFIT
 from ...actors.state_hooks import state_getter
 from ...actors.values import decode_value
@@ -69,17 +68,13 @@ from ..snapshot.image_writer import Imaging
 from ..snapshot.key_variables import StateMismatch, check_keys, restore_state, save_state, variables
 from ..turn_word import WAITS
 from .determinism_guard import DeterminismGuard
-from .life_state import HookTimers, LifeStage, RestoredState, SnapshotState
+from .life_state import Awaited, HookTimers, LifeStage, RestoredState, SnapshotState, TurnWaits
 from .readonly_guard import check_readonly
 from .recorded_context import Pending, RecordedContext
 from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
 from .replay_guard import digest_of
 
 T = TypeVar("T")
-
-Awaited: TypeAlias = "type[Message[Any]] | Effect | dict[str, type[Message[Any]]] | None"
-"""What a turn waits for: the reply to a message of that class, an effect, a message of one of these types (none: a
-moment), or that a `send` is accepted."""
 
 NOT_SAVED: Final = -2
 """In place of the turn after which the last snapshot was made: none has the state as it is."""
@@ -114,10 +109,8 @@ class Life:
         self.feed: Feed | None = None
         self.outs: list[Out] = []
         self.last_k = 0
-        self.asks: dict[tuple[int, int], tuple[asyncio.Future[Any], Awaited]] = {}
+        self.waits = TurnWaits()
         self.pipes = 0
-        self.moment = 0.0  # until which the handler of the turn in hand has waited
-        self.resting = 0  # how many moments and messages it waits for
         self.stash: list[Fed] = []
         self.returned: dict[int, Fed] = {}
         self.is_live = False
@@ -242,7 +235,7 @@ class Life:
     def _outcome(self, record: Outcome) -> None:
         if record.taken >= 0:
             self._drop(lambda feed: feed.id == record.taken)
-        waiting = self.asks.pop((record.turn, record.k), None)
+        waiting = self.waits.outcomes.pop((record.turn, record.k), None)
         if waiting is None:
             return
         future, kind = waiting
@@ -257,7 +250,7 @@ class Life:
             else:
                 future.set_exception(self.cell.node.codec.decode_error(answer.kind, answer.name, answer.body))
         except Exception as error:
-            name = type_name(kind) if isinstance(kind, type) else kind.key if isinstance(kind, Effect) else "send"
+            name = type_name(kind) if isinstance(kind, type) else kind.key if isinstance(kind, EffectCall) else "send"
             future.set_exception(BadReply(name, str(error)))
 
     def _result(self, answer: Answer, awaited: Awaited) -> object:
@@ -266,15 +259,15 @@ class Life:
             return None
         if isinstance(awaited, type):
             return self.cell.node.codec.decode_reply(awaited, answer.body)
-        if isinstance(awaited, Effect):
+        if isinstance(awaited, EffectCall):
             return decode_value(answer.body)
         return self.cell.node.codec.decode(awaited[answer.name], answer.body)
 
     def _perform(self, turn: int, k: int) -> None:
         """An effect of the turn in hand has no outcome yet."""
-        outcome, effect = self.asks.get((turn, k), (None, None))
+        outcome, effect = self.waits.outcomes.get((turn, k), (None, None))
         ctx = self.cell.ctx
-        if isinstance(outcome, Pending) and isinstance(effect, Effect) and isinstance(ctx, RecordedContext):
+        if isinstance(outcome, Pending) and isinstance(effect, EffectCall) and isinstance(ctx, RecordedContext):
             ctx.perform(turn, k, effect, outcome)
 
     # -- turns ------------------------------------------------------------------------------------------------------
@@ -287,7 +280,8 @@ class Life:
             self.turn += 1
         if self.returned:
             self.returned.pop(feed.id, None)  # It has come again: its feed may have been here before it was put back.
-        self.feed, self.outs, self.last_k, self.moment, self.resting = feed, [], 0, 0.0, 0
+        self.feed, self.outs, self.last_k = feed, [], 0
+        self.waits.begin()
         if self.page is not None:
             self.page[0] = feed.id + 1
 
@@ -317,7 +311,9 @@ class Life:
 
     def _mark(self, feed: Feed | None, how: int = 0) -> None:
         if self.page is not None and feed is not None and feed is self.feed:  # Else its life was abandoned.
-            self.page[0] = 0 if how and self.resting else feed.id + 1 | how  # What rests for days ends no process.
+            self.page[0] = (
+                0 if how and self.waits.resting else feed.id + 1 | how
+            )  # What rests for days ends no process.
 
     def close_turn(self, status: str, answer: Answer) -> None:
         """A turn has ended: report it, with what it sent."""
@@ -347,7 +343,7 @@ class Life:
         if self.cell.state is not RUNNING:
             return
         turn = None if self.cell.more is None else self.cell.more.turn
-        if not self.resting or turn is None or turn.then is not None:
+        if not self.waits.resting or turn is None or turn.then is not None:
             self.cell.urge(StopRecorded(self, reason))
             return
         self.feed, self.outs = None, []  # What its handler says while it is cancelled does not count.
@@ -402,10 +398,6 @@ class Life:
         else:
             self.outs.append(out)
         return k
-
-    def rested(self, _: asyncio.Future[Any]) -> None:
-        """Something has come that a turn has waited for, perhaps an earlier one."""
-        self.resting = max(0, self.resting - 1)
 
     def enter(self, hook: str) -> None:
         """A hook begins that is no turn."""
@@ -624,9 +616,9 @@ class Life:
         """End what the life has out, for it is over."""
         self.stage.is_over = True
         self.images.close()
-        for future, _ in self.asks.values():
+        for future, _ in self.waits.outcomes.values():
             future.cancel()
-        self.asks.clear()
+        self.waits.outcomes.clear()
         for call in self.stage.postponed:  # The next life's.
             self.cell.urge(call)
         self.port.closed()

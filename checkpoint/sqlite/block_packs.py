@@ -156,7 +156,7 @@ class Packs:
         return os.path.join(self.folder, blake2b(address.encode(errors="surrogatepass"), digest_size=12).hexdigest())
 
     def file(self, address: str, number: int) -> str:
-        """Where a pack is."""
+        """The file in which a pack of an address is kept."""
         return os.path.join(self._folder(address), f"{number:x}.pack")
 
 

@@ -10,6 +10,7 @@ import base64
 import datetime
 import math
 import os
+import sys
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
@@ -287,8 +288,8 @@ def as_plain(value: Any) -> Any:
 
 def _of_library(value: Any) -> Any:
     """A value of numpy, or of another type that a state may have: its numbers, or its text."""
-    kind = type_name(type(value))
-    if kind.startswith("numpy.") and isinstance(getattr(value, "nbytes", None), int):
+    kind, numpy = type_name(type(value)), sys.modules.get("numpy")
+    if numpy is not None and isinstance(value, numpy.ndarray | numpy.generic):
         array = {"dtype": str(value.dtype), "shape": list(value.shape)}
         return {"type": kind, **array, "base64": base64.b64encode(value.tobytes()).decode()}
     if isinstance(value, Iterable):  # such as a deque

@@ -60,7 +60,7 @@ class LineSender:
         self._receiver().require(self._line("stdout", ""))
 
     def send(self, stream: str, text: str) -> None:
-        """Send a line."""
+        """Send a line, and count it until the receiver has handled it."""
         node, to, line = self._cell.node, self._receiver(), self._line(stream, text)
         try:  # As from outside: it is no turn of ours, and waits for none.
             reply = node.base_context.copy().run(to.ref.ask, line, FOREVER)

@@ -88,7 +88,7 @@ CHECKS = {
     ),
     "a turn that rests is not blamed for the end of its process": Check(
         "checkpoint/life/recorded_life.py",
-        "0 if how and self.resting else ",
+        "0 if how and self.waits.resting else ",
         "",
         "tests/effects/test_long_waits.py",
         "test_a_turn_waits_on_whatever_ends and process",
@@ -102,7 +102,7 @@ CHECKS = {
     ),
     "a wait ends with the life": Check(
         "checkpoint/home/switch.py",
-        "        self.long_waits.abandon()\n",
+        "        self.calls.rests.abandon()\n",
         "",
         "tests/effects/test_long_waits.py",
         "test_a_turn_that_is_over_waits_for_nothing",

@@ -29,7 +29,7 @@ def running(tmp_path: Path, durability: str = "memory") -> hf.ActorSystem:
 async def waits(system: hf.ActorSystem, path: str = "/app/patient") -> None:
     """Wait until the turn of the patient waits, and its home knows."""
     async with asyncio.timeout(IN_TIME):
-        while not ((home := switch_of(system._node.cell_at(path))) and home.long_waits.is_busy):
+        while not ((home := switch_of(system._node.cell_at(path))) and home.calls.rests.is_busy):
             await asyncio.sleep(0.001)
 
 

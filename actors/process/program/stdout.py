@@ -121,7 +121,7 @@ class OutputReader:
         self._pause()
 
     def go_on(self) -> None:
-        """Hand on lines again."""
+        """Hand on lines again, from where it had stopped."""
         if self._is_held:
             self._is_held = False
             if self._slice is None and not self._is_closed:
