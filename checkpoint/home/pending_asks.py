@@ -131,7 +131,7 @@ class PendingCalls:
 
     Attributes:
         asks: asks of its own turns, by (turn, output).
-        sends: sends and publications of its own turns whose receivers have no room yet, and effects that are out.
+        sends: sends and publications of its own turns whose receivers have no room yet.
         rests: moments and messages that its own turns wait for.
         later: asks of others that are to be answered later, by input.
         owed: the same as read back from the store: asker and origin.
@@ -203,14 +203,14 @@ class PendingCalls:
     def order(self, turn: int, k: int) -> None:
         """Have the present life perform an effect: all that precedes it is safe."""
         if self._home.life.port is not None:
-            self.sends.add((turn, k))
             self._home.life.port.to_life(Perform(turn, k))
 
     def performed(self, record: Performed) -> None:
-        """An effect that was ordered has come to something."""
-        if (record.turn, record.k) in self.sends:
-            self.sends.remove((record.turn, record.k))
-            self.outcome(record.turn, record.k, timed(record.answer, self._home.node.clock.wall()), None)
+        """An effect of the turn in hand has come to something; what it comes to later, or once more, is of no use."""
+        place, ledger = (record.turn, record.k), self._home.ledger
+        is_out = ledger.turn < record.turn and ledger.digest_of(*place) and place not in ledger.outcomes
+        if is_out and place not in self.asks:
+            self.outcome(*place, timed(record.answer, self._home.node.clock.wall()), None)
 
     def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None, taken: int = -1) -> None:
         """An ask of ours has its outcome: journal it, then tell the turn that waits. `taken`: the input that it was."""

@@ -13,6 +13,7 @@ import random
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -60,18 +61,30 @@ def begin(store: Path, durability: str, *first: int) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": PATHS})
 
 
-@pytest.mark.parametrize("part", range(max(1, KILLS // (2 * ROUND))))
-@pytest.mark.parametrize("durability", ["os", "fsync"])
-def test_what_was_accepted_is_there_once_and_in_order(tmp_path: Path, durability: str, part: int) -> None:
-    seed = f"{SEED} {durability} {part}"
-    moments = random.Random(seed)
-    store = tmp_path / "app.db"
-    accepted: dict[int, set[int]] = {caller: set() for caller in range(CALLERS)}
-    following = [1] * CALLERS
-    for _ in range(ROUND):
-        root = begin(store, durability, *following)
+def accepted_under_kills(
+    begun: Callable[[list[int]], subprocess.Popen[bytes]],
+    callers: int,
+    rounds: int,
+    moments: random.Random,
+    most: int,
+    late: float,
+) -> dict[int, set[int]]:
+    """Begin a root again and again and kill it; what it says that it has accepted: "caller number", line by line.
+
+    Args:
+        begun: begins it, with the number that each caller goes on with.
+        callers: how many there are.
+        rounds: how often it is killed.
+        moments: draws when.
+        most: lines after which it is killed, at most.
+        late: seconds that it still has then, at most.
+    """
+    accepted: dict[int, set[int]] = {caller: set() for caller in range(callers)}
+    for _ in range(rounds):
+        # One more of each may have been accepted without our hearing of it.
+        root = begun([max(seen, default=-1) + 2 for seen in accepted.values()])
         assert root.stdout is not None
-        fatal, delay = moments.randint(1, 600), moments.uniform(0.0, 0.01)
+        fatal, delay = moments.randint(1, most), moments.uniform(0.0, late)
         with root.stdout as out:
             for count, line in enumerate(out):
                 if line.endswith(b"\n"):
@@ -79,9 +92,18 @@ def test_what_was_accepted_is_there_once_and_in_order(tmp_path: Path, durability
                     accepted[caller].add(n)
                 if count == fatal:
                     threading.Timer(delay, root.kill).start()
-        assert root.wait(60) == -9, f"seed {seed}: it ended by itself"
-        # One more of each may have been accepted without our hearing of it.
-        following = [max(seen, default=0) + 2 for seen in accepted.values()]
+        assert root.wait(60) == -9, "it ended by itself"
+    return accepted
+
+
+@pytest.mark.parametrize("part", range(max(1, KILLS // (2 * ROUND))))
+@pytest.mark.parametrize("durability", ["os", "fsync"])
+def test_what_was_accepted_is_there_once_and_in_order(tmp_path: Path, durability: str, part: int) -> None:
+    seed = f"{SEED} {durability} {part}"
+    moments = random.Random(seed)
+    store = tmp_path / "app.db"
+    print(f"seed {seed}")
+    accepted = accepted_under_kills(lambda first: begin(store, durability, *first), CALLERS, ROUND, moments, 600, 0.01)
     root = begin(store, durability)
     output, _ = root.communicate(timeout=120)
     assert root.returncode == 0

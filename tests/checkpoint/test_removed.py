@@ -44,6 +44,13 @@ CHECKS = {
         "tests/effects/test_long_waits.py",
         "test_what_is_told_to_somebody_who_is_not_started",
     ),
+    "an outcome counts of an effect that is out only": Check(
+        "checkpoint/home/pending_asks.py",
+        "        if is_out and place not in self.asks:\n",
+        "        if place not in self.asks:\n",
+        "tests/effects/test_effects.py",
+        "test_what_nobody_has_ordered_is_no_outcome",
+    ),
     "what is made at most once is not made again": Check(
         "checkpoint/home/pending_asks.py",
         "        if out.name:\n",

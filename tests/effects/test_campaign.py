@@ -11,7 +11,6 @@ import os
 import random
 import subprocess
 import sys
-import threading
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,6 +18,7 @@ from pathlib import Path
 import pytest
 
 import holdfast
+from tests.checkpoint.test_kills import accepted_under_kills
 from tests.effects.effect_player import WORKERS, program
 
 ROOTS = (str(Path(holdfast.__file__).parents[1]), str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))
@@ -74,22 +74,10 @@ def test_each_effect_is_made_as_often_as_was_promised(tmp_path: Path, durability
     moments = random.Random(seed)
     store, world = tmp_path / "app.db", tmp_path / "world"
     world.touch()
-    accepted: list[set[int]] = [set() for _ in WORKERS]
-    following = [1] * len(WORKERS)
-    for _ in range(ROUND):
-        root = begin(store, world, durability, *following)
-        assert root.stdout is not None
-        fatal, delay = moments.randint(1, 150), moments.uniform(0.0, 0.05)
-        with root.stdout as out:
-            for count, line in enumerate(out):
-                if line.endswith(b"\n"):
-                    worker, n = map(int, line.split())
-                    accepted[worker].add(n)
-                if count == fatal:
-                    threading.Timer(delay, root.kill).start()
-        assert root.wait(60) == -9, f"seed {seed}: it ended by itself"
-        # One more of each may have been accepted without our hearing of it.
-        following = [max(numbers, default=0) + 2 for numbers in accepted]
+    workers = len(WORKERS)
+    accepted = accepted_under_kills(
+        lambda first: begin(store, world, durability, *first), workers, ROUND, moments, 150, 0.05
+    )
     root = begin(store, world, durability)
     output, _ = root.communicate(timeout=120)
     assert root.returncode == 0

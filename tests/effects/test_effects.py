@@ -13,6 +13,9 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.values import encode_value
+from holdfast.checkpoint.home.recorded_home import switch_of
+from holdfast.checkpoint.protocol import REPLY, Answer, Performed
 from tests.checkpoint.test_commits import Slow
 from tests.effects.clerk import IN_TIME, Clerk, Do, Done, No, clerk, deed, lines, words
 
@@ -455,3 +458,16 @@ async def test_whatever_an_effect_raises_is_its_outcome(name: str, isolation: An
                 assert RAISED[name][1] in said
             assert await ref.ask(Done(), IN_TIME) == []
             assert not [event for event in stream.take() if isinstance(event, hf.events.ActorCrashed)]
+
+
+async def test_what_nobody_has_ordered_is_no_outcome(tmp_path: Path, world: str) -> None:
+    """A process says so, of a turn that is over and of one that is not there: its journal takes none of it."""
+    async with running(tmp_path, "memory") as system:
+        ref = await system.start(clerk())
+        await ref.ask(Do(world, ["a"]), IN_TIME)
+        home = switch_of(system._node.cell_at(ref.path))
+        assert home is not None
+        before = dict(home.ledger.outcomes)
+        for turn in (0, home.turn, home.turn + 1):
+            home.calls.performed(Performed(turn, 1, Answer(REPLY, "", encode_value("forged"))))
+        assert home.ledger.outcomes == before
