@@ -625,8 +625,11 @@ class Server(lifecycle.HerePlace):
             if self.life is None:  # It was dropped again: another state is put here.
                 part.give_up()
                 break
-            if is_new and self.reports.is_snapshot_wanted and not state.is_again:
+            brings = is_new and self.reports.is_snapshot_wanted and not state.is_again
+            if brings and pending[0].feed.id not in attempts.skips:
                 break  # What its hooks have left goes home before anything that stands on it.
+            if brings:  # What has failed ends by itself, and all that is said of the last life stands behind its end.
+                attempts.singles = max(attempts.singles, 1)
             chunk = next_requests(state, part, attempts, leads=self.standing.leads, has_work=self._has_work)
             if not chunk:
                 break  # It runs alone, when home has all that comes before it.
@@ -642,7 +645,7 @@ class Server(lifecycle.HerePlace):
                 attempts.crashes = 0
                 now = time.perf_counter()
                 attempts.size = size_after(attempts.size, len(chunk), now - at)
-                if (now - begin > PART and not state.is_again) or part.is_cut:
+                if (now - begin > PART and not state.is_again) or part.is_cut or brings:
                     break
                 if pending and self.life is None and not self._goes_on([], self._rest.missed or ENDED):
                     break  # It has ended between two turns, and with it what the first ones have left.

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import pytest
 
 import holdfast as hf
+from holdfast.checkpoint.home.recorded_home import switch_of
 from holdfast.ftm.bricks.bricks import Before
 from holdfast.ftm.events import FailedOver
 from holdfast.ftm.mechanisms.pbr import PBR
@@ -68,6 +69,27 @@ async def test_background_work_is_begun_again_or_said_to_be_lost(
                 await asyncio.sleep(0.005)
         assert lost == []
     events.close()
+
+
+async def test_a_turn_that_fails_has_ended_before_work_is_said_to_be_lost(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    """Also if a snapshot waits for that work: the actor begins anew behind that turn, and not before it for ever."""
+    ref = await started(system, hf.start(Waiter), recovery=hf.hybrid(interval=0.05))
+    there = tmp_path / "there"
+    await ref.ask(Add(0))
+    await ref.ask(Wait(str(there), 1))
+    switch = switch_of(ref._cell)
+    assert switch is not None
+    async with asyncio.timeout(20):
+        while switch.due.asked_at < 0:  # From here on a snapshot is wanted, and waits for the work.
+            await asyncio.sleep(0.005)
+    with pytest.raises(hf.RemoteCrash):
+        await ref.ask(Boom())
+    there.touch()
+    async with asyncio.timeout(10):
+        while await ref.ask(Tags(), timeout=10) != [0, 1]:
+            await asyncio.sleep(0.005)
 
 
 class Break(hf.Message): ...

@@ -16,6 +16,13 @@ SPOILED = "tests/ftm/test_spoiled_states.py"
 RANDOM_HOOKS = "tests/ftm/test_random_hooks.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 CHECKS = {
+    "a turn that has failed has ended before anything is said of the life that it has ended": Check(
+        "ftm/replica/protected_actor.py",
+        " and pending[0].feed.id not in attempts.skips:\n                break",
+        ":\n                break",
+        "tests/ftm/test_failover_turns.py",
+        "test_a_turn_that_fails_has_ended_before",
+    ),
     "an alternate gets the outcome of no other effect": Check(
         "ftm/bricks/runs.py",
         "is_alike = asked == out.digest()",
