@@ -137,8 +137,8 @@ CHECKS = {
     ),
     "what hooks have left is at home before what stands on it": Check(
         "ftm/replica/protected_actor.py",
-        "            if is_new and self.reports.is_snapshot_wanted and not state.is_again:\n",
-        "            if False:\n",
+        "brings = is_new and self.reports.is_snapshot_wanted and not state.is_again\n",
+        "brings = False\n",
         "tests/checkpoint/test_hook_changes.py",
         "test_replicas_that_die_before",
     ),
