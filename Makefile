@@ -57,7 +57,7 @@ alarms: $(VENV)/.dev
 	$(BIN)/python -m tests.alarms $(RUNS) $(SEED) $(PYTEST_ARGS)
 
 # The static part of `check`, cheapest first. The tables of removed checks and the walks name lines, tests and files that exist.
-NAMED := $(shell grep -rl 'as_tests(' tests --include='test_*.py') tests/test_internals.py
+NAMED := $(shell grep -rl as_tests tests --include='test_*.py') tests/test_internals.py
 lint: $(VENV)/.dev .link/holdfast
 	$(BIN)/python -m pytest -q -p no:cacheprovider -k 'table_is_true or internals' $(NAMED)
 	$(BIN)/ruff format --check .
