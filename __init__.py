@@ -55,6 +55,7 @@ from holdfast.actors.kernel.message import Message, Refusal
 from holdfast.actors.kernel.ref import ActorRef
 from holdfast.actors.kernel.timers import Timer
 from holdfast.actors.process.resource_limits import Limits
+from holdfast.actors.values.renamed import renamed
 from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
 from holdfast.checkpoint.recovery_file import load_recovery
 from holdfast.supervision.admin import DeleteChild, RestartChild, StartChild, TerminateChild, WhichChildren
@@ -135,6 +136,7 @@ __all__ = [
     "load_tree",
     "on",
     "replay_only",
+    "renamed",
     "rule",
     "run",
     "start",

@@ -290,6 +290,12 @@ class SnapshotDamaged(Event, frozen=True, eq=False):
     reason: str
 
 
+class RecordsMapped(Event, frozen=True, eq=False):
+    """What an earlier version of the program had recorded was mapped to the fields and variables of the present one."""
+
+    changes: str
+
+
 class RecoveryTableUnused(Event, frozen=True, eq=False):
     """Nobody has been started yet whom this table of the recovery file is for; `where` is its file and line."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import zlib
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -163,6 +164,11 @@ class Timers:
             for key, (name, body, left, interval) in saved.items()
             if interval > 0 or key not in waiting  # Else it would come twice.
         }
+
+    def map(self, said: Mapping[str, tuple[str, bytes]]) -> None:
+        """Have these timers say something else: type name and body, by key."""
+        for key, (name, body) in said.items():
+            self._states[key].name, self._states[key].body = name, body
 
     def saved(self) -> dict[str, Saved]:
         """All of them, with the time that is left."""

@@ -1,95 +1,47 @@
-"""The schema of recorded data: the actor's class and the fields of its messages, replies and refusals.
+"""The schema of recorded data: the actor's class, and the tables of the fields of all that is recorded as messages.
 
-Messages are coded by position. What the journal holds of a type can be read by a class that has the same fields in the
-same order, and perhaps more behind them, with defaults; any other class would take one field for another. So the fields
-are kept with what they describe, and compared before anything of it is handled again.
+Messages are coded by position. So the fields stand in the journal in front of what was written with them, and what was
+written by an earlier version of the program is mapped by their names when a home is taken up (`upgrade/`). A home that
+the present code cannot read is refused, before anything of it is changed.
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
-from msgspec import inspect
-
-from ..actors.errors import HoldfastError, StartFailed, type_name
+from ..actors.errors import HoldfastError, StartFailed
 from ..actors.kernel.actor import Actor
-from ..actors.kernel.message import Message, find_refusal, message_name, reply_type
+from ..actors.kernel.cell import Cell
+from ..actors.kernel.message import message_name
 from ..actors.persistence import UNFIT
-from ..actors.process.wire.start_codec import loaded
-from .protocol import MESSAGE, PIPE, REPLY, START, TICK, TIMED, Answer
+from ..actors.values.renamed import former_names
+from .protocol import START, shortened
+from .upgrade.field_tables import Shape, as_data, as_shape, difference, shape_of
+from .upgrade.mapping import Mapper, NotMapped, Unmapper
+from .upgrade.old_records import OldRecords, mapper_of
+from .upgrade.present_classes import former_keys, present_class, shape_name
 
 if TYPE_CHECKING:
-    from ..actors.kernel.cell import Cell
     from .home.switch import Switch
     from .journal import Entry
 
-Shape: TypeAlias = "tuple[tuple[str, bool, tuple[str, ...]], ...]"
-"""Where in a message a struct stands ("": the message itself), whether it is coded by position, and its fields."""
+    Timers = Mapping[str, tuple[str, bytes, float, float]]
+    Tables = Mapping[str, Sequence[Any]]
 
-REPLY_TO, REFUSAL = "the reply to ", "the refusal "
-"""How the names begin under which the fields of outcomes are kept."""
-
-
-@functools.cache
-def shape_of(kind: type) -> Shape:
-    """The fields of a message class, and of the structs in them.
-
-    >>> from holdfast import Message
-    >>> class Move(Message):
-    ...     x: int
-    ...     y: int = 0
-    >>> shape_of(Move)
-    (('', True, ('x', 'y')),)
-    """
-    found: dict[str, tuple[bool, tuple[str, ...]]] = {}
-    try:
-        _walk(inspect.type_info(kind), "", found, ())
-    except Exception as error:  # Annotations can be of any kind; the codec says what is wrong with them.
-        raise HoldfastError(f"the fields of {type_name(kind)} cannot be found out: {error}") from error
-    return tuple((place, *what) for place, what in found.items())
-
-
-def _walk(info: Any, place: str, found: dict[str, tuple[bool, tuple[str, ...]]], above: tuple[type, ...]) -> None:
-    if isinstance(info, inspect.StructType):
-        if info.cls in above:
-            return  # It contains itself: its fields stand there already.
-        found[place] = info.array_like, tuple(field.encode_name for field in info.fields)
-        for field in info.fields:
-            _walk(field.type, f"{place}.{field.encode_name}" if place else field.encode_name, found, (*above, info.cls))
-    elif isinstance(info, inspect.UnionType):
-        structs = sum(isinstance(one, inspect.StructType) for one in info.types)
-        for one in info.types:
-            many = structs > 1 and isinstance(one, inspect.StructType)
-            _walk(one, f"{place}|{cast('Any', one).cls.__name__}" if many else place, found, above)
-    else:
-        for part in ("item_type", "key_type", "value_type"):
-            inner = getattr(info, part, None)
-            if inner is not None:
-                _walk(inner, f"{place}[]", found, above)
-        for number, inner in enumerate(getattr(info, "item_types", ())):
-            _walk(inner, f"{place}[{number}]", found, above)
-
-
-def difference(old: Shape, new: Shape) -> str:
-    """Why what was written with the old fields would be misread with the new ones; "" if it would not be.
-
-    >>> difference((("", True, ("a", "b")),), (("", True, ("a", "b", "c")),))
-    ''
-    >>> difference((("", True, ("a", "b")),), (("", True, ("b", "a")),))
-    'its fields were (a, b), now they are (b, a)'
-    """
-    known = {place: (by_position, fields) for place, by_position, fields in new}
-    for place, by_position, fields in old:
-        now = known.get(place)
-        if now is None:
-            continue  # It is another type altogether, which the codec refuses, or a class of another name.
-        same = now[1][: len(fields)] == fields if by_position else set(fields) <= set(now[1])
-        if by_position != now[0] or not same:
-            where = f"{place}: its" if place else "its"
-            return f"{where} fields were ({', '.join(fields)}), now they are ({', '.join(now[1])})"
-    return ""
+__all__ = [
+    "Shape",
+    "Shapes",
+    "as_shape",
+    "class_of",
+    "difference",
+    "first_of",
+    "kind_in",
+    "shape_entry",
+    "shape_name",
+    "shape_of",
+    "start_name",
+]
 
 
 def class_of(cell: Cell) -> type[Actor] | None:
@@ -103,124 +55,194 @@ class Shapes:
 
     Attributes:
         kind: the class of the actor; "" if a holdfast of before has not said.
-        fields: by type of message (or `shape_name`), how what is recorded of it was written, newest last.
+        fields: by type of message (or `shape_name`), the tables with which what is recorded was written, newest last.
+        noted: the types of which this process has written the table, or need not.
+        old: what was read, and is coded otherwise than now.
     """
 
     def __init__(self, home: Switch) -> None:
         self._home = home
         self.kind = ""
         self.fields: dict[str, list[Shape]] = {}
-        self._noted: set[str] = set()  # what this process has said, or need not say
+        self.old = OldRecords(home.node.codec, self._class)
+        self._first: dict[str, Shape] = {}  # with which the entries behind the newest snapshot begin
+        self._sinks: dict[str, list[list[int]]] = {}  # where the tables stand in the journal
+        self.noted: set[str] = set()
+
+    @property
+    def _class(self) -> type[Actor] | None:
+        return None if self._home.cell is None else class_of(self._home.cell)
 
     # ---- writing
 
     def entry(self, name: str) -> Entry | None:
         """What has to be written in front of the first message of this type; None if that stands there already."""
-        if not name or name in self._noted:
+        if not name or name in self.noted:
             return None
-        self._noted.add(name)
-        shape = self._now(name)
+        self.noted.add(name)
+        shape = self.now(name)
         known = self.fields.setdefault(name, [])
         if shape is None or (known[-1] == shape if known else shape == ()):
             return None
-        known.append(shape)
-        return ("shape", name, shape)
+        self._know(name, shape)
+        return shape_entry(name, shape)
 
-    def knows(self, name: str) -> bool:
-        """Whether `entry` has nothing to say of this type."""
-        return name in self._noted
+    def stands_at(self, name: str, position: list[int]) -> None:
+        """The table of a type stands in the journal there, or will."""
+        self._sinks.setdefault(name, []).append(position)
 
-    def saved(self) -> dict[str, list[Shape]]:
-        """What a snapshot keeps: of types of which nothing waits only the newest."""
-        waiting = self._waiting()
-        return {name: all_ if name in waiting else all_[-1:] for name, all_ in self.fields.items() if all_}
+    def now(self, name: str) -> Shape | None:
+        """The table of what has this name, as it is written now; None if its class is not known here."""
+        found = present_class(name, self._class)
+        try:
+            return None if found is None else shape_of(found[1])
+        except HoldfastError:  # The codec says what is wrong with it.
+            return None
 
-    # ---- reading
+    def saved(self, turn: int) -> dict[str, list[Shape]]:
+        """What a snapshot of the state after `turn` keeps: the table that its entries begin with, and the newest one.
 
-    def loaded(self, kind: str, fields: Mapping[str, Iterable[Shape]]) -> None:
-        """What a snapshot has kept."""
-        self.kind = kind
-        self.fields = {name: [*all_] for name, all_ in fields.items()}
+        Of types of which no entry is left only the newest: where their tables stand in the journal is cut.
+        """
+        left = self._left(turn)
+        for name, known in self.fields.items():
+            if known and left is not None and self._name_now(name) not in left:
+                self._home.ledger.drop(*self._sinks.pop(name, ()))
+                self._first[name] = known[-1]
+                del known[:-1]
+        return {name: _from(self._first.get(name, known[0]), known) for name, known in self.fields.items() if known}
 
-    def read(self, name: str, shape: Shape) -> None:
-        """Take the fields of a type as the journal has them."""
+    def as_now(self) -> dict[str, list[Shape]]:
+        """As `saved`, for a copy of what is known here: all of it is coded as the present classes have it."""
+        return {name: _from(known[-1], known) for name, known in self.fields.items() if known}
+
+    def _left(self, turn: int) -> set[str] | None:
+        """The types of what is not contained in a snapshot of the state after a turn; None: it may be any."""
+        ledger = self._home.ledger
+        later = [past for number, past in ledger.turns.items() if number > turn]
+        if ledger.released or any(past.digests or past.reply for past in later):
+            return None  # Nobody has said what these are digests of.
+        names = {source.name for source in (*ledger.open.values(), *(past.input for past in later))}
+        return names | {shape_name(answer) for (number, _), answer in ledger.outcomes.items() if number > turn}
+
+    def _name_now(self, name: str) -> str:
+        found = present_class(name, self._class)
+        return name if found is None else found[0]
+
+    def _know(self, name: str, shape: Shape) -> None:
         known = self.fields.setdefault(name, [])
         if shape in known:
             known.remove(shape)
         known.append(shape)
 
+    # ---- reading
+
+    def loaded(self, kind: str, shapes: Tables) -> None:
+        """What a snapshot has kept."""
+        self.kind = kind
+        for name, rows in shapes.items():
+            tables = [as_shape(row) for row in rows]
+            for shape in tables:
+                self._know(name, shape)
+            first = self._first[name] = first_of(tables)
+            self.old.read(name, first)
+
+    def read(self, name: str, shape: Shape, position: int) -> None:
+        """Take the table of a type as the journal has it: what follows was written with it."""
+        self._know(name, shape)
+        self.stands_at(name, [position])
+        self.old.read(name, shape)
+
+    def timer_mappers(self, timers: Timers, shapes: Tables) -> dict[str, Mapper]:
+        """What maps the timers of a snapshot, by key: they were written with the newest tables that it has."""
+        tables = {name: as_shape(known[-1]) for name, known in shapes.items() if known}
+        codec = self._home.node.codec
+        found = {key: mapper_of(one[0], tables.get(one[0]), self._class, codec) for key, one in timers.items()}
+        return {key: mapper for key, mapper in found.items() if mapper is not None}
+
+    def timers_now(self, timers: Timers, shapes: Tables) -> dict[str, tuple[str, bytes, float, float]]:
+        """The timers of a snapshot as they would be written now. Raises NotMapped: one of them cannot be read."""
+        mappers = self.timer_mappers(timers, shapes)
+        return {
+            key: one if key not in mappers else (mappers[key].name, mappers[key].mapped(one[1]), *one[2:])
+            for key, one in timers.items()
+        }
+
     def check(self, cell: Cell) -> None:
-        """Refuse a class, or classes of messages, that would misread what is recorded.
+        """Refuse another class.
 
         Raises:
-            StartFailed: with the difference in words. Nothing was changed.
+            StartFailed: it says which one it was. Nothing was changed.
         """
-        problem = self._other_class(class_of(cell)) or self._other_fields()
+        problem = self._other_class(class_of(cell))
         if problem:
             raise StartFailed(cell.path, f"{UNFIT}: {problem}")
+
+    def all_read(self) -> OldRecords:
+        """All has been read; returns what was written otherwise than it would be now."""
+        old, self.old = self.old, OldRecords(self._home.node.codec, self._class)
+        return old
 
     def _other_class(self, kind: type[Actor] | None) -> str:
         if kind is None or not self.kind:
             return ""
         name = message_name(kind)
-        if name == self.kind or self.kind in kind.formerly:
+        if name == self.kind or self.kind in former_names(kind):
             return ""
         return (
             f"it was recorded by {self.kind}, and is to be started as {name}; start it as {self.kind}, "
             f"or with fresh=True, which forgets it; or, if {name} is to handle its messages and go on with its state, "
-            f"say formerly = ({self.kind!r},) in that class"
+            f"say @hf.renamed({self.kind!r}) above that class"
         )
 
-    def _other_fields(self) -> str:
-        for name in sorted(self._waiting() & self.fields.keys()):
-            now = self._now(name)
-            for shape in self.fields[name] if now is not None else ():
-                problem = difference(shape, now or ())
-                if problem:
-                    return (
-                        f"{name} is in its journal: {problem}; add new fields at the end and with a default, and give "
-                        "what has changed a new name beside the old one"
-                    )
-        return ""
+    # ---- comparing
 
-    def _waiting(self) -> set[str]:
-        """The types of messages that are still to be handled, or handled again."""
-        home, ledger = self._home, self._home.ledger
-        waiting = {source.name for source in ledger.handled_and_open() if source.kind in (MESSAGE, TICK, PIPE)}
-        waiting |= {shape_name(answer) for answer in ledger.outcomes.values()}
-        return waiting | {name for name, *_ in home.timers.saved().values()}
+    def former_names(self, name: str) -> tuple[str, ...]:
+        """What a type of messages was called before."""
+        return former_keys(name, self._class)
 
-    def _now(self, name: str) -> Shape | None:
-        """The fields of the class that has this name now; None if it is not known here."""
-        cell = self._home.cell
-        kind = None if cell is None else class_of(cell)
-        if kind is None:
-            return None
-        try:
-            if name.startswith(REPLY_TO):
-                asked = loaded(name.removeprefix(REPLY_TO), Message)
-                return None if asked is None else shape_of(reply_type(asked))
-            if name.startswith(REFUSAL):
-                refusal = find_refusal(name.removeprefix(REFUSAL))
-                return None if refusal is None else shape_of(refusal.schema())
-            return shape_of(kind._table.kind_named(name))
-        except (HoldfastError, TypeError, NameError):  # Annotations that say nothing: the codec tells.
-            return None
+    def older_forms(self, name: str, body: bytes) -> Iterator[tuple[str, bytes]]:
+        """What is coded now as it may have been coded before, each with the name that it had.
+
+        Raises:
+            NotMapped: behind the forms that are known, if there was one that cannot be known any more: a field is gone,
+                or of another type.
+        """
+        kind = self._class
+        found, names = present_class(name, kind), (name, *self.former_names(name))
+        now = self.now(name)
+        known = [(one, table) for one in names for table in self.fields.get(one, ()) if (one, table) != (name, now)]
+        lost: NotMapped | None = None
+        for one, table in known:
+            try:
+                yield one, body if found is None else Unmapper(table, self._home.node.codec).unmapped(found[1], body)
+            except NotMapped as error:
+                lost = error
+        if not known:  # Stores of before do not say what has been sent: more fields may have come at its end.
+            yield from ((one, short) for one in names for short in (body, *shortened(body)))
+        if lost is not None:
+            raise lost
 
 
-def shape_name(answer: Answer) -> str:
-    """Under which name the fields of an ask's outcome are kept; "" if they are not."""
-    kind = answer.kind.removeprefix(TIMED)
-    if kind == "refusal":
-        return REFUSAL + answer.name
-    if kind == MESSAGE:
-        return answer.name
-    return REPLY_TO + answer.name if kind == REPLY and answer.name else ""
+def first_of(tables: list[Shape]) -> Shape:
+    """The table that is in force for the first entry behind a snapshot.
+
+    A holdfast of before has added fields at the end only: its longest table is true of all that it has written.
+    """
+    older = [table for table in tables if not any(row.types for row in table)]
+    if tables[0] not in older:
+        return tables[0]
+    return max(older, key=lambda table: sum(len(row.fields) for row in table))
 
 
-def as_shape(data: Any) -> Shape:
-    """A shape as the journal has it."""
-    return tuple((str(place), bool(by_position), tuple(map(str, fields))) for place, by_position, fields in data)
+def _from(first: Shape, known: list[Shape]) -> list[Shape]:
+    """All tables of a type, beginning with the one that is in force for the first entry, and the newest last."""
+    return known if first == known[0] else [first, *known]
+
+
+def shape_entry(name: str, shape: Shape) -> Entry:
+    """What the journal has in front of what was written with a table."""
+    return "shape", name, as_data(shape)
 
 
 def start_name(cell: Cell | None) -> str:

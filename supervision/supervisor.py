@@ -500,10 +500,13 @@ class Supervisor(Inquiries):
                 self._again(other, crash(error))  # The others stay up, or are stopped, until it is tried again.
 
     def _again(self, one: Child, reason: ExitReason) -> None:
-        """A start has failed: try once more, which counts."""
+        """A start has failed: try once more, which counts, unless only other code can help."""
         one.state = RESTARTING
         if one.spec.backoff is not None:
             self._later(one, reason)
+            return
+        if UNFIT in str(reason):
+            self._give_up(one, reason, Shutdown(f"{self._path_of(one)} cannot be started again: {reason}"))
             return
         one.retry += 1
         self.ctx._cell.push(RestartAgain(one, one.retry, reason))  # Through our own mailbox: we answer in between.

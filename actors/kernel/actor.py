@@ -123,8 +123,6 @@ class Actor:
     """What a snapshot saves; None saves every instance attribute without a leading underscore."""
     schema_version: ClassVar[int] = 1
     """Raise it when the saved state changes its shape."""
-    formerly: ClassVar[tuple[str, ...]] = ()
-    """Classes, as "module:Class", whose records this one takes over: its own earlier names, or what it replaces."""
 
     _keeps_promises: ClassVar[bool] = False
     """Whether its reply handles belong to the address: the next life answers, or whatever `node.kept` has of it."""

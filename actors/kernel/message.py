@@ -16,6 +16,7 @@ import msgspec
 from typing_extensions import TypeVar, dataclass_transform
 
 from ..errors import BadMessage, HoldfastError, type_name
+from ..values.renamed import NOTED, Renames, former_members
 
 R = TypeVar("R", default=None, covariant=True)
 
@@ -153,7 +154,10 @@ class Refusal(HoldfastError):
             hints = typing.get_type_hints(cls)
             names = [name for name in hints if name != "_schema" and get_origin(hints[name]) is not typing.ClassVar]
             spec = [(n, hints[n], getattr(cls, n)) if hasattr(cls, n) else (n, hints[n]) for n in names]
-            cls._schema = msgspec.defstruct(cls.__name__, spec, frozen=True, array_like=True, module=cls.__module__)
+            named = {NOTED: Renames((), former_members(cls))}
+            cls._schema = msgspec.defstruct(
+                cls.__name__, spec, namespace=named, frozen=True, array_like=True, module=cls.__module__
+            )
         assert cls._schema is not None
         return cls._schema
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ...actors.kernel.codec import Parcel
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer, Out
+from ..schema import shape_entry
 from .input_ledger import outcome_entry
 from .pending_asks import MARK, OVER, SwitchAsk
 
@@ -78,16 +79,21 @@ class Rejoin:
         """Keep what a turn of `home` tells to an address that this program has not opened yet; False if it has."""
         if not self._homes.is_unopened(out.to):
             return False
-        kept = self._kept.setdefault(out.to, {})[origin] = KeptMessage(out.name, out.body, sender, [])
+        kept = self.kept_for(out.to)[origin] = KeptMessage(out.name, out.body, sender, [])
+        shape = home.shapes.now(out.name) if home.journal.durable else None
+        if shape is not None:  # Its journal may have the table of an older program.
+            batch.add(out.to, shape_entry(out.name, shape), [])
         if home.journal.durable:
             batch.add(out.to, ("kept", origin, *kept[:3]), kept.positions)
         return True
 
     def read(self, home: Switch, position: int, origin: str, name: str, body: bytes, sender: str) -> None:
         """Take a message that was kept up again, from the journal of its receiver."""
-        self._kept.setdefault(home.path, {}).setdefault(origin, KeptMessage(name, body, sender, [])).positions.append(
-            position
-        )
+        self.kept_for(home.path).setdefault(origin, KeptMessage(name, body, sender, [])).positions.append(position)
+
+    def kept_for(self, path: str) -> dict[str, KeptMessage]:
+        """What is kept for an address, by origin."""
+        return self._kept.setdefault(path, {})
 
     def _hand_over(self, home: Switch) -> None:
         """What was kept for an address becomes inputs, each once: the journal may have it as one already."""

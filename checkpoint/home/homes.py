@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from ...actors.errors import ControlFailed, HoldfastError, StartFailed
-from ...actors.events import RecoveryFailed
+from ...actors.events import RecordsMapped, RecoveryFailed
 from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.persistence import child_key
 from ..addresses import Addresses, renamed
@@ -23,6 +23,7 @@ from ..snapshot.snapshot_schedule import nobody
 from .ask_recovery import Rejoin
 from .capacity import HomeBound
 from .disposal import drop_all, forget_home, put_into_quarantine
+from .earlier_versions import take_over
 from .held_messages import Holding, let_go
 from .quarantine import PLACE, Quarantine
 from .switch import Switch
@@ -108,17 +109,20 @@ class Homes:
             raise StartFailed(path, str(error)) from error
 
     def _check(self, switch: Switch, cell: Cell) -> None:
-        """Refuse what would misread the records of a home that was just read.
+        """Map the records of a home that was just read to the code that there is now.
 
         Raises:
             StartFailed: with the difference in words; the home is forgotten, and the store as it was.
         """
         try:
             switch.shapes.check(cell)
+            mapped = take_over(switch)
         except StartFailed:
             switch.timers.pause()
             switch.images.close()
             raise
+        if mapped:
+            self.node.emit(RecordsMapped(switch.path, mapped))
 
     def _count_death(self, switch: Switch) -> None:
         """The root was killed in a turn of this actor: count that against its input, durably, before it begins again.

@@ -27,8 +27,6 @@ from ..protocol import (
     Answer,
     Out,
     TurnEnd,
-    answer_digest,
-    shortened,
 )
 
 if TYPE_CHECKING:
@@ -218,8 +216,16 @@ class InputLedger:
             del self.open[source.id]
         return turn
 
-    def judge_replay(self, end: TurnEnd, seen: int, explain: Callable[[Answer], str]) -> None:
+    def judge_replay(
+        self,
+        end: TurnEnd,
+        seen: int,
+        explain: Callable[[Answer], str],
+        is_same_reply: Callable[[Input, int, Answer], bool],
+    ) -> None:
         """Compare a turn that was handled again with what it was before; `seen` of its outputs have come again.
+
+        `is_same_reply`: whether the reply to an input is the one of a digest, but for what may have changed since.
 
         Raises:
             ReplayDiverged: it has ended otherwise.
@@ -241,7 +247,7 @@ class InputLedger:
                 "ctx.now(), ctx.random and ctx.uuid(), and find the cause with hybrid(strict=True)"
             )
             raise StateDiverged(self.path, number, 0, cause)
-        if past.reply and not is_same_reply(past.reply, end.answer):
+        if past.reply and not is_same_reply(past.input, past.reply, end.answer):
             cause = f"the reply to {past.input.name} is not what it was before the crash; {DIVERGES}"
             raise ReplayDiverged(self.path, number, seen + 1, cause)
 
@@ -414,12 +420,6 @@ def said_of(out: Out) -> str:
     ('tell of shop:Sold to /app/cart', 'effect charge')
     """
     return f"{out.verb} of {out.name} to {out.to}" if ":" in out.name else f"{out.verb} {out.to}".strip()
-
-
-def is_same_reply(digest: int, answer: Answer) -> bool:
-    """Whether a reply is the one of a digest; its class may have got more fields at the end since."""
-    older = (Answer(answer.kind, answer.name, body) for body in shortened(answer.body))
-    return digest == answer_digest(answer) or any(digest == answer_digest(one) for one in older)
 
 
 def outcome_entry(turn: int, k: int, answer: Answer) -> Entry:

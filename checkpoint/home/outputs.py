@@ -8,8 +8,6 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
 from ...actors.errors import AskDeadlock, HoldfastError, MailboxFull
 from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.codec import Parcel
@@ -17,7 +15,7 @@ from ...actors.kernel.envelope import Envelope
 from ..durable_links import UNDONE_BY, connect
 from ..inputs import Batch
 from ..life.recorded_inbox import STARTED
-from ..protocol import MESSAGE, PIPE, Answer, Hooked, LifePort, Out, PipeDone, shortened
+from ..protocol import MESSAGE, PIPE, Answer, Hooked, LifePort, Out, PipeDone
 from .ask_recovery import origin_kept
 from .held_messages import Inlet, inlet
 from .pending_asks import SwitchAsk, answer_ask, origin_of
@@ -138,7 +136,7 @@ class Outputs:
         if not self._home.journal.durable:
             return
         self.kept.append(out)
-        if out.verb == "timer" and not self._home.shapes.knows(out.name):
+        if out.verb == "timer" and out.name not in self._home.shapes.noted:
             self._home.note_shape(out.name, batch)
         now = self._home.node.clock.wall()
         entry = ("op", turn, out.verb, out.to, out.name, out.body, out.seconds, out.interval, now)
@@ -339,13 +337,3 @@ def _failure(done: asyncio.Future[None]) -> HoldfastError | None:
     """Why something was not accepted."""
     error = None if done.cancelled() else done.exception()
     return error if isinstance(error, HoldfastError) else None
-
-
-def is_as_before(home: Switch, out: Out, digest: int) -> bool:
-    """Whether a replayed output is the one of a digest but for what may have changed since.
-
-    Its binding leads elsewhere now, or its class has got more fields at the end.
-    """
-    others = (out.to, *home.node.led.get(home.path, {}).get(out.to, ()))
-    bodies = (out.body, *shortened(out.body))
-    return any(msgspec.structs.replace(out, to=to, body=body).digest() == digest for to in others for body in bodies)

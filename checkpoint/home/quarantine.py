@@ -16,10 +16,14 @@ from ...actors.kernel.cell import ANY
 from ...actors.kernel.codec import Parcel
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, PIPE, TICK
+from ..schema import as_shape, class_of
+from ..upgrade.field_tables import as_data
+from ..upgrade.old_records import mapper_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from ...actors.kernel.cell import Cell
     from ...actors.kernel.node import Node
     from ..group_commit import Commits
     from ..journal import Entry
@@ -74,6 +78,7 @@ class QuarantineEntry(msgspec.Struct, array_like=True, frozen=True):
     origin: str
     attempts: int
     since: float
+    shape: tuple[Any, ...] = ()  # the table with which it was written; stores of before do not say
 
 
 class Quarantine:
@@ -104,7 +109,7 @@ class Quarantine:
         """Put an input aside; its turn ends in the same append."""
         one = QuarantineEntry(
             home.path, source.id, source.kind, source.name, source.body, source.sender, source.origin,
-            source.deliveries, self._node.clock.wall(),
+            source.deliveries, self._node.clock.wall(), as_data(home.shapes.now(source.name) or ()),
         )  # fmt: skip
         self._held[one.address, one.id] = one
         if home.journal.durable:
@@ -122,7 +127,8 @@ class Quarantine:
             cell = self._node.find(one.address)
             if cell is not None and cell.table is not ANY:
                 try:
-                    message = self._node.codec.decode(cell.table.kind_named(one.name), one.body)
+                    name, body = self._as_now(one, cell)
+                    message = self._node.codec.decode(cell.table.kind_named(name), body)
                 except (HoldfastError, msgspec.DecodeError):  # The class has changed: it is shown as it came.
                     pass
         return QuarantinedMessage(one.address, message, one.attempts, one.since, one.sender, one.kind, one.id)
@@ -132,13 +138,15 @@ class Quarantine:
 
         Raises:
             NotQuarantined: it is not here any more. NoSuchActor: nobody was started at its address since the root was.
+            NotMapped: an earlier version of the program has recorded it, and its class cannot read it.
         """
         one = self._one(asked)
         if home is None or home.cell is None:
             raise NoSuchActor(one.address)
+        name, body = self._as_now(one, home.cell)
         batch = Batch()
         kind = MESSAGE if one.kind == TICK else one.kind  # Its timer goes its own way.
-        again = home.record(kind, one.name, one.body, one.sender, batch, one.origin if one.kind == PIPE else "")
+        again = home.record(kind, name, body, one.sender, batch, one.origin if one.kind == PIPE else "")
         self._free(one, home.journal.durable, batch)
         batch.after.append(lambda: home.admitted(again))
         batch.commit(home.journal)
@@ -178,6 +186,12 @@ class Quarantine:
             entries: list[Entry] = [("free", one.address, one.id) for one in moved]
             entries += [("held", *msgspec.structs.astuple(one)) for one in fresh]
             self._positions += self._journal.append([(PLACE, entry) for entry in entries])
+
+    def _as_now(self, one: QuarantineEntry, cell: Cell) -> tuple[str, bytes]:
+        """Its name and body as its class has them now. Raises NotMapped: it cannot read it."""
+        table = as_shape(one.shape) or None
+        mapper = mapper_of(one.name, table, class_of(cell), self._node.codec)
+        return (one.name, one.body) if mapper is None else (mapper.name, mapper.mapped(one.body))
 
     def _one(self, asked: QuarantinedMessage) -> QuarantineEntry:
         one = self._held.get((asked.address, asked.id))

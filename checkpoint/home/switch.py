@@ -55,17 +55,19 @@ from ..protocol import (
     answer_digest,
     pieces,
 )  # fmt: skip
-from ..schema import Shapes, start_name
+from ..schema import Shapes, shape_name, start_name
 from ..snapshot.snapshot_blocks import SnapshotImages
 from ..snapshot.snapshot_receiver import SnapshotReceiver
 from ..snapshot.snapshot_record import load
 from ..snapshot.snapshot_schedule import SnapshotSchedule
+from ..upgrade.present_classes import REPLY_TO
 from .admission import submit, taken_up
 from .disposal import lose, put_into_quarantine, undo_begun
+from .earlier_versions import MESSAGES, is_as_before, is_same_reply
 from .held_messages import Intake, let_go
 from .input_ledger import InputLedger
 from .journal_limit import Limit
-from .outputs import Outputs, is_as_before
+from .outputs import Outputs
 from .pending_asks import PendingCalls, SwitchAsk, answer_ask, origin_of
 from .present_life import PresentLife
 from .replay import PacedReplay
@@ -194,8 +196,9 @@ class Switch:
             self.intake.bound.added(source)
         if self.journal.durable:
             source.positions, source.held = [], True
-            if name and not self.shapes.knows(name):
+            if name and name not in self.shapes.noted:
                 self.note_shape(name, batch)
+                self.note_reply(name, batch)
             if batch is not None:
                 batch.add(self.path, source.entry(), source.positions)
             else:
@@ -210,9 +213,15 @@ class Switch:
         own = Batch() if batch is None else batch
         position: list[int] = []
         own.add(self.path, entry, position)
-        self.ledger.drop(position)  # The next snapshot keeps it.
+        self.shapes.stands_at(name, position)
         if batch is None:
             own.commit(self.journal)
+
+    def note_reply(self, name: str, batch: Batch | None = None) -> None:
+        """The same of what is replied to a type of messages: such replies are compared when they are made again."""
+        shape = self.shapes.now(REPLY_TO + name)
+        if shape is not None and any(row.fields for row in shape):
+            self.note_shape(REPLY_TO + name, batch)
 
     def note(self, turn: int, entry: tuple[Any, ...], batch: Batch) -> None:
         """Have an entry that belongs to a turn journaled, if anything is."""
@@ -394,13 +403,15 @@ class Switch:
             if out.verb in AWAITED:
                 self.calls.join(turn, key, out)
         for out in outs[again:]:
+            if self.journal.durable and out.name not in self.shapes.noted and out.verb in MESSAGES:
+                self.note_shape(out.name, batch)
             self.outputs.execute(turn, key, out, batch)
 
     def _turn_end(self, end: TurnEnd) -> None:
         ledger = self.ledger
         if end.turn <= ledger.turn:  # It was handled again, and must have sent just what it sent before.
             self._take(end.turn, end.id, end.outs, Batch())
-            ledger.judge_replay(end, self.life.seen_of(end.turn), self._error)
+            ledger.judge_replay(end, self.life.seen_of(end.turn), self._error, functools.partial(is_same_reply, self))
             return
         source = ledger.open.get(end.id)
         if source is None:
@@ -418,6 +429,8 @@ class Switch:
         if end.outs or ledger.released:
             self._take(end.turn, end.id, end.outs, batch)
         was_asked = source.ask is not None and end.status == OK
+        if is_durable and end.answer.kind == "refusal":
+            self.note_shape(shape_name(end.answer), batch)
         self.end_turn(source, end.turn, end.status, batch, end.state, answer_digest(end.answer) if was_asked else 0)
         if end.answer.kind == LATER:
             self.calls.owe(source, batch)

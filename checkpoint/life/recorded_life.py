@@ -24,6 +24,7 @@ from ...actors.errors import (
     remote_crash,
     type_name,
 )
+from ...actors.events import RecordsMapped
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.actor import Actor, Start
@@ -155,11 +156,14 @@ class Life:
             try:
                 data = restored.joined()
                 self.images.last_bytes = len(data)
-                restore_state(actor, data, (restored.variables, self.saving.variables))
+                dropped = restore_state(actor, data, (restored.variables, self.saving.variables))
             except BaseException as error:
                 why = UNFIT if isinstance(error, StateMismatch) else "its state could not be restored"
                 self._give_up(f"{why}: {error}", error)
             restored.seconds = time.perf_counter() - begin
+            if dropped:
+                said = f"{type_name(start.kind)} has no {', '.join(dropped)} any more: what was saved of it is dropped"
+                cell.node.emit(RecordsMapped(cell.path, said))
             self.saving.turn = turn
             if start.kind.on_recovered is not Actor.on_recovered and self._is_replayed_from_snapshots:
                 self.saving.begun_with = turn, _digest(data)

@@ -11,6 +11,7 @@ from ...actors.errors import HoldfastError, type_name
 from ...actors.kernel.actor import Actor
 from ...actors.state_hooks import state_getter, state_migrator, state_setter
 from ...actors.values import UnsavableValue, decode_value, encode_value
+from ...actors.values.renamed import former_members
 from ..method import Method
 from .state_image import is_image, read_image
 
@@ -88,7 +89,7 @@ def restore_state(
     data: bytes,
     variables: tuple[list[str], list[str]] = ([], []),
     meant: Callable[[Any], Any] = as_it_is,
-) -> None:
+) -> list[str]:
     """Put a saved state back; one of an older schema is handed to the class's `migrate` first.
 
     Args:
@@ -97,34 +98,53 @@ def restore_state(
         variables: those that the class had that has saved it, and that it has now, after `__init__` alone.
         meant: gives what is meant by a saved value.
 
+    Returns:
+        The saved variables that were dropped: the class has them no more.
+
     Raises:
         DamagedValue, StateMismatch: the data is damaged, or of another class or schema version.
     """
     saved = read_image(data) if is_image(data) else decode_value(data)
-    refuse_renamed(actor, saved, *variables)
+    dropped: list[str] = []
+    if isinstance(saved, tuple) and len(saved) == 3 and saved[:2] == (actor.schema_version, "keys"):
+        version, form, state = saved
+        if isinstance(state, dict):
+            state, dropped = as_named_now(actor, state, *variables)
+            saved = version, form, state
     put_back(actor, meant(saved))
+    return dropped
 
 
-def refuse_renamed(actor: Actor, saved: Any, before: list[str], now: list[str]) -> None:
-    """Refuse a state with a variable that the class has no more: it was renamed, or what it holds would be lost.
+def as_named_now(
+    actor: Actor, state: dict[str, Any], before: list[str], now: list[str]
+) -> tuple[dict[str, Any], list[str]]:
+    """A saved state under the names that its variables have now, without those that the class has no more.
 
     Variables that are only made later than in `__init__` are nobody's concern here.
 
+    Returns:
+        The state, and the names of what was dropped.
+
     Raises:
-        StateMismatch: with the difference in words.
+        StateMismatch: variables have gone and others have come: perhaps they were renamed, and nobody has said so.
     """
-    version, form, state = saved if isinstance(saved, tuple) and len(saved) == 3 else (None, "", None)
-    if form != "keys" or version != actor.schema_version or not isinstance(state, dict) or not now:
-        return
-    gone = [name for name in before if name in state and name not in now]
-    if gone:
-        kind = type_name(type(actor._state_root()))
+    kind = type(actor._state_root())
+    names: dict[str, str] = {}
+    for new, olds in former_members(kind).items():
+        found = [old for old in olds if old in state and new not in state]
+        names |= dict.fromkeys(found[:1], new)
+    state = {names.get(name, name): value for name, value in state.items()}
+    before = [names.get(name, name) for name in before]
+    gone = [name for name in before if name in state and name not in now] if now else []
+    come = [name for name in now if name not in before]
+    if gone and come:
         raise StateMismatch(
             actor.ctx.path,
-            f"it was saved with the variables ({', '.join(before)}), {kind} has ({', '.join(now)}): "
-            f"{', '.join(gone)} would be lost; raise its schema_version, and say in "
-            "migrate(state, from_version) what becomes of it",
+            f"it was saved with the variables ({', '.join(before)}), {type_name(kind)} has ({', '.join(now)}): "
+            f"{', '.join(gone)} would be lost; if it was renamed, say @hf.renamed({come[0]}={gone[0]!r}) above the "
+            "class; else raise its schema_version, and say in migrate(state, from_version) what becomes of it",
         )
+    return {name: value for name, value in state.items() if name not in gone}, gone
 
 
 def put_back(actor: Actor, saved: Any) -> None:

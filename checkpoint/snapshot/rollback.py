@@ -48,7 +48,11 @@ def roll_back(home: Switch, to: OnEscalate, why: str) -> None:
 
 
 def older_snapshot(home: Switch) -> Meta | None:
-    """The snapshot before the newest, if one is kept and it is really an older state."""
+    """The snapshot before the newest, if one is kept and it is really an older state.
+
+    Raises:
+        NotMapped: an earlier version of the program has written its timers, and their classes cannot read them.
+    """
     if not home.journal.durable:
         return home.ledger.older
     saved = home.journal.load(home.path, older=True)
@@ -56,4 +60,5 @@ def older_snapshot(home: Switch) -> Meta | None:
     if saved.snapshot is None or newest is None:
         return None
     meta = decode_meta(saved.snapshot)
-    return meta if 0 <= meta.base < newest.base else None
+    timers = home.shapes.timers_now(meta.timers, meta.shapes)
+    return msgspec.structs.replace(meta, timers=timers) if 0 <= meta.base < newest.base else None

@@ -13,8 +13,8 @@ from ..durable_links import Tie
 from ..durable_timers import Saved
 from ..journal import DamagedStore, Entry
 from ..journal import Saved as Journaled
-from ..protocol import DOWN, EXIT, TICK, Snapshot
-from ..schema import as_shape, kind_in
+from ..protocol import DOWN, EXIT, TICK, Answer, Snapshot
+from ..schema import as_shape, kind_in, shape_name
 from .shared_blocks import Place
 
 if TYPE_CHECKING:
@@ -172,7 +172,7 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
         HoldfastError: it could not be kept, and nothing has changed.
     """
     if home.journal.durable:
-        meta = msgspec.structs.replace(meta, shapes=home.shapes.saved())
+        meta = msgspec.structs.replace(meta, shapes=home.shapes.saved(meta.turn))
         home.journal.barrier()  # From here on it is known where everything stands.
         drop = home.ledger.contained_in(meta.turn)
         home.journal.cut(home.path, encode_meta(meta, home.method.compress), drop, turn=meta.turn, keep=keep)
@@ -204,11 +204,12 @@ def load(home: Switch, planted: Journaled | None = None) -> None:
         home.ledger.begin_after(meta)
         home.topics, home.calls.owed = dict.fromkeys(meta.topics), dict(meta.owed)
         home.ties.replace(meta.ties)
-        home.shapes.loaded(meta.kind, {name: map(as_shape, all_) for name, all_ in meta.shapes.items()})
+        home.shapes.loaded(meta.kind, meta.shapes)
         timers = {
             key: (name, body, left - elapsed(home, meta.time), interval)
             for key, (name, body, left, interval) in meta.timers.items()
         }
+        home.shapes.old.timers |= home.shapes.timer_mappers(meta.timers, meta.shapes)
     for position, entry in saved.entries:
         _reload(home, position, entry, timers)
     home.ties.untie()
@@ -256,7 +257,9 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
     ledger = home.ledger
     known = ledger.read_entry(position, values)
     match values:
-        case ("in", _, kind, _, body, _, _, origin):
+        case ("in", key, kind, name, body, _, _, origin):
+            if name and (mapper := home.shapes.old.mapper(name)) is not None:
+                home.shapes.old.inputs[key] = mapper
             if kind == TICK and origin in timers and not timers[origin][3]:
                 del timers[origin]
             if kind in (EXIT, DOWN):
@@ -264,9 +267,14 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
                 if not told.get("recovering"):
                     home.ties.over(told.get("verb", "link"), told["source"])
         case ("shape", name, shape):
-            ledger.drop([position])  # The next snapshot keeps it.
-            home.shapes.read(name, as_shape(shape))
+            home.shapes.read(name, as_shape(shape), position)
+        case ("got", turn, k, kind, name, body):
+            name = shape_name(Answer(kind, name))
+            if name and (mapper := home.shapes.old.mapper(name)) is not None:
+                home.shapes.old.outcomes[turn, k] = mapper
         case ("kept", origin, name, body, sender):
+            if (mapper := home.shapes.old.mapper(name)) is not None:
+                home.shapes.old.kept[origin] = mapper
             home.homes.rejoin.read(home, position, origin, name, body, sender)
         case ("tie", turn, verb, path):
             ledger.positions_of(turn).append(position)
@@ -284,6 +292,9 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
             match verb:
                 case "timer":
                     timers[key] = (name, body, seconds - elapsed(home, *when or (0.0,)), interval)
+                    home.shapes.old.timers.pop(key, None)
+                    if (mapper := home.shapes.old.mapper(name)) is not None:
+                        home.shapes.old.timers[key] = mapper
                     home.timers.made_again(key)
                 case "cancel":
                     timers.pop(key, None)

@@ -23,7 +23,7 @@ from ..addresses import KEY
 from ..compression import LibraryMissing
 from ..journal import DamagedStore, Entry, StoreFailed
 from ..protocol import REPLY, START, Answer, untimed
-from ..schema import Shape, as_shape, shape_name
+from ..schema import Shape, as_shape, first_of, shape_name
 from ..snapshot.snapshot_record import Meta, decode_meta
 from ..snapshot.state_image import is_image, read_image
 from ..sqlite.entry_chains import Chain, StoreScan
@@ -112,9 +112,9 @@ class _Export:
             if self._view.is_kept(number):  # Else the running system has a newer one now.
                 yield _damage(error, address)
             return
-        self._shapes[chain.id] = {
-            name: as_shape(known[-1]) for name, known in meta.shapes.items() if known
-        }  # The newest one counts, and it has all fields of those before it.
+        tables = {name: [*map(as_shape, known)] for name, known in meta.shapes.items() if known}
+        self._shapes.setdefault(chain.id, {name: first_of(known) for name, known in tables.items()})
+        newest = {name: known[-1] for name, known in tables.items()}
         yield {
             "record": "snapshot",
             "address": address,
@@ -124,13 +124,13 @@ class _Export:
             "next_input": meta.next_id,
             "stashed": meta.stash,
             "topics": meta.topics,
-            "timers": self._timers(chain.id, meta),
+            "timers": self._timers(meta, newest),
             **_state(data),
         }
 
-    def _timers(self, address: int, meta: Meta) -> Record:
+    def _timers(self, meta: Meta, tables: Mapping[str, Shape]) -> Record:
         return {
-            key: {"type": name, "message": self._message(address, name, body), "left": left, "interval": interval}
+            key: {"type": name, "message": _content(tables, name, body), "left": left, "interval": interval}
             for key, (name, body, left, interval) in meta.timers.items()
         }
 
@@ -179,13 +179,17 @@ class _Export:
                 return {"record": "unknown", "values": as_plain(entry)}
 
     def _message(self, key: int, name: str, body: bytes) -> Any:
-        """The content of a message: its fields by name, if the store has these."""
-        try:
-            value = msgpack.unpackb(body, ext_hook=_special, strict_map_key=False, timestamp=3)
-        except (ValueError, TypeError, msgpack.UnpackException):
-            return as_plain(body)
-        shape = self._shapes.get(key, {}).get(name, ())
-        return _named(value, "", {place: fields for place, is_by_position, fields in shape if is_by_position})
+        return _content(self._shapes.get(key, {}), name, body)
+
+
+def _content(tables: Mapping[str, Shape], name: str, body: bytes) -> Any:
+    """The content of a message: its fields by name, if the store has these."""
+    try:
+        value = msgpack.unpackb(body, ext_hook=_special, strict_map_key=False, timestamp=3)
+    except (ValueError, TypeError, msgpack.UnpackException):
+        return as_plain(body)
+    shape = tables.get(name, ())
+    return _named(value, "", {row.place: row.fields for row in shape if row.by_position})
 
 
 def _named_values(kind: str, values: Sequence[Any]) -> Record:

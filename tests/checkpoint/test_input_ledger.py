@@ -16,7 +16,19 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from holdfast.actors.errors import ReplayDiverged
 from holdfast.checkpoint.home.input_ledger import InputLedger, outcome_entry
 from holdfast.checkpoint.inputs import OVERHEAD, Input
-from holdfast.checkpoint.protocol import DROPPED, FAILED, MESSAGE, OK, REPLY, START, STASHED, Answer, Out, TurnEnd
+from holdfast.checkpoint.protocol import (
+    DROPPED,
+    FAILED,
+    MESSAGE,
+    OK,
+    REPLY,
+    START,
+    STASHED,
+    Answer,
+    Out,
+    TurnEnd,
+    answer_digest,
+)
 from holdfast.checkpoint.snapshot.snapshot_record import FORMAT, Meta
 
 MOST = 3
@@ -24,6 +36,10 @@ MOST = 3
 
 def same(out: Out, digest: int) -> bool:
     return False
+
+
+def same_reply(source: Input, digest: int, answer: Answer) -> bool:
+    return digest == answer_digest(answer)
 
 
 def outs_of(turn: int, count: int) -> list[Out]:
@@ -223,12 +239,12 @@ class Ledgers(RuleBasedStateMachine):
             outs = outs_of(number, self.left[number])
             assert ledger.compare_outputs(number, turn.input.id, outs, same) == len(outs)
             end = TurnEnd(number, turn.input.id, turn.status, outs, Answer())
-            ledger.judge_replay(end, len(outs), str)
+            ledger.judge_replay(end, len(outs), str, same_reply)
             with pytest.raises(ReplayDiverged):
                 ledger.compare_outputs(number, turn.input.id, outs_of(number, len(outs) + 1), same)
             if outs:
                 with pytest.raises(ReplayDiverged):
-                    ledger.judge_replay(end, len(outs) - 1, str)
+                    ledger.judge_replay(end, len(outs) - 1, str, same_reply)
                 with pytest.raises(ReplayDiverged):
                     ledger.compare_outputs(number, turn.input.id, outs_of(-number - 2, len(outs)), same)
 

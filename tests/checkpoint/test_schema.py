@@ -18,9 +18,8 @@ from tests.checkpoint.strikes import NEVER
 class Get(hf.Message[list[float]]): ...
 
 
+@hf.renamed(f"{__name__}:New", f"{__name__}:Stubborn", f"{__name__}:Never")
 class Old(hf.Actor):
-    formerly: ClassVar[tuple[str, ...]] = (f"{__name__}:New", f"{__name__}:Stubborn", f"{__name__}:Never")
-
     def __init__(self) -> None:
         self.total = 7
         self.grid = np.ones(200_000)
@@ -30,10 +29,10 @@ class Old(hf.Actor):
         return [self.total, float(self.grid.sum())]
 
 
+@hf.renamed(f"{__name__}:Old", f"{__name__}:Never")
 class New(hf.Actor):
     """Keeps the sum in another variable, as two numbers."""
 
-    formerly: ClassVar[tuple[str, ...]] = (f"{__name__}:Old", f"{__name__}:Never")
     schema_version: ClassVar[int] = 3
 
     def __init__(self) -> None:
@@ -51,17 +50,17 @@ class New(hf.Actor):
         return [*self.parts, float(self.grid.sum())]
 
 
+@hf.renamed(f"{__name__}:Old", f"{__name__}:New", f"{__name__}:Stubborn")
 class Never(New):
     """Comes from a version that `migrate` does not know."""
 
-    formerly: ClassVar[tuple[str, ...]] = (f"{__name__}:Old", f"{__name__}:New", f"{__name__}:Stubborn")
     schema_version: ClassVar[int] = 2
 
 
+@hf.renamed(f"{__name__}:Old", f"{__name__}:New", f"{__name__}:Stubborn")
 class Stubborn(Old):
     """Has another version, and no way to it."""
 
-    formerly: ClassVar[tuple[str, ...]] = (f"{__name__}:Old", f"{__name__}:New", f"{__name__}:Stubborn")
     schema_version: ClassVar[int] = 2
 
 

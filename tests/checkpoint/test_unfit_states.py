@@ -32,10 +32,10 @@ class Cart(hf.Actor):
         return self.items
 
 
+@hf.renamed(f"{__name__}:Cart")
 class Newer(Cart):
     """The next release, which has forgotten how to migrate."""
 
-    formerly = (f"{__name__}:Cart",)
     schema_version = 2
 
 

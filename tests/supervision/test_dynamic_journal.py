@@ -45,10 +45,10 @@ class Shy(hf.Actor):
         return ["here"]
 
 
+@hf.renamed(f"{__name__}:Pupil")
 class Student(hf.Actor):
     """The next release of a pupil: its words are numbered."""
 
-    formerly = (f"{__name__}:Pupil",)
     schema_version = 2
 
     def __init__(self, name: str = "nobody", town: str = "nowhere") -> None:
