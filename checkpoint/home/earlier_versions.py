@@ -17,7 +17,7 @@ from ...actors.errors import StartFailed
 from ...actors.persistence import UNFIT
 from ..protocol import OK, REPLY, STASHED, TIMED, Answer, Out, answer_digest, timed, untimed
 from ..schema import shape_name
-from ..upgrade.mapping import Mapper, NotMapped
+from ..upgrade.mapping import Mapper, NotMapped, in_whole_numbers
 from ..upgrade.present_classes import REFUSAL, REPLY_TO
 
 if TYPE_CHECKING:
@@ -112,7 +112,8 @@ def is_same_reply(home: Switch, source: Input, digest: int, answer: Answer) -> b
 def _is_any(home: Switch, name: str, body: bytes, is_same: Callable[[str, bytes], bool]) -> bool:
     """Whether one of the older forms of what has this name is the same; also if there was one that is not known."""
     try:
-        return any(is_same(*form) for form in home.shapes.older_forms(name, body))
+        forms = itertools.chain(((name, body),), home.shapes.older_forms(name, body))
+        return any(is_same(old, one) or is_same(old, in_whole_numbers(one)) for old, one in forms)
     except NotMapped:
         return True
 

@@ -234,3 +234,20 @@ def _coded(named: dict[str, Any], tag: tuple[str, str | int] | tuple[()], *, in_
     if in_order:
         return [tag[1], *named.values()] if tag else [*named.values()]
     return {tag[0]: tag[1], **named} if tag else named
+
+
+def in_whole_numbers(body: bytes) -> bytes:
+    """What is coded there, with each float that is whole as an int, as before ints became floats.
+
+    >>> msgspec.msgpack.decode(in_whole_numbers(msgspec.msgpack.encode([7.0, {"a": 0.5}])))
+    [7, {'a': 0.5}]
+    """
+    return msgspec.msgpack.encode(_whole(msgspec.msgpack.decode(body))) if body else body
+
+
+def _whole(value: Any) -> Any:
+    if isinstance(value, float):
+        return int(value) if value.is_integer() else value
+    if isinstance(value, list):
+        return [_whole(one) for one in value]
+    return {key: _whole(one) for key, one in value.items()} if isinstance(value, dict) else value
