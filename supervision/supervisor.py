@@ -506,6 +506,8 @@ class Supervisor(Inquiries):
             self._later(one, reason)
             return
         if UNFIT in str(reason):
+            if one.cell is not None:
+                one.cell.extra().reason = reason  # Whoever waits there is told this, and not how its last life ended.
             self._give_up(one, reason, Shutdown(f"{self._path_of(one)} cannot be started again: {reason}"))
             return
         one.retry += 1

@@ -18,6 +18,7 @@ from ...actors.exit_reasons import KILLED, ExitReason
 from ...actors.kernel import links
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.lifecycle import MAILBOX
+from ...actors.persistence import UNFIT
 from ..method import Method
 from ..protocol import LifePort
 from ..recovery.recoveries import Recovery
@@ -269,8 +270,9 @@ class JournalHome(RecordedHome):
         restarting = self.parent.is_restarting(cell)
         for topic in (*self.parent.topics(cell), *self.switch.topics):
             cell.node.topics.unsubscribe(topic, inlet(self.switch, topic))
-        diverged = self.switch.life.diverged
-        drop_all(self.switch, "for good" if diverged is None else str(diverged), keep_tells=restarting)
+        diverged, reason = self.switch.life.diverged, str(cell.extra().reason)
+        unfit = reason if UNFIT in reason else "for good"
+        drop_all(self.switch, unfit if diverged is None else str(diverged), keep_tells=restarting)
         let_go(self.switch)
         self.switch.ties.untie()
         why = "its supervisor has ended" if restarting else "it is not started again"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -73,3 +74,29 @@ async def test_code_that_does_not_fit_costs_no_acknowledged_message(tmp_path: Pa
             while "/app/carts/ann" not in system.tree():
                 await asyncio.sleep(0.005)
         assert await system.ref("/app/carts/ann", Cart).ask(Items(), timeout=20.0) == ["a", "b", "c", "d"]
+
+
+async def test_a_supervisor_gives_up_at_once_and_who_asks_is_told_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing but other code can help: it is not tried again, however many restarts are allowed."""
+    async with hf.ActorSystem("app", log=False) as system:
+        cart = hf.child("cart", hf.start(Cart), recovery=hf.hybrid(interval=1000.0))
+        await system.start(hf.supervisor("top", intensity=1000, children=[cart], restart="temporary"))
+        ref = system.ref("/app/top/cart", Cart)
+        await ref.ask(Put("a"))
+        await system.checkpoint(ref)
+        monkeypatch.setattr(Cart, "schema_version", 2)
+        with system.events() as stream:
+            ref.kill()
+            with pytest.raises(hf.ActorStopped, match=r"does not fit the code: .*has no classmethod migrate"):
+                await ref.ask(Items(), timeout=20.0)
+            async with asyncio.timeout(20.0):
+                told = [event async for event in _until_given_up(stream)]
+        assert sum(isinstance(event, hf.events.ChildStartFailed) for event in told) == 1
+
+
+async def _until_given_up(stream: hf.events.EventStream) -> AsyncIterator[hf.events.Event]:
+    async for event in stream:
+        yield event
+        if isinstance(event, hf.events.SupervisorGaveUp):
+            assert "does not fit the code" in str(event.reason)
+            return

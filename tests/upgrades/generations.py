@@ -64,7 +64,7 @@ class Generations:
 
     @contextlib.asynccontextmanager
     async def run(
-        self, text: str, *, method: Any = hf.hybrid, isolation: Any = "task", **recovery: Any
+        self, text: str, *, method: Any = hf.hybrid, isolation: Any = "task", mechanism: Any = None, **recovery: Any
     ) -> AsyncIterator[tuple[Any, Any, Any]]:
         """Run a program; its store is that which is there at the end of the block, as if it had been killed then."""
         how = hf.replay_only() if method is hf.replay_only else hf.hybrid(interval=1000.0, **recovery)
@@ -75,7 +75,9 @@ class Generations:
                 system._node.events.add_sink(self.events.append)
                 for name, kind in getattr(module, "OTHERS", {}).items():
                     await system.start(hf.child(name, hf.start(kind)))
-                actor = await system.start(hf.child("a", hf.start(module.A), recovery=how, isolation=isolation))
+                actor = await system.start(
+                    hf.child("a", hf.start(module.A), recovery=how, isolation=isolation, mechanism=mechanism)
+                )
                 yield system, actor, module
                 await system.backup(after)
         self._number += 1

@@ -1,0 +1,267 @@
+"""What was recorded is mapped wherever it is read: outcomes, quarantine, cuts, older snapshots, replicas, older stores."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+import holdfast as hf
+from holdfast.checkpoint import schema
+from holdfast.ftm.mechanisms.lfr import LFR
+from tests.upgrades.generations import LONG, Generations
+
+PROGRAM = """
+import os
+import signal
+
+
+class Add(hf.Message[int]):
+    n: int
+    why: str
+
+
+class Die(hf.Message):
+    n: int
+    why: str
+
+
+class Wait(hf.Message): ...
+
+
+class Tick(hf.Message):
+    n: int
+    why: str
+
+
+class Other(hf.Actor):
+    def __init__(self) -> None:
+        self.said: list[Any] = []
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.said = [*self.said, plain(message)]
+        return len(self.said)
+
+    @hf.on(Get, readonly=True)
+    def get(self, message: Get) -> list[Any]:
+        return self.said
+
+
+class A(Other):
+    @hf.on(Wait)
+    async def wait(self, message: Wait) -> None:
+        came = await self.ctx.wait_for(Tick)
+        self.said = [*self.said, plain(came)]
+        self.ctx.find("/app/other", Other).tell(Add(n=came.n, why="told"))
+        await self.ctx.sleep(3600.0)
+
+    @hf.on(Tick)
+    def tick(self, message: Tick) -> None:
+        self.said = [*self.said, plain(message)]
+
+    @hf.on(Die)
+    def die(self, message: Die) -> None:
+        if message.n:
+            os.kill(os.getpid(), signal.SIGKILL)
+        self.said = [*self.said, plain(message)]
+"""
+FIELDS = "    n: int\n    why: str\n"
+NEWER = PROGRAM.replace(FIELDS, '    why: str\n    by: str = "nobody"\n    n: int = 0\n')
+assert NEWER.count("by: str") == 3
+
+
+def said(n: int, why: str) -> dict[str, Any]:
+    """As the newer program has it."""
+    return {"why": why, "by": "nobody", "n": n}
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Generations:
+    return Generations(tmp_path)
+
+
+async def until(actor: Any, module: Any, count: int) -> list[Any]:
+    """What the actor has said, when it is so much."""
+    async with asyncio.timeout(LONG):
+        while len(found := await actor.ask(module.Get(), timeout=LONG)) < count:
+            await asyncio.sleep(0.01)
+    return found
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_message_that_a_turn_has_waited_for(store: Generations, isolation: Any) -> None:
+    """The turn goes on in the newer program; what it has told to another actor that is recorded is not told again."""
+    spec = hf.hybrid(interval=1000.0)
+    async with store.run(PROGRAM, isolation=isolation) as (system, actor, old):
+        other = await system.start(hf.child("other", hf.start(old.Other), recovery=spec))
+        actor.tell(old.Wait())
+        actor.tell(old.Tick(5, "came"))
+        async with asyncio.timeout(LONG):
+            while not any(out for out in system._homes.at("/app/a").ledger.dues):
+                await asyncio.sleep(0.01)
+        actor.tell(old.Add(6, "behind"))
+        await asyncio.sleep(0.05)
+    for _ in range(2):
+        async with store.run(NEWER, isolation=isolation) as (system, actor, new):
+            other = await system.start(hf.child("other", hf.start(new.Other), recovery=spec))
+            home = system._homes.at("/app/a")
+            async with asyncio.timeout(LONG):
+                while not home.calls.rests.is_busy:
+                    await asyncio.sleep(0.01)
+            assert [one.name for one in home.open.values()] == ["upgraded:Wait", "upgraded:Add"]
+            assert home.life.diverged is None
+            assert store.told(hf.events.RecordsMapped)
+            assert len(home.ledger.released) == 3, "it waits again where it waited"
+
+
+async def test_what_is_told_to_somebody_whose_home_is_not_open(store: Generations) -> None:
+    """Its journal has the table of the first program, and what the second one tells is written with another one."""
+    spec = hf.hybrid(interval=1000.0)
+    teller = "self.said = [*self.said, plain(message)]\n        return"
+    tells = 'self.said = [*self.said, plain(message)]\n        if message.why == "tell":\n            self.ctx.find("/app/other", Other).tell(Add(n=message.n, why="kept"))\n        return'
+    third = PROGRAM.replace(FIELDS, "    n: float = 0.5\n    why: str = ''\n    more: int = 1\n")
+    async with store.run(PROGRAM) as (system, actor, old):
+        other = await system.start(hf.child("other", hf.start(old.Other), recovery=spec))
+        await other.ask(old.Add(1, "first"), timeout=LONG)
+    async with store.run(NEWER.replace(teller, tells)) as (_, actor, new):
+        await actor.ask(new.Add(n=2, why="tell"), timeout=LONG)
+        await actor.ask(new.Get(), timeout=LONG)
+    async with store.run(third.replace(teller, tells)) as (system, _, last):
+        other = await system.start(hf.child("other", hf.start(last.Other), recovery=spec))
+        assert await until(other, last, 2) == [
+            {"n": 1.0, "why": "first", "more": 1},
+            {"n": 2.0, "why": "kept", "more": 1},
+        ]
+
+
+async def test_messages_in_quarantine(store: Generations) -> None:
+    async with store.run(PROGRAM, isolation="process", max_deliveries=1) as (system, actor, old):
+        await actor.ask(old.Add(1, "before"), timeout=LONG)
+        actor.tell(old.Die(7, "kills"))
+        await until(actor, old, 1)
+        assert [one.message for one in system.quarantined()] == [old.Die(7, "kills")]
+    gentle = NEWER.replace("if message.n:", "if message.n < 0:")
+    stubborn = PROGRAM.replace(FIELDS, "    n: str\n    why: str\n", 2)
+    async with store.run(stubborn, isolation="task") as (system, actor, other):
+        (one,) = system.quarantined()
+        assert not isinstance(one.message, other.Die)
+        with pytest.raises(hf.HoldfastError, match=r"now they are \(n: str, why: str\)"):
+            system.retry(one)
+    async with store.run(gentle, isolation="task") as (system, actor, new):
+        (one,) = system.quarantined()
+        assert one.message == new.Die(n=7, why="kills", by="nobody")
+        system.retry(one)
+        assert await until(actor, new, 2) == [{"n": 1, "why": "before"}, said(7, "kills")]
+
+
+async def test_the_cut_of_a_group(store: Generations) -> None:
+    """It is made in the newer program, of records of the older one, and brought back in one that is newer again."""
+    async with store.run(PROGRAM, method=hf.replay_only) as (_, actor, old):
+        await actor.ask(old.Add(1, "old"), timeout=LONG)
+    last = NEWER.replace('    by: str = "nobody"\n', "")
+    async with store.run(NEWER) as (system, actor, new):
+        await actor.ask(new.Add(n=2, why="new"), timeout=LONG)
+        await system.suspend(actor)
+        actor.tell(new.Add(n=3, why="waits"))
+        await system.checkpoint_group([actor], name="cut")
+        await system.resume(actor)
+        await actor.ask(new.Add(n=4, why="gone"), timeout=LONG)
+    async with store.run(last) as (system, actor, newest):
+        await system.restore_group("cut")
+        found = await until(actor, newest, 3)
+        assert [(one["n"], one["why"]) for one in found] == [(1, "old"), (2, "new"), (3, "waits")]
+
+
+TIMED = """
+class Tick(hf.Message):
+    n: int
+    why: str
+
+
+class Set(hf.Message): ...
+
+
+class A(hf.Actor):
+    def __init__(self) -> None:
+        self.said: list[Any] = []
+
+    @hf.on(Set)
+    def set(self, message: Set) -> None:
+        self.ctx.every(0.5, Tick(n=1, why="timer"))
+
+    @hf.on(Tick)
+    def tick(self, message: Tick) -> None:
+        self.said = [*self.said, plain(message)]
+
+    @hf.on(Get, readonly=True)
+    def get(self, message: Get) -> list[Any]:
+        return self.said
+"""
+
+
+async def test_the_timers_of_a_snapshot_are_written_anew_by_each_program(store: Generations) -> None:
+    """A snapshot of the second program has them as that one has coded them, whatever its journal begins with."""
+    second = TIMED.replace("    n: int\n    why: str\n", "    why: str\n    n: float\n")
+    third = TIMED.replace("    n: int\n    why: str\n", "    more: int = 5\n    n: float = 0.0\n    why: str = ''\n")
+    async with store.run(TIMED) as (system, actor, old):
+        actor.tell(old.Set())
+        await until(actor, old, 1)
+        await system.checkpoint(actor, timeout=LONG)
+    async with store.run(second) as (system, actor, new):
+        assert (await until(actor, new, 2))[1] == {"why": "timer", "n": 1.0}
+        await system.checkpoint(actor, timeout=LONG)
+    async with store.run(third) as (_, actor, new):
+        count = len(await actor.ask(new.Get(), timeout=LONG))
+        assert (await until(actor, new, count + 1))[-1] == {"more": 5, "n": 1.0, "why": "timer"}
+
+
+async def test_replicas_get_what_was_mapped(tmp_path: Path, store: Generations) -> None:
+    async with store.run(PROGRAM, method=hf.replay_only) as (system, actor, old):
+        await actor.ask(old.Add(1, "handled"), timeout=LONG)
+        await system.suspend(actor)
+        actor.tell(old.Add(2, "waits"))
+        await asyncio.sleep(0)
+    async with store.run(NEWER, mechanism=LFR()) as (_, actor, new):
+        assert await until(actor, new, 2) == [said(1, "handled"), said(2, "waits")]
+
+
+async def test_a_store_of_before_with_names_only(store: Generations, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has no types, no defaults and no tags; and nothing of what turns have sent."""
+
+    def as_before(name: str, shape: schema.Shape) -> Any:
+        return "shape", name, tuple(tuple(row[:3]) for row in shape if row.place != "=")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(schema, "shape_entry", as_before)
+        async with store.run(PROGRAM, method=hf.replay_only) as (system, actor, old):
+            await actor.ask(old.Add(1, "handled"), timeout=LONG)
+            await system.suspend(actor)
+            actor.tell(old.Add(2, "waits"))
+            await asyncio.sleep(0)
+    for _ in range(2):
+        async with store.run(NEWER, method=hf.replay_only) as (system, actor, new):
+            entries = system._homes.journal.load("/app/a").entries
+            assert ("shape", "upgraded:Add", (("", True, ("n", "why")),)) in [entry for _, entry in entries]
+            assert await until(actor, new, 2) == [said(1, "handled"), said(2, "waits")]
+
+
+class One(msgspec.Struct, array_like=True, tag="one"):
+    x: int
+
+
+class Two(msgspec.Struct, array_like=True, tag="two"):
+    x: int | None = None
+
+
+class Both(hf.Message):
+    which: list[One | Two] = []
+
+
+def test_a_table_is_read_as_it_was_written() -> None:
+    table = schema.shape_of(Both)
+    assert schema.as_shape(msgspec.msgpack.decode(msgspec.msgpack.encode(table))) == table
+    assert [row.place for row in table] == ["", "which[]|One", "which[]|Two"]
