@@ -6,6 +6,8 @@ import dataclasses
 import enum
 import sys
 import types
+from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from itertools import chain
 from typing import Any, cast
@@ -15,6 +17,11 @@ from msgpack import ExtType
 
 from ..errors import DamagedValue, UnsavableValue, type_name
 from .forms import DATACLASS, ENUM, KNOWN, NAMED, SCALARS, STRUCT, flat
+from .renamed import former_members
+
+
+Defaults = dict[str, tuple[tuple[str, ...], Callable[[], Any] | None]]
+"""Members of a class that may be missing in what was saved: what they were called, and what gives their default."""
 
 
 def find_class(name: str, *, imports: bool = True) -> type:
@@ -68,6 +75,26 @@ def slots_of(kind: type) -> dict[str, Any]:
     """Descriptors of all slots, by name, inherited ones first."""
     found = chain.from_iterable(vars(base).items() for base in reversed(kind.__mro__))
     return {name: slot for name, slot in found if type(slot) is types.MemberDescriptorType}
+
+
+def defaults_of(kind: Any) -> Defaults:
+    """The members whose instances may have been saved without, and what to do then."""
+    former = former_members(kind)
+    defaults: dict[str, Callable[[], Any] | None] = dict.fromkeys(former)
+    if dataclasses.is_dataclass(kind):
+        for field in dataclasses.fields(kind):
+            if field.default_factory is not dataclasses.MISSING:
+                defaults[field.name] = field.default_factory
+            elif field.default is not dataclasses.MISSING and field.name in slots_of(kind):  # Else the class has it.
+                defaults[field.name] = partial(as_it_is, field.default)
+    elif class_mark(kind) is NAMED:
+        defaults |= {name: partial(as_it_is, default) for name, default in kind._field_defaults.items()}
+    return {name: (former.get(name, ()), default) for name, default in defaults.items()}
+
+
+def as_it_is(value: Any) -> Any:
+    """Return the value."""
+    return value
 
 
 def class_parts(x: Any, slots: dict[str, Any]) -> list[Any]:

@@ -14,7 +14,7 @@ from msgpack import ExtType
 from ..errors import DamagedValue
 from .arrays import MAKE_ARRAYS
 from .budget import MANY_KEYS, LargeInts, spread
-from .classes import class_mark, find_class, is_factory, slots_of
+from .classes import Defaults, class_mark, defaults_of, find_class, is_factory, slots_of
 from .forms import (
     AGAIN,
     BUFFER,
@@ -75,7 +75,7 @@ class Decoder:
         self.buffers = buffers  # those not yet read: they lie in the order in which the tree names them
         self.open_marks = 0
         self.shared: dict[int, object] = {}
-        self.classes: dict[str, tuple[Any, ExtType | None, dict[str, Any]]] = {}
+        self.classes: dict[str, tuple[Any, ExtType | None, dict[str, Any], Defaults]] = {}
         self.make: dict[int, Make] = _MAKE | {
             BUFFER.code: self.make_buffer,
             SHARED.code: self.make_shared,
@@ -130,18 +130,18 @@ class Decoder:
             spread(parts[1::2])
         return defaultdict(factory, pairs(parts[1:]))
 
-    def find(self, mark: ExtType, name: str) -> tuple[Any, dict[str, Any]]:
+    def find(self, mark: ExtType, name: str) -> tuple[Any, dict[str, Any], Defaults]:
         if name not in self.classes:
             kind = find_class(name, imports=self._imports)
-            self.classes[name] = kind, class_mark(kind), slots_of(kind)
-        kind, found, slots = self.classes[name]
+            self.classes[name] = kind, class_mark(kind), slots_of(kind), defaults_of(kind)
+        kind, found, slots, defaults = self.classes[name]
         if found is not mark:
             raise DamagedValue(f"class {name} is of another kind now")
-        return kind, slots
+        return kind, slots, defaults
 
     def make_enum(self, parts: list[Any]) -> object:
         name, member = parts
-        kind, _ = self.find(ENUM, name)
+        kind, *_ = self.find(ENUM, name)
         if isinstance(member, str):
             return kind.__members__[member]
         if issubclass(kind, enum.Flag):
@@ -150,8 +150,15 @@ class Decoder:
 
     def make_record(self, mark: ExtType, parts: list[Any]) -> object:
         name = parts[0]
-        kind, slots = self.find(mark, name)
+        kind, slots, defaults = self.find(mark, name)
         attributes = pairs(parts[1:])
+        for field in defaults.keys() - attributes.keys():  # It was saved by an earlier version of its class.
+            old, default = defaults[field]
+            found = next((name for name in old if name in attributes), None)
+            if found is not None:
+                attributes[field] = attributes.pop(found)
+            elif default is not None:
+                attributes[field] = default()
         if mark is DATACLASS:
             made: Any = object.__new__(kind)
         elif mark is STRUCT:

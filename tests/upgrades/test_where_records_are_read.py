@@ -265,3 +265,59 @@ def test_a_table_is_read_as_it_was_written() -> None:
     table = schema.shape_of(Both)
     assert schema.as_shape(msgspec.msgpack.decode(msgspec.msgpack.encode(table))) == table
     assert [row.place for row in table] == ["", "which[]|One", "which[]|Two"]
+
+
+PARTS = """
+from typing import NamedTuple
+
+
+@dataclasses.dataclass
+class Part:
+    n: int
+
+
+class Pair(NamedTuple):
+    x: int
+
+
+class Kept(msgspec.Struct):
+    x: int
+
+
+class Set(hf.Message): ...
+
+
+class A(hf.Actor):
+    def __init__(self) -> None:
+        self.parts: list[Any] = []
+
+    @hf.on(Set)
+    def set(self, message: Set) -> None:
+        self.parts = [Part(1), Pair(2), Kept(3)]
+
+    @hf.on(Get, readonly=True)
+    def get(self, message: Get) -> list[Any]:
+        return [repr(part) for part in self.parts]
+"""
+
+
+async def test_classes_inside_of_a_state(store: Generations) -> None:
+    """Fields with defaults are added, and fields are renamed."""
+    newer = (
+        PARTS.replace("@dataclasses.dataclass\n", '@hf.renamed(count="n")\n@dataclasses.dataclass\n')
+        .replace(
+            "    n: int\n",
+            "    tags: list[str] = dataclasses.field(default_factory=list, kw_only=True)\n    count: int\n",
+        )
+        .replace("class Pair(NamedTuple):\n    x: int\n", "class Pair(NamedTuple):\n    x: int\n    y: int = 5\n")
+        .replace(
+            "class Kept(msgspec.Struct):\n    x: int\n", "class Kept(msgspec.Struct):\n    x: int\n    y: int = 6\n"
+        )
+    )
+    async with store.run(PARTS) as (system, actor, old):
+        actor.tell(old.Set())
+        assert await actor.ask(old.Get(), timeout=LONG) == ["Part(n=1)", "Pair(x=2)", "Kept(x=3)"]
+        await system.checkpoint(actor, timeout=LONG)
+    async with store.run(newer) as (_, actor, new):
+        found = await actor.ask(new.Get(), timeout=LONG)
+        assert found == ["Part(tags=[], count=1)", "Pair(x=2, y=5)", "Kept(x=3, y=6)"]

@@ -105,7 +105,7 @@ FORGED = {
     "something beside the rows": mark(54, "<f8", mark(1, 1), mark(34, 0), 0, None),
     "something nowhere in the rows": mark(54, "<f8", mark(1, 1), mark(34, 0), 0),
     "tuples of texts": mark(40, "ab"),
-    "tuple without a field": mark(39, f"{HERE}:Size", "width", 1),
+    "tuple without a field": mark(39, f"{HERE}:Size", "height", 1),
 }
 
 
