@@ -102,9 +102,10 @@ class Shapes:
     def saved(self, turn: int) -> dict[str, list[Shape]]:
         """What a snapshot of the state after `turn` keeps: the table that its entries begin with, and the newest one.
 
-        Of types of which no entry is left only the newest: where their tables stand in the journal is cut.
+        What is written behind it is looked at anew, for code may have been loaded once more. Of types of which no entry is left only the newest: where their tables stand in the journal is cut.
         """
         left = self._left(turn)
+        self.noted.clear()
         for name, known in self.fields.items():
             if known and left is not None and self._name_now(name) not in left:
                 self._home.ledger.drop(*self._sinks.pop(name, ()))
