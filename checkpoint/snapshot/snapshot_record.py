@@ -256,7 +256,7 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
     ledger = home.ledger
     known = ledger.read_entry(position, values)
     match values:
-        case ("in", _, kind, _, body, _, _, origin):
+        case ("in", _, kind, _, body, _, _, origin, *_):
             if kind == TICK and origin in timers and not timers[origin][3]:
                 del timers[origin]
             if kind in (EXIT, DOWN):
