@@ -15,6 +15,7 @@ import gc
 import os
 import signal
 import socket
+import sqlite3
 import struct
 import subprocess
 import sys
@@ -455,3 +456,45 @@ ROLES: Final[dict[str, Callable[[socket.socket], None]]] = {"echo": serve, "fork
 
 if __name__ == "__main__":
     ROLES[sys.argv[1]](socket.socket(fileno=int(sys.argv[2])))
+
+
+class SqliteLoop:
+    """Limit of recorded turns: what a tick has brought is handled, written in one row each, committed, answered."""
+
+    def __init__(self, path: str, *, is_synced: bool) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._db = sqlite3.connect(path, isolation_level=None)
+        self._db.execute("PRAGMA journal_mode = WAL")
+        self._db.execute(f"PRAGMA synchronous = {'FULL' if is_synced else 'NORMAL'}")
+        self._db.execute("CREATE TABLE turns (id INTEGER PRIMARY KEY, message BLOB, reply BLOB)")
+        self._waiting: list[tuple[bytes, asyncio.Future[bytes] | None]] = []
+        self.told = 0
+
+    def ask(self, message: bytes) -> asyncio.Future[bytes]:
+        reply: asyncio.Future[bytes] = self._loop.create_future()
+        self._take(message, reply)
+        return reply
+
+    def tell(self, message: bytes) -> None:
+        self._take(message, None)
+
+    def _take(self, message: bytes, reply: asyncio.Future[bytes] | None) -> None:
+        if not self._waiting:
+            self._loop.call_soon(self._tick)
+        self._waiting.append((message, reply))
+
+    def _tick(self) -> None:
+        taken, self._waiting = self._waiting, []
+        rows: list[tuple[bytes, bytes | None]] = []
+        for message, reply in taken:
+            self.told += 1
+            rows.append((message, None if reply is None else message))
+        self._db.execute("BEGIN")
+        self._db.executemany("INSERT INTO turns VALUES (NULL, ?, ?)", rows)
+        self._db.execute("COMMIT")
+        for message, reply in taken:
+            if reply is not None:
+                reply.set_result(message)
+
+    def close(self) -> None:
+        self._db.close()

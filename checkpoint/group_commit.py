@@ -94,10 +94,18 @@ class Commits:
         Raises:
             HoldfastError: the store does not take anything now.
         """
+        self.check()
+        self.submit(submission)
+
+    def check(self) -> None:
+        """Raise what `admit` would raise now.
+
+        Raises:
+            HoldfastError: the store does not take anything now.
+        """
         error = self.stopped or self.blocked
         if error is not None:
             raise type(error)(*error.args)
-        self.submit(submission)
 
     def submit(self, submission: Submission) -> None:
         """Take in what has happened: it is written at the end of this tick, or when the store has room again."""
@@ -158,9 +166,7 @@ class Commits:
             self._write()
             if self._lanes.ready and not self._is_running and not self._is_awake:
                 self._wake()
-        error = self.stopped or self.blocked
-        if error is not None:
-            raise type(error)(*error.args)
+        self.check()
 
     def _write(self, most: int | None = None) -> None:
         """Write what was submitted, the first `most` of it if that is given."""

@@ -97,11 +97,16 @@ class TimerState:
 
 
 class Batch:
-    """What becomes one append, and what happens when it is safe."""
+    """What becomes one append, and what happens when it is safe.
 
-    __slots__ = ("after", "asks", "entries", "sinks")
+    Attributes:
+        is_taken: whether somebody else has it take effect.
+    """
+
+    __slots__ = ("after", "asks", "entries", "is_taken", "sinks")
 
     def __init__(self) -> None:
+        self.is_taken = False
         self.asks: list[Ask] = []  # what it answers when it is safe
         self.entries: list[tuple[str, Entry]] = []
         self.sinks: list[list[int]] = []
@@ -116,7 +121,7 @@ class Batch:
         """Have all of it appended; then it takes effect."""
         if self.entries:
             journal.submit(self)
-        else:
+        elif not self.is_taken:
             self.safe()
 
     def written(self, positions: Sequence[int]) -> None:

@@ -102,7 +102,8 @@ class Shapes:
     def saved(self, turn: int) -> dict[str, list[Shape]]:
         """What a snapshot of the state after `turn` keeps: the table that its entries begin with, and the newest one.
 
-        What is written behind it is looked at anew, for code may have been loaded once more. Of types of which no entry is left only the newest: where their tables stand in the journal is cut.
+        Of types of which no entry is left it is only the newest, and where their tables stand in the journal is cut.
+        What is written behind it is looked at anew, for code may have been loaded once more.
         """
         left = self._left(turn)
         self.noted.clear()

@@ -19,7 +19,6 @@ from ..errors import DamagedValue, UnsavableValue, type_name
 from .forms import DATACLASS, ENUM, KNOWN, NAMED, SCALARS, STRUCT, flat
 from .renamed import former_members
 
-
 Defaults = dict[str, tuple[tuple[str, ...], Callable[[], Any] | None]]
 """Members of a class that may be missing in what was saved: what they were called, and what gives their default."""
 

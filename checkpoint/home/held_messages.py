@@ -284,11 +284,13 @@ class Intake:
         bound: what a message has to pass; None: nothing.
         holding: stands as the bound while the actor is recovered.
         inlets: the topics that have a rule of their own then.
+        last: the last input that was to be safe before it is fed.
     """
 
     bound: HomeBound | Holding | None = None
     holding: Holding | None = None
     inlets: dict[str, Inlet] = dataclasses.field(default_factory=dict)
+    last: Input | None = None
 
 
 def hold(home: Switch, running: int = -1) -> None:

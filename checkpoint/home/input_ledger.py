@@ -7,6 +7,7 @@ from the journal's entry: a ledger that is read back equals the one that was los
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -55,6 +56,7 @@ class InputLedger:
         older: the one before it, if the store does not have it.
         stash: inputs that had been put aside when the newest snapshot was made.
         positions: in the journal, of what belongs to a turn besides its input.
+        rows: the same of the ends of several turns, by the last of them.
         dropped: the same of what the next snapshot need not be followed by.
     """
 
@@ -74,6 +76,7 @@ class InputLedger:
     older: Meta | None = None
     stash: list[int] = dataclasses.field(default_factory=list)
     positions: dict[int, list[int]] = dataclasses.field(default_factory=dict)
+    rows: dict[int, list[int]] = dataclasses.field(default_factory=dict)
     dropped: list[list[int]] = dataclasses.field(default_factory=list)
 
     # -- what there is ----------------------------------------------------------------------------------------------
@@ -307,7 +310,7 @@ class InputLedger:
     def contained_in(self, turn: int) -> list[int]:
         """The positions that need not follow a snapshot of the state after `turn`."""
         drop = [position for known in self.dropped for position in known]
-        for number, known in self.positions.items():  # Those of hooks are among them.
+        for number, known in itertools.chain(self.positions.items(), self.rows.items()):  # Those of hooks are there.
             if number <= turn:
                 drop += known
         # An image may be behind: what was stashed when it was begun may have been handled since.
@@ -330,7 +333,7 @@ class InputLedger:
             turn = self.turns.pop(number)
             if turn.status != STASHED:
                 self.journal_bytes -= turn.input.size
-        for known in (self.positions, self.pipes_done):
+        for known in (self.positions, self.rows, self.pipes_done):
             for number in [number for number in known if number <= meta.turn]:
                 del known[number]
         self._forget_outcomes(key for key in self.outcomes if key[0] <= meta.turn)
@@ -373,7 +376,7 @@ class InputLedger:
     def read_entry(self, position: int, entry: tuple[Any, ...]) -> bool:
         """Take a journal entry up again, in order; False if it is of another kind."""
         match entry:
-            case ("in", key, kind, name, body, when, sender, origin):
+            case ("in", key, kind, name, body, when, sender, origin, *end):
                 source = self.open[key] = Input(key, kind, name, body, when, sender)
                 source.origin, source.positions = origin, [position]
                 self.next_id = max(self.next_id, key + 1)
@@ -381,11 +384,18 @@ class InputLedger:
                 if kind == PIPE and origin:
                     turn, k = map(int, origin.split("."))
                     self.admit_result(turn, k)
+                if end:
+                    number, status, *more = end
+                    self._read_end(source, number, status, (), *more)
+            case ("ends", first, keys):
+                self.rows[first + len(keys) - 1] = [position]
+                for number, key in enumerate(keys, first):
+                    if key in self.open:  # Else the snapshot contains it.
+                        self._read_end(self.open[key], number, OK, ())
             case ("end", turn, key, status, digests, *more):
                 if key in self.open:
                     self.positions_of(turn).append(position)
-                    self.released = list(digests)
-                    self.end_turn(self.open[key], turn, status, *more)
+                    self._read_end(self.open[key], turn, status, digests, *more)
             case ("out", turn, key, digests, *more):
                 self.positions_of(turn).append(position)
                 if turn > self.turn:
@@ -411,6 +421,10 @@ class InputLedger:
             case _:
                 return False
         return True
+
+    def _read_end(self, source: Input, number: int, status: str, digests: Iterable[int], *more: int) -> None:
+        self.released = list(digests)
+        self.end_turn(source, number, status, *more)
 
 
 def said_of(out: Out) -> str:

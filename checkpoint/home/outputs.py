@@ -16,6 +16,7 @@ from ..durable_links import UNDONE_BY, connect
 from ..inputs import Batch
 from ..life.recorded_inbox import STARTED
 from ..protocol import MESSAGE, PIPE, Answer, Hooked, LifePort, Out, PipeDone
+from .admission import TurnRows
 from .ask_recovery import origin_kept
 from .held_messages import Inlet, inlet
 from .pending_asks import SwitchAsk, answer_ask, origin_of
@@ -30,11 +31,17 @@ OPPOSITES = (("subscribe", "unsubscribe"), *((one, other) for other, one in UNDO
 
 
 class Outputs:
-    """Lets outputs out of one home."""
+    """Lets outputs out of one home.
+
+    Attributes:
+        rows: what the journal has of the ends of turns.
+        kept: what outlives the life, and has not taken effect yet.
+    """
 
     def __init__(self, home: Switch) -> None:
         self._home = home
-        self.kept: list[Out] = []  # what outlives the life, and has not taken effect yet
+        self.rows = TurnRows(home)
+        self.kept: list[Out] = []
         self._lines: dict[Cell, deque[Callable[[], bool]]] = {}  # what waits for room at who keeps no journal
 
     def execute(self, turn: int, key: int, out: Out, batch: Batch) -> None:

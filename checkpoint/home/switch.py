@@ -160,6 +160,8 @@ class Switch:
             return
         origin = origin_of(ask) if isinstance(ask, SwitchAsk) else ""
         try:
+            if not origin and self.journal.durable and self.outputs.rows.let_ahead(ask, name, body, sender):
+                return
             source = self.record(MESSAGE, name, body, sender, origin=origin)
         except HoldfastError as error:  # The store has no room, or has failed.
             ask.fail(error)
@@ -196,6 +198,7 @@ class Switch:
             self.intake.bound.added(source)
         if self.journal.durable:
             source.positions, source.held = [], True
+            self.intake.last = source
             if name and name not in self.shapes.noted:
                 self.note_shape(name, batch)
                 self.note_reply(name, batch)
@@ -226,6 +229,7 @@ class Switch:
     def note(self, turn: int, entry: tuple[Any, ...], batch: Batch) -> None:
         """Have an entry that belongs to a turn journaled, if anything is."""
         if self.journal.durable:
+            self.outputs.rows.close()
             batch.add(self.path, entry, self.ledger.positions_of(turn))
 
     def admitted(self, source: Input) -> None:
@@ -419,12 +423,17 @@ class Switch:
         if source.kind == START and end.status == FAILED:
             return  # Its start failed, and will be tried again.
         is_durable = self.journal.durable
-        if not end.outs and source.ask is None and not ledger.released and self.intake.bound is None and not is_durable:
+        if not end.outs and source.ask is None and not ledger.released and self.intake.bound is None:
             # The shortest way: nothing leaves, nobody waits.
-            ledger.end_turn(source, end.turn, end.status, end.state)
-            if end.status == DROPPED:
-                self._lose(source, end)
-            return
+            if not is_durable:
+                ledger.end_turn(source, end.turn, end.status, end.state)
+                if end.status == DROPPED:
+                    self._lose(source, end)
+                return
+            if end.status == OK and not end.state:
+                ledger.end_turn(source, end.turn, OK)
+                self.outputs.rows.end_quietly(end.turn, source.id)
+                return
         batch = Batch()
         if end.outs or ledger.released:
             self._take(end.turn, end.id, end.outs, batch)
@@ -444,7 +453,8 @@ class Switch:
         turn = self.ledger.end_turn(source, number, status, state, reply)
         if self.intake.bound is not None:
             batch.after.append(functools.partial(self.intake.bound.ended, source))
-        if self.journal.durable:
+        if self.journal.durable and (status == STASHED or not self.outputs.rows.end_with_input(number, turn, batch)):
+            self.outputs.rows.close()
             batch.add(self.path, turn.entry(number), self.ledger.positions_of(number))
 
     def end_without_turn(self, source: Input, answer: Answer, batch: Batch) -> None:

@@ -257,7 +257,7 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
     ledger = home.ledger
     known = ledger.read_entry(position, values)
     match values:
-        case ("in", key, kind, name, body, _, _, origin):
+        case ("in", key, kind, name, body, _, _, origin, *_):
             if name and (mapper := home.shapes.old.mapper(name)) is not None:
                 home.shapes.old.inputs[key] = mapper
             if kind == TICK and origin in timers and not timers[origin][3]:

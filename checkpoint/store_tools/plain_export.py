@@ -34,6 +34,7 @@ Record = dict[str, Any]
 _NAMES: Final[dict[str, tuple[str, ...]]] = {
     "out": ("turn", "input", "outputs", "since"),
     "end": ("turn", "input", "status", "outputs", "state", "reply"),
+    "ends": ("turn", "inputs"),
     "got": ("turn", "output", "outcome", "type", "value"),
     "due": ("turn", "output", "time"),
     "kept": ("origin", "type", "value", "sender"),
@@ -148,7 +149,7 @@ class _Export:
 
     def _entry(self, key: int, entry: Entry) -> Record:
         match entry:
-            case ("in", number, str() as kind, str() as name, bytes() as body, when, sender, origin):
+            case ("in", number, str() as kind, str() as name, bytes() as body, when, sender, origin, *end):
                 is_start = kind == START
                 content = _text(body) if is_start else self._message(key, name, body)
                 return {
@@ -160,6 +161,11 @@ class _Export:
                     "time": as_plain(when),
                     "sender": sender,
                     "origin": origin,
+                    **(
+                        {"end": dict(zip(("turn", "status", "state", "reply"), map(as_plain, end), strict=False))}
+                        if end
+                        else {}
+                    ),
                 }
             case ("shape", str() as name, shape):
                 self._shapes.setdefault(key, {})[name] = as_shape(shape)

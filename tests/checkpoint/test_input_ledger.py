@@ -127,6 +127,33 @@ class Ledgers(RuleBasedStateMachine):
         else:
             self.ended[source.id] = status
 
+    @precondition(lambda self: self.next_input() is not None)
+    @rule(most=st.integers(1, 4))
+    def end_quietly(self, most: int) -> None:
+        """Turns in a row let nothing out: one row has their ends."""
+        ledger, first, keys = self.ledger, self.ledger.turn + 1, list[int]()
+        while len(keys) < most and (source := self.next_input()) is not None and not self.left.get(ledger.turn + 1):
+            self.left[ledger.turn + 1] = 0
+            ledger.end_turn(source, ledger.turn + 1, OK)
+            keys.append(source.id)
+            self.deaths.pop(source.id, None)
+            self.ended[source.id] = OK
+        if keys:
+            self.write(("ends", first, tuple(keys)), ledger.rows.setdefault(ledger.turn, []))
+
+    @precondition(lambda self: self.next_input() is None)
+    @rule(reply=st.sampled_from([0, answer_digest(Answer())]), status=st.sampled_from([OK, FAILED, DROPPED]))
+    def run_ahead(self, reply: int, status: str) -> None:
+        """An ask is handled before it is written: one row has it and the end of its turn."""
+        ledger, number = self.ledger, self.ledger.turn + 1
+        source = ledger.admit(MESSAGE, "m:Do", b"ask", 0.0, None)
+        source.positions = []
+        self.admitted.append(source.id)
+        turn = ledger.end_turn(source, number, status, 0, reply)
+        _, _, _, _, _, *more = turn.entry(number)
+        self.write((*source.entry(), number, status, *more), source.positions)
+        self.left[number], self.ended[source.id] = 0, status
+
     @precondition(lambda self: self.stashed & self.ledger.open.keys())
     @rule()
     def end_of_the_stash(self) -> None:

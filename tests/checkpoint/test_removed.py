@@ -9,6 +9,41 @@ from __future__ import annotations
 from tests.removing import Check, as_tests
 
 CHECKS = {
+    "an ask that runs ahead overtakes nothing that waits until it is safe": Check(
+        "checkpoint/home/admission.py",
+        "(last is not None and last.held and last.id in home.ledger.open)",
+        "(last is None)",
+        "tests/checkpoint/test_turn_rows.py",
+        "test_an_ask_that_runs_ahead_overtakes_no_message",
+    ),
+    "what a turn leads to waits for the row that it shares with its ask": Check(
+        "checkpoint/inputs.py",
+        "        elif not self.is_taken:\n",
+        "        else:\n",
+        "tests/checkpoint/test_turn_rows.py",
+        "test_nothing_leaves_a_turn_that_runs_ahead",
+    ),
+    "what was handled is not refused": Check(
+        "checkpoint/home/admission.py",
+        "if not self._source.held or not take_back(",
+        "if not take_back(",
+        "tests/checkpoint/test_commits.py",
+        "test_a_full_disk_refuses_clearly",
+    ),
+    "a row of ends stays until a snapshot contains the last of them": Check(
+        "checkpoint/home/input_ledger.py",
+        "itertools.chain(self.positions.items(), self.rows.items())",
+        "[*self.positions.items(), *((n - 1, known) for n, known in self.rows.items())]",
+        "tests/checkpoint/test_input_ledger.py",
+        "TestLedgers",
+    ),
+    "the ends of turns stand in their order": Check(
+        "checkpoint/home/admission.py",
+        "        self._quiet = None\n        if self._ahead:\n            self._ahead.clear()\n",
+        "        pass\n",
+        "tests/checkpoint/test_turn_rows.py",
+        "test_the_rows_of_a_mixture",
+    ),
     "an effect leaves when all before it is safe": Check(
         "checkpoint/home/outputs.py",
         "batch.after.append(lambda: self._begin(turn, key, out, port))",

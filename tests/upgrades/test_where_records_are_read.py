@@ -1,4 +1,4 @@
-"""What was recorded is mapped wherever it is read: outcomes, quarantine, cuts, older snapshots, replicas, older stores."""
+"""What was recorded is mapped wherever it is read: outcomes, quarantine, cuts, timers, replicas, older stores."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ async def test_a_message_that_a_turn_has_waited_for(store: Generations, isolatio
     """The turn goes on in the newer program; what it has told to another actor that is recorded is not told again."""
     spec = hf.hybrid(interval=1000.0)
     async with store.run(PROGRAM, isolation=isolation) as (system, actor, old):
-        other = await system.start(hf.child("other", hf.start(old.Other), recovery=spec))
+        await system.start(hf.child("other", hf.start(old.Other), recovery=spec))
         actor.tell(old.Wait())
         actor.tell(old.Tick(5, "came"))
         async with asyncio.timeout(LONG):
@@ -107,7 +107,7 @@ async def test_a_message_that_a_turn_has_waited_for(store: Generations, isolatio
         await asyncio.sleep(0.05)
     for _ in range(2):
         async with store.run(NEWER, isolation=isolation) as (system, actor, new):
-            other = await system.start(hf.child("other", hf.start(new.Other), recovery=spec))
+            await system.start(hf.child("other", hf.start(new.Other), recovery=spec))
             home = system._homes.at("/app/a")
             async with asyncio.timeout(LONG):
                 while not home.calls.rests.is_busy:
@@ -121,16 +121,18 @@ async def test_a_message_that_a_turn_has_waited_for(store: Generations, isolatio
 async def test_what_is_told_to_somebody_whose_home_is_not_open(store: Generations) -> None:
     """Its journal has the table of the first program, and what the second one tells is written with another one."""
     spec = hf.hybrid(interval=1000.0)
-    teller = "self.said = [*self.said, plain(message)]\n        return"
-    tells = 'self.said = [*self.said, plain(message)]\n        if message.why == "tell":\n            self.ctx.find("/app/other", Other).tell(Add(n=message.n, why="kept"))\n        return'
+    says = "        self.said = [*self.said, plain(message)]\n        return"
+    tells = """        if message.why == "tell":
+            self.ctx.find("/app/other", Other).tell(Add(n=message.n, why="kept"))
+"""
     third = PROGRAM.replace(FIELDS, "    n: float = 0.5\n    why: str = ''\n    more: int = 1\n")
     async with store.run(PROGRAM) as (system, actor, old):
         other = await system.start(hf.child("other", hf.start(old.Other), recovery=spec))
         await other.ask(old.Add(1, "first"), timeout=LONG)
-    async with store.run(NEWER.replace(teller, tells)) as (_, actor, new):
+    async with store.run(NEWER.replace(says, tells + says)) as (_, actor, new):
         await actor.ask(new.Add(n=2, why="tell"), timeout=LONG)
         await actor.ask(new.Get(), timeout=LONG)
-    async with store.run(third.replace(teller, tells)) as (system, _, last):
+    async with store.run(third.replace(says, tells + says)) as (system, _, last):
         other = await system.start(hf.child("other", hf.start(last.Other), recovery=spec))
         assert await until(other, last, 2) == [
             {"n": 1.0, "why": "first", "more": 1},
@@ -258,7 +260,7 @@ class Two(msgspec.Struct, array_like=True, tag="two"):
 
 
 class Both(hf.Message):
-    which: list[One | Two] = []
+    which: list[One | Two]
 
 
 def test_a_table_is_read_as_it_was_written() -> None:
