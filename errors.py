@@ -47,6 +47,7 @@ from .checkpoint.life.replay_guard import StateDiverged
 from .checkpoint.snapshot.key_variables import StateMismatch
 from .checkpoint.snapshot.snapshot_groups import NoSuchGroup
 from .checkpoint.snapshot.snapshot_schedule import CheckpointFailed
+from .checkpoint.upgrade.mapping import NotMapped
 from .ftm.group.reconfiguration import CannotAdapt
 from .ftm.mechanisms.rb import NotAccepted
 from .ftm.model.mechanism import MechanismRefused
@@ -112,6 +113,7 @@ __all__ = [
     "NotCopied",
     "NotDeterministic",
     "NotGranted",
+    "NotMapped",
     "NotQuarantined",
     "NotReadonly",
     "NotSupported",

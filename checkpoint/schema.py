@@ -18,7 +18,7 @@ from ..actors.persistence import UNFIT
 from ..actors.values.renamed import former_names
 from .protocol import START, shortened
 from .upgrade.field_tables import Shape, as_data, as_shape, difference, shape_of
-from .upgrade.mapping import Mapper, NotMapped, Unmapper
+from .upgrade.mapping import BodyMapper, BodyUnmapper, NotMapped
 from .upgrade.old_records import OldRecords, mapper_of
 from .upgrade.present_classes import former_keys, present_class, shape_name
 
@@ -155,7 +155,7 @@ class Shapes:
         self.stands_at(name, [position])
         self.old.read(name, shape)
 
-    def timer_mappers(self, timers: Timers, shapes: Tables) -> dict[str, Mapper]:
+    def timer_mappers(self, timers: Timers, shapes: Tables) -> dict[str, BodyMapper]:
         """What maps the timers of a snapshot, by key: they were written with the newest tables that it has."""
         tables = {name: as_shape(known[-1]) for name, known in shapes.items() if known}
         codec = self._home.node.codec
@@ -217,7 +217,10 @@ class Shapes:
         lost: NotMapped | None = None
         for one, table in known:
             try:
-                yield one, body if found is None else Unmapper(table, self._home.node.codec).unmapped(found[1], body)
+                yield (
+                    one,
+                    body if found is None else BodyUnmapper(table, self._home.node.codec).unmapped(found[1], body),
+                )
             except NotMapped as error:
                 lost = error
         if not known:  # Stores of before do not say what has been sent: more fields may have come at its end.

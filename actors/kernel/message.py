@@ -25,7 +25,7 @@ R = TypeVar("R", default=None, covariant=True)
 class Message(msgspec.Struct, Generic[R], frozen=True, array_like=True):
     """Base of all messages; `R` is the type of the reply, None if it is left out.
 
-    Fields travel by position: add new ones at the end and with a default, and old data can still be read.
+    Fields travel by position. What a store has of earlier versions of the class is mapped by their names (`renamed`).
 
     >>> class Add(Message[int]):
     ...     n: int = 1

@@ -78,13 +78,13 @@ def slots_of(kind: type) -> dict[str, Any]:
 
 def defaults_of(kind: Any) -> Defaults:
     """The members whose instances may have been saved without, and what to do then."""
-    former = former_members(kind)
+    former, slots = former_members(kind), slots_of(kind)
     defaults: dict[str, Callable[[], Any] | None] = dict.fromkeys(former)
     if dataclasses.is_dataclass(kind):
         for field in dataclasses.fields(kind):
             if field.default_factory is not dataclasses.MISSING:
                 defaults[field.name] = field.default_factory
-            elif field.default is not dataclasses.MISSING and field.name in slots_of(kind):  # Else the class has it.
+            elif field.default is not dataclasses.MISSING and field.name in slots:  # Else the class has it.
                 defaults[field.name] = partial(as_it_is, field.default)
     elif class_mark(kind) is NAMED:
         defaults |= {name: partial(as_it_is, default) for name, default in kind._field_defaults.items()}

@@ -17,7 +17,7 @@ from ...actors.errors import StartFailed
 from ...actors.persistence import UNFIT
 from ..protocol import OK, REPLY, STASHED, TIMED, Answer, Out, answer_digest, timed, untimed
 from ..schema import shape_name
-from ..upgrade.mapping import Mapper, NotMapped, in_whole_numbers
+from ..upgrade.mapping import BodyMapper, NotMapped, in_whole_numbers
 from ..upgrade.present_classes import REFUSAL, REPLY_TO
 
 if TYPE_CHECKING:
@@ -45,13 +45,13 @@ def _taken_over(home: Switch, old: OldRecords) -> list[str]:
     ledger, clocks, messages = home.ledger, home.timers.saved(), home.homes.rejoin.kept_for(home.path)
     ended = (turn.input for turn in ledger.turns.values() if turn.status in (OK, STASHED) and home.method.replays)
     sources = {source.id: source for source in (*ended, *ledger.open.values())}
-    counts = Counter[Mapper]()
+    counts = Counter[BodyMapper]()
 
-    def mapped(mapper: Mapper, body: bytes) -> bytes:
+    def mapped(mapper: BodyMapper, body: bytes) -> bytes:
         counts[mapper] += 1
         return mapper.mapped(body)
 
-    def outcome(mapper: Mapper, answer: Answer) -> Answer:
+    def outcome(mapper: BodyMapper, answer: Answer) -> Answer:
         own, when = untimed(answer)
         own = Answer(own.kind, mapper.name.rpartition(" ")[2], mapped(mapper, own.body))
         return timed(own, when) if answer.kind.startswith(TIMED) else own

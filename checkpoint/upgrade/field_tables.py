@@ -25,7 +25,7 @@ WHOLE = "="
 """The place of the row of a reply that is no record: its type in words."""
 
 
-class Row(NamedTuple):
+class FieldRow(NamedTuple):
     """The fields of one class in a message, or of the message itself.
 
     Attributes:
@@ -44,13 +44,13 @@ class Row(NamedTuple):
     optional: tuple[bool, ...] = ()
     tag: tuple[str, str | int] | tuple[()] | None = None
 
-    def agrees(self, now: Row) -> bool:
+    def agrees(self, now: FieldRow) -> bool:
         """Whether what was coded with this row is read well with that one."""
         known = self if self.types else self._replace(types=now.types, optional=now.optional, tag=now.tag)
         return known == now
 
 
-Shape: TypeAlias = "tuple[Row, ...]"
+Shape: TypeAlias = "tuple[FieldRow, ...]"
 """A table: the rows of a message class, and of the classes in it."""
 
 
@@ -64,8 +64,8 @@ def as_data(shape: Shape) -> tuple[tuple[Any, ...], ...]:
     return tuple(map(tuple, shape))
 
 
-def _row(place: Any, by_position: Any, fields: Any, types: Any = (), optional: Any = (), tag: Any = None) -> Row:
-    return Row(
+def _row(place: Any, by_position: Any, fields: Any, types: Any = (), optional: Any = (), tag: Any = None) -> FieldRow:
+    return FieldRow(
         str(place),
         bool(by_position),
         tuple(map(str, fields)),
@@ -84,13 +84,13 @@ def shape_of(kind: Any) -> Shape:
     ...     x: int
     ...     y: int = 0
     >>> shape_of(Move)
-    (Row(place='', by_position=True, fields=('x', 'y'), types=('int', 'int'), optional=(False, True), tag=()),)
+    (FieldRow(place='', by_position=True, fields=('x', 'y'), types=('int', 'int'), optional=(False, True), tag=()),)
     """
-    found: dict[str, Row] = {}
+    found: dict[str, FieldRow] = {}
     try:
         info = plain(inspect.type_info(kind))
         if not isinstance(info, RECORDS):
-            found[WHOLE] = Row(WHOLE, by_position=False, fields=(), types=(in_words(info),), tag=())
+            found[WHOLE] = FieldRow(WHOLE, by_position=False, fields=(), types=(in_words(info),), tag=())
         for row in _rows(info, "", ()):
             found[row.place] = row
     except Exception as error:  # Annotations can be of any kind; the codec says what is wrong with them.
@@ -98,13 +98,13 @@ def shape_of(kind: Any) -> Shape:
     return tuple(found.values())
 
 
-def _rows(info: inspect.Type, place: str, above: tuple[type, ...]) -> Iterator[Row]:
+def _rows(info: inspect.Type, place: str, above: tuple[type, ...]) -> Iterator[FieldRow]:
     info = plain(info)
     if isinstance(info, RECORDS):
         if info.cls in above:
             return  # It contains itself: its fields stand there already.
         fields = info.fields
-        yield Row(
+        yield FieldRow(
             place,
             is_by_position(info),
             tuple(field.encode_name for field in fields),
@@ -207,7 +207,7 @@ def difference(old: Shape, new: Shape) -> str:
     return ""
 
 
-def _listed(row: Row, has_types: bool) -> str:
+def _listed(row: FieldRow, has_types: bool) -> str:
     if not has_types:
         return ", ".join(row.fields)
     words = zip(row.fields, row.types, row.optional, strict=False)

@@ -14,8 +14,8 @@ from ...actors.values.renamed import former_members, former_names
 from .field_tables import (
     LISTS,
     RECORDS,
+    FieldRow,
     Record,
-    Row,
     Shape,
     difference,
     in_words,
@@ -69,7 +69,7 @@ class _Walk:
             return [self.of(item, kind, f"{place}[{number}]", above) for number, (item, kind) in enumerate(items)]
         return value
 
-    def _row(self, info: Record, place: str, above: Above) -> Row | None:
+    def _row(self, info: Record, place: str, above: Above) -> FieldRow | None:
         """The row of a class at a place, under whichever name it has there; None: it was another type altogether."""
         names = (message_name(info.cls), *former_names(info.cls))
         places = [place, *(f"{place}|{name.rpartition(':')[2].rpartition('.')[2]}" for name in names)]
@@ -86,15 +86,15 @@ class _Walk:
             return isinstance(value, list)
         return isinstance(info, inspect.DictType) and isinstance(value, dict)
 
-    def _record(self, value: Any, info: Record, row: Row, above: Above) -> Any:
+    def _record(self, value: Any, info: Record, row: FieldRow, above: Above) -> Any:
         raise NotImplementedError
 
-    def _named(self, value: Any, info: Record, row: Row) -> dict[str, Any] | None:
+    def _named(self, value: Any, info: Record, row: FieldRow) -> dict[str, Any] | None:
         """The values of the fields by name, if it is a value of this class."""
         raise NotImplementedError
 
 
-class Mapper(_Walk):
+class BodyMapper(_Walk):
     """Maps bodies that were written with a table to what the present class reads.
 
     Args:
@@ -137,7 +137,7 @@ class Mapper(_Walk):
             raise NotMapped(f"{self.written} is in its journal{self.change}: {error}") from error
         return made
 
-    def _record(self, value: Any, info: Record, row: Row, above: Above) -> Any:
+    def _record(self, value: Any, info: Record, row: FieldRow, above: Above) -> Any:
         named = self._named(value, info, row)
         if named is None:
             return value  # Another type of a union, say: the codec judges.
@@ -158,11 +158,11 @@ class Mapper(_Walk):
         default = field.default if field.default is not msgspec.NODEFAULT else field.default_factory()
         return msgspec.msgpack.decode(self._codec.encoder.encode(default))
 
-    def _named(self, value: Any, info: Record, row: Row) -> dict[str, Any] | None:
+    def _named(self, value: Any, info: Record, row: FieldRow) -> dict[str, Any] | None:
         return named_by(value, row.fields, row.tag if row.tag is not None else tag_of(info), in_order=row.by_position)
 
 
-class Unmapper(_Walk):
+class BodyUnmapper(_Walk):
     """Says how a table would have coded what the present class codes: so its digest can be compared with an old one."""
 
     def unmapped(self, kind: Any, body: bytes) -> bytes:
@@ -175,7 +175,7 @@ class Unmapper(_Walk):
             return body
         return msgspec.msgpack.encode(self.of(msgspec.msgpack.decode(body), inspect.type_info(kind), "", {}))
 
-    def _record(self, value: Any, info: Record, row: Row, above: Above) -> Any:
+    def _record(self, value: Any, info: Record, row: FieldRow, above: Above) -> Any:
         named = self._named(value, info, row)
         if named is None:
             return value
@@ -190,12 +190,12 @@ class Unmapper(_Walk):
         tag = row.tag if row.tag is not None else tag_of(info)
         return _coded(made, tag, in_order=row.by_position)
 
-    def _named(self, value: Any, info: Record, row: Row) -> dict[str, Any] | None:
+    def _named(self, value: Any, info: Record, row: FieldRow) -> dict[str, Any] | None:
         names = tuple(field.encode_name for field in info.fields)
         return named_by(value, names, tag_of(info), in_order=is_by_position(info))
 
 
-def sources(info: Record, row: Row) -> Iterator[tuple[inspect.Field, str]]:
+def sources(info: Record, row: FieldRow) -> Iterator[tuple[inspect.Field, str]]:
     """The present fields of a class, each with what it is called in a row ("": it is not there)."""
     former = former_members(info.cls)
     before = {

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from ...actors.kernel.actor import Actor
 from .field_tables import Shape
-from .mapping import Mapper
+from .mapping import BodyMapper
 from .present_classes import present_class
 
 if TYPE_CHECKING:
@@ -29,25 +29,25 @@ class OldRecords:
     def __init__(self, codec: Codec, kind: type[Actor] | None) -> None:
         self._codec, self._kind = codec, kind
         self._tables: dict[str, Shape] = {}  # in force at the place to which the journal was read
-        self._mappers: dict[str, Mapper | None] = {}
-        self.inputs: dict[int, Mapper] = {}
-        self.outcomes: dict[Place, Mapper] = {}
-        self.timers: dict[str, Mapper] = {}
-        self.kept: dict[str, Mapper] = {}
+        self._mappers: dict[str, BodyMapper | None] = {}
+        self.inputs: dict[int, BodyMapper] = {}
+        self.outcomes: dict[Place, BodyMapper] = {}
+        self.timers: dict[str, BodyMapper] = {}
+        self.kept: dict[str, BodyMapper] = {}
 
     def read(self, name: str, table: Shape) -> None:
         """What follows was written with this table."""
         self._tables[name] = table
         self._mappers.pop(name, None)
 
-    def mapper(self, name: str) -> Mapper | None:
+    def mapper(self, name: str) -> BodyMapper | None:
         """What maps what is read next; None if it would be written just so now, or its class is not known here."""
         if name not in self._mappers:
             self._mappers[name] = mapper_of(name, self._tables.get(name), self._kind, self._codec)
         return self._mappers[name]
 
 
-def mapper_of(name: str, table: Shape | None, kind: type[Actor] | None, codec: Codec) -> Mapper | None:
+def mapper_of(name: str, table: Shape | None, kind: type[Actor] | None, codec: Codec) -> BodyMapper | None:
     """What maps that which was written under a name with a table (None: nobody has said); None if nothing has to be.
 
     Args:
@@ -59,5 +59,5 @@ def mapper_of(name: str, table: Shape | None, kind: type[Actor] | None, codec: C
     found = present_class(name, kind)
     if found is None:
         return None
-    made = Mapper(name, *found, table, codec)
+    made = BodyMapper(name, *found, table, codec)
     return made if made.is_needed else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import sys
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncGenerator, Generator
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ def plain(value):
 
 
 @contextlib.contextmanager
-def program(text: str, folder: Path) -> Iterator[Any]:
+def program(text: str, folder: Path) -> Generator[Any]:
     """Load the text of a program as the module that all of them have been; processes find it in this folder."""
     folder.mkdir()
     (folder / f"{NAME}.py").write_text(HEAD + text)
@@ -65,7 +65,7 @@ class Generations:
     @contextlib.asynccontextmanager
     async def run(
         self, text: str, *, method: Any = hf.hybrid, isolation: Any = "task", mechanism: Any = None, **recovery: Any
-    ) -> AsyncIterator[tuple[Any, Any, Any]]:
+    ) -> AsyncGenerator[tuple[Any, Any, Any]]:
         """Run a program; its store is that which is there at the end of the block, as if it had been killed then."""
         how = hf.replay_only() if method is hf.replay_only else hf.hybrid(interval=1000.0, **recovery)
         after = self._folder / f"{self._number + 1}.db"

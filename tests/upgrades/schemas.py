@@ -68,9 +68,14 @@ class Schema:
 
     # -- one step from a generation to the next, and what it does to a dict of before -------------------------------
 
-    def step(self, chance: random.Random, messages: list[dict[str, Any]]) -> None:
-        """Change something, in the classes and in what was said before."""
-        what = chance.choice(("add", "add", "remove", "swap", "rename", "widen", "inner", "form", "class"))
+    def step(
+        self,
+        chance: random.Random,
+        messages: list[dict[str, Any]],
+        kinds: tuple[str, ...] = ("add", "add", "remove", "swap", "rename", "widen", "inner", "form", "class"),
+    ) -> None:
+        """Change something of these kinds, in the classes and in what was said before."""
+        what = chance.choice(kinds)
         if what == "form":
             self.is_array = not self.is_array
         elif what == "class":

@@ -12,7 +12,7 @@ import pytest
 import holdfast as hf
 from holdfast.checkpoint import schema
 from holdfast.ftm.mechanisms.lfr import LFR
-from tests.upgrades.generations import LONG, Generations
+from tests.upgrades.generations import LONG, Generations, program
 
 PROGRAM = """
 import os
@@ -178,49 +178,6 @@ async def test_the_cut_of_a_group(store: Generations) -> None:
         assert [(one["n"], one["why"]) for one in found] == [(1, "old"), (2, "new"), (3, "waits")]
 
 
-TIMED = """
-class Tick(hf.Message):
-    n: int
-    why: str
-
-
-class Set(hf.Message): ...
-
-
-class A(hf.Actor):
-    def __init__(self) -> None:
-        self.said: list[Any] = []
-
-    @hf.on(Set)
-    def set(self, message: Set) -> None:
-        self.ctx.every(0.5, Tick(n=1, why="timer"))
-
-    @hf.on(Tick)
-    def tick(self, message: Tick) -> None:
-        self.said = [*self.said, plain(message)]
-
-    @hf.on(Get, readonly=True)
-    def get(self, message: Get) -> list[Any]:
-        return self.said
-"""
-
-
-async def test_the_timers_of_a_snapshot_are_written_anew_by_each_program(store: Generations) -> None:
-    """A snapshot of the second program has them as that one has coded them, whatever its journal begins with."""
-    second = TIMED.replace("    n: int\n    why: str\n", "    why: str\n    n: float\n")
-    third = TIMED.replace("    n: int\n    why: str\n", "    more: int = 5\n    n: float = 0.0\n    why: str = ''\n")
-    async with store.run(TIMED) as (system, actor, old):
-        actor.tell(old.Set())
-        await until(actor, old, 1)
-        await system.checkpoint(actor, timeout=LONG)
-    async with store.run(second) as (system, actor, new):
-        assert (await until(actor, new, 2))[1] == {"why": "timer", "n": 1.0}
-        await system.checkpoint(actor, timeout=LONG)
-    async with store.run(third) as (_, actor, new):
-        count = len(await actor.ask(new.Get(), timeout=LONG))
-        assert (await until(actor, new, count + 1))[-1] == {"more": 5, "n": 1.0, "why": "timer"}
-
-
 async def test_replicas_get_what_was_mapped(tmp_path: Path, store: Generations) -> None:
     async with store.run(PROGRAM, method=hf.replay_only) as (system, actor, old):
         await actor.ask(old.Add(1, "handled"), timeout=LONG)
@@ -323,3 +280,192 @@ async def test_classes_inside_of_a_state(store: Generations) -> None:
     async with store.run(newer) as (_, actor, new):
         found = await actor.ask(new.Get(), timeout=LONG)
         assert found == ["Part(tags=[], count=1)", "Pair(x=2, y=5)", "Kept(x=3, y=6)"]
+
+
+ASIDE = """
+class Add(hf.Message):
+    n: int
+    why: str
+
+
+class Keep(hf.Message): ...
+
+
+class A(hf.Actor):
+    key_variables = ("said",)
+    keeps = True
+
+    def __init__(self) -> None:
+        self.said: list[Any] = []
+
+    @hf.on(Add)
+    def add(self, message: Add) -> None:
+        if self.keeps:
+            self.ctx.stash()
+        else:
+            self.said = [*self.said, plain(message)]
+
+    @hf.on(Keep)
+    def keep(self, message: Keep) -> None:
+        self.ctx.unstash()
+
+    @hf.on(Get, readonly=True)
+    def get(self, message: Get) -> list[Any]:
+        return self.said
+"""
+
+
+N_WHY = "    n: int\n    why: str\n"
+LIVE = ("keeps = True", "keeps = False")
+
+
+async def test_what_is_put_aside_over_snapshots_of_several_programs(store: Generations) -> None:
+    """Each snapshot says with which table the first of what is left was written."""
+    second = ASIDE.replace(N_WHY, "    why: str\n    n: int\n")
+    third = ASIDE.replace(N_WHY, "    n: float\n    why: str\n").replace(*LIVE)
+    async with store.run(ASIDE.replace(*LIVE)) as (system, actor, old):
+        actor.tell(old.Add(0, "contained"))
+        await actor.ask(old.Get(), timeout=LONG)
+        await system.checkpoint(actor, timeout=LONG)  # Only this has the table from here on.
+    async with store.run(ASIDE) as (system, actor, old):
+        actor.tell(old.Add(1, "first"))
+        await actor.ask(old.Get(), timeout=LONG)
+        await system.checkpoint(actor, timeout=LONG)
+    for number in (2, 3):
+        async with store.run(second) as (system, actor, new):
+            actor.tell(new.Add(n=number, why="later"))
+            await actor.ask(new.Get(), timeout=LONG)
+            await system.checkpoint(actor, timeout=LONG)
+            assert len(system._homes.at("/app/a").shapes.fields["upgraded:Add"]) == 2
+    async with store.run(third) as (system, actor, new):
+        actor.tell(new.Keep())
+        found = [(one["n"], one["why"]) for one in await until(actor, new, 4)]
+        assert found == [(0, "contained"), (1, "first"), (2, "later"), (3, "later")]
+        await system.checkpoint(actor, timeout=LONG)
+        assert len(system._homes.at("/app/a").shapes.fields["upgraded:Add"]) == 1, "nothing is left of the older ones"
+        await actor.ask(new.Get(), timeout=LONG)
+        await system.checkpoint(actor, timeout=LONG)
+        assert not [entry for _, entry in system._homes.journal.load("/app/a").entries if "upgraded:Add" in entry]
+
+
+async def test_the_timers_of_a_snapshot_are_written_anew_by_each_program(store: Generations) -> None:
+    """A snapshot of the second program has them as that one has coded them, whatever its journal begins with."""
+    timed = ASIDE.replace("self.ctx.unstash()", 'self.ctx.every(3600.0, Add(n=9, why="timer"))')
+    second = timed.replace(N_WHY, "    why: str\n    n: int\n")
+    third = timed.replace(N_WHY, "    n: float\n    why: str\n")
+    async with store.run(timed) as (system, actor, old):
+        actor.tell(old.Keep())
+        actor.tell(old.Add(1, "aside"))
+        await actor.ask(old.Get(), timeout=LONG)
+        await system.checkpoint(actor, timeout=LONG)
+    for text in (second, third, third):
+        async with store.run(text) as (system, actor, new):
+            ((name, body, *_),) = system._homes.at("/app/a").timers.saved().values()
+            assert name == "upgraded:Add"
+            assert system._node.codec.decode(new.Add, body) == new.Add(n=9, why="timer")
+            actor.tell(new.Add(n=2, why="aside"))
+            await actor.ask(new.Get(), timeout=LONG)
+            await system.checkpoint(actor, timeout=LONG)
+
+
+SENDS = """
+class Note(hf.Message):
+    n: int
+    why: str = "none"
+    more: int = 0
+
+
+class Add(hf.Message[float]):
+    n: int
+
+
+class Sink(hf.Actor):
+    @hf.on(Note)
+    def note(self, message: Note) -> None: ...
+
+
+OTHERS = {"sink": Sink}
+
+
+class A(hf.Actor):
+    def __init__(self) -> None:
+        self.total = 0
+
+    @hf.on(Add)
+    async def add(self, message: Add) -> float:
+        self.total += message.n
+        self.ctx.find("/app/sink", Sink).tell(Note(n=message.n))
+        return self.total
+
+    @hf.on(Get, readonly=True)
+    def get(self, message: Get) -> list[Any]:
+        return [self.total]
+"""
+SENT = {
+    "in another order": ({'    n: int\n    why: str = "none"\n': '    why: str = "none"\n    n: int = 0\n'}, ""),
+    "renamed": (
+        {
+            "class Note": '@hf.renamed("Note", count="n")\nclass Told',
+            "Note": "Told",
+            "    n: int\n    why": "    count: int\n    why",
+            "(n=message": "(count=message",
+        },
+        "",
+    ),
+    "a field gone, which cannot be compared": ({"    more: int = 0\n": "", "n=message.n)": "n=message.n + 1)"}, ""),
+    "another type, which cannot be compared": ({"    n: int\n    why": "    n: float\n    why"}, ""),
+    "what is added up is a float": (
+        {"Add(hf.Message[float]):\n    n: int\n": "Add(hf.Message[float]):\n    n: float\n"},
+        "",
+    ),
+    "another value": ({"n=message.n)": "n=message.n + 1)"}, "output 1 .tell of upgraded:Note"),
+    "another value in another order": (
+        {
+            '    n: int\n    why: str = "none"\n': '    why: str = "none"\n    n: int = 0\n',
+            "n=message.n)": "n=message.n + 1)",
+        },
+        "output 1 .tell of upgraded:Note",
+    ),
+    "another reply": (
+        {"return self.total\n": "return self.total + 0.5\n"},
+        "the reply to upgraded:Add is not what it was",
+    ),
+}
+
+
+@pytest.mark.parametrize("change", SENT)
+async def test_what_turns_have_sent_is_compared_with_the_table_that_it_had(store: Generations, change: str) -> None:
+    async with store.run(SENDS, method=hf.replay_only) as (_, actor, old):
+        for number in (1, 2):
+            await actor.ask(old.Add(number), timeout=LONG)
+    text, (changes, diverges) = SENDS, SENT[change]
+    for one, other in changes.items():
+        assert one in text
+        text = text.replace(one, other)
+    text = text.replace('@hf.renamed("Told"', '@hf.renamed("Note"')
+    if diverges:
+        with pytest.raises(hf.StartFailed, match=diverges):
+            async with store.run(text, method=hf.replay_only):
+                pass
+        return
+    for _ in range(2):
+        async with store.run(text, method=hf.replay_only) as (_, actor, new):
+            assert await actor.ask(new.Get(), timeout=LONG) == [3]
+            await actor.ask(new.Add(0), timeout=LONG)
+
+
+async def test_code_that_is_loaded_once_more_has_its_own_table(store: Generations, tmp_path: Path) -> None:
+    """A snapshot is taken when it comes in; what follows is written by other classes of the same names."""
+    newer = ASIDE.replace(N_WHY, "    why: str\n    n: int\n").replace(*LIVE)
+    async with store.run(ASIDE.replace(*LIVE)) as (system, actor, old):
+        await actor.ask(old.Get(), timeout=LONG)
+        actor.tell(old.Add(1, "old"))
+        await actor.ask(old.Get(), timeout=LONG)
+        await system.suspend(actor)
+        with program(newer, tmp_path / "again") as new:
+            await system.replace_code(actor, new.A)
+            await system.resume(actor)
+            actor.tell(new.Add("new", 2))
+            await actor.ask(new.Get(), timeout=LONG)
+    async with store.run(newer) as (_, actor, new):
+        assert await actor.ask(new.Get(), timeout=LONG) == [{"n": 1, "why": "old"}, {"why": "new", "n": 2}]

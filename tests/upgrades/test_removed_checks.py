@@ -1,0 +1,121 @@
+"""Each check of upgrades is there for a reason: take it out, and a test fails, as `tests/removing.py` does."""
+
+from __future__ import annotations
+
+from tests.removing import Check, as_tests
+
+TABLE = "tests/upgrades/test_what_a_change_does.py"
+READ = "tests/upgrades/test_where_records_are_read.py"
+MAPPING = "tests/upgrades/test_mapping.py"
+UNFIT = "tests/checkpoint/test_unfit_states.py"
+
+CHECKS = {
+    "what was recorded is mapped before its home is used": Check(
+        "checkpoint/home/homes.py",
+        "            mapped = take_over(switch)\n",
+        '            mapped = ""\n',
+        TABLE,
+        "test_messages",
+    ),
+    "what was mapped is decoded before anything is changed": Check(
+        "checkpoint/upgrade/mapping.py",
+        "            self._codec.decode(self._kind, made)\n",
+        "",
+        TABLE,
+        "test_messages",
+    ),
+    "a table is in force for what follows it": Check(
+        "checkpoint/upgrade/old_records.py",
+        "        self._mappers.pop(name, None)\n",
+        "",
+        READ,
+        "test_what_is_told_to_somebody",
+    ),
+    "what is kept for somebody stands behind its own table": Check(
+        "checkpoint/home/ask_recovery.py",
+        "        if shape is not None:  # Its",
+        "        if False:  # Its",
+        READ,
+        "test_what_is_told_to_somebody",
+    ),
+    "timers in a snapshot have the newest table": Check(
+        "checkpoint/schema.py", "as_shape(known[-1])", "as_shape(known[0])", READ, "test_the_timers_of_a_snapshot"
+    ),
+    "a snapshot says which table its entries begin with": Check(
+        "checkpoint/schema.py",
+        "    return known if first == known[0] else [first, *known]\n",
+        "    return known[-1:]\n",
+        READ,
+        "test_what_is_put_aside",
+    ),
+    "the table of what is left stays in the journal": Check(
+        "checkpoint/schema.py",
+        "left is not None and self._name_now(name) not in left",
+        "left is not None",
+        READ,
+        "test_what_is_put_aside",
+    ),
+    "a copy of a home is coded as the present classes have it": Check(
+        "checkpoint/schema.py", "_from(known[-1], known)", "_from(known[0], known)", READ, "test_the_cut_of_a_group"
+    ),
+    "what a turn has sent is compared with the table that it had": Check(
+        "checkpoint/home/earlier_versions.py",
+        "itertools.chain(((name, body),), home.shapes.older_forms(name, body))",
+        "[(name, body)]",
+        READ,
+        "test_what_turns_have_sent",
+    ),
+    "what has lost a field is not compared": Check(
+        "checkpoint/home/earlier_versions.py",
+        "    except NotMapped:\n        return True\n",
+        "    except NotMapped:\n        return False\n",
+        READ,
+        "test_what_turns_have_sent",
+    ),
+    "a whole float is the int that it was": Check(
+        "checkpoint/home/earlier_versions.py",
+        " or is_same(old, in_whole_numbers(one))",
+        "",
+        READ,
+        "test_what_turns_have_sent",
+    ),
+    "a field does not take what was another's": Check(
+        "checkpoint/upgrade/mapping.py", '"" if own in taken else own', "own", MAPPING, "test_named_tuples"
+    ),
+    "a value of one class is not taken for one of another": Check(
+        "checkpoint/upgrade/mapping.py",
+        "(tag and value[:1] != [tag[1]])",
+        "False",
+        MAPPING,
+        "test_a_class_that_contains_itself",
+    ),
+    "a message in quarantine is mapped": Check(
+        "checkpoint/home/quarantine.py",
+        "        return (one.name, one.body) if mapper is None else",
+        "        return (one.name, one.body) if True else",
+        READ,
+        "test_messages_in_quarantine",
+    ),
+    "a snapshot has the next message looked at anew": Check(
+        "checkpoint/schema.py", "        self.noted.clear()\n", "", READ, "test_code_that_is_loaded_once_more"
+    ),
+    "a variable that may have been renamed is not dropped": Check(
+        "checkpoint/snapshot/key_variables.py", "    if gone and come:\n", "    if False:\n", TABLE, "test_states"
+    ),
+    "only other code helps a child that does not fit": Check(
+        "supervision/supervisor.py",
+        "        if UNFIT in str(reason):\n",
+        "        if False:\n",
+        UNFIT,
+        "test_a_supervisor_gives_up_at_once",
+    ),
+    "who waits at a child that does not fit is told why": Check(
+        "supervision/supervisor.py",
+        "                one.cell.extra().reason = reason",
+        "                pass",
+        UNFIT,
+        "test_a_supervisor_gives_up_at_once",
+    ),
+}
+
+test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
