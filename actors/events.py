@@ -291,7 +291,7 @@ class SnapshotDamaged(Event, frozen=True, eq=False):
 
 
 class RecordsMapped(Event, frozen=True, eq=False):
-    """What an earlier version of the program had recorded was mapped to the fields and variables of the present one."""
+    """Records of an earlier version of the program were mapped to the fields and variables of the present one."""
 
     changes: str
 

@@ -48,7 +48,8 @@ def renamed(*formerly: str, **members: str | tuple[str, ...]) -> Callable[[K], K
         unknown = [] if fields is None else [name for name in said if name not in fields]
         if unknown:
             raise TypeError(f"@renamed({unknown[0]}=...): {kind.__qualname__} has no field {unknown[0]!r}")
-        own = tuple(name if ":" in name else f"{kind.__module__}:{name}" for name in formerly)
+        module = "__main__" if kind.__module__ == "__mp_main__" else kind.__module__  # As `message_name` has it.
+        own = tuple(name if ":" in name else f"{module}:{name}" for name in formerly)
         before = own_renames(kind)  # Several of them may stand above one class.
         setattr(kind, NOTED, Renames((*own, *before.names), {**before.members, **said}))
         return kind

@@ -19,11 +19,11 @@ from ..recovery_file import RecoveryFile
 from ..recovery_settings import RecoveryHooks
 from ..snapshot.rollback import older_snapshot, roll_back
 from ..snapshot.snapshot_groups import Groups
+from ..snapshot.snapshot_record import take_over
 from ..snapshot.snapshot_schedule import nobody
 from .ask_recovery import Rejoin
 from .capacity import HomeBound
 from .disposal import drop_all, forget_home, put_into_quarantine
-from .earlier_versions import take_over
 from .held_messages import Holding, let_go
 from .quarantine import PLACE, Quarantine
 from .switch import Switch

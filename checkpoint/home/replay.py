@@ -1,4 +1,7 @@
-"""Replay: what was handled since the snapshot is fed again, as fast as it goes or as it once came.
+"""Replay: what was handled since the snapshot is fed again, as fast as it goes or as it once came, and compared.
+
+What a turn sends and replies then has the checksum that it had. What an earlier version of the program has coded
+otherwise is coded so once more, as far as that is known.
 
 Source: Zou and Bai, who wait between two messages as long as there was between them when they were recorded.
 """
@@ -6,12 +9,19 @@ Source: Zou and Bai, who wait between two messages as long as there was between 
 from __future__ import annotations
 
 import asyncio
+import itertools
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from ...actors.events import ReplayPaced
-from ..inputs import Turn
+from ..inputs import Input, Turn
+from ..protocol import REPLY, Answer, Out, answer_digest
+from ..schema import shape_name
+from ..upgrade.mapping import NotMapped, in_whole_numbers
+from ..upgrade.present_classes import REFUSAL, REPLY_TO
 
 if TYPE_CHECKING:
     from ..protocol import LifePort
@@ -86,3 +96,65 @@ class PacedReplay:
         if self._handle is not None:
             self._handle.cancel()
             self._handle = None
+
+
+# -- comparing ------------------------------------------------------------------------------------------------------
+
+
+def is_as_before(home: Switch, out: Out, digest: int) -> bool:
+    """Whether a replayed output is the one of a digest but for what may have changed since.
+
+    Its binding leads elsewhere now, or its class has other fields, or another name. It is taken for the same if its
+    class has lost a field, or one has another type: how it was coded cannot be known then.
+    """
+    receivers = (out.to, *home.node.led.get(home.path, {}).get(out.to, ()))
+
+    def is_same(name: str, body: bytes) -> bool:
+        return any(msgspec.structs.replace(out, to=to, name=name, body=body).digest() == digest for to in receivers)
+
+    if is_same(out.name, out.body):
+        return True
+    if out.verb == "wait":
+        return any(is_same("|".join(names), b"") for names in _former_waits(home, out.name.split("|")))
+    if out.verb != "reply":
+        return _is_any(home, out.name, out.body, is_same)
+    kind, _, name = out.name.partition("|")
+    answer = Answer(kind, _asked(home, int(out.to)) if kind == REPLY else name, out.body)
+    return _is_any(home, shape_name(answer), out.body, lambda old, body: is_same(_reply_name(kind, old), body))
+
+
+def is_same_reply(home: Switch, source: Input, digest: int, answer: Answer) -> bool:
+    """Whether the reply to an input is the one of a digest but for what may have changed since, as `is_as_before`."""
+    if digest == answer_digest(answer):
+        return True
+    name = shape_name(Answer(answer.kind, source.name if answer.kind == REPLY else answer.name))
+
+    def is_same(old: str, body: bytes) -> bool:
+        own = old.removeprefix(REFUSAL) if answer.kind == "refusal" else answer.name
+        return answer_digest(Answer(answer.kind, own, body)) == digest
+
+    return _is_any(home, name, answer.body, is_same)
+
+
+def _is_any(home: Switch, name: str, body: bytes, is_same: Callable[[str, bytes], bool]) -> bool:
+    """Whether one of the older forms of what has this name is the same; also if there was one that is not known."""
+    try:
+        forms = itertools.chain(((name, body),), home.shapes.older_forms(name, body))
+        return any(is_same(old, one) or is_same(old, in_whole_numbers(one)) for old, one in forms)
+    except NotMapped:
+        return True
+
+
+def _former_waits(home: Switch, names: list[str]) -> Iterator[tuple[str, ...]]:
+    """The classes that a turn waits for, under all names that they have had."""
+    return itertools.product(*((name, *home.shapes.former_names(name)) for name in names))
+
+
+def _asked(home: Switch, key: int) -> str:
+    """The type of the message that was input `key`; "" if that is not known any more."""
+    return next((source.name for source in home.ledger.handled_and_open() if source.id == key), "")
+
+
+def _reply_name(kind: str, old: str) -> str:
+    """How an output that is a reply names its class."""
+    return f"{kind}|{old.removeprefix(REFUSAL)}" if not old.startswith(REPLY_TO) else f"{kind}|"

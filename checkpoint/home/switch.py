@@ -63,14 +63,14 @@ from ..snapshot.snapshot_schedule import SnapshotSchedule
 from ..upgrade.present_classes import REPLY_TO
 from .admission import submit, taken_up
 from .disposal import lose, put_into_quarantine, undo_begun
-from .earlier_versions import MESSAGES, is_as_before, is_same_reply
 from .held_messages import Intake, let_go
 from .input_ledger import InputLedger
 from .journal_limit import Limit
+from .life_ports import SENT
 from .outputs import Outputs
 from .pending_asks import PendingCalls, SwitchAsk, answer_ask, origin_of
 from .present_life import PresentLife
-from .replay import PacedReplay
+from .replay import PacedReplay, is_as_before, is_same_reply
 from .replay_filter import turns_to_replay
 
 if TYPE_CHECKING:
@@ -407,7 +407,7 @@ class Switch:
             if out.verb in AWAITED:
                 self.calls.join(turn, key, out)
         for out in outs[again:]:
-            if self.journal.durable and out.name not in self.shapes.noted and out.verb in MESSAGES:
+            if self.journal.durable and out.name not in self.shapes.noted and out.verb in SENT:
                 self.note_shape(out.name, batch)
             self.outputs.execute(turn, key, out, batch)
 

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ...actors.errors import HoldfastError
+from ...actors.errors import HoldfastError, StartFailed
 from ...actors.events import SnapshotDamaged
+from ...actors.persistence import UNFIT
 from ..compression import PLAIN, compressor, decompress
 from ..durable_links import Tie
 from ..durable_timers import Saved
 from ..journal import DamagedStore, Entry
 from ..journal import Saved as Journaled
-from ..protocol import DOWN, EXIT, TICK, Answer, Snapshot
+from ..protocol import DOWN, EXIT, OK, STASHED, TICK, TIMED, Answer, Snapshot, timed, untimed
 from ..schema import as_shape, kind_in, shape_name
+from ..upgrade.mapping import BodyMapper, NotMapped
+from ..upgrade.old_records import OldRecords
 from .shared_blocks import Place
 
 if TYPE_CHECKING:
@@ -305,3 +309,48 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
         case _:
             if not known:
                 raise HoldfastError(f"{home.path}: journal entry {position} is of an unknown kind {entry[0]!r}")
+
+
+def take_over(home: Switch) -> str:
+    """Map what was read of a home and was written otherwise than it would be now; what that was, in words.
+
+    Raises:
+        StartFailed: something of it cannot be read by its class; the difference in words. Nothing was changed.
+    """
+    try:
+        return "; ".join(_taken_over(home, home.shapes.all_read()))
+    except NotMapped as error:
+        raise StartFailed(home.path, f"{UNFIT}: {error}") from error
+
+
+def _taken_over(home: Switch, old: OldRecords) -> list[str]:
+    ledger, clocks, messages = home.ledger, home.timers.saved(), home.homes.rejoin.kept_for(home.path)
+    ended = (turn.input for turn in ledger.turns.values() if turn.status in (OK, STASHED) and home.method.replays)
+    sources = {source.id: source for source in (*ended, *ledger.open.values())}
+    counts = Counter[BodyMapper]()
+
+    def mapped(mapper: BodyMapper, body: bytes) -> bytes:
+        counts[mapper] += 1
+        return mapper.mapped(body)
+
+    def outcome(mapper: BodyMapper, answer: Answer) -> Answer:
+        own, when = untimed(answer)
+        own = Answer(own.kind, mapper.name.rpartition(" ")[2], mapped(mapper, own.body))
+        return timed(own, when) if answer.kind.startswith(TIMED) else own
+
+    inputs = {key: mapped(one, sources[key].body) for key, one in old.inputs.items() if key in sources}
+    outcomes = {key: outcome(one, ledger.outcomes[key]) for key, one in old.outcomes.items() if key in ledger.outcomes}
+    timers = {key: (one.name, mapped(one, clocks[key][1])) for key, one in old.timers.items() if key in clocks}
+    kept = {
+        origin: messages[origin]._replace(name=one.name, body=mapped(one, messages[origin].body))
+        for origin, one in old.kept.items()
+        if origin in messages
+    }
+    for key, body in inputs.items():  # From here on nothing can fail.
+        source = sources[key]
+        ledger.journal_bytes += len(body) - len(source.body)
+        source.name, source.body = old.inputs[key].name, body
+    ledger.outcomes.update(outcomes)
+    home.timers.map(timers)
+    messages.update(kept)
+    return [f"{count} of {mapper.written}{mapper.change}" for mapper, count in counts.items()]

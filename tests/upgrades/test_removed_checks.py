@@ -59,21 +59,21 @@ CHECKS = {
         "checkpoint/schema.py", "_from(known[-1], known)", "_from(known[0], known)", READ, "test_the_cut_of_a_group"
     ),
     "what a turn has sent is compared with the table that it had": Check(
-        "checkpoint/home/earlier_versions.py",
+        "checkpoint/home/replay.py",
         "itertools.chain(((name, body),), home.shapes.older_forms(name, body))",
         "[(name, body)]",
         READ,
         "test_what_turns_have_sent",
     ),
     "what has lost a field is not compared": Check(
-        "checkpoint/home/earlier_versions.py",
+        "checkpoint/home/replay.py",
         "    except NotMapped:\n        return True\n",
         "    except NotMapped:\n        return False\n",
         READ,
         "test_what_turns_have_sent",
     ),
     "a whole float is the int that it was": Check(
-        "checkpoint/home/earlier_versions.py",
+        "checkpoint/home/replay.py",
         " or is_same(old, in_whole_numbers(one))",
         "",
         READ,
