@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -214,6 +215,20 @@ def test_replies_and_refusals_in_the_journal_are_not_misread(tmp_path: Path, cha
         assert (done.returncode, done.stdout) == (1, "")
         assert problem in done.stderr
         done = run(tmp_path, ASKING, "read")
+    assert (done.stdout, done.stderr) == (WHOLE, "")
+
+
+@pytest.mark.parametrize("what", ["killed", "saved"])
+def test_a_refusal_and_what_was_asked_may_be_renamed(tmp_path: Path, what: str) -> None:
+    assert run(tmp_path, ASKING, what).returncode == -9
+    code = re.sub(r"\bNo\b", "Never", re.sub(r"\bAsk\b", "Question", ASKING)).replace("no.m", "no.k")
+    code = code.replace("    m: int\n    c: int = 7\n", "    c: int\n    k: int\n").replace(
+        "(message.n, 7)\n        return [", "(7, message.n)\n        return ["
+    )
+    undeclared = run(tmp_path, code, "read")
+    assert undeclared.returncode == 1
+    code = code.replace("class Never(", '@hf.renamed("No", k="m")\nclass Never(')
+    done = run(tmp_path, code.replace("class Question(", '@hf.renamed("Ask")\nclass Question('), "read")
     assert (done.stdout, done.stderr) == (WHOLE, "")
 
 
