@@ -31,24 +31,22 @@ class StoreRow(NamedTuple):
     live: int
 
 
-def read_store_row(db: sqlite3.Connection, path: str) -> StoreRow:
-    """The row of the store as it is now.
+def read_store_row(db: sqlite3.Connection, path: str, key: bytes) -> StoreRow:
+    """The row of the store as it is now; `key` is that of its digests.
 
     Raises:
         DamagedStore: it is missing or its checksum is wrong.
     """
     row = db.execute("SELECT epoch, pid, start, floor, live, crc FROM store").fetchone()
-    if row is None or row[5] != crc_of(*row[:5]):
+    if row is None or row[5] != crc_of(*row[:5], key=key):
         raise DamagedStore(path, None, None, "the checksum of the store row is wrong")
     return StoreRow(*row[:5])
 
 
-def write_store_row(db: sqlite3.Connection, row: StoreRow) -> None:
-    """Put the row in the place of the present one, within a transaction of the caller."""
-    fields = tuple(row)
-    db.execute(
-        "UPDATE store SET epoch = ?, pid = ?, start = ?, floor = ?, live = ?, crc = ?", (*fields, crc_of(*fields))
-    )
+def write_store_row(db: sqlite3.Connection, row: StoreRow, key: bytes) -> None:
+    """Put the row in the place of the present one, within a transaction of the caller; `key` is that of its digests."""
+    crc = crc_of(*row, key=key)
+    db.execute("UPDATE store SET epoch = ?, pid = ?, start = ?, floor = ?, live = ?, crc = ?", (*row, crc))
 
 
 class StoreClaim:
@@ -67,11 +65,13 @@ class StoreClaim:
         Raises:
             StoreInUse: a living process has the store open, and it may not or cannot be killed.
             DamagedStore: the file is not ours, or is broken. ForeignStore: what lies beside it is of another store.
+            WrongStoreKey: the key is not its own.
         """
         deadline = monotonic() + _KILL_SECONDS
         while True:
             try:
                 refuse_foreign(self._db, self.path)
+                self._parts.unlock(self._db)
                 seen = self.read()
                 self._refuse_living(seen.pid, seen.start, takeover)
                 refuse_broken(self._db, self.path)
@@ -128,11 +128,12 @@ class StoreClaim:
         Raises:
             DamagedStore: it is missing or its checksum is wrong.
         """
-        return read_store_row(self._db, self.path)
+        return read_store_row(self._db, self.path, self._parts.cipher.digest_key)
 
     def write(self, floor: int, live: int) -> None:
         """Bring the row up to date, within a transaction of the caller."""
-        write_store_row(self._db, StoreRow(self.epoch, *self._owner, floor, live))
+        row = StoreRow(self.epoch, *self._owner, floor, live)
+        write_store_row(self._db, row, self._parts.cipher.digest_key)
 
     def release(self) -> None:
         """Strike ourselves out as the owner, leaving everything else as it is."""
