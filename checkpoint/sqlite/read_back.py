@@ -33,8 +33,9 @@ class ChainReader:
         candidates = kept[: max(1, len(kept) - older)]
         for number in reversed(candidates):
             try:
-                snapshot, turn = self.read_snapshot(chain, number)
+                found = self.read_snapshot(chain, number)
                 dropped = self.read_drops(chain, kept[: kept.index(number) + 1])
+                snapshot, turn = found
                 break
             except DamagedStore as error:
                 reason = reason or error.reason
