@@ -18,7 +18,7 @@ from .append_log import FrontLog, LogSealed, NoRoom, Row, following
 from .database import connect, create_database, result_code
 from .entry_chains import Chain, StoreContents, StoreScan, create_chain
 from .in_hand import InputsInHand
-from .ownership import StoreClaim
+from .ownership import StoreClaim, refuse_copy
 from .position_mark import PositionMark
 from .sealing import format_of, may_have_log
 from .snapshot_files import SnapshotFiles, sync
@@ -129,6 +129,8 @@ class Store:
 
     def _connect(self) -> None:
         is_there = self.parts.inspect()
+        if is_there:
+            refuse_copy(self.parts)
         with contextlib.suppress(FileExistsError):
             os.mkdir(self.files.folder, mode=0o700)  # not its parents: a mistyped path should not be made true
         if not is_there:

@@ -19,9 +19,9 @@ import sqlite3
 import stat
 import threading
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 from urllib.parse import quote
 
 from ..journal import DamagedStore, ForeignStore, StoreInUse, WrongStoreKey
@@ -29,6 +29,7 @@ from .row_codec import crc_of
 from .sealing import Cipher, NoCipher, StoreCipher, is_sealed
 from .snapshot_files import write_durably
 
+T = TypeVar("T")
 NOTE: Final = "\0store"
 """The note with the identity. No user's note has such a name, and nobody is shown it."""
 COPY_NOTE: Final = "\0copy"
@@ -220,10 +221,9 @@ class Parts:
         Raises:
             ForeignStore: they differ, or its WAL is of another store.
         """
-        has_wal = os.path.exists(f"{self.path}-wal") and os.path.getsize(f"{self.path}-wal") > 0
         try:
-            main = self._query("?mode=ro&immutable=1")
-            both = self._query("?mode=ro") if has_wal else main
+            main = self.peek(self._identity_in, with_wal=False)
+            both = self.peek(self._identity_in)
         except (sqlite3.Error, UnicodeDecodeError, DamagedStore):
             return  # It is damaged, or kept by somebody: the opening says so, and then compares.
         if main is not None and both is not None and main.id != both.id:
@@ -234,10 +234,16 @@ class Parts:
             )
         self.compare(both)
 
-    def _query(self, options: str) -> StoreIdentity | None:
+    def peek(self, work: Callable[[sqlite3.Connection], T], *, with_wal: bool = True) -> T:
+        """Read something of the database, without changing anything."""
+        has_wal = os.path.exists(f"{self.path}-wal") and os.path.getsize(f"{self.path}-wal") > 0
+        options = "?mode=ro" if with_wal and has_wal else "?mode=ro&immutable=1"
         with contextlib.closing(sqlite3.connect(f"file:{quote(self.path)}{options}", uri=True, timeout=1.0)) as db:
-            self.unlock(db)
-            return identity_of(db, self.path)
+            return work(db)
+
+    def _identity_in(self, db: sqlite3.Connection) -> StoreIdentity | None:
+        self.unlock(db)
+        return identity_of(db, self.path)
 
     # ---- opening
 

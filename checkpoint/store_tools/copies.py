@@ -152,6 +152,7 @@ class _CopyUnderWay:
         self._identity = str(uuid.uuid4())
         self._parts = Parts(dest, new_key)
         self._parts.cipher = new_cipher(new_key, self._identity)
+        self._files = SnapshotFiles(dest, self._parts)
         self._made: list[str] = []  # folders
         self._account = StoreCopy(dest, self._identity, "", 0, 0, 0)
 
@@ -258,7 +259,7 @@ class _CopyUnderWay:
         needs: list[_Need] = []
         if file is not None:
             name = os.path.basename(str(file))
-            reseal = partial(SnapshotFiles(self._dest, self._parts).copied, view.files, name)
+            reseal = partial(self._files.copied, view.files, name)
             needs.append(_Need(os.path.join(view.files.folder, name), os.path.join(self._snapshots, name), reseal))
         if chain is None or chain.path is None or not view.packs.names(chain.path):
             return needs
@@ -289,7 +290,7 @@ class _CopyUnderWay:
         with contextlib.closing(sqlite3.connect(self._new, isolation_level=None)) as db:
             db.execute("PRAGMA synchronous = OFF")  # It is synced as a whole.
             if self._is_sealed:
-                Resealing(view, cipher).write(db)
+                Resealing(view, cipher, self._files).write(db)
                 db.execute("BEGIN IMMEDIATE")
             else:
                 view.db.backup(db)

@@ -10,13 +10,13 @@ import struct
 from collections.abc import Iterator
 from typing import Any
 
-from ..journal import DamagedStore
 from ..sqlite.database import create_tables
 from ..sqlite.entry_chains import CHAINS, Chain
 from ..sqlite.open_store import INSERT
 from ..sqlite.read_back import opened_entry
 from ..sqlite.row_codec import PLACE, row_crc, snapshot_digest
 from ..sqlite.sealing import Cipher, drops_place, note_row, read_note, sealed_entry, snapshot_place
+from ..sqlite.snapshot_files import SnapshotFiles
 from ..sqlite.store_parts import is_hidden
 from .store_view import StoreView
 
@@ -24,10 +24,16 @@ Row = tuple[Any, ...]
 
 
 class Resealing:
-    """Writes the rows of a view into a new database, as they are in a store with that cipher."""
+    """Writes the rows of a view into a new database.
 
-    def __init__(self, view: StoreView, cipher: Cipher) -> None:
-        self._view, self._old, self._new = view, view.parts.cipher, cipher
+    Args:
+        view: of the old store.
+        cipher: of the new one.
+        files: of snapshots, which the new one has already: the old one may have gone on, and have removed its own.
+    """
+
+    def __init__(self, view: StoreView, cipher: Cipher, files: SnapshotFiles) -> None:
+        self._view, self._old, self._new, self._files = view, view.parts.cipher, cipher, files
         self._chains: dict[int, Chain] = {}
 
     def write(self, db: sqlite3.Connection) -> None:
@@ -66,19 +72,24 @@ class Resealing:
 
     def _snapshots(self) -> Iterator[Row]:
         query = "SELECT id, address, turn, epoch, drops, file, digest, data FROM snapshots"
-        for number, address, turn, epoch, drops, file, _, data in self._view.db.execute(query):
-            chain = self._chains.get(address, Chain(address, None))
+        for number, address, turn, epoch, drops, file, digest, data in self._view.db.execute(query):
+            chain, kept = self._chains.get(address), data
+            about = ("" if chain is None else chain.path or "", turn, epoch)
             try:
-                state, _ = self._view.reader.read_snapshot(chain, number)
-                digest = snapshot_digest(chain.path or "", turn, epoch, state, self._new.digest_key)
-                kept = None if file is not None else self._new.seal(snapshot_place(number), state)
-            except DamagedStore:
-                digest, kept = b"", data
+                if file is None:
+                    state = self._old.unseal(snapshot_place(number), data)
+                    kept = self._new.seal(snapshot_place(number), state)
+                else:
+                    state = self._files.read(str(file))
+                is_good = digest == snapshot_digest(*about, state, self._old.digest_key)
+                new_digest = snapshot_digest(*about, state, self._new.digest_key) if is_good else b""
+            except (OSError, ValueError, TypeError):
+                new_digest = b""
             try:
                 kept_drops = self._new.seal(drops_place(number), self._old.unseal(drops_place(number), drops))
             except ValueError:
                 kept_drops = drops
-            yield number, address, turn, epoch, kept_drops, file, digest, kept
+            yield number, address, turn, epoch, kept_drops, file, new_digest, kept
 
     def _notes(self) -> Iterator[Row]:
         for name, value, crc in self._view.db.execute("SELECT name, value, crc FROM notes ORDER BY key"):

@@ -143,7 +143,7 @@ async def test_a_system_keeps_nothing_that_can_be_read(path: Path) -> None:
 # ---- keys
 
 
-@pytest.mark.parametrize("key", [None, OTHER_KEY])
+@pytest.mark.parametrize("key", [None, OTHER_KEY], ids=["no key", "another key"])
 @pytest.mark.parametrize("state", ["filled", "killed"])
 def test_another_key_is_refused_and_nothing_is_changed(
     request: pytest.FixtureRequest, state: str, key: bytes | None

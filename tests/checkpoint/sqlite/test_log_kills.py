@@ -108,7 +108,7 @@ def shim(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return library
 
 
-@pytest.mark.parametrize("key", [b"", KEY])
+@pytest.mark.parametrize("key", [b"", KEY], ids=["plain", "encrypted"])
 def test_what_was_acknowledged_survives_a_kill_at_each_step(shim: Path, tmp_path: Path, key: bytes) -> None:
     folder = tmp_path / "disk"
     folder.mkdir()

@@ -108,7 +108,7 @@ def numbers_in(folder: Path, key: bytes = b"") -> tuple[int, list[str]]:
 
 
 @pytest.mark.parametrize("what", ["os", "fsync"])
-@pytest.mark.parametrize(("seed", "key"), [(1, b""), (2, b""), (3, KEY)])
+@pytest.mark.parametrize(("seed", "key"), [(1, b""), (2, b""), (3, KEY)], ids=["1", "2", "encrypted"])
 def test_a_power_loss_leaves_the_store_sound_and_with_fsync_complete(
     shim: Path, tmp_path: Path, what: str, seed: int, key: bytes
 ) -> None:
