@@ -135,8 +135,8 @@ class StoreCipher:
         yield _HEAD.pack(self._salt, number)
         view = memoryview(data)
         for piece, at in enumerate(range(0, max(1, len(view)), _PIECE)):
-            mark = piece | (_LAST if at + _PIECE >= len(view) else 0)
-            yield self._own.encrypt(_NONCE.pack(number, mark), view[at : at + _PIECE], place)
+            nonce = _nonce(number, piece, is_last=at + _PIECE >= len(view))
+            yield self._own.encrypt(nonce, view[at : at + _PIECE], place)
 
     def unseal(self, place: bytes, kept: bytes) -> bytes:
         """Decrypt it.
@@ -156,11 +156,15 @@ class StoreCipher:
                 return cipher.decrypt(_NONCE.pack(number, _LAST), view, place)
             parts: list[bytes] = []
             for piece, at in enumerate(range(0, len(view), size)):
-                mark = piece | (_LAST if at + size >= len(view) else 0)
-                parts.append(cipher.decrypt(_NONCE.pack(number, mark), view[at : at + size], place))
+                nonce = _nonce(number, piece, is_last=at + size >= len(view))
+                parts.append(cipher.decrypt(nonce, view[at : at + size], place))
             return b"".join(parts)
         except InvalidTag:
             raise ValueError("it was changed, or belongs to another place: its tag is wrong") from None
+
+
+def _nonce(number: int, piece: int, *, is_last: bool) -> bytes:
+    return _NONCE.pack(number, piece | _LAST if is_last else piece)
 
 
 # ---- formats: an older holdfast refuses those that it does not know
@@ -210,7 +214,10 @@ def block_place(address: str, number: int, offset: int, length: int, codec: int)
 # ---- entries: what is kept of one is an entry, too, of no kind
 
 SEALED_KIND: Final = ""
-_ENTRY: Final = b"entry"
+
+
+def _entry_place(packed: bytes) -> bytes:
+    return b"entry" + packed
 
 
 def entry_sealer(cipher: Cipher) -> Callable[[bytes, bytes], bytes] | None:
@@ -218,7 +225,7 @@ def entry_sealer(cipher: Cipher) -> Callable[[bytes, bytes], bytes] | None:
     if not cipher.digest_key:
         return None
     seal, pack = cipher.seal, entry_packer()
-    return lambda place, data: pack((SEALED_KIND, bytes(seal(_ENTRY + place, data))))
+    return lambda place, data: pack((SEALED_KIND, bytes(seal(_entry_place(place), data))))
 
 
 def kept_kind(cipher: Cipher, entry: Entry) -> Primitive:
@@ -243,7 +250,7 @@ def unseal_entry(cipher: Cipher, place: bytes, data: bytes) -> bytes:
     kind, kept = decode_entry(data)
     if kind != SEALED_KIND or not isinstance(kept, bytes):
         raise ValueError("it is no sealed data")
-    return cipher.unseal(_ENTRY + place, kept)
+    return cipher.unseal(_entry_place(place), kept)
 
 
 # ---- rows whose keys are not to be read either
