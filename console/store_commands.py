@@ -1,4 +1,4 @@
-"""The `holdfast store` commands, for a store on the disk: verify, stats, backup, restore, rekey, export, compact."""
+"""The `holdfast store` commands, for a store on the disk: verify, stats, backup, restore, rekey, export and compact."""
 
 from __future__ import annotations
 
