@@ -112,7 +112,7 @@ class Store:
                 try:
                     self._scan()
                     self._begin_log()
-                    self.hands.open(uuid.UUID(self.parts.id).bytes, self.parts.cipher.digest_key)
+                    self.hands.open(self.log.identity, self.parts.cipher.digest_key)
                     yield
                     self.parts.opened()
                 except BaseException:
@@ -166,6 +166,7 @@ class Store:
                 raise DamagedStore(self.path, None, None, reason)
             sync(os.path.dirname(self.path))
         self.parts.adopt(self.db)
+        log.identity = uuid.UUID(self.parts.id).bytes
         # A store was closed, and its owner killed before it had removed these; or its WAL is missing: the mark knows.
         stale, left = ([], log.left()) if may_have_log(version) else (log.left(), [])
         rows = following(log.read(left), self.contents.last)

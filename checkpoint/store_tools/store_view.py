@@ -9,13 +9,14 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
+import uuid
 from collections.abc import Callable, Generator, Iterator
 from typing import Any, Final, TypeVar
 from urllib.parse import quote
 
 from ...actors.errors import HoldfastError
 from ..journal import DamagedStore, StoreFailed
-from ..sqlite.append_log import FrontLog, Row, following
+from ..sqlite.append_log import FrontLog, Row, batches_in, following
 from ..sqlite.block_packs import Packs
 from ..sqlite.database import refuse_foreign, result_code, text_of
 from ..sqlite.ownership import StoreRow, living, read_store_row
@@ -52,7 +53,7 @@ class StoreView:
     """
 
     def __init__(
-        self, path: str, parts: Parts, db: sqlite3.Connection, mark: bytes, log: list[list[Row]], has_wal: bool
+        self, path: str, parts: Parts, db: sqlite3.Connection, mark: bytes, log: list[bytes], has_wal: bool
     ) -> None:
         self.path, self.parts, self.db, self.mark, self.has_wal = path, parts, db, mark, has_wal
         self.files = SnapshotFiles(path, parts)
@@ -63,7 +64,10 @@ class StoreView:
         (self.version,) = db.execute("PRAGMA user_version").fetchone()
         (newest,) = db.execute("SELECT max(position) FROM entries").fetchone()
         self.last = max(newest or 0, self.row.floor)
-        self.rows = following(log, self.last) if may_have_log(self.version) else []
+        identity = b"" if self.identity is None else uuid.UUID(self.identity.id).bytes
+        self.rows: list[Row] = []
+        if may_have_log(self.version):
+            self.rows = following(batches_in(log, identity), self.last)
         if self.rows:
             self.last = self.rows[-1][0]
         with living(self.row.pid, self.row.start) as pidfd:

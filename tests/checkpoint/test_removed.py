@@ -724,6 +724,13 @@ CHECKS = {
         "tests/checkpoint/sqlite/test_damage.py",
         "test_a_snapshot_whose_list",
     ),
+    "log: that of another store is none": Check(
+        "checkpoint/sqlite/open_store.py",
+        "        log.identity = uuid.UUID(self.parts.id).bytes\n",
+        "        log.identity = bytes(16)\n",
+        "tests/checkpoint/sqlite/test_log.py",
+        "test_a_log_of_another_store",
+    ),
     "a copy of an open store ends nobody": Check(
         "checkpoint/sqlite/open_store.py",
         "            refuse_copy(self.parts)\n",
