@@ -1,9 +1,9 @@
 """How many durable workflows of one step are done in a second, beside DBOS on SQLite?
 
-Baseline: DBOS with the same setting of SQLite's `synchronous` (NORMAL beside `durability="os"`, FULL beside `"fsync"`), its
-database in WAL mode like ours. Its workflow is an asynchronous function that awaits one step. Ours is a recorded turn, once
-with the step in its own code, which a replay makes again, and once as an effect, which a replay does not. All callers wait
-for the result. Needs `pip install dbos`; without it nothing is measured.
+Baseline: DBOS with the same setting of SQLite's `synchronous` (NORMAL beside `durability="os"`, FULL beside `"fsync"`)
+and its database in WAL mode, like ours. Its workflow is an asynchronous function that awaits one step. Ours is a
+recorded turn: once with the step in its own code, which a replay makes again, and once as an effect, which it does not.
+All callers wait for the result. Needs `pip install dbos`; without it nothing is measured.
 Command: python benchmarks/bench_dbos.py [--quick]
 """
 
@@ -15,18 +15,14 @@ import functools
 import tempfile
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from harness import Run, main
 
 import holdfast as hf
-
-try:
-    import dbos
-    import sqlalchemy
-except ImportError:
-    dbos = sqlalchemy = None  # type: ignore[assignment]
 
 BODY = "x" * 100
 CALLERS = 100
@@ -83,6 +79,8 @@ async def ours(folder: str, durability: Any, order: Order) -> AsyncGenerator[Cal
 @contextlib.contextmanager
 def theirs(folder: str, durability: str) -> Any:
     """Calls of their workflow."""
+    dbos: Any = import_module("dbos")
+    sqlalchemy: Any = import_module("sqlalchemy")
     setting = SETTINGS[durability]
 
     def connected(connection: Any, record: object) -> None:
@@ -91,7 +89,7 @@ def theirs(folder: str, durability: str) -> Any:
 
     sqlalchemy.event.listen(sqlalchemy.Engine, "connect", connected)
     config = {"name": "bench", "system_database_url": f"sqlite:///{folder}/theirs.db", "log_level": "ERROR"}
-    dbos.DBOS(config=config)  # type: ignore[arg-type]  # it is one
+    dbos.DBOS(config=config)
     made = dbos.DBOS.step()(step)
 
     async def order(body: str) -> str:
@@ -118,7 +116,7 @@ async def rate(call: Callable[[], Awaitable[object]], callers: int, count: int) 
 
 
 async def workflows(run: Run) -> None:
-    if dbos is None:
+    if find_spec("dbos") is None:
         print("dbos is not installed: nothing is measured (pip install dbos)")
         return
     for durability, setting in SETTINGS.items():
