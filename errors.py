@@ -40,7 +40,15 @@ from .actors.kernel.context import StashError
 from .actors.kernel.message import Refusal, UnknownRefusal
 from .actors.process.program.external_program import ProgramFailed
 from .checkpoint.home.quarantine import NotQuarantined
-from .checkpoint.journal import DamagedStore, ForeignStore, NotCopied, StaleEpoch, StoreFailed, StoreInUse
+from .checkpoint.journal import (
+    DamagedStore,
+    ForeignStore,
+    NotCopied,
+    StaleEpoch,
+    StoreFailed,
+    StoreInUse,
+    WrongStoreKey,
+)
 from .checkpoint.life.determinism_guard import NotDeterministic
 from .checkpoint.life.readonly_guard import NotReadonly
 from .checkpoint.life.replay_guard import StateDiverged
@@ -146,5 +154,6 @@ __all__ = [
     "UntrustedFile",
     "WaitTimeout",
     "WrongActor",
+    "WrongStoreKey",
     "WrongThread",
 ]

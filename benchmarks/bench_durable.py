@@ -27,9 +27,11 @@ CHILDREN = 1000
 
 
 @contextlib.asynccontextmanager
-async def running(folder: str, durability: Any) -> AsyncGenerator[tuple[hf.ActorSystem, hf.ActorRef[Echo]], None]:
-    store = f"sqlite:{folder}/{durability}.db"
-    async with hf.ActorSystem("bench", store=store, durability=durability, log=False) as system:
+async def running(
+    folder: str, durability: Any, key: bytes | None = None
+) -> AsyncGenerator[tuple[hf.ActorSystem, hf.ActorRef[Echo]], None]:
+    store = f"sqlite:{folder}/{durability}{'' if key is None else '-encrypted'}.db"
+    async with hf.ActorSystem("bench", store=store, store_key=key, durability=durability, log=False) as system:
         recovery = hf.hybrid(interval=1000.0)
         yield system, await system.start(hf.child("echo", hf.start(Echo), recovery=recovery))
 
@@ -93,17 +95,34 @@ async def os_turns(run: Run) -> None:
     count = run.size(20_000)
     with tempfile.TemporaryDirectory() as folder:
         async with running(folder, "os") as (system, echo):
-            spent: list[float] = []
-            for _ in range(run.n):
-                began = time.perf_counter()
-                for i in range(count):
-                    echo.tell(DATA)
-                    if not i % BURST:
-                        await asyncio.sleep(0)
-                await echo.ask(Told(), timeout=600.0)
-                await system._homes.settled()
-                spent.append((time.perf_counter() - began) / count * 1e6)
+            spent = [await _turns(system, echo, count) for _ in range(run.n)]
             run.bound("a whole turn that outlives the root, pipelined", min(spent), unit="us", target=25.0)
+
+
+async def _turns(system: hf.ActorSystem, echo: hf.ActorRef[Echo], count: int) -> float:
+    """Microseconds of a whole turn, in a flood of them."""
+    began = time.perf_counter()
+    for i in range(count):
+        echo.tell(DATA)
+        if not i % BURST:
+            await asyncio.sleep(0)
+    await echo.ask(Told(), timeout=600.0)
+    await system._homes.settled()
+    return (time.perf_counter() - began) / count * 1e6
+
+
+async def encrypted_turns(run: Run) -> None:
+    """The same turns in a store with a key, beside one without."""
+    count = run.size(20_000)
+    with tempfile.TemporaryDirectory() as folder:
+        async with running(folder, "os") as plain, running(folder, "os", bytes(32)) as encrypted:
+            await run.compare(
+                "whole turns in an encrypted store, beside a plain one",
+                lambda: _turns(*encrypted, count),
+                lambda: _turns(*plain, count),
+                unit="us",
+                target=0.7,
+            )
 
 
 async def fsync_turns(run: Run) -> None:
@@ -155,4 +174,4 @@ async def restart(run: Run) -> None:
 
 
 if __name__ == "__main__":
-    main([os_level, os_turns, fsync, fsync_turns, restart])
+    main([os_level, os_turns, encrypted_turns, fsync, fsync_turns, restart])

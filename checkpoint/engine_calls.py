@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 from ..actors.errors import HoldfastError
-from .journal import Entry, InHand, Journal, Saved, StoreFailed
+from .journal import Entry, InHand, Journal, Saved, StoreFailed, StoreFile
 
 if TYPE_CHECKING:
     from .snapshot.shared_blocks import Segment
@@ -28,7 +28,7 @@ class Called:
         file: the database of its store, if that is one of ours on the disk.
     """
 
-    def __init__(self, engine: Journal, file: str | None = None) -> None:
+    def __init__(self, engine: Journal, file: StoreFile | None = None) -> None:
         self._engine = engine
         self.file = file
         self._name = str(getattr(engine, "path", type(engine).__qualname__))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
@@ -24,7 +25,9 @@ __all__ = [
     "StaleEpoch",
     "StoreEngine",
     "StoreFailed",
+    "StoreFile",
     "StoreInUse",
+    "WrongStoreKey",
 ]
 
 Primitive: TypeAlias = "int | float | str | bytes | bool | tuple[Primitive, ...] | None"
@@ -94,6 +97,14 @@ class ForeignStore(
     remedy: str
 
 
+class WrongStoreKey(StoreError, text="store {path} is not opened, and nothing in it was changed: {problem}; {remedy}"):
+    """The store was not opened, and nothing in it was changed: its key is another one, is missing, or it has none."""
+
+    path: str
+    problem: str
+    remedy: str
+
+
 class NotCopied(StoreError, text="store {path} was not copied to {dest}: {problem}; {remedy}"):
     """A backup or a restore was refused or has failed: nothing of it was left behind, and nothing was overwritten."""
 
@@ -101,6 +112,14 @@ class NotCopied(StoreError, text="store {path} was not copied to {dest}: {proble
     dest: str
     problem: str
     remedy: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class StoreFile:
+    """The database of a store, and the key that it is encrypted with."""
+
+    path: str
+    key: bytes | None = dataclasses.field(repr=False)
 
 
 class Saved(NamedTuple):
@@ -230,7 +249,7 @@ class StoreEngine(Journal, Protocol):
     """A journal with what only some engines have, and a default for those that have it not."""
 
     @property
-    def file(self) -> str | None:
+    def file(self) -> StoreFile | None:
         """The database of the store, if that is one of holdfast's own on the disk."""
         ...
 

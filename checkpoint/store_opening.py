@@ -7,16 +7,17 @@ from typing import get_args
 
 from ..actors.errors import SpecError
 from .engine_calls import Called
-from .journal import Journal, MemoryJournal, StoreEngine
+from .journal import Journal, MemoryJournal, StoreEngine, StoreFile
 from .method import Durability
+from .store_key import StoreKey, read_store_key
 
 
-def open_journal(store: str | Journal | None, *, takeover: bool = False) -> StoreEngine:
+def open_journal(store: str | Journal | None, *, takeover: bool = False, key: StoreKey | None = None) -> StoreEngine:
     """The journal that `store` names: None or "memory", or "sqlite:PATH"; or the open engine that it is.
 
     Raises:
-        SpecError: the name is of no known form, or its folder is not there. StoreInUse: another living process has it
-            open.
+        SpecError: the name is of no known form, its folder is not there, or the key is none. StoreInUse: another living
+            process has it open. WrongStoreKey: the key is not the store's.
     """
     if store is None or store == "memory":
         return MemoryJournal()
@@ -29,8 +30,9 @@ def open_journal(store: str | Journal | None, *, takeover: bool = False) -> Stor
         raise SpecError("store", f"{store!r} must name a file in a folder that is there")
     from .sqlite import SqliteJournal  # only now: sqlite3 takes a while to import, and most tests need no store
 
-    engine = SqliteJournal(path, takeover=takeover)
-    return Called(engine, engine.path)
+    secret = read_store_key(key)
+    engine = SqliteJournal(path, takeover=takeover, key=secret)
+    return Called(engine, StoreFile(engine.path, secret))
 
 
 def check_system(journal: Journal, system: str) -> None:
@@ -68,3 +70,13 @@ def check_durability(store: str | Journal | None, durability: Durability | None)
     lasts = store is not None and store != "memory" and (isinstance(store, str) or store.durable)
     if durability in ("os", "fsync") and not lasts:
         raise SpecError("ActorSystem", f"durability={durability!r} needs a store: store='sqlite:PATH'")
+
+
+def check_store_key(store: str | Journal | None, key: StoreKey | None) -> None:
+    """Refuse a key for what is not encrypted.
+
+    Raises:
+        SpecError: the store is none of holdfast's own on the disk.
+    """
+    if key is not None and not (isinstance(store, str) and store.startswith("sqlite:")):
+        raise SpecError("ActorSystem", "store_key needs a store on the disk that it encrypts: store='sqlite:PATH'")

@@ -1,4 +1,4 @@
-"""The `holdfast store` commands, for a store on the disk: verify, stats, backup, restore, export and compact."""
+"""The `holdfast store` commands, for a store on the disk: verify, stats, backup, restore, rekey, export and compact."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from ..checkpoint.store_tools import (
     back_up_store,
     compact_store,
     export_store,
+    rekey_store,
     restore_store,
     store_stats,
     verify_store,
@@ -34,11 +35,19 @@ store = typer.Typer(
 )
 
 StorePath = Annotated[Path, typer.Argument(help="The database of a store: app.db, as in store='sqlite:app.db'.")]
+KeyFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--key-file",
+        envvar="HOLDFAST_STORE_KEY_FILE",
+        help="Of an encrypted store: the file with its key, which only its owner may read.",
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
 @store.command()
-def verify(path: StorePath, as_json: Json = False) -> None:
+def verify(path: StorePath, key_file: KeyFile = None, as_json: Json = False) -> None:
     """Read every byte of a store that counts, and compare all checksums. Nothing is changed.
 
     A running system may have the store open: then one instant of it is verified.
@@ -46,7 +55,7 @@ def verify(path: StorePath, as_json: Json = False) -> None:
     Exit status 0: all is good. 1: something is damaged. 2: there is no store, or it cannot be read.
     """
     try:
-        found = verify_store(path)
+        found = verify_store(path, key=key_file)
     except HoldfastError as error:
         raise _ended("verify", error, UNREADABLE) from error
     _show_verification(found, as_json=as_json)
@@ -55,13 +64,13 @@ def verify(path: StorePath, as_json: Json = False) -> None:
 
 
 @store.command()
-def stats(path: StorePath, as_json: Json = False) -> None:
+def stats(path: StorePath, key_file: KeyFile = None, as_json: Json = False) -> None:
     """Print what is recorded of each address, how much room it takes, and what waits. Nothing is changed.
 
     Exit status 0: done. 1: something is damaged. 2: there is no store, or it cannot be read.
     """
     try:
-        found = store_stats(path)
+        found = store_stats(path, key=key_file)
     except DamagedStore as error:
         raise _ended("stats", error, DAMAGED) from error
     except HoldfastError as error:
@@ -128,14 +137,16 @@ def _bytes(size: float) -> str:
 
 
 @store.command()
-def export(path: StorePath) -> None:
+def export(path: StorePath, key_file: KeyFile = None) -> None:
     """Print everything that a store has, one JSON object a line. Nothing is changed, and no class is imported.
+
+    What is encrypted in the store is printed in plain text.
 
     Exit status 0: done. 1: something is damaged; it is a line of its own. 2: there is no store, or it cannot be read.
     """
     is_damaged = False
     try:
-        for record in export_store(path):
+        for record in export_store(path, key=key_file):
             is_damaged = is_damaged or record["record"] == "damage"
             typer.echo(json.dumps(record))
     except DamagedStore as error:
@@ -151,13 +162,13 @@ def export(path: StorePath) -> None:
 
 
 @store.command()
-def compact(path: StorePath, as_json: Json = False) -> None:
+def compact(path: StorePath, key_file: KeyFile = None, as_json: Json = False) -> None:
     """Give back the room of what a store does not need. No system may have it open.
 
     Exit status 0: done. 1: it is in use, or damaged. 2: there is no store, it cannot be read, or there is no room.
     """
     try:
-        done = compact_store(path)
+        done = compact_store(path, key=key_file)
     except (DamagedStore, StoreInUse) as error:
         raise _ended("compact", error, DAMAGED) from error
     except HoldfastError as error:
@@ -173,33 +184,66 @@ def backup(
     path: StorePath,
     dest: Annotated[Path, typer.Argument(help="The database of the copy, which must not be there.")],
     check: Annotated[bool, typer.Option("--verify/--no-verify", help="Verify the copy when it is made.")] = True,
+    key_file: KeyFile = None,
     as_json: Json = False,
 ) -> None:
     """Copy a store as it is at one instant, also while a system runs on it. The copy is a store of its own.
 
+    That of an encrypted store is encrypted with the same key.
+
     Exit status 0: the copy is there, and good. 1: the store is damaged; a copy that was made is damaged as it is.
     2: there is no copy: there is no store, it cannot be read, or DEST cannot be written.
     """
-    _copy("backup", lambda: back_up_store(path, dest), check=check, as_json=as_json)
+    _copy("backup", lambda: back_up_store(path, dest, key=key_file), check=check, key=key_file, as_json=as_json)
 
 
 @store.command()
 def restore(
     path: Annotated[Path, typer.Argument(metavar="BACKUP", help="The database of the backup; it stays as it is.")],
     dest: Annotated[Path, typer.Argument(help="The database to be made, which must not be there.")],
+    key_file: KeyFile = None,
     as_json: Json = False,
 ) -> None:
     """Verify a backup, and copy it to where a system will open it. Nothing is ever overwritten.
 
     Exit status 0: done. 1: the copy is damaged. 2: the backup is damaged or cannot be read, or DEST cannot be written.
     """
-    _copy("restore", lambda: restore_store(path, dest), check=True, as_json=as_json)
+    _copy("restore", lambda: restore_store(path, dest, key=key_file), check=True, key=key_file, as_json=as_json)
 
 
-def _copy(command: str, make: Callable[[], StoreCopy], *, check: bool, as_json: bool) -> None:
+@store.command()
+def rekey(
+    path: StorePath,
+    dest: Annotated[Path, typer.Argument(help="The database to be made, which must not be there.")],
+    key_file: KeyFile = None,
+    new_key_file: Annotated[
+        Path | None, typer.Option("--new-key-file", help="The file with the key of the copy.")
+    ] = None,
+    plain: Annotated[bool, typer.Option("--plain", help="Make a copy that is not encrypted.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Verify a store, and make a copy of it with another key, or of a plain one an encrypted one.
+
+    No system may have the store open. It stays as it is: remove it yourself.
+
+    Exit status 0: done. 1: the copy is damaged. 2: the store is damaged, open or cannot be read, or DEST cannot be
+    written.
+    """
+    if plain == (new_key_file is not None):
+        raise _ended("rekey", HoldfastError("name either --new-key-file or --plain"), UNREADABLE)
+    _copy(
+        "rekey",
+        lambda: rekey_store(path, dest, key=key_file, new_key=new_key_file),
+        check=True,
+        key=new_key_file,
+        as_json=as_json,
+    )
+
+
+def _copy(command: str, make: Callable[[], StoreCopy], *, check: bool, key: Path | None, as_json: bool) -> None:
     try:
         copy = make()
-        found = verify_store(copy.path) if check else None
+        found = verify_store(copy.path, key=key) if check else None
     except DamagedStore as error:
         raise _ended(command, error, DAMAGED) from error
     except HoldfastError as error:

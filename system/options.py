@@ -11,7 +11,8 @@ from ..checkpoint.journal import Journal
 from ..checkpoint.method import Durability
 from ..checkpoint.recovery_file import RecoveryFile, load_recovery
 from ..checkpoint.recovery_settings import RecoveryHooks
-from ..checkpoint.store_opening import check_durability
+from ..checkpoint.store_key import StoreKey
+from ..checkpoint.store_opening import check_durability, check_store_key
 from ..supervision.spec import Flags
 
 
@@ -25,6 +26,7 @@ class SystemOptions:
 
     name: str
     store: str | Journal | None
+    store_key: StoreKey | None = dataclasses.field(repr=False)
     durability: Durability | None
     flags: Flags
     preload: tuple[str, ...]
@@ -41,6 +43,7 @@ class SystemOptions:
         if not self.name or "/" in self.name:
             raise SpecError("ActorSystem", f"the name must be text without '/', not {self.name!r}")
         check_durability(self.store, self.durability)
+        check_store_key(self.store, self.store_key)
         hooks = self.recovery_hooks
         if hooks is not None and not isinstance(hooks, RecoveryHooks):
             raise SpecError("ActorSystem", f"recovery_hooks must come from recovery_hooks(...), not be {hooks!r}")

@@ -56,7 +56,8 @@ class Recorded:
         """Copy the store of this system as it is now, while the system goes on; a thread does it.
 
         All that was acknowledged before the call is in the copy, which is a store of its own: `holdfast store restore`
-        brings it back. Cancelling does not end the thread: the copy is then finished all the same.
+        brings it back. That of an encrypted store is encrypted with the same key. Cancelling does not end the thread:
+        the copy is then finished all the same.
 
         Args:
             path: the database of the copy. Neither it nor anything of a store may be there; its folder must be.
@@ -70,7 +71,7 @@ class Recorded:
         file = self._homes.journal.engine.file
         if file is None:
             raise SpecError("backup", "needs a system with a store on the disk: store='sqlite:PATH'")
-        return await asyncio.to_thread(back_up_store, file, path)
+        return await asyncio.to_thread(back_up_store, file.path, path, key=file.key)
 
     async def checkpoint_group(self, actors: Sequence[ActorRef[Any] | str], *, name: str) -> None:
         """Keep one consistent cut of several recorded actors: their states, and the messages between them (R78).

@@ -36,6 +36,7 @@ from ..checkpoint.places.subtree_place import subtree
 from ..checkpoint.protocol import Wanted
 from ..checkpoint.recovery_file import RecoveryFile
 from ..checkpoint.recovery_settings import RecoveryHooks
+from ..checkpoint.store_key import StoreKey
 from ..checkpoint.store_opening import check_system, open_journal
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.patience import end_within
@@ -75,6 +76,8 @@ class ActorSystem(Recorded, Controls):
         name: the first part of all addresses.
         store: where journals and snapshots go: None (memory: survives any process but this one), or
             "sqlite:PATH", or an engine of your own: anything that keeps to `Journal` (see holdfast.testing.stores).
+        store_key: encrypts the store "sqlite:PATH", from its making on: 32 bytes, the path of a file that has them and
+            that only its owner may read, or a function that returns them (docs/recovery/encryption.md).
         durability: what an admission outlives when it is told of (send returns, an ask is fed, a reply leaves):
             "memory" (without a store) any process but this one, "os" (with one) this one too, "fsync" the machine.
             Each child may say otherwise: `hybrid(durability=...)`.
@@ -100,6 +103,7 @@ class ActorSystem(Recorded, Controls):
         name: str = "app",
         *,
         store: str | Journal | None = None,
+        store_key: StoreKey | None = None,
         durability: Durability | None = None,
         intensity: int = 3,
         period: float = 5.0,
@@ -116,6 +120,7 @@ class ActorSystem(Recorded, Controls):
         self._options = SystemOptions(
             name=name,
             store=store,
+            store_key=store_key,
             durability=durability,
             flags=Flags("one_for_one", intensity, period),
             preload=tuple(preload),
@@ -151,7 +156,7 @@ class ActorSystem(Recorded, Controls):
         options = self._options
         file = options.read_recovery_file()
         node = self._running = Node(self.name, asyncio.get_running_loop(), seed=options.seed)
-        engine = open_journal(options.store, takeover=options.takeover)
+        engine = open_journal(options.store, takeover=options.takeover, key=options.store_key)
         try:
             check_system(engine, self.name)
             self._homes = Homes(node, engine, durability=options.durability, file=file, hooks=options.recovery_hooks)

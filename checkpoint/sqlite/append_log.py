@@ -33,7 +33,8 @@ MOST_ROWS: Final = 512
 """Rows the log takes, before they go to the database: about a millisecond's work."""
 MOST_BYTES: Final = 512 << 10
 _NAME: Final = re.compile(r"\d+-\d+\.log")
-_MAGIC: Final = b"HFLOG\x01\0\0"
+_MAGIC: Final = b"HFLOG\x02\0\0"
+_UNBOUND: Final = b"HFLOG\x01\0\0"  # of before: it does not say of which store it is
 _SEAL: Final = struct.Struct("=Q")  # 0: open
 _HEAD: Final = struct.Struct("<8sQQ")  # magic, epoch, generation
 _RECORD: Final = struct.Struct("<II")  # checksum, length of what follows: entries
@@ -65,6 +66,7 @@ class FrontLog:
     """The logs of the store at `path`, in a folder of their own.
 
     Attributes:
+        identity: of the store, 16 bytes: the checksums begin with it, so that a log of another store is none of this.
         rows: what is in the log and not in the database yet.
         size: their bytes.
         is_used: without it nothing is written to the log.
@@ -77,6 +79,7 @@ class FrontLog:
         self.is_used = is_used
         self.is_broken_off = False
         self.epoch = 0
+        self.identity = b""
         self.size = 0
         self._files: list[_File] = []  # all of them
         self._file: _File | None = None  # the one written to
@@ -109,16 +112,16 @@ class FrontLog:
                 os.pwrite(fd, _SEAL.pack(1), 0)
             finally:
                 os.close(fd)
-        yield from batches_in([read_own(name) for name in names])
+        yield from batches_in([read_own(name) for name in names], self.identity)
 
-    def look(self) -> list[list[Row]]:
-        """What was appended as one, oldest first, while others may write; what goes meanwhile is in the database."""
+    def look(self) -> list[bytes]:
+        """The contents of all logs, while others may write; what goes meanwhile is in the database."""
         contents: list[bytes] = []
         with contextlib.suppress(FileNotFoundError):
             for name in self.left():
                 with contextlib.suppress(FileNotFoundError):
                     contents.append(read_own(name))
-        return list(batches_in(contents))
+        return contents
 
     def remove(self, names: Sequence[str]) -> None:
         """Remove these files for good."""
@@ -217,7 +220,7 @@ class FrontLog:
         self._generation += 1
         self._at = _SEAL.size
         head = _HEAD.pack(_MAGIC, self.epoch, self._generation)
-        self._crc = zlib.crc32(head)
+        self._crc = zlib.crc32(head, zlib.crc32(self.identity))
         self._head = head + _CRC.pack(self._crc)
 
     # ---- power losses
@@ -260,8 +263,8 @@ class FrontLog:
                     os.unlink(file.name)
 
 
-def batches_in(files: Sequence[bytes]) -> Iterator[list[Row]]:
-    """What was appended as one, oldest first, from the contents of logs.
+def batches_in(files: Sequence[bytes], identity: bytes) -> Iterator[list[Row]]:
+    """What was appended as one to the store of that identity, oldest first, from the contents of logs.
 
     What is damaged ends its file: whether it was acknowledged, the mark knows.
     """
@@ -271,7 +274,9 @@ def batches_in(files: Sequence[bytes]) -> Iterator[list[Row]]:
         if len(data) < start + _CRC.size:
             continue
         magic, epoch, generation = _HEAD.unpack_from(data, _SEAL.size)
-        if magic == _MAGIC and _CRC.unpack_from(data, start)[0] == zlib.crc32(data[_SEAL.size : start]):
+        begin = 0 if magic == _UNBOUND else zlib.crc32(identity)
+        expected = zlib.crc32(data[_SEAL.size : start], begin)
+        if magic in (_MAGIC, _UNBOUND) and _CRC.unpack_from(data, start)[0] == expected:
             found.append((epoch, generation, data))
     for _, _, data in sorted(found, key=lambda one: one[:2]):
         yield from _records(data)

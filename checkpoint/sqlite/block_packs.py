@@ -2,6 +2,7 @@
 
 A pack holds what one snapshot wrote anew; the snapshot's row names the blocks of all packs that it consists of. The
 bytes: magic, then for each block a head (offset in its segment, length, stored length, codec, checksum) and the block.
+In a store with a key the block is sealed, and the checksum is that of what is stored: of the block it would tell.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Collection, Generator, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 from hashlib import blake2b
-from typing import Final
+from typing import IO, Final
 
-from ..compression import PLAIN, LibraryMissing, compressor, decompress
+from ..compression import PLAIN, Compress, LibraryMissing, compressor, decompress
 from ..journal import DamagedStore, StoreFailed
 from ..snapshot.shared_blocks import PAGE, Segment, memory_file
+from .sealing import Bytes, block_place
 from .snapshot_files import no_link, refuse_shared, write_durably
 from .store_parts import Parts
 
@@ -41,12 +43,6 @@ class Packs:
         Raises:
             StoreFailed: it is not written, and nothing of it is left.
         """
-        deflate = compressor(compress)
-        parts: list[bytes | memoryview] = [_MAGIC]
-        for offset, block in blocks:
-            codec, data = deflate(block)
-            head = _HEAD.pack(offset, len(block), len(data), codec, 0)[:-4]
-            parts += (head, struct.pack("<I", zlib.crc32(block, zlib.crc32(head))), data)
         folder = self._folder(address)
         try:
             for one in (self.folder, folder):
@@ -56,9 +52,58 @@ class Packs:
                     self._parts.mark(one)
                 if os.path.islink(one):
                     raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), one)
-            write_durably(self.file(address, number), parts)
+            write_durably(self.file(address, number), self._packed(address, number, blocks, compressor(compress)))
         except OSError as error:
             raise StoreFailed(self.path, f"snapshot not written: {error}; older one and journal stay") from error
+
+    def _packed(
+        self, address: str, number: int, blocks: Iterable[tuple[int, memoryview]], deflate: Compress
+    ) -> Iterator[Bytes]:
+        yield _MAGIC
+        for offset, block in blocks:
+            codec, data = deflate(block)
+            yield from self._stored(address, number, offset, codec, data, block)
+
+    def _stored(self, address: str, number: int, offset: int, codec: int, data: Bytes, block: Bytes) -> Iterator[Bytes]:
+        """The bytes of a block, whose `data` are what its codec has made of it."""
+        cipher = self._parts.cipher
+        kept = cipher.seal(block_place(address, number, offset, len(block), codec), data)
+        head = _HEAD.pack(offset, len(block), len(kept), codec, 0)[:-4]
+        yield head + struct.pack("<I", zlib.crc32(kept if cipher.digest_key else block, zlib.crc32(head)))
+        yield kept
+
+    def _opened(self, address: str, number: int, head: bytes, kept: bytes) -> tuple[bytes, bytes]:
+        """What the codec of a block has made of it, and the block itself, verified.
+
+        Raises:
+            ValueError: it is damaged.
+        """
+        cipher = self._parts.cipher
+        offset, length, _, codec, crc = _HEAD.unpack(head)
+        data = cipher.unseal(block_place(address, number, offset, length, codec), kept)
+        block = data if codec == PLAIN else decompress(codec, data, length)
+        if len(block) != length or zlib.crc32(kept if cipher.digest_key else block, zlib.crc32(head[:-4])) != crc:
+            raise ValueError(f"the checksum of the block at {offset} is wrong")
+        return data, block
+
+    def copied(self, source: Packs, address: str, number: int, file: IO[bytes]) -> Iterator[Bytes]:
+        """The bytes of a pack of another store as it is to be in this one; what is damaged in it stays so.
+
+        Raises:
+            LibraryMissing: it is compressed.
+        """
+        yield file.read(len(_MAGIC))
+        while len(head := file.read(_HEAD.size)) == _HEAD.size:
+            offset, _, stored, codec, _ = _HEAD.unpack(head)
+            kept = file.read(stored)
+            try:
+                data, block = source._opened(address, number, head, kept)
+            except LibraryMissing:
+                raise
+            except ValueError:
+                yield head + kept
+            else:
+                yield from self._stored(address, number, offset, codec, data, block)
 
     def read(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
         """Read back the blocks at these (offset, length), and verify them.
@@ -69,7 +114,7 @@ class Packs:
         name = self.file(address, number)
         file = memory_file(number)
         try:
-            for offset, block in _blocks(name, set(places)):
+            for offset, block in self._blocks(address, number, set(places)):
                 os.pwrite(file, block, offset)
             end = max((offset + length for offset, length in places), default=0)
             os.ftruncate(file, -(-end // PAGE) * PAGE)
@@ -86,7 +131,7 @@ class Packs:
         """
         name = self.file(address, number)
         try:
-            for _ in _blocks(name, set(places)):
+            for _ in self._blocks(address, number, set(places)):
                 pass
         except LibraryMissing as error:
             raise StoreFailed(self.path, str(error)) from error
@@ -104,7 +149,7 @@ class Packs:
             name = self.file(address, number)
             wanted = {(offset, length) for pack, offset, length in places if pack == number}
             try:
-                blocks.update(((number, offset), block) for offset, block in _blocks(name, wanted))
+                blocks.update(((number, offset), block) for offset, block in self._blocks(address, number, wanted))
             except LibraryMissing as error:
                 raise StoreFailed(self.path, str(error)) from error
             except (OSError, ValueError, struct.error) as error:
@@ -153,32 +198,29 @@ class Packs:
             raise StoreFailed(self.path, f"{error}; blocks of snapshots are left behind") from error
 
     def _folder(self, address: str) -> str:
-        return os.path.join(self.folder, blake2b(address.encode(errors="surrogatepass"), digest_size=12).hexdigest())
+        data, key = address.encode(errors="surrogatepass"), self._parts.cipher.digest_key
+        return os.path.join(self.folder, blake2b(data, digest_size=12, key=key).hexdigest())
 
     def file(self, address: str, number: int) -> str:
         """The file in which a pack of an address is kept."""
         return os.path.join(self._folder(address), f"{number:x}.pack")
 
+    def _blocks(self, address: str, number: int, wanted: set[tuple[int, int]]) -> Iterator[tuple[int, bytes]]:
+        """The verified blocks of a pack that are wanted, as (offset, length), each with its offset.
 
-def _blocks(name: str, wanted: set[tuple[int, int]]) -> Iterator[tuple[int, bytes]]:
-    """The verified blocks of a pack that are wanted, as (offset, length), each with its offset.
-
-    Raises:
-        OSError, ValueError, struct.error: one is missing or damaged.
-    """
-    with open(name, "rb", opener=no_link) as pack:
-        refuse_shared(name, os.fstat(pack.fileno()))
-        if pack.read(len(_MAGIC)) != _MAGIC:
-            raise ValueError("it is no pack")
-        while wanted and (head := pack.read(_HEAD.size)):
-            offset, length, stored, codec, crc = _HEAD.unpack(head)
-            data = pack.read(stored)
-            if (offset, length) not in wanted:
-                continue
-            block = data if codec == PLAIN else decompress(codec, data, length)
-            if len(block) != length or zlib.crc32(block, zlib.crc32(head[:-4])) != crc:
-                raise ValueError(f"the checksum of the block at {offset} is wrong")
-            yield offset, block
-            wanted.discard((offset, length))
-    if wanted:
-        raise ValueError(f"the block at {min(wanted)[0]} is missing")
+        Raises:
+            OSError, ValueError, struct.error: one is missing or damaged.
+        """
+        name = self.file(address, number)
+        with open(name, "rb", opener=no_link) as pack:
+            refuse_shared(name, os.fstat(pack.fileno()))
+            if pack.read(len(_MAGIC)) != _MAGIC:
+                raise ValueError("it is no pack")
+            while wanted and (head := pack.read(_HEAD.size)):
+                offset, length, stored, _, _ = _HEAD.unpack(head)
+                kept = pack.read(stored)
+                if (offset, length) in wanted:
+                    yield offset, self._opened(address, number, head, kept)[1]
+                    wanted.discard((offset, length))
+        if wanted:
+            raise ValueError(f"the block at {min(wanted)[0]} is missing")

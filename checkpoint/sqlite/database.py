@@ -6,17 +6,17 @@ import contextlib
 import os
 import sqlite3
 import threading
+import uuid
 from pathlib import Path
 from typing import Final
 
 from ..journal import DamagedStore
 from .row_codec import crc_of
+from .sealing import FORMATS, Cipher, format_of
 from .snapshot_files import sync
-from .store_parts import new_note
+from .store_parts import new_cipher, new_notes
 
 _APPLICATION: Final = 0x486F6C64  # "Hold", in the file header
-VERSION: Final = 1
-VERSION_WITH_LOG: Final = 2  # while there may be a log with rows, which an older holdfast would not see
 _TABLES: Final = {
     "store": "one INTEGER PRIMARY KEY, epoch INTEGER, pid INTEGER, start TEXT, floor INTEGER, live INTEGER, "
     "crc INTEGER",
@@ -31,20 +31,17 @@ _SCHEMA: Final = [f"CREATE TABLE {name}({columns})" for name, columns in _TABLES
 _BUSY_SECONDS: Final = 0.25  # Nobody holds a lock for long, except a stopped process, and that one is looked up.
 
 
-def create_database(path: str, folder: str) -> None:
+def create_database(path: str, folder: str, key: bytes | None) -> None:
     """Make the database in `folder` and link it into place: half a database is then never seen under its name."""
+    identity = str(uuid.uuid4())
+    cipher = new_cipher(key, identity)
     new = os.path.join(folder, f"new-{os.getpid()}-{threading.get_ident()}")
     with contextlib.suppress(FileNotFoundError):
         os.unlink(new)  # left by an earlier process with our pid
     os.close(os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600))  # SQLite gives -wal and -shm the same mode
     with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as db:
-        db.execute("PRAGMA journal_mode = WAL")
-        db.execute(f"PRAGMA application_id = {_APPLICATION}")
-        db.execute(f"PRAGMA user_version = {VERSION}")
-        for statement in _SCHEMA:
-            db.execute(statement)
-        db.execute("INSERT INTO store VALUES (1, 0, 0, '', 0, 0, ?)", (crc_of(0, 0, "", 0, 0),))
-        db.execute("INSERT INTO notes VALUES (NULL, ?, ?, ?)", new_note())
+        create_tables(db, cipher)
+        db.executemany("INSERT INTO notes VALUES (NULL, ?, ?, ?)", new_notes(identity, cipher))
         # What is left in the WAL would be missing under the other name, and closing says nothing of what it could not
         # bring over.
         (is_busy, left, _) = db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
@@ -58,6 +55,17 @@ def create_database(path: str, folder: str) -> None:
         pass  # Another opener was quicker, and as the owner it may have swept ours away.
     with contextlib.suppress(FileNotFoundError):
         os.unlink(new)
+
+
+def create_tables(db: sqlite3.Connection, cipher: Cipher) -> None:
+    """Make a new database a store without contents and without an identity."""
+    db.execute("PRAGMA journal_mode = WAL")
+    db.execute(f"PRAGMA application_id = {_APPLICATION}")
+    db.execute(f"PRAGMA user_version = {format_of(cipher, may_have_log=False)}")
+    for statement in _SCHEMA:
+        db.execute(statement)
+    crc = crc_of(0, 0, "", 0, 0, key=cipher.digest_key)
+    db.execute("INSERT INTO store VALUES (1, 0, 0, '', 0, 0, ?)", (crc,))
 
 
 def connect(path: str) -> sqlite3.Connection:
@@ -86,8 +94,8 @@ def refuse_foreign(db: sqlite3.Connection, path: str, *, is_wal: bool = True) ->
     (mode,) = db.execute("PRAGMA journal_mode").fetchone()
     if application != _APPLICATION or (is_wal and mode != "wal"):
         raise DamagedStore(path, None, None, "this is not a holdfast store")
-    if version not in (VERSION, VERSION_WITH_LOG):
-        reason = f"its format is {version}, this holdfast reads {VERSION} and {VERSION_WITH_LOG}"
+    if version not in FORMATS:
+        reason = f"its format is {version}, this holdfast reads {FORMATS[0]} to {FORMATS[-1]}"
         raise DamagedStore(path, None, None, reason)
     found = [sql for (sql,) in db.execute("SELECT sql FROM sqlite_master WHERE sql NOT NULL ORDER BY rowid")]
     if [sql for sql in found if "sqlite_sequence" not in sql] != _SCHEMA:

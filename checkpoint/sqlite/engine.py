@@ -14,22 +14,14 @@ from typing import Final, Literal
 
 from ..journal import DamagedStore, Entry, Saved, StaleEpoch, StoreFailed
 from ..snapshot.shared_blocks import Segment
+from ..store_key import StoreKey, read_store_key
 from .append_log import Row
 from .block_packs import Packs
 from .entry_chains import MODULUS, Chain
 from .open_store import INSERT, Store
-from .read_back import ChainReader
-from .row_codec import (
-    CHUNK,
-    PLACE,
-    check_entry,
-    crc_of,
-    entry_packer,
-    is_plain,
-    pack_positions,
-    snapshot_digest,
-    unpack_positions,
-)
+from .read_back import ChainReader, dropped_by
+from .row_codec import CHUNK, PLACE, check_entry, entry_packer, is_plain, pack_positions, snapshot_digest
+from .sealing import SEALED_KIND, drops_place, entry_sealer, note_name, note_row, snapshot_place
 
 _FEW: Final = 128  # More entries at a time, or more bytes, are worth a transaction of their own.
 _SMALL: Final = 64 << 10
@@ -45,10 +37,12 @@ class SqliteJournal:
         synchronous: `"os"` survives the death of the process at any instant; a power loss may take the newest
             appends, but leaves the store sound. `"fsync"` survives power loss too; each append then waits for the
             disk, so call it in a worker thread, with as many entries as have gathered.
+        key: with one, all that the store keeps is encrypted, from its making on: see `read_store_key`.
 
     Raises:
         StoreInUse: a live process, this one included, has it open.
         ForeignStore: its parts do not belong together, or others than this user may write to them; nothing was changed.
+        WrongStoreKey: the key is not the store's; nothing was changed.
         DamagedStore: the file is damaged, or entries that were acknowledged are gone. Damage that concerns one address
             only is raised when that address is used; the others work.
         StoreFailed: the operating system refused.
@@ -58,7 +52,12 @@ class SqliteJournal:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], *, takeover: bool = False, synchronous: Literal["os", "fsync"] = "os"
+        self,
+        path: str | os.PathLike[str],
+        *,
+        takeover: bool = False,
+        synchronous: Literal["os", "fsync"] = "os",
+        key: StoreKey | None = None,
     ) -> None:
         if synchronous not in ("os", "fsync"):
             raise ValueError(f"synchronous is 'os' or 'fsync', not {synchronous!r}")
@@ -67,15 +66,17 @@ class SqliteJournal:
         self.durable = True
         self.path = os.path.realpath(path)
         self._pack = entry_packer()
-        self._store = store = Store(self.path, fsync=synchronous == "fsync")
+        self._store = store = Store(self.path, read_store_key(key), fsync=synchronous == "fsync")
         if os.path.islink(path):
             store.parts.refuse_link(os.path.abspath(path))
         with store.opening(takeover=takeover):
+            self._cipher = store.parts.cipher
+            self._seal = entry_sealer(self._cipher)
             self._finish()
             self.epoch = store.claim.epoch
             self.in_hand = store.hands
             self._packs = Packs(self.path, store.parts)
-            self._reader = ChainReader(store.reader, self.path, store.files)
+            self._reader = ChainReader(store.reader, self.path, store.files, self._cipher)
 
     def _finish(self) -> None:
         """Finish what an earlier owner began."""
@@ -134,7 +135,7 @@ class SqliteJournal:
     def _rows(self, entries: Sequence[tuple[str, Entry]], packed: list[bytes]) -> list[Row]:
         """Give each entry its position and its place in its chain."""
         rows: list[Row] = []
-        place, crc32 = PLACE.pack, zlib.crc32  # `row_crc`, but this is done for every message
+        seal, place, crc32 = self._seal, PLACE.pack, zlib.crc32  # `row_crc`, but this is done for every message
         position, address = self._store.contents.last, entries[0][0]
         chain = self._store.chain(address)
         for (where, entry), data in zip(entries, packed, strict=True):
@@ -144,7 +145,10 @@ class SqliteJournal:
             number = chain.last = chain.last + 1
             chain.positions.append(position)
             key = chain.id
-            rows.append((position, key, number, entry[0], data, crc32(data, crc32(place(position, key, number)))))
+            at, kind = place(position, key, number), entry[0]
+            if seal is not None:
+                data, kind = seal(at, data), SEALED_KIND
+            rows.append((position, key, number, kind, data, crc32(data, crc32(at))))
         self._store.contents.last = position
         self._store.contents.live += len(rows)
         return rows
@@ -156,7 +160,7 @@ class SqliteJournal:
         transaction, if there is little to remove; to remove much takes more, and long: call it in a worker thread.
         """
         self._store.refuse_failed()
-        digest = snapshot_digest(address, turn, self.epoch, snapshot)
+        digest = snapshot_digest(address, turn, self.epoch, snapshot, self._cipher.digest_key)
         file = self._store.files.write(self.epoch, snapshot) if len(snapshot) > _INLINE_BYTES else None
         data = snapshot if file is None else None
         try:
@@ -164,12 +168,11 @@ class SqliteJournal:
                 chain = self._store.chain(address)
                 last = self._store.contents.last  # A position that is yet to come is none that the address has.
                 drops = pack_positions([position for position in drop if position <= last])
-                row = (chain.id, turn, self.epoch, drops, file, digest, data)
-                number = db.execute("INSERT INTO snapshots VALUES (NULL, ?, ?, ?, ?, ?, ?, ?)", row).lastrowid
-                chain.kept.append(number or 0)
+                row = chain.id, turn, self.epoch
+                chain.kept.append(self._insert_snapshot(db, row, drops, file, digest, data))
                 chain.floor = chain.last
                 files = self._clean_at_once(chain, db, keep)
-                chain.write(db)
+                chain.write(db, self._cipher)
         except (StaleEpoch, StoreFailed):
             if file is not None and self._store.failure is None:  # After a failed sync nobody knows if the row exists.
                 os.unlink(os.path.join(self._store.files.folder, file))
@@ -183,6 +186,29 @@ class SqliteJournal:
             if self._store.failure is not None:
                 raise
             # The snapshot is kept, which is what we promised; the next cut cleans up.
+
+    def _insert_snapshot(
+        self,
+        db: sqlite3.Connection,
+        row: tuple[int, int, int],
+        drops: bytes,
+        file: str | None,
+        digest: bytes,
+        data: bytes | None,
+    ) -> int:
+        """Give a snapshot its row, and return its number, which what is sealed in that row is bound to."""
+        (last,) = db.execute("SELECT max(seq) FROM sqlite_sequence WHERE name = 'snapshots'").fetchone()
+        number = 1 + (last or 0)
+        kept_drops = self._cipher.seal(drops_place(number), drops)
+        kept = None if data is None else self._cipher.seal(snapshot_place(number), data)
+        db.execute(
+            "INSERT INTO snapshots VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (number, *row, kept_drops, file, digest, kept)
+        )
+        return number
+
+    def _set_drops(self, db: sqlite3.Connection, number: int, drops: bytes) -> None:
+        kept = self._cipher.seal(drops_place(number), drops)
+        db.execute("UPDATE snapshots SET drops = ? WHERE id = ?", (kept, number))
 
     def _clean_at_once(self, chain: Chain, db: sqlite3.Connection, keep: int) -> list[str] | None:
         """Remove what only outdated snapshots need, in the transaction of the cut, if it is little.
@@ -202,7 +228,7 @@ class SqliteJournal:
         except DamagedStore:
             return None
         if drops:
-            db.execute("UPDATE snapshots SET drops = x'' WHERE id = ?", (heir,))
+            self._set_drops(db, heir, b"")
         del chain.kept[: len(outdated)]
         return self._delete_snapshots(db, outdated)
 
@@ -217,27 +243,17 @@ class SqliteJournal:
             heir = chain.kept[-keep]
             with self._store.transaction(note=True) as db:
                 drops = self._drops(chain, db, [*outdated, heir])
-                db.execute(
-                    "UPDATE snapshots SET drops = ? WHERE id = ?", (pack_positions(list(drops)) if drops else b"", heir)
-                )
+                self._set_drops(db, heir, pack_positions(list(drops)) if drops else b"")
                 files = self._delete_snapshots(db, outdated)
                 del chain.kept[: len(outdated)]
-                chain.write(db)
+                chain.write(db, self._cipher)
             self._store.remove_files(files)
         if len(chain.kept) >= keep:
             self._remove_dropped(chain, chain.kept[0])
 
     def _drops(self, chain: Chain, db: sqlite3.Connection, numbers: Sequence[int]) -> set[int]:
         """What these snapshots have still to remove."""
-        drops: set[int] = set()
-        for number in numbers:
-            row = db.execute("SELECT drops FROM snapshots WHERE id = ?", (number,)).fetchone()
-            try:
-                drops.update(unpack_positions(row[0]))
-            except (TypeError, ValueError, zlib.error) as error:
-                reason = f"the drop list of snapshot {number} is damaged"
-                raise DamagedStore(self.path, chain.path, None, reason) from error
-        return drops
+        return dropped_by(db, self.path, self._cipher, chain, numbers)
 
     def _remove_dropped(self, chain: Chain, number: int) -> None:
         """Physically remove the entries that a snapshot made superfluous, then forget which they were."""
@@ -247,13 +263,13 @@ class SqliteJournal:
             for start in range(0, len(positions), CHUNK):
                 self._remove(chain, positions[start : start + CHUNK])
             with self._store.transaction() as db:
-                db.execute("UPDATE snapshots SET drops = x'' WHERE id = ?", (number,))
+                self._set_drops(db, number, b"")
 
     def _remove(self, chain: Chain, positions: array[int]) -> None:
         """Remove those of the sorted positions that the chain has, in one transaction."""
         with self._store.transaction(note=True) as db:
             self._remove_rows(chain, db, positions)
-            chain.write(db)
+            chain.write(db, self._cipher)
 
     def _remove_rows(self, chain: Chain, db: sqlite3.Connection, positions: array[int]) -> None:
         """Remove those of the sorted positions that the chain has.
@@ -321,7 +337,7 @@ class SqliteJournal:
                 # From here on it is gone; if we die before the rest is done, the next opening does it.
                 chain = self._store.contents.chains.pop(address)
                 chain.path = None
-                chain.write(db)
+                chain.write(db, self._cipher)
         self._finish_erase(chain)
         if self._packs.names(address):
             self._store.sync_rows()
@@ -398,10 +414,10 @@ class SqliteJournal:
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a small named fact; see `Journal`."""
         with self._store.transaction(len(value or b""), note=True) as db:
-            db.execute("DELETE FROM notes WHERE name = ?", (key,))
+            db.execute("DELETE FROM notes WHERE name = ?", (note_name(self._cipher, key),))
             self._store.contents.notes.pop(key, None)
             if value is not None:
-                db.execute("INSERT INTO notes VALUES (NULL, ?, ?, ?)", (key, value, crc_of(key, value)))
+                db.execute("INSERT INTO notes VALUES (NULL, ?, ?, ?)", note_row(self._cipher, key, value))
                 self._store.contents.notes[key] = value
 
     def noted(self, key: str) -> bytes | None:

@@ -6,13 +6,15 @@ import sqlite3
 from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 from ..journal import DamagedStore
 from .append_log import Row
 from .row_codec import crc_of
+from .sealing import Cipher, NoCipher, read_note, seal_path, unseal_path
 from .store_parts import is_hidden
 
+CHAINS: Final = "SELECT id, path, removed, removed_sum, floor, kept, crc FROM addresses"
 MODULUS: Final = 1 << 62  # SQLite integers end at 2**63
 
 
@@ -31,22 +33,41 @@ class Chain:
     positions: array[int] = field(default_factory=lambda: array("q"))
     damage: DamagedStore | None = None
 
-    def write(self, db: sqlite3.Connection) -> None:
-        """Bring the row of the address up to date, within the running transaction."""
+    @classmethod
+    def read(cls, row: Sequence[Any], cipher: Cipher) -> Chain:
+        """What the row of an address says.
+
+        Raises:
+            ValueError: it is damaged.
+        """
+        *fields, crc = row
+        number, kept_path, removed, removed_sum, floor, kept = fields
+        path = unseal_path(cipher, number, kept_path)
+        if crc_of(*fields, key=cipher.digest_key) != crc:
+            raise ValueError(f"the checksum of the row of the address {path} is wrong")
+        return cls(number, path, removed, removed_sum, floor, [int(one) for one in kept.split(",") if one])
+
+    def row(self, cipher: Cipher) -> tuple[Any, ...]:
+        """The row of the address."""
         kept = ",".join(map(str, self.kept))
-        fields = self.id, self.path, self.removed, self.removed_sum, self.floor, kept
+        fields = self.id, seal_path(cipher, self.id, self.path), self.removed, self.removed_sum, self.floor, kept
+        return *fields, crc_of(*fields, key=cipher.digest_key)
+
+    def write(self, db: sqlite3.Connection, cipher: Cipher) -> None:
+        """Bring the row of the address up to date, within the running transaction."""
+        number, *fields = self.row(cipher)
         db.execute(
             "UPDATE addresses SET path = ?, removed = ?, removed_sum = ?, floor = ?, kept = ?, crc = ? WHERE id = ?",
-            (*fields[1:], crc_of(*fields), self.id),
+            (*fields, number),
         )
 
 
-def create_chain(db: sqlite3.Connection, address: str) -> Chain:
+def create_chain(db: sqlite3.Connection, address: str, cipher: Cipher) -> Chain:
     """Give an address its row, within the running transaction."""
-    number = db.execute("INSERT INTO addresses(path) VALUES (?)", (address,)).lastrowid
+    number = db.execute("INSERT INTO addresses(path) VALUES (NULL)").lastrowid
     assert number is not None
     chain = Chain(number, address)
-    chain.write(db)
+    chain.write(db, cipher)
     return chain
 
 
@@ -91,11 +112,14 @@ class StoreScan:
     Args:
         db: reads it.
         path: of the store.
+        cipher: of the store.
         tell: is told what is damaged and cannot be laid to one address; what it does not raise is passed over.
     """
 
-    def __init__(self, db: sqlite3.Connection, path: str, tell: Callable[[DamagedStore], None] = refuse) -> None:
-        self._db, self._path, self._tell = db, path, tell
+    def __init__(
+        self, db: sqlite3.Connection, path: str, cipher: Cipher, tell: Callable[[DamagedStore], None] = refuse
+    ) -> None:
+        self._db, self._path, self._cipher, self._tell = db, path, cipher, tell
 
     def contents(self) -> StoreContents:
         """Find where each address has its entries, and verify that none is missing: else its chain says so (`damage`).
@@ -118,14 +142,12 @@ class StoreScan:
 
     def _addresses(self) -> dict[int, Chain]:
         chains: dict[int, Chain] = {}
-        for *fields, crc in self._db.execute("SELECT id, path, removed, removed_sum, floor, kept, crc FROM addresses"):
-            if crc_of(*fields) != crc:
-                problem = "the checksum of the row of the address is wrong"
-                self._tell(DamagedStore(self._path, str(fields[1]), None, problem))
-                continue
-            number, path, removed, removed_sum, floor, kept = fields
-            ids = [int(snapshot) for snapshot in kept.split(",") if snapshot]
-            chains[number] = Chain(number, path, removed, removed_sum, floor, ids)
+        for row in self._db.execute(CHAINS):
+            try:
+                chains[row[0]] = Chain.read(row, self._cipher)
+            except ValueError as error:
+                address = row[1] if isinstance(row[1], str) else None
+                self._tell(DamagedStore(self._path, address, None, str(error)))
         for number, address in self._db.execute("SELECT id, address FROM snapshots"):
             if address not in chains:
                 self._tell(DamagedStore(self._path, None, None, f"snapshot {number} belongs to no address"))
@@ -152,11 +174,13 @@ class StoreScan:
     def _notes(self) -> dict[str, bytes]:
         notes: dict[str, bytes] = {}
         for name, value, crc in self._db.execute("SELECT name, value, crc FROM notes ORDER BY key"):
-            if crc != crc_of(name, value):
-                self._tell(DamagedStore(self._path, None, None, f"the checksum of note {name!r} is wrong"))
+            try:
+                known, data = read_note(NoCipher() if is_hidden(name) else self._cipher, name, value, crc)
+            except ValueError as error:
+                self._tell(DamagedStore(self._path, None, None, str(error)))
                 continue
             if not is_hidden(name):
-                notes[name] = value
+                notes[known] = data
         return notes
 
     def _verify(self, chain: Chain) -> None:

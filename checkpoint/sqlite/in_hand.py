@@ -31,13 +31,15 @@ class InputsInHand:
         self._pages: list[tuple[mmap.mmap, memoryview]] = []
         self._places: dict[int, int] = {}
         self._one_worked = False
+        self._digest_key = b""
 
-    def open(self, identity: bytes) -> None:
+    def open(self, identity: bytes, digest_key: bytes) -> None:
         """Take up what an earlier owner has left, if it was this store's.
 
         Raises:
             OSError: it cannot be had.
         """
+        self._digest_key = digest_key
         self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         refuse_shared(self.path, os.fstat(self._fd))
         if os.pread(self._fd, _HEAD, 0) != identity:
@@ -53,12 +55,12 @@ class InputsInHand:
 
     def begun(self, address: str) -> int:
         """The input in whose turn the last owner was killed, as far as the words say; -1: none."""
-        place = self._places.get(_digest(address))
+        place = self._places.get(self._digest(address))
         return -1 if place is None else blamed(self._at(place)[1], one_works=self._one_worked)
 
     def word(self, address: str) -> memoryview:
         """The word of an actor, to be set as `word[0]`."""
-        digest = _digest(address)
+        digest = self._digest(address)
         place = self._places.get(digest)
         if place is None:
             place = self._places[digest] = len(self._places) + 1
@@ -95,7 +97,6 @@ class InputsInHand:
         page = mmap.mmap(self._fd, _PAGE, offset=begin)
         self._pages.append((page, memoryview(page).cast("Q")))
 
-
-def _digest(address: str) -> int:
-    data = blake2b(address.encode(errors="surrogatepass"), digest_size=8).digest()
-    return int.from_bytes(data, "little") or 1
+    def _digest(self, address: str) -> int:
+        data = blake2b(address.encode(errors="surrogatepass"), digest_size=8, key=self._digest_key).digest()
+        return int.from_bytes(data, "little") or 1

@@ -15,11 +15,12 @@ from typing import Final, NamedTuple
 from ...actors.errors import HoldfastError
 from ..journal import DamagedStore, Entry, StaleEpoch, StoreFailed
 from .append_log import FrontLog, LogSealed, NoRoom, Row, following
-from .database import VERSION, VERSION_WITH_LOG, connect, create_database, result_code
+from .database import connect, create_database, result_code
 from .entry_chains import Chain, StoreContents, StoreScan, create_chain
 from .in_hand import InputsInHand
-from .ownership import StoreClaim
+from .ownership import StoreClaim, refuse_copy
 from .position_mark import PositionMark
+from .sealing import format_of, may_have_log
 from .snapshot_files import SnapshotFiles, sync
 from .store_parts import Parts
 
@@ -75,10 +76,10 @@ class Store:
         failure: why everything is refused from now on.
     """
 
-    def __init__(self, path: str, *, fsync: bool) -> None:
+    def __init__(self, path: str, key: bytes | None, *, fsync: bool) -> None:
         self.path = path
-        self.files = SnapshotFiles(path)
-        self.parts = Parts(path)
+        self.parts = Parts(path, key)
+        self.files = SnapshotFiles(path, self.parts)
         self.lock = threading.RLock()
         self._joint: Joint | None = None
         self.read_lock = threading.Lock()
@@ -111,7 +112,7 @@ class Store:
                 try:
                     self._scan()
                     self._begin_log()
-                    self.hands.open(uuid.UUID(self.parts.id).bytes)
+                    self.hands.open(self.log.identity, self.parts.cipher.digest_key)
                     yield
                     self.parts.opened()
                 except BaseException:
@@ -128,11 +129,13 @@ class Store:
 
     def _connect(self) -> None:
         is_there = self.parts.inspect()
+        if is_there:
+            refuse_copy(self.parts)
         with contextlib.suppress(FileExistsError):
             os.mkdir(self.files.folder, mode=0o700)  # not its parents: a mistyped path should not be made true
         if not is_there:
             self.log.make_folder()
-            create_database(self.path, self.files.folder)
+            create_database(self.path, self.files.folder, self.parts.key)
         if os.path.getsize(self.path) == 0:  # SQLite would take it for a new database
             raise DamagedStore(self.path, None, None, "the file is empty")
         self.db, self.reader = connect(self.path), connect(self.path)
@@ -144,7 +147,7 @@ class Store:
 
     def _scan(self) -> None:
         """Take into memory what is in the file."""
-        self.contents, self.in_doubt = StoreScan(self.db, self.path).contents(), False
+        self.contents, self.in_doubt = StoreScan(self.db, self.path, self.parts.cipher).contents(), False
         rows = self.log.rows
         if rows and rows[0][0] <= self.contents.last:  # It was only broken off when all was done.
             self.log.restart()
@@ -157,14 +160,15 @@ class Store:
         log.epoch = self.claim.epoch
         (version,) = self.db.execute("PRAGMA user_version").fetchone()
         if log.make_folder():
-            if version == VERSION_WITH_LOG:
+            if may_have_log(version):
                 os.rmdir(log.folder)
                 reason = f"its log is missing (make an empty folder {log.folder} to go on without what was in it)"
                 raise DamagedStore(self.path, None, None, reason)
             sync(os.path.dirname(self.path))
         self.parts.adopt(self.db)
+        log.identity = uuid.UUID(self.parts.id).bytes
         # A store was closed, and its owner killed before it had removed these; or its WAL is missing: the mark knows.
-        stale, left = (log.left(), []) if version == VERSION else ([], log.left())
+        stale, left = ([], log.left()) if may_have_log(version) else (log.left(), [])
         rows = following(log.read(left), self.contents.last)
         self.contents.take_in(rows, self.path)
         self._mark.check(self.contents.last, synced=self._fsync)
@@ -174,7 +178,7 @@ class Store:
         if left:  # They are removed next.
             self.db.execute("PRAGMA synchronous = FULL")
         with self.transaction() as db:
-            db.execute(f"PRAGMA user_version = {VERSION_WITH_LOG}")
+            db.execute(f"PRAGMA user_version = {format_of(self.parts.cipher, may_have_log=True)}")
         if left:
             log.remove(left)
             self._configure()
@@ -215,7 +219,7 @@ class Store:
             clean = db.execute("SELECT epoch FROM store").fetchone() == (self.claim.epoch,)
             if clean:
                 db.executemany(INSERT, self.log.rows)
-                db.execute(f"PRAGMA user_version = {VERSION}")
+                db.execute(f"PRAGMA user_version = {format_of(self.parts.cipher, may_have_log=False)}")
                 self.claim.write(self.contents.last, self.contents.live)
             db.execute("COMMIT")
         if clean:
@@ -438,7 +442,7 @@ class Store:
         """
         chain = self.contents.chains.get(address)
         if chain is None:
-            chain = self.contents.chains[address] = create_chain(self.db, address)
+            chain = self.contents.chains[address] = create_chain(self.db, address, self.parts.cipher)
         elif chain.damage is not None:
             raise DamagedStore(*chain.damage.args)
         return chain

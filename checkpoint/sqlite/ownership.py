@@ -26,29 +26,46 @@ class StoreRow(NamedTuple):
 
     epoch: int
     pid: int  # of the owner, 0 for none, with its start
-    start: str
+    start: str  # and, of an owner, which file its database is
     floor: int  # up to this position there were `live` entries
     live: int
 
 
-def read_store_row(db: sqlite3.Connection, path: str) -> StoreRow:
-    """The row of the store as it is now.
+def read_store_row(db: sqlite3.Connection, path: str, key: bytes) -> StoreRow:
+    """The row of the store as it is now; `key` is that of its digests.
 
     Raises:
         DamagedStore: it is missing or its checksum is wrong.
     """
     row = db.execute("SELECT epoch, pid, start, floor, live, crc FROM store").fetchone()
-    if row is None or row[5] != crc_of(*row[:5]):
+    if row is None or row[5] != crc_of(*row[:5], key=key):
         raise DamagedStore(path, None, None, "the checksum of the store row is wrong")
     return StoreRow(*row[:5])
 
 
-def write_store_row(db: sqlite3.Connection, row: StoreRow) -> None:
-    """Put the row in the place of the present one, within a transaction of the caller."""
-    fields = tuple(row)
-    db.execute(
-        "UPDATE store SET epoch = ?, pid = ?, start = ?, floor = ?, live = ?, crc = ?", (*fields, crc_of(*fields))
-    )
+def write_store_row(db: sqlite3.Connection, row: StoreRow, key: bytes) -> None:
+    """Put the row in the place of the present one, within a transaction of the caller; `key` is that of its digests."""
+    crc = crc_of(*row, key=key)
+    db.execute("UPDATE store SET epoch = ?, pid = ?, start = ?, floor = ?, live = ?, crc = ?", (*row, crc))
+
+
+def refuse_copy(parts: Parts) -> None:
+    """Refuse files that were copied from those that a living process has open. Nothing is changed.
+
+    Raises:
+        ForeignStore: they are of no instant, and to take over would end the owner of the others.
+    """
+    try:
+        row = parts.peek(lambda db: read_store_row(db, parts.path, parts.cipher.digest_key))
+    except (sqlite3.Error, UnicodeDecodeError, DamagedStore):
+        return  # The opening says what is wrong.
+    with living(row.pid, row.start) as pidfd:
+        if pidfd is not None and row.start.count(":") > 1 and not row.start.endswith(_file_word(parts.path)):
+            raise parts.refused(
+                parts.path,
+                f"it is a copy of a store that process {row.pid} has open, made while that wrote to it",
+                "have `holdfast store backup` make the copy; or stop that process first",
+            )
 
 
 class StoreClaim:
@@ -67,11 +84,13 @@ class StoreClaim:
         Raises:
             StoreInUse: a living process has the store open, and it may not or cannot be killed.
             DamagedStore: the file is not ours, or is broken. ForeignStore: what lies beside it is of another store.
+            WrongStoreKey: the key is not its own.
         """
         deadline = monotonic() + _KILL_SECONDS
         while True:
             try:
                 refuse_foreign(self._db, self.path)
+                self._parts.unlock(self._db)
                 seen = self.read()
                 self._refuse_living(seen.pid, seen.start, takeover)
                 refuse_broken(self._db, self.path)
@@ -114,7 +133,7 @@ class StoreClaim:
             if self.read() != seen:
                 return False
             self.epoch = seen.epoch + 1
-            self._owner = os.getpid(), start_of(os.getpid()) or ""
+            self._owner = os.getpid(), f"{start_of(os.getpid()) or ''}{_file_word(self.path)}"
             self.write(seen.floor, seen.live)
             db.execute("COMMIT")
         finally:
@@ -128,11 +147,12 @@ class StoreClaim:
         Raises:
             DamagedStore: it is missing or its checksum is wrong.
         """
-        return read_store_row(self._db, self.path)
+        return read_store_row(self._db, self.path, self._parts.cipher.digest_key)
 
     def write(self, floor: int, live: int) -> None:
         """Bring the row up to date, within a transaction of the caller."""
-        write_store_row(self._db, StoreRow(self.epoch, *self._owner, floor, live))
+        row = StoreRow(self.epoch, *self._owner, floor, live)
+        write_store_row(self._db, row, self._parts.cipher.digest_key)
 
     def release(self) -> None:
         """Strike ourselves out as the owner, leaving everything else as it is."""
@@ -159,6 +179,12 @@ def start_of(pid: int) -> str | None:
     return f"{boot_id()}:{fields[19]}"
 
 
+def _file_word(path: str) -> str:
+    """Tell a file from its copies, on one machine since its start."""
+    info = os.stat(path)
+    return f":{info.st_dev}:{info.st_ino}"
+
+
 @contextlib.contextmanager
 def living(pid: int, start: str | None) -> Generator[int | None, None, None]:
     """Hold a pidfd of that very process, or `None` if it is dead. One that may not be looked at counts as alive."""
@@ -171,7 +197,7 @@ def living(pid: int, start: str | None) -> Generator[int | None, None, None]:
         return
     try:
         # The start time is read after the pidfd is held: the pid cannot pass to another process in between.
-        same = start is None or start_of(pid) in (start, None)
+        same = start is None or start_of(pid) in (":".join(start.split(":")[:2]), None)
         yield pidfd if same and not has_ended(pidfd, 0.0) else None
     finally:
         os.close(pidfd)

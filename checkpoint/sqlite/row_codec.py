@@ -68,14 +68,17 @@ def row_crc(position: int, address: int, chain: int, data: bytes) -> int:
     return zlib.crc32(data, zlib.crc32(PLACE.pack(position, address, chain)))
 
 
-def crc_of(*fields: object) -> int:
-    """Checksum of the fields of a small row."""
-    return zlib.crc32(repr(fields).encode("utf-8", "surrogatepass"))
+def crc_of(*fields: object, key: bytes = b"") -> int:
+    """Checksum of the fields of a small row; with a key it is one that nobody else can make."""
+    data = repr(fields).encode("utf-8", "surrogatepass")
+    if not key:
+        return zlib.crc32(data)
+    return int.from_bytes(blake2b(data, digest_size=8, key=key).digest(), "little", signed=True)
 
 
-def snapshot_digest(address: str, turn: int, epoch: int, data: bytes) -> bytes:
-    """Checksum of a snapshot: 16 bytes."""
-    digest = blake2b(repr((address, turn, epoch, len(data))).encode(), digest_size=16)
+def snapshot_digest(address: str, turn: int, epoch: int, data: bytes, key: bytes = b"") -> bytes:
+    """Checksum of a snapshot: 16 bytes; with a key it tells nothing of the snapshot."""
+    digest = blake2b(repr((address, turn, epoch, len(data))).encode(), digest_size=16, key=key)
     digest.update(data)  # releases the GIL, so the loop goes on while a worker thread is here
     return digest.digest()
 

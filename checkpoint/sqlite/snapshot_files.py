@@ -8,11 +8,12 @@ import mmap
 import os
 import re
 import stat
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from itertools import count
-from typing import Final
+from typing import IO, Final
 
 from ..journal import StoreFailed
+from .sealing import Bytes, HasCipher, file_place
 
 _SNAPSHOT: Final = re.compile(r"\d+-\d+\.snapshot")
 _MADE_HERE: Final = re.compile(r"\d+-\d+\.snapshot(\.tmp)?|new-\d+-\d+(-wal|-shm|-journal)?|store-id\.tmp")
@@ -20,10 +21,11 @@ _MADE_HERE: Final = re.compile(r"\d+-\d+\.snapshot(\.tmp)?|new-\d+-\d+(-wal|-shm
 
 
 class SnapshotFiles:
-    """The directory of snapshot files of the store at `path`."""
+    """The directory of snapshot files of the store at `path`; `parts` has its cipher."""
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, parts: HasCipher) -> None:
         self.path = path
+        self._parts = parts
         self.folder = f"{path}-snapshots"
         self._numbers = count(1)
 
@@ -35,17 +37,28 @@ class SnapshotFiles:
         """
         name = f"{epoch}-{next(self._numbers)}.snapshot"
         try:
-            write_durably(os.path.join(self.folder, name), [snapshot])
+            parts = self._parts.cipher.sealed_parts(file_place(name), snapshot)
+            write_durably(os.path.join(self.folder, name), parts)
         except OSError as error:
             # The journal goes on: nothing is synced twice here, the next attempt writes a new file.
             raise StoreFailed(self.path, f"snapshot not written: {error}; older one and journal stay") from error
         return name
 
     def read(self, name: str) -> bytes:
-        """Read a file; OSError or ValueError if there is none of that name."""
+        """Read a file; OSError or ValueError if there is none of that name, or it was changed."""
         if _SNAPSHOT.fullmatch(name) is None:
             raise ValueError(f"{name!r} is no name of a snapshot")
-        return read_own(os.path.join(self.folder, name))
+        return self._parts.cipher.unseal(file_place(name), read_own(os.path.join(self.folder, name)))
+
+    def copied(self, source: SnapshotFiles, name: str, file: IO[bytes]) -> Iterator[Bytes]:
+        """The bytes of a file of another store as it is to be in this one; what is damaged in it stays so."""
+        place, kept = file_place(name), file.read()
+        try:
+            data = source._parts.cipher.unseal(place, kept)
+        except ValueError:
+            yield kept
+        else:
+            yield from self._parts.cipher.sealed_parts(place, data)
 
     def remove(self, names: Sequence[str]) -> None:
         """Remove snapshot files that no row names, which is on the disk (`sync_rows`)."""
@@ -86,7 +99,7 @@ class Word:
         self._map.close()
 
 
-def write_durably(path: str, parts: Sequence[bytes | memoryview]) -> None:
+def write_durably(path: str, parts: Iterable[bytes | memoryview]) -> None:
     """Create the file so that it exists after a power loss completely or not at all."""
     temporary = f"{path}.tmp"
     with contextlib.suppress(FileNotFoundError):

@@ -19,19 +19,24 @@ import sqlite3
 import stat
 import threading
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 from urllib.parse import quote
 
-from ..journal import DamagedStore, ForeignStore, StoreInUse
+from ..journal import DamagedStore, ForeignStore, StoreInUse, WrongStoreKey
 from .row_codec import crc_of
+from .sealing import Cipher, NoCipher, StoreCipher, is_sealed
 from .snapshot_files import write_durably
 
+T = TypeVar("T")
 NOTE: Final = "\0store"
 """The note with the identity. No user's note has such a name, and nobody is shown it."""
 COPY_NOTE: Final = "\0copy"
 """The note of a copy: of which store it is, and of when. Nobody is shown it either."""
+KEY_NOTE: Final = "\0key"
+"""The note of a store that is encrypted: what only its key opens. Nobody is shown it either."""
+_KEY_PLACE: Final = b"key"
 NAME: Final = "store-id"
 _PENDING, _FINAL = b"~", b"="
 _HALF_MADE: Final = re.compile(r"new-\d+-\d+(-wal|-shm|-journal)?")
@@ -48,27 +53,44 @@ class StoreIdentity(NamedTuple):
 
 def is_hidden(note: object) -> bool:
     """Whether a note is the store's own."""
-    return note in (NOTE, COPY_NOTE)
+    return note in (NOTE, COPY_NOTE, KEY_NOTE)
 
 
-def new_note() -> tuple[str, bytes, int]:
-    """The note that a new database begins with: name, value, checksum."""
-    value = _PENDING + uuid.uuid4().bytes
-    return NOTE, value, crc_of(NOTE, value)
+def new_cipher(key: bytes | None, identity: str) -> Cipher:
+    """What encrypts a store that is being made.
+
+    Raises:
+        SpecError: the library for it is not installed.
+    """
+    return NoCipher() if key is None else StoreCipher(key, uuid.UUID(identity).bytes)
 
 
-def copy_notes(identity: str, origin: str, when: float) -> list[tuple[str, bytes, int]]:
+def new_notes(identity: str, cipher: Cipher) -> list[tuple[str, bytes, int]]:
+    """The notes that a new database begins with: name, value, checksum."""
+    return _own_notes({NOTE: _PENDING + uuid.UUID(identity).bytes}, cipher)
+
+
+def copy_notes(identity: str, origin: str, when: float, cipher: Cipher) -> list[tuple[str, bytes, int]]:
     """The store's own notes in a copy that has an identity of its own; `when` is Unix time."""
-    values = ((NOTE, _FINAL + uuid.UUID(identity).bytes), (COPY_NOTE, f"{origin} {when:.3f}".encode()))
-    return [(name, value, crc_of(name, value)) for name, value in values]
+    values = {NOTE: _FINAL + uuid.UUID(identity).bytes, COPY_NOTE: f"{origin} {when:.3f}".encode()}
+    return _own_notes(values, cipher)
+
+
+def _own_notes(values: dict[str, bytes], cipher: Cipher) -> list[tuple[str, bytes, int]]:
+    if cipher.digest_key:
+        values[KEY_NOTE] = bytes(cipher.seal(_KEY_PLACE, b""))
+    return [(name, value, crc_of(name, value)) for name, value in values.items()]
 
 
 def origin_of(db: sqlite3.Connection) -> tuple[str, float] | None:
     """Of which store a copy was made, and when; None if this is no copy."""
-    row = db.execute("SELECT value, crc FROM notes WHERE name = ?", (COPY_NOTE,)).fetchone()
-    if row is None or row[1] != crc_of(COPY_NOTE, row[0]):
+    try:
+        note = _note_of(db, "", COPY_NOTE)
+    except DamagedStore:
         return None
-    origin, _, when = row[0].decode().partition(" ")
+    if note is None:
+        return None
+    origin, _, when = note.decode().partition(" ")
     return origin, float(when)
 
 
@@ -88,13 +110,17 @@ class Parts:
 
     Args:
         path: the database.
+        key: of the store, if it is encrypted.
 
     Attributes:
         folders: those that lie beside it; the first one is locked.
+        cipher: what all payloads go through; not the store's before it has been `unlock`ed.
     """
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, key: bytes | None = None) -> None:
         self.path = path
+        self.key = key
+        self.cipher: Cipher = NoCipher()
         self.folders = tuple(path + suffix for suffix in ("-snapshots", "-log", "-packs"))
         self.id = ""
         self._lock = -1
@@ -107,7 +133,7 @@ class Parts:
         """Look at all that is there, without changing any of it. Returns whether there is a database.
 
         Raises:
-            ForeignStore: it does not belong together, or others may write to it.
+            ForeignStore: it does not belong together, or others may write to it. WrongStoreKey: the key is not its own.
         """
         found = self._look(self.path)
         for suffix in ("-wal", "-shm", "-mark", "-hands"):
@@ -195,10 +221,9 @@ class Parts:
         Raises:
             ForeignStore: they differ, or its WAL is of another store.
         """
-        has_wal = os.path.exists(f"{self.path}-wal") and os.path.getsize(f"{self.path}-wal") > 0
         try:
-            main = self._query("?mode=ro&immutable=1")
-            both = self._query("?mode=ro") if has_wal else main
+            main = self.peek(self._identity_in, with_wal=False)
+            both = self.peek(self._identity_in)
         except (sqlite3.Error, UnicodeDecodeError, DamagedStore):
             return  # It is damaged, or kept by somebody: the opening says so, and then compares.
         if main is not None and both is not None and main.id != both.id:
@@ -209,11 +234,45 @@ class Parts:
             )
         self.compare(both)
 
-    def _query(self, options: str) -> StoreIdentity | None:
+    def peek(self, work: Callable[[sqlite3.Connection], T], *, with_wal: bool = True) -> T:
+        """Read something of the database, without changing anything."""
+        has_wal = os.path.exists(f"{self.path}-wal") and os.path.getsize(f"{self.path}-wal") > 0
+        options = "?mode=ro" if with_wal and has_wal else "?mode=ro&immutable=1"
         with contextlib.closing(sqlite3.connect(f"file:{quote(self.path)}{options}", uri=True, timeout=1.0)) as db:
-            return identity_of(db, self.path)
+            return work(db)
+
+    def _identity_in(self, db: sqlite3.Connection) -> StoreIdentity | None:
+        self.unlock(db)
+        return identity_of(db, self.path)
 
     # ---- opening
+
+    def unlock(self, db: sqlite3.Connection) -> None:
+        """Have the cipher be the one of the store that this connection reads.
+
+        Raises:
+            WrongStoreKey: the key is another one, is missing, or there should be none. DamagedStore: nobody can tell.
+        """
+        identity = identity_of(db, self.path)
+        proof = _note_of(db, self.path, KEY_NOTE)
+        (version,) = db.execute("PRAGMA user_version").fetchone()
+        if (proof is not None) != is_sealed(version) or (proof is not None and identity is None):
+            raise DamagedStore(self.path, None, None, "its format does not say whether it is encrypted")
+        if proof is None or identity is None:
+            if self.key is not None:
+                remedy = "leave the key out; or have `holdfast store rekey` make an encrypted copy"
+                raise WrongStoreKey(self.path, "it is not encrypted, and there is a key for it", remedy)
+            return
+        if self.key is None:
+            remedy = "give its key: store_key=..., or --key-file"
+            raise WrongStoreKey(self.path, "it is encrypted, and there is no key for it", remedy)
+        cipher = new_cipher(self.key, identity.id)
+        try:
+            cipher.unseal(_KEY_PLACE, proof)
+        except ValueError:
+            remedy = "give the one that it was made with; without that nobody can read it"
+            raise WrongStoreKey(self.path, "the key is not the one that it is encrypted with", remedy) from None
+        self.cipher = cipher
 
     def compare(self, identity: StoreIdentity | None) -> None:
         """Refuse folders that are not of the database's store.
@@ -274,7 +333,7 @@ class Parts:
         """As the owner, within no transaction: have the database and all folders that there are carry the identity."""
         identity = identity_of(db, self.path)
         if identity is None:
-            _, value, crc = new_note()
+            ((_, value, crc),) = new_notes(str(uuid.uuid4()), NoCipher())
             _write(db, value, crc)
             identity = identity_of(db, self.path)
             assert identity is not None
@@ -331,12 +390,27 @@ def identity_of(db: sqlite3.Connection, path: str) -> StoreIdentity | None:
     Raises:
         DamagedStore: it cannot be read.
     """
-    row = db.execute("SELECT value, crc FROM notes WHERE name = ?", (NOTE,)).fetchone()
+    value = _note_of(db, path, NOTE)
+    if value is None:
+        return None
+    if len(value) != 17:
+        raise DamagedStore(path, None, None, "the identity of the store is damaged")
+    return StoreIdentity(str(uuid.UUID(bytes=value[1:])), value[:1] == _PENDING)
+
+
+def _note_of(db: sqlite3.Connection, path: str, name: str) -> bytes | None:
+    """One of the store's own notes.
+
+    Raises:
+        DamagedStore: it cannot be read.
+    """
+    row = db.execute("SELECT value, crc FROM notes WHERE name = ?", (name,)).fetchone()
     if row is None:
         return None
-    if not isinstance(row[0], bytes) or len(row[0]) != 17 or row[1] != crc_of(NOTE, row[0]):
-        raise DamagedStore(path, None, None, "the identity of the store is damaged")
-    return StoreIdentity(str(uuid.UUID(bytes=row[0][1:])), row[0][:1] == _PENDING)
+    if not isinstance(row[0], bytes) or row[1] != crc_of(name, row[0]):
+        kind = "identity" if name == NOTE else "key" if name == KEY_NOTE else "origin"
+        raise DamagedStore(path, None, None, f"the {kind} of the store is damaged")
+    return row[0]
 
 
 def _write(db: sqlite3.Connection, value: bytes, crc: int) -> None:

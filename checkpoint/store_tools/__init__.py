@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from ..journal import NotCopied
 from .compaction import Compaction, compact_store
-from .copies import StoreCopy, back_up_store, restore_store
+from .copies import StoreCopy, back_up_store, rekey_store, restore_store
 from .plain_export import export_store
 from .store_counts import AddressStats, SnapshotStats, StoreStats, store_stats
 from .verification import Damage, Verification, verify_store
@@ -26,6 +26,7 @@ __all__ = [
     "back_up_store",
     "compact_store",
     "export_store",
+    "rekey_store",
     "restore_store",
     "store_stats",
     "verify_store",

@@ -11,6 +11,7 @@ from ..journal import StoreFailed
 from ..snapshot.snapshot_record import decode_meta
 from ..sqlite import SqliteJournal
 from ..sqlite.store_parts import Parts
+from ..store_key import StoreKey, read_store_key
 from .store_counts import files_of
 from .store_view import reading
 
@@ -30,23 +31,27 @@ class Compaction:
     after: int
 
 
-def compact_store(path: str | os.PathLike[str]) -> Compaction:
+def compact_store(path: str | os.PathLike[str], *, key: StoreKey | None = None) -> Compaction:
     """Remove what a store does not need, and write its database anew without gaps.
 
     Removed are entries that the oldest kept snapshot contains, files that no snapshot names, and what an erase has
     left. What a recovery reads stays. The store is opened as a system opens it, so that no other can have it meanwhile.
     A kill at any moment leaves it as it was, or compact.
 
+    Args:
+        path: the database of the store.
+        key: of the store, if it is encrypted.
+
     Raises:
         StoreInUse: a system has it open. StoreFailed: there is no store, or no room: for a moment the database takes
-            up to twice as much again. DamagedStore, ForeignStore: it cannot be opened.
+            up to twice as much again. DamagedStore, ForeignStore, WrongStoreKey: it cannot be opened.
     """
-    where = os.path.realpath(path)
+    where, secret = os.path.realpath(path), read_store_key(key)
     with reading(where):
-        if not Parts(where).inspect():
+        if not Parts(where, secret).inspect():
             raise StoreFailed(where, "there is no database; name the file, as in store='sqlite:PATH'")
         before = sum(files_of(where).values())
-    with closing(SqliteJournal(where)) as journal:
+    with closing(SqliteJournal(where, key=secret)) as journal:
         for address in journal.addresses():
             _forget_packs(journal, address)
         journal.compact()

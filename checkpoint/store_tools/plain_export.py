@@ -27,7 +27,8 @@ from ..schema import Shape, as_shape, first_of, shape_name
 from ..snapshot.snapshot_record import Meta, decode_meta
 from ..snapshot.state_image import is_image, read_image
 from ..sqlite.entry_chains import Chain, StoreScan
-from ..sqlite.read_back import ChainReader, checked_entry
+from ..sqlite.read_back import checked_entry
+from ..store_key import StoreKey, read_store_key
 from .store_view import StoreView, open_view, stamp
 
 Record = dict[str, Any]
@@ -49,22 +50,29 @@ _NAMES: Final[dict[str, tuple[str, ...]]] = {
 """What the values of a journal entry are, by its kind."""
 
 
-def export_store(path: str | os.PathLike[str]) -> Generator[Record, None, None]:
+def export_store(path: str | os.PathLike[str], *, key: StoreKey | None = None) -> Generator[Record, None, None]:
     """Give all that a store has at one instant, record by record; nothing is changed, and a system may have it open.
 
     Each record has `record`, which says what it is: first one "store", then "note", "address" and "snapshot", and then
     what is in the journal, oldest first: "input" and the others. "damage" stands for what cannot be read. All values
     are such as JSON has; bytes are `{"base64": text}`.
 
+    What is encrypted in the store is in plain text in these records.
+
     In memory are one snapshot, or one entry, at a time, and 8 bytes for each entry.
+
+    Args:
+        path: the database of the store.
+        key: of the store, if it is encrypted.
 
     Raises:
         StoreFailed: there is no store, it cannot be read, or it was opened while it was read as a closed one.
-        DamagedStore, ForeignStore: it is so damaged that nothing of it can be read.
+        DamagedStore, ForeignStore: it is so damaged that nothing of it can be read. WrongStoreKey: the key is not its
+            own.
     """
     where = os.path.realpath(path)
     before = stamp(where)
-    with open_view(where) as view:
+    with open_view(where, read_store_key(key)) as view:
         yield from _Export(view).records()
         if not view.has_wal and stamp(where) != before:
             raise StoreFailed(where, "it was opened while it was exported; export it again")
@@ -74,14 +82,14 @@ class _Export:
     def __init__(self, view: StoreView) -> None:
         self._view = view
         self._damages: list[DamagedStore] = []
-        self._reader = ChainReader(view.db, view.path, view.files)
+        self._reader = view.reader
         self._shapes: dict[int, dict[str, Shape]] = {}  # by address, and type of message
 
     def records(self) -> Iterator[Record]:
         view = self._view
         identity = "" if view.identity is None else view.identity.id
         yield {"record": "store", "path": view.path, "identity": identity, "epoch": view.row.epoch, "last": view.last}
-        contents = StoreScan(view.db, view.path, self._damages.append).contents()
+        contents = StoreScan(view.db, view.path, view.parts.cipher, self._damages.append).contents()
         try:
             contents.take_in(view.rows, view.path)
         except DamagedStore as error:
@@ -141,7 +149,7 @@ class _Export:
             if key not in chains:
                 continue  # It is of an address that is being erased, or was told as damaged.
             try:
-                entry = checked_entry(view.path, chains[key], position, key, *rest)
+                entry = checked_entry(view.path, view.parts.cipher, chains[key], position, key, *rest)
             except DamagedStore as error:
                 yield _damage(error, addresses[key])
                 continue

@@ -15,9 +15,10 @@ from ..journal import DamagedStore, Entry
 from ..protocol import START
 from ..snapshot.snapshot_record import Meta
 from ..sqlite.entry_chains import Chain, StoreScan
-from ..sqlite.read_back import ChainReader, checked_entry
+from ..sqlite.read_back import checked_entry
 from ..sqlite.row_codec import CHUNK
 from ..sqlite.store_parts import origin_of, part_names
+from ..store_key import StoreKey, read_store_key
 from .store_view import StoreView, look
 
 _COLUMNS: Final = "position, address, chain, kind, data, crc"
@@ -72,7 +73,7 @@ class StoreStats:
         identity: of the store; "" if it has none.
         origin: the identity of the store that it is a copy of; "" if it is none.
         copied_at: when it was copied, in Unix time.
-        version: of the format; 2 while there may be something in the log.
+        version: of the format; even while there may be something in the log, more than 2 if it is encrypted.
         epoch: how often it was opened.
         pid: of the process that has it open; 0 if there is none to be seen.
         last: the newest position.
@@ -94,24 +95,25 @@ class StoreStats:
     files: dict[str, int]
 
 
-def store_stats(path: str | os.PathLike[str]) -> StoreStats:
+def store_stats(path: str | os.PathLike[str], *, key: StoreKey | None = None) -> StoreStats:
     """Count what is in a store, per address and in all; nothing is changed, and a system may have the store open.
+
+    Args:
+        path: the database of the store.
+        key: of the store, if it is encrypted.
 
     Raises:
         StoreFailed: there is no store, or it cannot be read. DamagedStore, ForeignStore: it is so damaged that its
-            contents are not known; what concerns one address only is told there.
+            contents are not known; what concerns one address only is told there. WrongStoreKey: the key is not its own.
     """
-    return look(path, _counted)
+    return look(path, _counted, read_store_key(key))
 
 
 def _counted(view: StoreView) -> StoreStats:
-    contents = StoreScan(view.db, view.path).contents()
+    contents = StoreScan(view.db, view.path, view.parts.cipher).contents()
     contents.take_in(view.rows, view.path)
     names = {key.decode(): at.removeprefix(KEY) for at, key in contents.notes.items() if at.startswith(KEY)}
-    reader = ChainReader(view.db, view.path, view.files)
-    addresses = [
-        _count_address(view, reader, chain, names.get(key, key)) for key, chain in sorted(contents.chains.items())
-    ]
+    addresses = [_count_address(view, chain, names.get(key, key)) for key, chain in sorted(contents.chains.items())]
     origin, copied_at = origin_of(view.db) or ("", 0.0)
     identity = "" if view.identity is None else view.identity.id
     return StoreStats(
@@ -144,7 +146,7 @@ def _size(name: str) -> int:
         return 0
 
 
-def _count_address(view: StoreView, reader: ChainReader, chain: Chain, address: str) -> AddressStats:
+def _count_address(view: StoreView, chain: Chain, address: str) -> AddressStats:
     found = AddressStats(address)
     if chain.damage is not None:
         found.damage = chain.damage.reason
@@ -152,8 +154,8 @@ def _count_address(view: StoreView, reader: ChainReader, chain: Chain, address: 
     contained: set[int] = set()
     for place, number in enumerate(chain.kept):
         try:
-            meta = msgspec.msgpack.decode(reader.read_snapshot(chain, number)[0], type=Meta)
-            contained = reader.read_drops(chain, chain.kept[: place + 1])
+            meta = msgspec.msgpack.decode(view.reader.read_snapshot(chain, number)[0], type=Meta)
+            contained = view.reader.read_drops(chain, chain.kept[: place + 1])
         except (DamagedStore, msgspec.MsgspecError) as error:
             if view.is_kept(number):  # Else the running system has a newer one now.
                 found.damage = found.damage or (error.reason if isinstance(error, DamagedStore) else str(error))
@@ -196,7 +198,7 @@ def entries_of(view: StoreView, chain: Chain) -> Iterator[tuple[int, int, Entry]
         marks = ",".join("?" * len(chunk))
         query = f"SELECT {_COLUMNS} FROM entries WHERE position IN ({marks}) ORDER BY position"
         for row in view.db.execute(query, chunk):
-            yield row[0], len(row[4]), checked_entry(view.path, chain, *row)
+            yield row[0], len(row[4]), checked_entry(view.path, view.parts.cipher, chain, *row)
     for row in view.rows:
         if row[1] == chain.id:
-            yield row[0], len(row[4]), checked_entry(view.path, chain, *row)
+            yield row[0], len(row[4]), checked_entry(view.path, view.parts.cipher, chain, *row)

@@ -9,17 +9,20 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
+import uuid
 from collections.abc import Callable, Generator, Iterator
 from typing import Any, Final, TypeVar
 from urllib.parse import quote
 
 from ...actors.errors import HoldfastError
 from ..journal import DamagedStore, StoreFailed
-from ..sqlite.append_log import FrontLog, Row, following
+from ..sqlite.append_log import FrontLog, Row, batches_in, following
 from ..sqlite.block_packs import Packs
-from ..sqlite.database import VERSION, refuse_foreign, result_code, text_of
+from ..sqlite.database import refuse_foreign, result_code, text_of
 from ..sqlite.ownership import StoreRow, living, read_store_row
 from ..sqlite.position_mark import read_mark, refuse_missing
+from ..sqlite.read_back import ChainReader
+from ..sqlite.sealing import may_have_log
 from ..sqlite.snapshot_files import SnapshotFiles
 from ..sqlite.store_parts import Parts, StoreIdentity, identity_of
 
@@ -38,7 +41,7 @@ class StoreView:
     Attributes:
         db: reads the database; its transaction is never ended, so that all of it is of one instant.
         path: of the database.
-        parts: what belongs to it.
+        parts: what belongs to it, with its cipher.
         row: the row of the store.
         identity: of the store; None if it is of before there were any.
         last: the newest position.
@@ -50,17 +53,21 @@ class StoreView:
     """
 
     def __init__(
-        self, path: str, parts: Parts, db: sqlite3.Connection, mark: bytes, log: list[list[Row]], has_wal: bool
+        self, path: str, parts: Parts, db: sqlite3.Connection, mark: bytes, log: list[bytes], has_wal: bool
     ) -> None:
         self.path, self.parts, self.db, self.mark, self.has_wal = path, parts, db, mark, has_wal
-        self.files = SnapshotFiles(path)
+        self.files = SnapshotFiles(path, parts)
         self.packs = Packs(path, parts)
-        self.row: StoreRow = read_store_row(db, path)
+        self.reader = ChainReader(db, path, self.files, parts.cipher)
+        self.row: StoreRow = read_store_row(db, path, parts.cipher.digest_key)
         self.identity: StoreIdentity | None = identity_of(db, path)
         (self.version,) = db.execute("PRAGMA user_version").fetchone()
         (newest,) = db.execute("SELECT max(position) FROM entries").fetchone()
         self.last = max(newest or 0, self.row.floor)
-        self.rows = [] if self.version == VERSION else following(log, self.last)
+        identity = b"" if self.identity is None else uuid.UUID(self.identity.id).bytes
+        self.rows: list[Row] = []
+        if may_have_log(self.version):
+            self.rows = following(batches_in(log, identity), self.last)
         if self.rows:
             self.last = self.rows[-1][0]
         with living(self.row.pid, self.row.start) as pidfd:
@@ -85,18 +92,18 @@ class StoreView:
             return db.execute("SELECT 1 FROM snapshots WHERE id = ?", (snapshot,)).fetchone() is not None
 
 
-def look(path: str | os.PathLike[str], work: Callable[[StoreView], T]) -> T:
+def look(path: str | os.PathLike[str], work: Callable[[StoreView], T], key: bytes | None = None) -> T:
     """Do some work on one instant of a store; it is done again if the store goes on in a way that spoils it.
 
     Raises:
         StoreFailed: it cannot be read, or there is none. DamagedStore, ForeignStore: it is damaged, or parts of it are
-            another store's.
+            another store's. WrongStoreKey: the key is not its own.
     """
     where = os.path.realpath(path)
     for attempt in range(1, _LOOKS + 1):
         before = stamp(where)
         try:
-            with open_view(where) as view:
+            with open_view(where, key) as view:
                 done = work(view)
         except Overtaken:
             continue
@@ -125,15 +132,15 @@ def _has_wal(path: str) -> bool:
 
 
 @contextlib.contextmanager
-def open_view(path: str) -> Generator[StoreView, None, None]:
+def open_view(path: str, key: bytes | None = None) -> Generator[StoreView, None, None]:
     """Look at a store for as long as the block lasts; its real path is given.
 
     Raises:
         StoreFailed: it cannot be read, or there is none. DamagedStore, ForeignStore: it is damaged, or parts of it are
-            another store's.
+            another store's. WrongStoreKey: the key is not its own.
     """
     with reading(path):
-        parts = Parts(path)
+        parts = Parts(path, key)
         if not parts.inspect():
             raise StoreFailed(path, "there is no database; name the file, as in store='sqlite:PATH'")
         mark, log = read_mark(path), FrontLog(path, is_used=False).look()
@@ -141,6 +148,7 @@ def open_view(path: str) -> Generator[StoreView, None, None]:
         with contextlib.closing(_connect(path, has_wal)) as db:
             db.execute("BEGIN")
             refuse_foreign(db, path, is_wal=has_wal)
+            parts.unlock(db)
             parts.compare(identity_of(db, path))
             yield StoreView(path, parts, db, mark, log, has_wal)
 

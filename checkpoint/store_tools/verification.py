@@ -14,7 +14,8 @@ from ..journal import DamagedStore
 from ..snapshot.shared_blocks import by_segment
 from ..snapshot.snapshot_record import FORMAT, IMAGES, Meta
 from ..sqlite.entry_chains import Chain, StoreScan
-from ..sqlite.read_back import ChainReader, checked_entry
+from ..sqlite.read_back import checked_entry
+from ..store_key import StoreKey, read_store_key
 from .store_view import StoreView, look
 
 MOST_DAMAGES: Final = 1000
@@ -95,19 +96,23 @@ class Verification:
             self.untold += 1
 
 
-def verify_store(path: str | os.PathLike[str]) -> Verification:
+def verify_store(path: str | os.PathLike[str], *, key: StoreKey | None = None) -> Verification:
     """Read all of a store and compare every checksum; nothing is changed, and a system may have the store open.
 
     Of an open store one instant is verified, not before all that was acknowledged when the call began. Files that the
     running system removes meanwhile, because a newer snapshot has taken their place, are no damage.
 
+    Args:
+        path: the database of the store.
+        key: of the store, if it is encrypted.
+
     Raises:
         StoreFailed: there is no store, or it cannot be read. ForeignStore: a part of it is missing or another store's,
-            or this user may not read it: nothing was verified.
+            or this user may not read it: nothing was verified. WrongStoreKey: the key is not its own.
     """
-    where = os.path.realpath(path)
+    where, secret = os.path.realpath(path), read_store_key(key)
     try:
-        return look(where, lambda view: StoreCheck(view).result())
+        return look(where, lambda view: StoreCheck(view).result(), secret)
     except DamagedStore as error:  # It is so damaged that nothing more of it can be read.
         return Verification(where, damages=[Damage(error.reason, _RESTORE, where, error.address, error.position)])
 
@@ -117,7 +122,7 @@ class StoreCheck:
 
     def __init__(self, view: StoreView) -> None:
         self._view = view
-        self._reader = ChainReader(view.db, view.path, view.files)
+        self._reader = view.reader
         identity = "" if view.identity is None else view.identity.id
         self._found = Verification(view.path, identity, view.pid, view.last)
 
@@ -155,7 +160,7 @@ class StoreCheck:
     def _check_chains(self) -> dict[int, Chain]:
         """Verify that nothing is missing; returns the chain of each address."""
         view = self._view
-        contents = StoreScan(view.db, view.path, self._tell).contents()
+        contents = StoreScan(view.db, view.path, view.parts.cipher, self._tell).contents()
         contents.take_in(view.rows, view.path)
         chains = {chain.id: chain for chain in (*contents.chains.values(), *contents.erased)}
         for chain in chains.values():
@@ -171,7 +176,7 @@ class StoreCheck:
                 continue  # It was told that it belongs to none.
             self._found.entries += 1
             try:
-                checked_entry(view.path, chain, position, address, *rest)
+                checked_entry(view.path, view.parts.cipher, chain, position, address, *rest)
             except DamagedStore as error:
                 self._tell(error)
 

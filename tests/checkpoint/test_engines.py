@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,14 @@ from holdfast.testing.schedules.disk import SimulatedDisk, SimulatedJournal
 from holdfast.testing.stores import conformance
 from tests.checkpoint.one_file import OneFile
 from tests.checkpoint.players import Doer, Note, Seen
-from tests.checkpoint.sqlite.stores import disown
+from tests.checkpoint.sqlite.stores import KEY, disown
 
 
-def killed(journal: Journal, folder: Path) -> Path:
+def killed(journal: Journal, folder: Path, key: bytes | None = None) -> Path:
     """The files as they are now, with an owner that is dead."""
     copy = folder.with_name(str(int(folder.name) + 1))
     shutil.copytree(folder, copy)
-    disown(copy / "app.db")
+    disown(copy / "app.db", key)
     return copy
 
 
@@ -38,6 +39,14 @@ def synced(path: Path) -> Journal:
 
 class TestSqliteSynced(conformance(synced, crash=killed)):  # type: ignore[misc]
     """The same, when each append is synced."""
+
+
+def encrypted(path: Path) -> Journal:
+    return SqliteJournal(path / "app.db", key=KEY)
+
+
+class TestSqliteEncrypted(conformance(encrypted, crash=partial(killed, key=KEY))):  # type: ignore[misc]
+    """The same, with a key."""
 
 
 class TestMemory(conformance(lambda path: MemoryJournal())):  # type: ignore[misc]

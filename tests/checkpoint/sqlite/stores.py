@@ -16,6 +16,7 @@ from holdfast.checkpoint.journal import (
 )
 from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.sqlite.row_codec import crc_of
+from holdfast.checkpoint.sqlite.store_parts import Parts
 
 A, B = "/app/bank/alice", "/app/bank/bob"
 
@@ -28,8 +29,12 @@ def numbers(saved: Saved) -> list[Any]:
     return [entry[1] for _, entry in saved.entries]
 
 
-def reopened(path: Path) -> Saved:
-    with closing(SqliteJournal(path)) as journal:
+KEY = bytes(range(32))
+"""The key of the encrypted stores of these tests, also in the scripts."""
+
+
+def reopened(path: Path, key: bytes | None = None) -> Saved:
+    with closing(SqliteJournal(path, key=key)) as journal:
         return journal.load(A)
 
 
@@ -45,11 +50,14 @@ def edit(path: Path, *statements: str) -> None:
             db.execute(statement)
 
 
-def disown(path: Path | str) -> None:
+def disown(path: Path | str, key: bytes | None = None) -> None:
     """Have the owner of the store taken for dead, though it may live."""
+    parts = Parts(str(path), key)
     with closing(sqlite3.connect(path, isolation_level=None)) as db:
+        parts.unlock(db)
         epoch, _, _, *rest = db.execute("SELECT epoch, pid, start, floor, live FROM store").fetchone()
-        db.execute("UPDATE store SET pid = 0, start = '', crc = ?", (crc_of(epoch, 0, "", *rest),))
+        crc = crc_of(epoch, 0, "", *rest, key=parts.cipher.digest_key)
+        db.execute("UPDATE store SET pid = 0, start = '', crc = ?", (crc,))
 
 
 def flip(path: Path, bit: int) -> None:
@@ -62,8 +70,8 @@ CHILD = """
 import os, random, signal, sys
 from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.sqlite.row_codec import crc_of
-path, what, seed = sys.argv[1], sys.argv[2], int(sys.argv[3])
-journal = SqliteJournal(path, synchronous="fsync" if seed % 2 else "os")
+path, what, seed, key = sys.argv[1], sys.argv[2], int(sys.argv[3]), bytes.fromhex(sys.argv[4]) or None
+journal = SqliteJournal(path, synchronous="fsync" if seed % 2 else "os", key=key)
 print("open", journal.epoch, flush=True)
 choose = random.Random(seed)
 if what == "hold":
@@ -90,9 +98,9 @@ while what == "write":
 """
 
 
-def spawn(path: Path, what: str, seed: int = 0) -> subprocess.Popen[bytes]:
+def spawn(path: Path, what: str, seed: int = 0, key: bytes | None = None) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        [sys.executable, "-c", CHILD, str(path), what, str(seed)],
+        [sys.executable, "-c", CHILD, str(path), what, str(seed), (key or b"").hex()],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},

@@ -144,6 +144,15 @@ def test_a_damaged_snapshot_gives_way_to_the_older_one_with_all_entries_since(fi
     assert "snapshot" in saved.passed_over
 
 
+def test_a_snapshot_whose_list_of_contents_is_damaged_is_not_used(filled: Path) -> None:
+    """Nor is the last one there is: what it contains would be handled again."""
+    edit(filled, "UPDATE snapshots SET drops = x'00' WHERE turn = 4")
+    assert contents(filled)[0].snapshot == b"older"
+    edit(filled, "UPDATE snapshots SET drops = x'00'")
+    with pytest.raises(DamagedStore, match="no snapshot is left: the drop list"):
+        contents(filled)
+
+
 def test_without_a_usable_snapshot_nothing_is_made_up(filled: Path) -> None:
     (file,) = made(f"{filled}-snapshots")
     file.unlink()

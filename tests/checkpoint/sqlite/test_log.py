@@ -8,6 +8,9 @@ import random
 import shutil
 import sqlite3
 import stat
+import struct
+import uuid
+import zlib
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -18,6 +21,7 @@ import pytest
 from holdfast.checkpoint.journal import DamagedStore, StaleEpoch, StoreFailed
 from holdfast.checkpoint.sqlite import SqliteJournal, append_log
 from holdfast.checkpoint.sqlite.append_log import FrontLog
+from holdfast.checkpoint.store_tools import verify_store
 from tests.checkpoint.sqlite.stores import A, B, disown, edit, inputs, made, numbers, reopened
 
 
@@ -125,6 +129,7 @@ def test_each_byte_of_the_log_counts(killed: Path) -> None:
     (file,) = logs(killed)
     data = file.read_bytes()
     front = FrontLog(str(killed), is_used=True)
+    front.identity = uuid.UUID(verify_store(killed).identity).bytes
     whole = list(front.read([str(file)]))
     assert [len(batch) for batch in whole] == [1, 1, 1, 2, 2]
     lengths = set()
@@ -247,6 +252,43 @@ def test_a_store_that_may_have_a_log_is_none_for_those_who_know_of_no_log(path: 
     file.write_bytes(stale)  # It was killed before it had removed it.
     assert numbers(reopened(path)) == [0, 1]
     assert logs(path) == []
+
+
+def test_a_log_of_another_store_is_not_taken_for_its_own(killed: Path, tmp_path: Path) -> None:
+    """It has the same name, and goes on where the database ends."""
+    (tmp_path / "other").mkdir()
+    other = tmp_path / "other" / "app.db"
+    with closing(SqliteJournal(other)) as journal:
+        journal.append([*inputs(2), *inputs(1, B)])
+        for _ in range(7):
+            journal.append([(A, ("in", "another's"))])
+        copy = shutil.copytree(other.parent, tmp_path / "left") / "app.db"
+    (log,), (foreign,) = logs(killed), logs(copy)
+    own = log.read_bytes()
+    log.write_bytes(foreign.read_bytes())
+    with pytest.raises(DamagedStore, match="were acknowledged"):
+        SqliteJournal(killed)
+    log.write_bytes(own)
+    assert "another's" not in str(both(killed))
+
+
+def test_a_log_of_before_that_is_bound_to_no_store_is_read(killed: Path) -> None:
+    """As an older holdfast has left it, when it was killed."""
+    (log,) = logs(killed)
+    data = log.read_bytes()
+    head = b"HFLOG\x01\0\0" + data[16:32]
+    crc = zlib.crc32(head)
+    parts, at = [data[:8], head, struct.pack("<I", crc)], 36
+    while at + 8 <= len(data):
+        _, length = struct.unpack_from("<II", data, at)
+        body = data[at + 8 : at + 8 + length]
+        if not length:
+            break
+        crc = zlib.crc32(body, crc)
+        parts += [struct.pack("<II", crc, length), body]
+        at += 8 + length
+    log.write_bytes(b"".join(parts))
+    assert both(killed) == ([0, 1, 2, 3, 4, 5, 6], [0, 1, 2])
 
 
 def test_a_log_of_a_closed_store_is_not_read(killed: Path) -> None:

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.checkpoint.sqlite.stores import KEY
+
 SOURCE = Path(__file__).with_name("disk.c")
 EVERY = 1 if "HOLDFAST_CUTS" in os.environ else 3
 """Each step in a campaign, else each third."""
@@ -22,11 +24,11 @@ import ctypes, os, shutil, sys, traceback
 from contextlib import closing
 from holdfast.checkpoint.sqlite import SqliteJournal, append_log
 append_log.MOST_ROWS = 6
-shim, folder = ctypes.CDLL(sys.argv[1]), sys.argv[2]
+shim, folder, key = ctypes.CDLL(sys.argv[1]), sys.argv[2], bytes.fromhex(sys.argv[4]) or None
 steps_left = ctypes.c_long.in_dll(shim, "steps_left")
 
 def live(say):
-    journal = SqliteJournal(folder + "/app.db")
+    journal = SqliteJournal(folder + "/app.db", key=key)
     positions, number = [], 0
     for step, size in enumerate([1, 1, 2, 1, 1, 3, 1, 40, 1, 1, 1, 1, 5, 2, 1, 1]):
         numbers = range(number, number + size)
@@ -48,7 +50,7 @@ def look(said):
     words = said.split()
     acknowledged = max((int(word[1:]) for word in words if word[:1] in b"+c"), default=0)
     cut = max((int(word[1:]) for word in words if word[:1] == b"c"), default=0)
-    with closing(SqliteJournal(folder + "/app.db")) as journal:
+    with closing(SqliteJournal(folder + "/app.db", key=key)) as journal:
         saved = journal.load("/a")
         known = int(saved.snapshot or b"0")
         found = [entry[1] for _, entry in saved.entries]
@@ -84,7 +86,7 @@ def forked(do, steps=0):
 for steps in range(1, 100_000, int(sys.argv[3])):
     shutil.rmtree(folder)
     os.mkdir(folder)
-    assert forked(lambda say: SqliteJournal(folder + "/app.db").close())[1] == 0
+    assert forked(lambda say: SqliteJournal(folder + "/app.db", key=key).close())[1] == 0
     said, code = forked(live, steps)
     assert (code == 0) == (b"end" in said) and code in (0, -9), (steps, said, code)
     heard, found = forked(lambda say: look(said))
@@ -106,13 +108,14 @@ def shim(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return library
 
 
-def test_what_was_acknowledged_survives_a_kill_at_each_step(shim: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("key", [b"", KEY], ids=["plain", "encrypted"])
+def test_what_was_acknowledged_survives_a_kill_at_each_step(shim: Path, tmp_path: Path, key: bytes) -> None:
     folder = tmp_path / "disk"
     folder.mkdir()
     paths = os.pathsep.join(filter(None, sys.path))
     env = {**os.environ, "PYTHONPATH": paths, "LD_PRELOAD": str(shim)}
     env |= {"DISK_ROOT": str(folder), "DISK_LOG": os.devnull, "DISK_FAIL": "0"}
-    command = [sys.executable, "-c", SERVER, str(shim), str(folder), str(EVERY)]
+    command = [sys.executable, "-c", SERVER, str(shim), str(folder), str(EVERY), key.hex()]
     done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) > 50

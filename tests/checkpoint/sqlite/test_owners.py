@@ -23,7 +23,7 @@ from holdfast.checkpoint.journal import (
 )
 from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.sqlite.row_codec import crc_of
-from tests.checkpoint.sqlite.stores import A, disown, edit, end, inputs, line, made, numbers, reopened, spawn
+from tests.checkpoint.sqlite.stores import KEY, A, disown, edit, end, inputs, line, made, numbers, reopened, spawn
 
 
 def test_the_epoch_rises_at_each_opening(path: Path) -> None:
@@ -143,11 +143,11 @@ def test_after_close_everything_is_refused(path: Path) -> None:
             attempt()
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_what_was_acknowledged_survives_kill_9(path: Path, seed: int) -> None:
+@pytest.mark.parametrize(("seed", "key"), [*((seed, None) for seed in range(12)), *((seed, KEY) for seed in range(6))])
+def test_what_was_acknowledged_survives_kill_9(path: Path, seed: int, key: bytes | None) -> None:
     """Kill a writer at a random moment; each acknowledged batch is whole and in order, and no batch is half there."""
     choose = random.Random(seed)
-    child = spawn(path, "write", seed)
+    child = spawn(path, "write", seed, key)
     assert line(child) == b"open 1\n"
     assert child.stdout is not None
     select.select([child.stdout], [], [])
@@ -155,7 +155,7 @@ def test_what_was_acknowledged_survives_kill_9(path: Path, seed: int) -> None:
     said = end(child).splitlines()
     acknowledged = max((int(word) for word in said if word.isdigit()), default=0)
     cuts = {int(words[1]): int(words[2]) for words in map(bytes.split, said) if words[0] == b"cut"}
-    with closing(SqliteJournal(path)) as journal:
+    with closing(SqliteJournal(path, key=key)) as journal:
         assert journal.epoch == 2
         found: set[int] = set()
         upto = 0

@@ -172,6 +172,30 @@ def test_a_linked_database_of_a_living_owner_is_not_opened_under_its_other_name(
     assert numbers(reopened(tmp_path / "app.db")) == [0, 1, 2]
 
 
+def test_a_copy_of_what_a_living_owner_has_open_is_refused_and_the_owner_lives_on(tmp_path: Path) -> None:
+    """Not even a takeover is meant for the owner of other files. When that has ended, it is like one of a kill."""
+    path = made_in(tmp_path / "a")
+    child = spawn(path, "hold")
+    try:
+        assert [line(child), line(child)] == [b"open 1\n", b"held\n"]
+        copy = shutil.copytree(path.parent, tmp_path / "b") / path.name
+        before = content(copy.parent)
+        for takeover in (False, True):
+            with pytest.raises(ForeignStore, match=f"a copy of a store that process {child.pid} has open"):
+                SqliteJournal(copy, takeover=takeover)
+        assert content(copy.parent) == before
+        assert child.poll() is None
+        with pytest.raises(StoreInUse):
+            SqliteJournal(path)
+        path.rename(path.with_name("moved"))  # The same file under another name is no copy.
+        path.with_name("moved").rename(path)
+        with pytest.raises(StoreInUse):
+            SqliteJournal(path)
+    finally:
+        end(child)
+    assert numbers(reopened(copy)) == numbers(reopened(path)) == [1]
+
+
 def test_a_living_owner_that_nobody_sees_has_the_lock(tmp_path: Path) -> None:
     """Its row says that it is dead, as it seems from a container with process ids of its own."""
     path = tmp_path / "app.db"

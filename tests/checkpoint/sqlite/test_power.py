@@ -15,6 +15,7 @@ import pytest
 from holdfast.checkpoint.journal import DamagedStore
 from holdfast.checkpoint.sqlite import SqliteJournal
 from tests.checkpoint.sqlite.disk import Disk, operations
+from tests.checkpoint.sqlite.stores import KEY
 
 SOURCE = Path(__file__).with_name("disk.c")
 CUTS = int(os.environ.get("HOLDFAST_CUTS", "80"))
@@ -25,9 +26,9 @@ import os, random, sys
 from holdfast.checkpoint.sqlite import SqliteJournal, append_log, open_store
 from holdfast.checkpoint.journal import StoreFailed
 open_store._CHECKPOINT_BYTES, open_store._WAL_FRAMES, append_log.MOST_ROWS = 1 << 16, 32, 12
-folder, seed, syncs = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "fsync"
+folder, seed, syncs, key = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "fsync", bytes.fromhex(sys.argv[4]) or None
 draw = random.Random(seed)
-journal = SqliteJournal(folder + "/app.db", takeover=True)
+journal = SqliteJournal(folder + "/app.db", takeover=True, key=key)
 acks = os.open(folder + "/acks", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
 number, live, packs, refused = 0, {0: [], 1: []}, {0: [], 1: []}, False
 for step in range(120):
@@ -71,21 +72,21 @@ def shim(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return library
 
 
-def write(shim: Path, folder: Path, log: Path, seed: int, what: str, fail: int = 0) -> str:
+def write(shim: Path, folder: Path, log: Path, seed: int, what: str, fail: int = 0, key: bytes = b"") -> str:
     paths = os.pathsep.join(filter(None, sys.path))
     env = {**os.environ, "PYTHONPATH": paths, "LD_PRELOAD": str(shim)}
     env |= {"DISK_ROOT": str(folder), "DISK_LOG": str(log), "DISK_FAIL": str(fail)}
-    command = [sys.executable, "-c", WRITER, str(folder), str(seed), what]
+    command = [sys.executable, "-c", WRITER, str(folder), str(seed), what, key.hex()]
     done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-def numbers_in(folder: Path) -> tuple[int, list[str]]:
+def numbers_in(folder: Path, key: bytes = b"") -> tuple[int, list[str]]:
     """How many numbers are there (or in a snapshot), and what is wrong with them."""
     wrong: list[str] = []
     highest = 0
-    with closing(SqliteJournal(folder / "app.db", takeover=True)) as journal:
+    with closing(SqliteJournal(folder / "app.db", takeover=True, key=key or None)) as journal:
         for owner in (0, 1):
             saved = journal.load(f"/{owner}")
             known = 0
@@ -107,15 +108,15 @@ def numbers_in(folder: Path) -> tuple[int, list[str]]:
 
 
 @pytest.mark.parametrize("what", ["os", "fsync"])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(("seed", "key"), [(1, b""), (2, b""), (3, KEY)], ids=["1", "2", "encrypted"])
 def test_a_power_loss_leaves_the_store_sound_and_with_fsync_complete(
-    shim: Path, tmp_path: Path, what: str, seed: int
+    shim: Path, tmp_path: Path, what: str, seed: int, key: bytes
 ) -> None:
     folder, log = tmp_path / "disk", tmp_path / "log"
     folder.mkdir()
-    SqliteJournal(folder / "app.db").close()
+    SqliteJournal(folder / "app.db", key=key or None).close()
     before = Disk(folder)
-    write(shim, folder, log, seed, what)
+    write(shim, folder, log, seed, what, key=key)
     ops = list(operations(log, folder))
     draw = random.Random(seed)
     moments = sorted(draw.sample(range(1, len(ops)), min(CUTS, len(ops) - 1)))
@@ -128,7 +129,7 @@ def test_a_power_loss_leaves_the_store_sound_and_with_fsync_complete(
             before.cut_off(after, draw)
             where = f"seed {seed}, power lost before operation {index} of {len(ops)} ({op.kind} {op.path})"
             try:
-                highest, wrong = numbers_in(after)
+                highest, wrong = numbers_in(after, key)
             except DamagedStore as error:
                 pytest.fail(f"{where}: {error}")
             assert not wrong, f"{where}: {wrong}"

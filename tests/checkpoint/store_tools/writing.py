@@ -30,10 +30,10 @@ import os, random, sys
 import msgspec
 from holdfast.checkpoint.snapshot.snapshot_record import IMAGES, Meta
 from holdfast.checkpoint.sqlite import SqliteJournal, append_log, open_store
-path, seed, steps = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+path, seed, steps, key = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), bytes.fromhex(sys.argv[4]) or None
 append_log.MOST_ROWS, open_store._CHECKPOINT_BYTES = 12, 1 << 20
 draw = random.Random(seed)
-journal = SqliteJournal(path, synchronous="fsync" if seed % 3 == 2 else "os")
+journal = SqliteJournal(path, synchronous="fsync" if seed % 3 == 2 else "os", key=key)
 number, live, packs = 0, {0: [], 1: []}, {0: [], 1: []}
 os.write(1, b"open\\n")
 for step in range(1, steps + 1):
@@ -77,10 +77,10 @@ def meta(state: bytes, turn: int, blocks: list[tuple[int, int, int]] | None = No
     return msgspec.msgpack.encode(Meta(IMAGES, turn, turn, [], {}, [], 1, state, turn, blocks or []))
 
 
-def filled(path: Path) -> Path:
+def filled(path: Path, key: bytes | None = None) -> Path:
     """A closed store: of A a small and a large snapshot and entries, of B one with a pack, and a note."""
     path.parent.mkdir(exist_ok=True)
-    with closing(SqliteJournal(path)) as journal:
+    with closing(SqliteJournal(path, key=key)) as journal:
         positions = journal.append([*inputs(4), *inputs(4, B)])
         journal.cut(A, meta(b"older", 2), positions[:2], turn=2)
         positions += journal.append(inputs(2, start=4))
@@ -99,9 +99,9 @@ def left_by_a_kill(path: Path) -> Path:
     return path
 
 
-def contents(path: Path) -> Any:
+def contents(path: Path, key: bytes | None = None) -> Any:
     """All that a recovery reads."""
-    with closing(SqliteJournal(path)) as journal:
+    with closing(SqliteJournal(path, key=key)) as journal:
         segment = journal.read_blocks(B, 7, [(0, 10_000)])
         blocks = bytes(segment.block(0, 10_000))
         segment.close()
@@ -126,9 +126,9 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
-def begin_writing(path: Path, seed: int, steps: int = 1_000_000) -> subprocess.Popen[bytes]:
+def begin_writing(path: Path, seed: int, steps: int = 1_000_000, key: bytes | None = None) -> subprocess.Popen[bytes]:
     """Start a writer; it is at work when this returns."""
-    command = [sys.executable, "-c", WRITER, str(path), str(seed), str(steps)]
+    command = [sys.executable, "-c", WRITER, str(path), str(seed), str(steps), (key or b"").hex()]
     writer = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment())
     assert writer.stdout is not None
     assert writer.stdout.readline() == b"open\n"
@@ -155,7 +155,7 @@ def acknowledged(writer: subprocess.Popen[bytes], least: int = 0) -> int:
     return number
 
 
-def count_numbers(path: Path) -> int:
+def count_numbers(path: Path, key: bytes | None = None) -> int:
     """How many numbers there are: all up to there, and each batch as a whole.
 
     Packs are compared byte by byte, with both snapshots that are kept.
@@ -163,7 +163,7 @@ def count_numbers(path: Path) -> int:
     found: set[int] = set()
     known = [0, 0]
     newest: tuple[int, ...] = (-1, 1, 0)
-    with closing(SqliteJournal(path)) as journal:
+    with closing(SqliteJournal(path, key=key)) as journal:
         for owner in (0, 1):
             address = f"/app/{owner}"
             for older in (1, 0):
