@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import random
 from collections.abc import Awaitable, Callable
+from contextvars import ContextVar
 from typing import Any
 
 from .backoff import Backoff
@@ -43,6 +44,31 @@ class Retry:
 ONCE = Retry(attempts=1)
 """No further attempt."""
 
+_token: ContextVar[int] = ContextVar("fencing_token", default=0)
+"""While an effect is performed: the fencing token of the life that performs it."""
+
+
+def fencing_token() -> int:
+    """Return the fencing token of the life that makes this effect, for the other side to refuse what comes too late.
+
+    Call it in the function of a `ctx.effect`. A later life of the actor has a larger token, and so has a replica that
+    leads after another one; two effects of one life have the same. The other side keeps the largest token that it has
+    seen, and refuses what comes with a smaller one: that is from a life which has been replaced and does not know it,
+    such as a thread that was left behind.
+
+    It is no part of the turn: a handler that is run again would see another one, and could go another way.
+
+    Raises:
+        HoldfastError: no effect is being performed here.
+
+    Source:
+        Kleppmann 2016, "How to do distributed locking".
+    """
+    token = _token.get()
+    if not token:
+        raise HoldfastError("a fencing token belongs to an effect: read it in the function that ctx.effect calls")
+    return token
+
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class EffectCall:
@@ -63,17 +89,19 @@ class EffectCall:
     retry: Retry
     is_async: bool
 
-    async def perform(self, in_thread: Callable[..., Awaitable[Any]], seed: int) -> object:
-        """Attempt it until it succeeds or has failed, and return what it returns.
+    async def perform(self, in_thread: Callable[..., Awaitable[Any]], seed: int, token: int) -> object:
+        """Attempt it until it succeeds or has failed, and return what it returns. It is awaited in a task of its own.
 
         Args:
             in_thread: runs a function with its arguments in a thread.
             seed: of the jitter of the back-off.
+            token: the fencing token of the life that performs it.
 
         Raises:
             EffectFailed: the last attempt has raised, or has taken too long.
             HoldfastError: the function has raised one itself: that is its answer, and is not attempted again.
         """
+        _token.set(token)
         numbers: random.Random | None = None
         attempt = 0
         while True:

@@ -140,10 +140,14 @@ class Outcome(msgspec.Struct, array_like=True, tag=2):
 
 
 class Perform(msgspec.Struct, array_like=True, tag=22):
-    """The effect that was output (turn, k) has no outcome, and all that precedes it is safe: perform it."""
+    """The effect that was output (turn, k) has no outcome, and all that precedes it is safe: perform it.
+
+    `token` is the fencing token of whoever is ordered to.
+    """
 
     turn: int
     k: int
+    token: int
 
 
 class Go(msgspec.Struct, array_like=True, tag=3):

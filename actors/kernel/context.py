@@ -51,7 +51,7 @@ class Borrowed(list["Ask"]):
 class ActorContext:
     """An actor's view of the runtime. It belongs to one life: after that life's end it refuses to send."""
 
-    __slots__ = ("_asking", "_cell", "_closed", "_owes", "_random", "_turn")
+    __slots__ = ("_asking", "_cell", "_closed", "_owes", "_random", "_token", "_turn")
 
     _may_fail_fast: ClassVar[bool] = True
     """Whether an ask may end by what the receiver happens to be doing; a replay could not repeat that."""
@@ -63,6 +63,7 @@ class ActorContext:
         self._turn = 0
         self._random: random.Random | None = None
         self._owes: list[Ask] | None = None  # asks that may be answered later
+        self._token = 0  # of its effects; it gets one with the first
 
     # -- who, when --------------------------------------------------------------------------------------------------
 
@@ -395,7 +396,8 @@ class ActorContext:
     def _performed(self, effect: EffectCall, at_most_once: bool) -> asyncio.Future[object]:
         """The outcome of an effect: without recovery, whatever it comes to now."""
         node = self._cell.node
-        return self._beside(effect.perform(node.threads.run, node.numbers.next_seed()), "effect")
+        self._token = self._token or node.numbers.next_token()
+        return self._beside(effect.perform(node.threads.run, node.numbers.next_seed(), self._token), "effect")
 
     def sleep_until(self, when: float) -> asyncio.Future[None]:
         """Have the turn in hand wait until a moment, be it days away.

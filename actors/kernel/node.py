@@ -7,6 +7,7 @@ import contextvars
 import dataclasses
 import itertools
 import random
+import sys
 import time
 import weakref
 from collections.abc import Callable
@@ -104,6 +105,10 @@ class Clock:
         return deadline if self.is_monotonic else monotonic() + deadline - self._loop.time()
 
 
+TOKENS = 1 << 16
+"""Fencing tokens that the actors of one process may use up; they keep the last one then."""
+
+
 class Numbers:
     """What a node counts, and the numbers that it gives out."""
 
@@ -111,6 +116,7 @@ class Numbers:
         self._seeds = random.Random(seed)
         self._names = itertools.count(1)
         self._turns = itertools.count(1)
+        self._token, self._last_token = 0, sys.maxsize
         self.dead_letters = 0
         self.late_replies = 0
 
@@ -125,6 +131,21 @@ class Numbers:
     def next_turn(self) -> int:
         """A number for a turn that asks."""
         return next(self._turns)
+
+    def next_token(self) -> int:
+        """A fencing token: larger than all that were given out before, unless a process has used up its own."""
+        self._token = min(self._token + 1, self._last_token)
+        return self._token
+
+    def tokens_for_process(self) -> int:
+        """Put fencing tokens aside for the actors of a process; returns the one before the first of them."""
+        before = self._token
+        self._token += TOKENS
+        return before
+
+    def begin_tokens(self, before: int, last: int = sys.maxsize) -> None:
+        """Give out the fencing tokens that follow this one, up to the last one."""
+        self._token, self._last_token = before, last
 
 
 class Node(RunLoop):

@@ -27,7 +27,7 @@ from ..kernel.cell import RUNNING, Cell
 from ..kernel.envelope import AnyTable
 from ..kernel.lifecycle import HERE, MAILBOX
 from ..kernel.message import Message, RuntimeOrder, message_name
-from ..kernel.node import Node, Ports
+from ..kernel.node import TOKENS, Node, Ports
 from ..kernel.ref import current
 from ..kernel.topics import Topics
 from ..migration.worker_moves import Attempt, GuestMoves, Replaced, hand_on_stash
@@ -368,7 +368,8 @@ class Guest(Peer):
         return cell
 
     def _launch(self, frame: frames.Launch) -> None:
-        path = self.connection.names.from_wire(frame.to)
+        path, before = self.connection.names.from_wire(frame.to), int(frame.options["tokens"])
+        self.node.numbers.begin_tokens(before, before + TOKENS)
         if frame.options.get("prepare"):
             self._prepare(frame)
             return

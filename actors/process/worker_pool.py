@@ -133,6 +133,7 @@ class Worker(Peer):
             raise StartFailed(cell.path, "its process has ended")
         up = self._launches[key] = self.node.loop.create_future()
         connection = self.connection
+        options = dict(options, tokens=self.node.numbers.tokens_for_process())
         connection.send(frames.Launch(key, connection.names.to_wire(cell.path), cell.life, recipe, options), cell.path)
         if "prepare" not in options:
             self._order_again(cell)

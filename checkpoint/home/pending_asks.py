@@ -203,7 +203,7 @@ class PendingCalls:
     def order(self, turn: int, k: int) -> None:
         """Have the present life perform an effect: all that precedes it is safe."""
         if self._home.life.port is not None:
-            self._home.life.port.to_life(Perform(turn, k))
+            self._home.life.port.to_life(Perform(turn, k, self._home.life.token))
 
     def performed(self, record: Performed) -> None:
         """An effect of the turn in hand has come to something; what it comes to later, or once more, is of no use."""

@@ -261,6 +261,7 @@ class Switch:
         self.timers.claimed.clear()
         live: asyncio.Future[float] = self.node.loop.create_future()
         self.life.expect(live)
+        self.life.token = self.node.numbers.next_token()
         return live
 
     def restore_records(self) -> list[Restore]:

@@ -32,7 +32,7 @@ from ...actors.kernel.message import Message, message_name, require_message
 from ...actors.kernel.ref import ActorRef, current
 from ...actors.seconds import check_seconds
 from ...actors.values import encode_value
-from ..protocol import REPLY, SINCE_THEN, Answer, Feed, Performed, PipeDone
+from ..protocol import REPLY, SINCE_THEN, Answer, Feed, Perform, Performed, PipeDone
 from .recorded_inbox import INIT, STARTED, Fed
 
 if TYPE_CHECKING:
@@ -320,18 +320,18 @@ class RecordedContext(ActorContext):
         names = {message_name(kind): kind for kind in kinds}
         return self._rest("wait", "|".join(names), timeout or 0.0, names)
 
-    def perform(self, turn: int, k: int, effect: EffectCall, outcome: Pending) -> None:
+    def perform(self, order: Perform, effect: EffectCall, outcome: Pending) -> None:
         """Perform an effect of the turn in hand, in a task of its own, and have the home journal what it comes to."""
         if outcome.is_out:
             return  # Whoever led before has been told so, too.
-        outcome.is_out = True
-        task = self._beside(self._carried_out(turn, k, effect), "effect")
+        outcome.is_out, self._token = True, order.token
+        task = self._beside(self._carried_out(order.turn, order.k, effect), "effect")
         outcome.add_done_callback(lambda _: task.cancel())  # The handler does not wait for it any more.
 
     async def _carried_out(self, turn: int, k: int, effect: EffectCall) -> None:
         node, life = self._cell.node, self.recorded
         try:
-            value = await effect.perform(node.threads.run, node.numbers.next_seed())
+            value = await effect.perform(node.threads.run, node.numbers.next_seed(), self._token)
             answer = Answer(REPLY, "", encode_value(value, where=f"the result of {effect.key}"))
         except Exception as error:
             answer = self._kept(effect, error)

@@ -193,7 +193,7 @@ class Life:
             case Outcome():
                 self._outcome(record)
             case Perform():
-                self._perform(record.turn, record.k)
+                self._perform(record)
             case Go():
                 self._queue(GoLive(self, record))
             case SnapshotNow(urgent=True):
@@ -263,12 +263,12 @@ class Life:
             return decode_value(answer.body)
         return self.cell.node.codec.decode(awaited[answer.name], answer.body)
 
-    def _perform(self, turn: int, k: int) -> None:
+    def _perform(self, order: Perform) -> None:
         """An effect of the turn in hand has no outcome yet."""
-        outcome, effect = self.waits.outcomes.get((turn, k), (None, None))
+        outcome, effect = self.waits.outcomes.get((order.turn, order.k), (None, None))
         ctx = self.cell.ctx
         if isinstance(outcome, Pending) and isinstance(effect, EffectCall) and isinstance(ctx, RecordedContext):
-            ctx.perform(turn, k, effect, outcome)
+            ctx.perform(order, effect, outcome)
 
     # -- turns ------------------------------------------------------------------------------------------------------
 

@@ -191,7 +191,8 @@ class Group:
         self.poke()
 
     def forget_answers(self) -> None:
-        """Another one is to lead: what it asks again is answered again."""
+        """Another one is to lead: what it asks again is answered again, and its effects have a token of their own."""
+        self.switch.life.token = self.replicas.node.numbers.next_token()
         self.delivery.inward.clear()
         self.delivery.finished.clear()
         self.copies.restart()
