@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import msgspec
 
 from ..actors.errors import WaitTimeout
+from ..actors.kernel.node import cell_kind
+from .home.replay_filter import declared
 from .inputs import Batch, Input
-from .protocol import MESSAGE, MOMENT, REPLY, SINCE_THEN, Answer, Out, timed
+from .protocol import MESSAGE, MOMENT, REPLY, SINCE_THEN, Answer, Glance, Glanced, Out, timed
 
 if TYPE_CHECKING:
     from .home.switch import Switch
@@ -37,12 +40,12 @@ class LongWaits:
     def __init__(self, home: Switch) -> None:
         self._home = home
         self._clocks: dict[Place, asyncio.TimerHandle] = {}
-        self.wanted: dict[Place, tuple[str, ...]] = {}  # types of messages, in the order in which turns wait for them
+        self.wanted: dict[Place, tuple[str, ...]] = {}  # types of messages, none: a moment; in the order of the waits
 
     @property
     def is_busy(self) -> bool:
         """Whether the turn in hand waits for a moment or a message."""
-        return bool(self._clocks or self.wanted)
+        return bool(self.wanted)
 
     def fix(self, turn: int, out: Out, batch: Batch) -> None:
         """Until when a turn waits is fixed when it first wants to, for all of its lives."""
@@ -54,17 +57,19 @@ class LongWaits:
     def begin(self, turn: int, key: int, out: Out) -> None:
         """The turn with input `key` waits: until a moment, or for a message, for which there may be a time limit."""
         place = turn, out.k
-        if place in self._clocks or place in self.wanted:
+        if place in self.wanted:
             return
-        if out.verb == "wait":
-            names = tuple(out.name.split("|"))
+        names = tuple(out.name.split("|")) if out.verb == "wait" else ()
+        if names:
             source = next((one for one in self._home.ledger.open.values() if self._suits(one, names, key)), None)
             if source is not None:
                 self._take(place, source)
                 return
-            self.wanted[place] = names
-        if out.verb == "sleep" or out.seconds:
+        self.wanted[place] = names
+        if not names or out.seconds:
             self._look(place, self._home.ledger.dues.get(place, out.seconds))
+        if self.wanted:
+            self.show(self._home.ledger.open.values())
 
     def _suits(self, source: Input, names: tuple[str, ...], running: int) -> bool:
         """Whether an input is a message that a turn waits for, and nobody has begun it."""
@@ -95,9 +100,9 @@ class LongWaits:
         if now < when:
             self._clocks[place] = home.node.loop.call_later(min(when - now, LONGEST), self._look, place, when)
             return
-        names = self.wanted.get(place)
+        names = self.wanted[place]
         self._forget(place)
-        if names is None:
+        if not names:
             answer = Answer(MOMENT)
         else:
             answer = Answer(*home.node.codec.encode_error(WaitTimeout(home.path, " or ".join(names))))
@@ -111,5 +116,31 @@ class LongWaits:
 
     def abandon(self) -> None:
         """Wait for nothing any more, since the life is over."""
-        for place in {*self._clocks, *self.wanted}:
+        for place in list(self.wanted):
             self._forget(place)
+
+    # -- asks that change nothing -----------------------------------------------------------------------------------
+
+    def show(self, sources: Iterable[Input]) -> None:
+        """Have the life answer those of these inputs beside its turn that are asks and change nothing."""
+        home = self._home
+        if home.life.port is None or not home.life.is_released:
+            return
+        for source in sources:
+            if source.ask is not None and not source.ask.is_done and self._changes_nothing(source):
+                home.life.port.to_life(Glance(source.feed()))
+
+    def _changes_nothing(self, source: Input) -> bool:
+        kind = None if self._home.cell is None else cell_kind(self._home.cell)
+        if kind is None or source.kind != MESSAGE or source.held or source.id == self._home.ledger.begun:
+            return False
+        handles = declared(kind, source.name)
+        return handles is not None and handles.readonly and source.id not in self._home.ledger.stashed()
+
+    def glanced(self, record: Glanced) -> None:
+        """Such an ask has its answer: it is no input any more."""
+        source = self._home.ledger.open.get(record.id)
+        if source is not None and self._changes_nothing(source):
+            batch = Batch()
+            self._home.end_without_turn(source, record.answer, batch)
+            batch.commit(self._home.journal)

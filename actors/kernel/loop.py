@@ -14,7 +14,7 @@ import types
 from asyncio.tasks import _enter_task, _leave_task  # the documented hooks for stepping coroutines in a task's name
 from collections import deque
 from collections.abc import Callable, Generator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..errors import WrongThread
 from ..ordered import Ordered
@@ -36,6 +36,7 @@ STRIDE = 16
 RUNNERS = 8
 """Idle runner tasks kept for the next turns."""
 
+T = TypeVar("T")
 Coroutine_ = types.CoroutineType
 
 
@@ -228,6 +229,17 @@ class RunLoop:
             return True
         self.hold(cell, item, turn, waiting)
         return False
+
+    def step_beside(self, context: Context, work: Callable[[], T]) -> T:
+        """Call something in a runner's name, while no slice runs: it may need a current task, as turns have one."""
+        self.enter()
+        try:
+            return context.run(work)
+        finally:
+            if self.entered is not None:
+                self._leave()
+            else:
+                self._leave_struck()
 
     def hold(self, cell: Cell, item: Any, turn: Any, waiting: Any) -> None:
         """A coroutine has suspended in its first step: its runner stays with it."""

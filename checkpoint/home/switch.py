@@ -36,6 +36,7 @@ from ..protocol import (
     STASHED,
     Answer,
     Closed,
+    Glanced,
     Go,
     Hooked,
     Ignored,
@@ -229,13 +230,15 @@ class Switch:
         """Feed an input that is safe, unless they are held."""
         if source.held:
             return
-        life, bound = self.life, self.intake.bound
-        if self.calls.rests.wanted and self.calls.rests.takes(source):
+        life, bound, rests = self.life, self.intake.bound, self.calls.rests
+        if rests.wanted and rests.takes(source):
             return
         if life.is_released and life.port is not None and (bound is None or bound.may_feed(source)):
             if source.ask is not None and life.port.begins:
                 source.ask.started = True
             life.port.to_life(source.feed())
+        if rests.wanted:
+            rests.show((source,))
 
     def push(self, item: Item) -> None:
         """An EXIT or DOWN is an input too."""
@@ -361,6 +364,8 @@ class Switch:
                     self.outputs.work_done(record)
                 case Performed():
                     self.calls.performed(record)
+                case Glanced():
+                    self.calls.rests.glanced(record)
                 case Hooked():
                     self.outputs.hooked(record)
                 case Unsaved():

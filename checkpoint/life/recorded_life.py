@@ -45,6 +45,7 @@ from ..protocol import (
     TICK,
     Answer,
     Feed,
+    Glance,
     Go,
     Hooked,
     Ignored,
@@ -68,6 +69,7 @@ from ..snapshot.image_writer import Imaging
 from ..snapshot.key_variables import StateMismatch, check_keys, restore_state, save_state, variables
 from ..turn_word import WAITS
 from .determinism_guard import DeterminismGuard
+from .glances import answer_beside
 from .life_state import Awaited, HookTimers, LifeStage, RestoredState, SnapshotState, TurnWaits
 from .readonly_guard import check_readonly
 from .recorded_context import Pending, RecordedContext
@@ -194,6 +196,8 @@ class Life:
                 self._outcome(record)
             case Perform():
                 self._perform(record)
+            case Glance():  # Not here and now: this may be called in a turn of the very actor.
+                self.cell.node.loop.call_soon(answer_beside, self, record.feed)
             case Go():
                 self._queue(GoLive(self, record))
             case SnapshotNow(urgent=True):
@@ -234,7 +238,7 @@ class Life:
 
     def _outcome(self, record: Outcome) -> None:
         if record.taken >= 0:
-            self._drop(lambda feed: feed.id == record.taken)
+            self.drop_queued(record.taken)
         waiting = self.waits.outcomes.pop((record.turn, record.k), None)
         if waiting is None:
             return
@@ -416,6 +420,10 @@ class Life:
         self.put("cancel", key)
         self.timers.cancelled.add(key)
         self._drop(lambda feed: feed.kind == TICK and feed.origin == key and feed.turn < 0)
+
+    def drop_queued(self, number: int) -> None:
+        """An input is none any more."""
+        self._drop(lambda feed: feed.id == number)
 
     def _drop(self, is_over: Callable[[Feed], bool]) -> None:
         """Forget inputs that are queued, and are none any more."""

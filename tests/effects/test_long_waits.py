@@ -33,13 +33,13 @@ async def waits(system: hf.ActorSystem, path: str = "/app/patient") -> None:
             await asyncio.sleep(0.001)
 
 
-async def end_of(system: hf.ActorSystem, isolation: str) -> None:
+async def end_of(system: hf.ActorSystem, isolation: str, path: str = "/app/patient") -> None:
     """End the life in the middle of its turn, and wait until the next one is there."""
     with system.events() as stream:
         if isolation == "process":
-            os.kill(system.pid_of(system.ref("/app/patient", hf.Actor)), signal.SIGKILL)
+            os.kill(system.pid_of(system.ref(path, hf.Actor)), signal.SIGKILL)
         else:
-            system.ref("/app/patient", hf.Actor).kill()
+            system.ref(path, hf.Actor).kill()
         async with asyncio.timeout(IN_TIME):
             async for event in stream:
                 if isinstance(event, hf.events.Recovered):
