@@ -35,11 +35,12 @@ def due_entry(turn: int, k: int, when: float) -> Entry:
 class LongWaits:
     """What the turn in hand at one home waits for. It ends with the life; the next one's turn waits again."""
 
-    __slots__ = ("_clocks", "_home", "wanted")
+    __slots__ = ("_clocks", "_home", "taken", "wanted")
 
     def __init__(self, home: Switch) -> None:
         self._home = home
         self._clocks: dict[Place, asyncio.TimerHandle] = {}
+        self.taken: dict[Place, int] = {}  # the messages that the turn in hand has waited for
         self.wanted: dict[Place, tuple[str, ...]] = {}  # types of messages, none: a moment; in the order of the waits
 
     @property
@@ -88,9 +89,10 @@ class LongWaits:
         """The message is no input any more, but an outcome of the turn, in one append."""
         home, batch = self._home, Batch()
         self._forget(place)
+        self.taken = {known: key for known, key in self.taken.items() if known[0] == place[0]} | {place: source.id}
         home.end_without_turn(source, HAD if source.ask is not None else Answer(), batch)
         outcome = timed(Answer(MESSAGE, source.name, source.body), home.node.clock.wall())
-        home.calls.outcome(*place, outcome, batch, taken=source.id)
+        home.calls.outcome(*place, outcome, batch)
         batch.commit(home.journal)
 
     def _look(self, place: Place, when: float) -> None:

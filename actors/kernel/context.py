@@ -444,7 +444,7 @@ class ActorContext:
             A future of the message.
 
         Raises:
-            HoldfastError: the actor has no recovery, or lives behind a mechanism; or this is no turn.
+            HoldfastError: the actor has no recovery, or this is no turn.
 
         Raises (by the future):
             WaitTimeout: none has come in time.

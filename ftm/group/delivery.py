@@ -97,6 +97,8 @@ class Delivery:
                 self.waiting.append(record)
             case Outcome() | Perform() | SnapshotNow():
                 self.inward.append(record)
+                if isinstance(record, Outcome) and self.fed.pop(record.taken, None) is not None:
+                    self.inside.discard(record.taken)  # It is none any more: a turn has waited for it.
             case _:
                 return False
         return True

@@ -257,3 +257,14 @@ async def test_the_next_program_goes_on_without_what_was_answered(tmp_path: Path
         await waits(system, PATH)
         assert len(system._node.cell_at(PATH).host.home.switch.open) == 1  # type: ignore[attr-defined]  # a unit
         assert await ref.ask(See(), IN_TIME) == ["begun"]
+
+
+async def test_behind_a_mechanism_they_wait(tmp_path: Path) -> None:
+    async with running(tmp_path) as system:
+        ref = await system.start(sleeper(mechanism=hf.ftm.TR()))
+        asked = await resting(system, ref)
+        seen = ref.ask(See(), IN_TIME)
+        await asyncio.sleep(0.05)
+        assert not seen.done()
+        await ref.ask(Word("a"), IN_TIME)
+        assert await asked == await seen == ["begun", "a"]
