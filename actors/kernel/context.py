@@ -56,6 +56,9 @@ class ActorContext:
     _may_fail_fast: ClassVar[bool] = True
     """Whether an ask may end by what the receiver happens to be doing; a replay could not repeat that."""
 
+    _may_rest: ClassVar[bool] = False
+    """Whether a turn may wait for days, and be run again elsewhere."""
+
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
         self._closed = False
@@ -576,6 +579,15 @@ class ActorContext:
         actor = self._cell.actor
         assert actor is not None
         return StatePacker(actor, owe).pack()
+
+    @property
+    def _is_adrift(self) -> bool:
+        """Whether a turn was left in the middle: this life handles nothing any more."""
+        return False
+
+    def _leaves_turn(self) -> bool:
+        """Leave the turn in hand, if it rests (for days, perhaps) and the next life runs it again from its start."""
+        return False
 
     def _postpones(self, call: Item) -> bool:
         """Whether an order has to wait (a journaled actor takes none before it has caught up); it comes again then."""

@@ -264,7 +264,7 @@ class RunLoop:
             more.bindings.update(turn.rebinds)
         if turn.then is not None and not (turn.killed and cell.children):
             turn.then()
-        elif turn.killed or error is not None:
+        elif turn.killed or (error is not None and not turn.is_left):
             # What follows is again user code, maybe: it runs on the run queue, not in this runner's name.
             turn.item = turn.item if cell.ctx is None else cell.item  # It may have been forwarded or stashed.
             mailbox.queue_of(cell).appendleft(TurnRemains(turn, error))
@@ -380,11 +380,11 @@ class TurnRemains(Item):
 class Suspended:
     """A turn that waits for something, and the runner that waits with it."""
 
-    __slots__ = ("cell", "coroutine", "item", "killed", "rebinds", "runner", "since", "then", "waiting")
+    __slots__ = ("cell", "coroutine", "is_left", "item", "killed", "rebinds", "runner", "since", "then", "waiting")
 
     def __init__(self, cell: Cell, item: Any, coroutine: Any, waiting: Any, runner: Runner) -> None:
         self.cell, self.item, self.coroutine, self.waiting, self.runner = cell, item, coroutine, waiting, runner
-        self.killed = False
+        self.killed = self.is_left = False  # (left: cancelled, and it does not matter how it ends)
         self.since: float = cell.node.now  # on the loop's clock, of the slice it began in
         self.rebinds: dict[str, Cell] | None = None  # bindings that change when this turn is over
         self.then: Callable[[], None] | None = None  # set when the coroutine is no turn but a winding down

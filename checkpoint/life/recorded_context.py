@@ -106,6 +106,7 @@ class RecordedContext(ActorContext):
     __slots__ = ("_drawn", "recorded")
 
     _may_fail_fast = False
+    _may_rest = True
 
     recorded: Life
     _drawn: int  # the turn that `_random` belongs to
@@ -397,6 +398,19 @@ class RecordedContext(ActorContext):
     def _depart(self, owe: Callable[[Ask], int]) -> bytes:
         self.recorded.last_snapshot()
         return b""
+
+    @property
+    def _is_adrift(self) -> bool:
+        return self.recorded.stage.is_adrift
+
+    def _leaves_turn(self) -> bool:
+        more = self._cell.more
+        turn = None if more is None else more.turn
+        if turn is None or turn.killed or turn.then is not None or not self.recorded.leave_turn():
+            return False
+        turn.is_left = True
+        turn.runner.task.cancel()
+        return True
 
     def _postpones(self, call: Item) -> bool:
         if self.recorded.is_live:

@@ -354,6 +354,14 @@ class Life:
         turn.then = functools.partial(lifecycle.finish, self.cell, reason, is_orderly=False)
         turn.runner.task.cancel()
 
+    def leave_turn(self) -> bool:
+        """Leave the turn in hand for the next life, which runs it again from its start; False if it does not rest."""
+        if not self.waits.resting or self.feed is None or not self.is_live or not self.method.replays:
+            return False
+        self.feed, self.outs = None, []  # What its handler says while it is cancelled does not count.
+        self.stage.is_adrift = True
+        return True
+
     def ignore(self, why: str) -> None:
         """The actor does not want to be started: turn 0 stays open for the next start."""
         self.feed, self.outs, self.stage.ignored_why = None, [], why
@@ -495,7 +503,7 @@ class Life:
 
     def take_snapshot(self, *, is_last: bool = False) -> None:
         """Save the state after the last turn; while background work is out, its turn must stay in the journal."""
-        if not self.method.snapshots:
+        if not self.method.snapshots or self.stage.is_adrift:
             return
         if self.pipes:
             self.saving.is_postponed = True
@@ -565,6 +573,8 @@ class Life:
         actor = self.cell.actor
         assert actor is not None
         begin = time.perf_counter()
+        if self.stage.is_adrift:
+            return  # All is replayed up to the turn that was left.
         if self.method.snapshots and (self.turn != self.saving.turn or self.images.is_busy):  # Else all is replayed.
             self._send_snapshot(save_state(actor), begin)
 
