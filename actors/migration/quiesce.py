@@ -68,6 +68,8 @@ class PackLife(Item):
         if take.is_void or ctx._postpones(take) or any(map(_ends, cell.extra().urgent or ())):
             return TurnLeft.run(actor, item) if is_adrift else None
         take.why = _busy(cell)
+        if take.why and is_adrift:
+            return TurnLeft.run(actor, item)
         if take.why:
             cell.node.loop.call_later(LOOK_AGAIN, take._again, cell, cell.life)
             return None
@@ -97,7 +99,7 @@ class PackLife(Item):
             return
         if cell.state is not RUNNING:
             return
-        is_next = bool(more.urgent) and more.urgent[0] is self
+        is_next = more.urgent is not None and next(iter(more.urgent), None) is self
         stays_behind = any(name not in self._ignored for name in cell.children or ())
         if is_next and not stays_behind and not _busy(cell) and ctx._leaves_turn():
             return

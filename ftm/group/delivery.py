@@ -192,6 +192,12 @@ class Delivery:
         self.waiting = deque([*left, *gone])
         self.out, self.is_again = None, True
 
+    def withdraw(self, open_inputs: Container[int], begun: int) -> None:
+        """Nothing is inside any more: all that has no end yet is sent again when something may go in."""
+        self.send_again(open_inputs, begun)
+        self.inside.clear()
+        self.is_again = False
+
     def only_suspect_input(self) -> int:
         """The input in whose turn a replica must have died, if only one was inside; else -1."""
         requests = [] if self.out is None else self.out.requests

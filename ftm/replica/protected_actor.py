@@ -382,6 +382,11 @@ class Server(lifecycle.HerePlace):
         self.kill(cell)
         await gone
 
+    async def withdraw(self) -> None:
+        """What is being run has not happened: the next life stands before it."""
+        self.part.begun, self.traces.withheld = [], []
+        await self.drop_life()
+
     def _note_work(self, life: ServerLife | None) -> None:
         """A life has ended; its background work has ended with it, and nobody runs its turns again to begin it anew."""
         if life is not None and life.pipes and self.standing.leads:

@@ -177,9 +177,9 @@ async def test_a_turn_that_has_rested_does_not_hang_when_it_goes_on() -> None:
 LONGER = hf.ftm.Detection(interval=0.02, watch_turns=1.0)
 
 
-class Late(Patient):
+class Late(hf.Actor):
     @hf.on(Count)
-    async def one_more(self, message: Count) -> int:
+    async def rest(self, message: Count) -> int:
         await self.ctx.sleep(1.2)
         await self.ctx.effect(asyncio.sleep, 0.7)
         return 1

@@ -37,6 +37,20 @@ CHECKS = {
         "tests/effects/test_effects_protected.py",
         "test_what_a_turn_waits_for_is_taken_once",
     ),
+    "what is left by a turn that rests is sent again": Check(
+        "ftm/group/group.py",
+        "        self.delivery.withdraw(switch.open",
+        "        (switch.open",
+        "tests/effects/test_changes_while_resting.py",
+        "test_mechanisms_are_exchanged",
+    ),
+    "a turn is left only if nothing is out that would end with its life": Check(
+        "ftm/bricks/request_protocol.py",
+        "server.state.has_access and life.only_rests",
+        "server.state.has_access",
+        "tests/effects/test_changes_while_resting.py",
+        "test_an_effect_that_is_out_beside",
+    ),
     "a turn that waits for days is not taken for one that hangs": Check(
         "ftm/replica/heartbeat.py",
         "            if not life.waits.resting:",
