@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 import msgspec
 
 from ..actors.errors import WaitTimeout
-from ..actors.kernel.node import cell_kind
-from .home.replay_filter import declared
 from .inputs import Batch, Input
 from .protocol import MESSAGE, MOMENT, REPLY, SINCE_THEN, Answer, Glance, Glanced, Out, timed
 
@@ -129,20 +127,13 @@ class LongWaits:
         if home.life.port is None or not home.life.is_released:
             return
         for source in sources:
-            if source.ask is not None and not source.ask.is_done and self._changes_nothing(source):
+            if source.ask is not None and not source.ask.is_done and self._home.changes_nothing(source):
                 home.life.port.to_life(Glance(source.feed()))
-
-    def _changes_nothing(self, source: Input) -> bool:
-        kind = None if self._home.cell is None else cell_kind(self._home.cell)
-        if kind is None or source.kind != MESSAGE or source.held or source.id == self._home.ledger.begun:
-            return False
-        handles = declared(kind, source.name)
-        return handles is not None and handles.readonly and source.id not in self._home.ledger.stashed()
 
     def glanced(self, record: Glanced) -> None:
         """Such an ask has its answer: it is no input any more."""
         source = self._home.ledger.open.get(record.id)
-        if source is not None and self._changes_nothing(source):
+        if source is not None and self._home.changes_nothing(source):
             batch = Batch()
             self._home.end_without_turn(source, record.answer, batch)
             batch.commit(self._home.journal)

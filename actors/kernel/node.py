@@ -10,7 +10,7 @@ import random
 import sys
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
@@ -63,6 +63,11 @@ def begin_with(cell: Cell, start: Start[Any]) -> None:
     cell.extra().start = start
 
 
+async def in_no_process(function: Callable[..., object], *args: object) -> object:
+    """Refuse to run a function in a process, where nobody has said how."""
+    raise HoldfastError("this node has no processes for effects")
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class Ports:
     """What a node asks of those around it; the composition root connects it once. By itself it answers like this."""
@@ -82,6 +87,8 @@ class Ports:
     """In an actor process: the guest, through which the root is reached."""
     overdue: Overdue | None = None
     """In an actor process: who ends it when it is blocked."""
+    run_in_process: Callable[..., Awaitable[object]] = in_no_process
+    """Runs a function with its arguments in a process of its own."""
 
 
 class Clock:

@@ -32,6 +32,7 @@ from ..kernel.ref import current
 from ..kernel.topics import Topics
 from ..migration.worker_moves import Attempt, GuestMoves, Replaced, hand_on_stash
 from ..persistence import Keeper
+from .effect_processes import EffectProcesses
 from .wire import frames
 from .wire.connection import Connection
 from .wire.frames import BadFrame
@@ -188,6 +189,7 @@ class Guest(Peer):
                 keeper=composition.keeper,
                 uplink=self,
                 overdue=overdue,
+                run_in_process=EffectProcesses(self.node.codec).run,  # They are killed when this process ends.
             )
         )
         self.node.events.add_sink(self._on_event)

@@ -19,6 +19,7 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, Envelope, Item
 from ...actors.kernel.message import message_name
+from ...actors.kernel.node import cell_kind
 from ..durable_links import DurableTies
 from ..durable_timers import Timers
 from ..inputs import Batch, HomeJournal, Input, Turn
@@ -70,7 +71,7 @@ from .outputs import Outputs, is_as_before
 from .pending_asks import PendingCalls, SwitchAsk, answer_ask, origin_of
 from .present_life import PresentLife
 from .replay import PacedReplay
-from .replay_filter import turns_to_replay
+from .replay_filter import declared, turns_to_replay
 
 if TYPE_CHECKING:
     from .homes import Homes
@@ -239,6 +240,14 @@ class Switch:
             life.port.to_life(source.feed())
         if rests.wanted:
             rests.show((source,))
+
+    def changes_nothing(self, source: Input) -> bool:
+        """Whether an input is a message that waits, and whose handler is declared to change nothing."""
+        kind = None if self.cell is None else cell_kind(self.cell)
+        if kind is None or source.kind != MESSAGE or source.held or source.id == self.ledger.begun:
+            return False
+        handles = declared(kind, source.name)
+        return handles is not None and handles.readonly and source.id not in self.ledger.stashed()
 
     def push(self, item: Item) -> None:
         """An EXIT or DOWN is an input too."""

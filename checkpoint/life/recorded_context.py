@@ -285,11 +285,11 @@ class RecordedContext(ActorContext):
         said = f"{self.path}|{feed.id}|{feed.time}"
         return hashlib.blake2b(said.encode(), digest_size=16).hexdigest()
 
-    def _performed(self, effect: EffectCall, at_most_once: bool) -> asyncio.Future[object]:
+    def _performed(self, effect: EffectCall) -> asyncio.Future[object]:
         if not self._in_turn():
             self._outside()
-            return super()._performed(effect, at_most_once)
-        return self._awaited("effect", effect.key, "at most once" if at_most_once else "", 0.0, effect)
+            return super()._performed(effect)
+        return self._awaited("effect", effect.key, "at most once" if effect.at_most_once else "", 0.0, effect)
 
     def _awaited(self, verb: str, to: str, name: str, until: float, kind: Awaited) -> asyncio.Future[Any]:
         """An output of the turn in hand, and a future of what comes of it; the turn need not wait for that."""
@@ -330,9 +330,9 @@ class RecordedContext(ActorContext):
         outcome.add_done_callback(lambda _: task.cancel())  # The handler does not wait for it any more.
 
     async def _carried_out(self, turn: int, k: int, effect: EffectCall) -> None:
-        node, life = self._cell.node, self.recorded
+        life = self.recorded
         try:
-            value = await effect.perform(node.threads.run, node.numbers.next_seed(), self._token)
+            value = await self._perform(effect)
             answer = Answer(REPLY, "", encode_value(value, where=f"the result of {effect.key}"))
         except Exception as error:
             answer = self._kept(effect, error)

@@ -198,6 +198,27 @@ CHECKS = {
         "tests/effects/test_changes_while_resting.py",
         "test_an_effect_that_is_out_beside",
     ),
+    "a function whose process has ended is in doubt": Check(
+        "actors/effects.py",
+        "                if isinstance(error, FunctionDied) and self.at_most_once:\n",
+        "                if False:\n",
+        "tests/effects/test_effect_processes.py",
+        "test_what_comes_of_it",
+    ),
+    "the process of a function that nobody waits for is killed": Check(
+        "actors/process/effect_processes.py",
+        "        except BaseException:\n            self._all.discard(process)\n            process.end()\n",
+        "        except BaseException:\n            self._all.discard(process)\n",
+        "tests/effects/test_effect_processes.py",
+        "test_a_time_limit_ends_it",
+    ),
+    "the process of a function ends with whoever has begun it": Check(
+        "actors/process/effect_main.py",
+        "    bind_prctl()(PR_SET_PDEATHSIG, signal.SIGKILL)\n",
+        "",
+        "tests/effects/test_effect_processes.py",
+        "test_it_ends_with_whoever and root",
+    ),
     "T13: after a failed sync nothing takes effect": Check(
         "checkpoint/group_commit.py",
         "        if error is not None:\n            failure =",
