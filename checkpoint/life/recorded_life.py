@@ -279,7 +279,10 @@ class Life:
     def open_turn(self, feed: Feed) -> None:
         """A turn begins; a replayed one gets the number it had."""
         if feed.turn >= 0:
-            self.turn, self.stage.has_replayed = feed.turn, True
+            self.turn = feed.turn
+            kind: Any = type(self.cell.actor)
+            if feed.kind != START or kind.on_start is not Actor.on_start:  # Else nothing is run again.
+                self.stage.has_replayed = True
         else:
             self.turn += 1
         if self.returned:

@@ -67,8 +67,8 @@ CHECKS = {
     ),
     "a task beside the turn has no effect": Check(
         "checkpoint/life/recorded_context.py",
-        "            self._outside()\n            return super()._performed(effect, at_most_once)",
-        "            return super()._performed(effect, at_most_once)",
+        "            self._outside()\n            return super()._performed(effect)",
+        "            return super()._performed(effect)",
         "tests/effects/test_effects.py",
         "test_a_task_beside_the_turn_has_none and effect",
     ),

@@ -352,3 +352,25 @@ async def test_where_no_home_can_hold_a_message_for_it_a_turn_does_not_wait() ->
         with pytest.raises(hf.RemoteCrash, match="recovery"):
             await ref.ask(Go(["c"]), IN_TIME)
         assert await ref.ask(Go(["s0.01"]), IN_TIME) == "slept"
+
+
+class Starting(Patient):
+    async def on_start(self, restored: bool) -> None:
+        self.count += 1
+
+
+@pytest.mark.parametrize("kind", [Patient, Starting])
+async def test_a_start_that_does_nothing_is_not_worth_a_snapshot(tmp_path: Path, kind: type[Patient]) -> None:
+    """Ten thousand turns that rest would each wait for one, when a program begins."""
+    spec = hf.child("patient", hf.start(kind), recovery=hf.hybrid(interval=1000.0))
+    async with running(tmp_path, "os") as system:
+        (await system.start(spec)).tell(Go(["c"]))
+        await waits(system)
+    async with running(tmp_path, "os") as system:
+        with system.events() as stream:
+            ref = await system.start(spec)
+            await waits(system)
+            taken = [event for event in stream.take() if isinstance(event, hf.events.SnapshotTaken)]
+        assert bool(taken) is (kind is Starting)
+        await ref.ask(Call("a"), IN_TIME)
+        assert await ref.ask(Look(), IN_TIME) == ["call a"]
