@@ -12,7 +12,7 @@ from holdfast import ftm as ftm
 from holdfast import supervision as supervision
 from holdfast import system as system
 from holdfast.actors.backoff import Backoff
-from holdfast.actors.effects import Retry
+from holdfast.actors.effects import Retry, fencing_token
 from holdfast.actors.errors import (
     ActorStopped,
     AskFailed,
@@ -130,6 +130,7 @@ __all__ = [
     "checkpoint_only",
     "child",
     "dynamic",
+    "fencing_token",
     "fresh",
     "hybrid",
     "load_recovery",

@@ -7,10 +7,11 @@ import dataclasses
 import functools
 import random
 from collections.abc import Awaitable, Callable
-from typing import Any
+from contextvars import ContextVar
+from typing import Any, Literal, TypeAlias
 
 from .backoff import Backoff
-from .errors import EffectFailed, HoldfastError, SpecError, error_text, type_name
+from .errors import EffectFailed, EffectInDoubt, HoldfastError, SpecError, error_text, type_name
 from .seconds import check_seconds
 
 
@@ -43,6 +44,51 @@ class Retry:
 ONCE = Retry(attempts=1)
 """No further attempt."""
 
+Isolation: TypeAlias = Literal["thread", "process"]
+"""Where the plain function of an effect runs."""
+
+_token: ContextVar[int] = ContextVar("fencing_token", default=0)
+"""While an effect is performed: the fencing token of the life that performs it."""
+
+
+class FunctionRaised(Exception):
+    """A function in another process has raised something: its type, what it says, and all types that it is of."""
+
+    def __init__(self, kind: str, text: str, kinds: list[str]) -> None:
+        super().__init__(kind, text, kinds)
+        self.kind, self.text, self.kinds = kind, text, kinds
+
+
+class FunctionDied(Exception):
+    """The process of a function has ended before the function."""
+
+
+def begin_effect(token: int) -> None:
+    """From here on an effect is performed, by the life with this fencing token."""
+    _token.set(token)
+
+
+def fencing_token() -> int:
+    """Return the fencing token of the life that makes this effect, for the other side to refuse what comes too late.
+
+    Call it in the function of a `ctx.effect`. A later life of the actor has a larger token, and so has a replica that
+    leads after another one; two effects of one life have the same. The other side keeps the largest token that it has
+    seen, and refuses what comes with a smaller one: that is from a life which has been replaced and does not know it,
+    such as a thread that was left behind.
+
+    It is no part of the turn: a handler that is run again would see another one, and could go another way.
+
+    Raises:
+        HoldfastError: no effect is being performed here.
+
+    Source:
+        Kleppmann 2016, "How to do distributed locking".
+    """
+    token = _token.get()
+    if not token:
+        raise HoldfastError("a fencing token belongs to an effect: read it in the function that ctx.effect calls")
+    return token
+
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class EffectCall:
@@ -53,7 +99,9 @@ class EffectCall:
         key: what names it where a replay is compared, and in errors and events.
         timeout: seconds that one attempt may take; None: as long as it wants.
         retry: how often it is attempted.
-        is_async: whether the function is awaited on the event loop; any other runs in a thread.
+        at_most_once: whether it is in doubt, and is not attempted again, when its process has ended.
+        is_async: whether the function is awaited on the event loop.
+        isolation: whether any other runs in a thread or in a process of its own.
     """
 
     function: Callable[..., Any]
@@ -61,26 +109,32 @@ class EffectCall:
     key: str
     timeout: float | None
     retry: Retry
+    at_most_once: bool
     is_async: bool
+    isolation: Isolation
 
-    async def perform(self, in_thread: Callable[..., Awaitable[Any]], seed: int) -> object:
-        """Attempt it until it succeeds or has failed, and return what it returns.
+    async def perform(self, path: str, run: Callable[..., Awaitable[Any]], seed: int, token: int) -> object:
+        """Attempt it until it succeeds or has failed, and return what it returns. It is awaited in a task of its own.
 
         Args:
-            in_thread: runs a function with its arguments in a thread.
+            path: the address of the actor.
+            run: runs a function with its arguments in a thread or a process.
             seed: of the jitter of the back-off.
+            token: the fencing token of the life that performs it.
 
         Raises:
-            EffectFailed: the last attempt has raised, or has taken too long.
+            EffectFailed: the last attempt has raised, or has taken too long, or its process has ended.
+            EffectInDoubt: its process has ended, and it is made at most once.
             HoldfastError: the function has raised one itself: that is its answer, and is not attempted again.
         """
+        begin_effect(token)
         numbers: random.Random | None = None
         attempt = 0
         while True:
             attempt += 1
             limit = asyncio.timeout(self.timeout)
             try:
-                work = self.function(*self.args) if self.is_async else in_thread(self.function, *self.args)
+                work = self.function(*self.args) if self.is_async else run(self.function, *self.args)
                 if self.timeout is None:
                     return await work
                 async with limit:
@@ -90,13 +144,29 @@ class EffectCall:
             except BaseException as error:  # Whatever a function can raise; it ends neither the program nor its actor.
                 if isinstance(error, asyncio.CancelledError) and _is_cancelled():
                     raise
-                text = error_text(error)
-                if self.timeout is not None and limit.expired() and isinstance(error, TimeoutError):
+                if isinstance(error, FunctionDied) and self.at_most_once:
+                    raise EffectInDoubt(path, self.key) from error
+                kind, text = type_name(type(error)), error_text(error)
+                if isinstance(error, FunctionRaised):
+                    kind, text = error.kind, error.text
+                elif self.timeout is not None and limit.expired() and isinstance(error, TimeoutError):
                     text = f"it took longer than {self.timeout:g} s"
-                if attempt >= self.retry.attempts or not isinstance(error, self.retry.on):
-                    raise EffectFailed(self.key, attempt, type_name(type(error)), text) from error
+                if attempt >= self.retry.attempts or not is_one_of(error, self.retry.on):
+                    raise EffectFailed(self.key, attempt, kind, text) from error
             numbers = numbers or random.Random(seed)
             await asyncio.sleep(self.retry.backoff.delay(attempt - 1, numbers))
+
+
+def is_one_of(error: BaseException, kinds: tuple[type[Exception], ...]) -> bool:
+    """Whether an error is of one of these classes, be it raised here or in another process.
+
+    >>> raised = FunctionRaised("KeyError", "'a'", ["KeyError", "LookupError"])
+    >>> is_one_of(raised, (LookupError,)), is_one_of(KeyError("a"), (OSError,))
+    (True, False)
+    """
+    if isinstance(error, FunctionRaised):
+        return any(type_name(kind) in error.kinds for kind in kinds)
+    return isinstance(error, kinds)
 
 
 def _is_cancelled() -> bool:
@@ -114,6 +184,7 @@ def effect_of(
     *,
     at_most_once: bool,
     is_async: bool,
+    isolation: Isolation,
 ) -> EffectCall:
     """The effect that a handler wants.
 
@@ -130,7 +201,12 @@ def effect_of(
         raise SpecError("effect", "what is performed at most once is not attempted again: leave `retry` out")
     if not isinstance(key, str):
         raise SpecError("effect", f"key must be a str, not {key!r}")
-    return EffectCall(function, args, key or name_of(function), timeout, retry or ONCE, is_async)
+    if isolation not in ("thread", "process"):
+        raise SpecError("effect", f"isolation must be 'thread' or 'process', not {isolation!r}")
+    if isolation == "process" and is_async:
+        raise SpecError("effect", "an async function runs on the event loop: isolation='process' is for a plain def")
+    name = key or name_of(function)
+    return EffectCall(function, args, name, timeout, retry or ONCE, at_most_once, is_async, isolation)
 
 
 def name_of(function: Callable[..., Any]) -> str:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import msgspec
 
 from ..actors.errors import WaitTimeout
 from .inputs import Batch, Input
-from .protocol import MESSAGE, MOMENT, REPLY, SINCE_THEN, Answer, Out, timed
+from .protocol import MESSAGE, MOMENT, REPLY, SINCE_THEN, Answer, Glance, Glanced, Out, timed
 
 if TYPE_CHECKING:
     from .home.switch import Switch
@@ -32,17 +33,18 @@ def due_entry(turn: int, k: int, when: float) -> Entry:
 class LongWaits:
     """What the turn in hand at one home waits for. It ends with the life; the next one's turn waits again."""
 
-    __slots__ = ("_clocks", "_home", "wanted")
+    __slots__ = ("_clocks", "_home", "taken", "wanted")
 
     def __init__(self, home: Switch) -> None:
         self._home = home
         self._clocks: dict[Place, asyncio.TimerHandle] = {}
-        self.wanted: dict[Place, tuple[str, ...]] = {}  # types of messages, in the order in which turns wait for them
+        self.taken: dict[Place, int] = {}  # the messages that the turn in hand has waited for
+        self.wanted: dict[Place, tuple[str, ...]] = {}  # types of messages, none: a moment; in the order of the waits
 
     @property
     def is_busy(self) -> bool:
         """Whether the turn in hand waits for a moment or a message."""
-        return bool(self._clocks or self.wanted)
+        return bool(self.wanted)
 
     def fix(self, turn: int, out: Out, batch: Batch) -> None:
         """Until when a turn waits is fixed when it first wants to, for all of its lives."""
@@ -54,17 +56,19 @@ class LongWaits:
     def begin(self, turn: int, key: int, out: Out) -> None:
         """The turn with input `key` waits: until a moment, or for a message, for which there may be a time limit."""
         place = turn, out.k
-        if place in self._clocks or place in self.wanted:
+        if place in self.wanted:
             return
-        if out.verb == "wait":
-            names = tuple(out.name.split("|"))
+        names = tuple(out.name.split("|")) if out.verb == "wait" else ()
+        if names:
             source = next((one for one in self._home.ledger.open.values() if self._suits(one, names, key)), None)
             if source is not None:
                 self._take(place, source)
                 return
-            self.wanted[place] = names
-        if out.verb == "sleep" or out.seconds:
+        self.wanted[place] = names
+        if not names or out.seconds:
             self._look(place, self._home.ledger.dues.get(place, out.seconds))
+        if self.wanted:
+            self.show(self._home.ledger.open.values())
 
     def _suits(self, source: Input, names: tuple[str, ...], running: int) -> bool:
         """Whether an input is a message that a turn waits for, and nobody has begun it."""
@@ -83,9 +87,10 @@ class LongWaits:
         """The message is no input any more, but an outcome of the turn, in one append."""
         home, batch = self._home, Batch()
         self._forget(place)
+        self.taken = {known: key for known, key in self.taken.items() if known[0] == place[0]} | {place: source.id}
         home.end_without_turn(source, HAD if source.ask is not None else Answer(), batch)
         outcome = timed(Answer(MESSAGE, source.name, source.body), home.node.clock.wall())
-        home.calls.outcome(*place, outcome, batch, taken=source.id)
+        home.calls.outcome(*place, outcome, batch)
         batch.commit(home.journal)
 
     def _look(self, place: Place, when: float) -> None:
@@ -95,9 +100,9 @@ class LongWaits:
         if now < when:
             self._clocks[place] = home.node.loop.call_later(min(when - now, LONGEST), self._look, place, when)
             return
-        names = self.wanted.get(place)
+        names = self.wanted[place]
         self._forget(place)
-        if names is None:
+        if not names:
             answer = Answer(MOMENT)
         else:
             answer = Answer(*home.node.codec.encode_error(WaitTimeout(home.path, " or ".join(names))))
@@ -111,5 +116,24 @@ class LongWaits:
 
     def abandon(self) -> None:
         """Wait for nothing any more, since the life is over."""
-        for place in {*self._clocks, *self.wanted}:
+        for place in list(self.wanted):
             self._forget(place)
+
+    # -- asks that change nothing -----------------------------------------------------------------------------------
+
+    def show(self, sources: Iterable[Input]) -> None:
+        """Have the life answer those of these inputs beside its turn that are asks and change nothing."""
+        home = self._home
+        if home.life.port is None or not home.life.is_released:
+            return
+        for source in sources:
+            if source.ask is not None and not source.ask.is_done and self._home.changes_nothing(source):
+                home.life.port.to_life(Glance(source.feed()))
+
+    def glanced(self, record: Glanced) -> None:
+        """Such an ask has its answer: it is no input any more."""
+        source = self._home.ledger.open.get(record.id)
+        if source is not None and self._home.changes_nothing(source):
+            batch = Batch()
+            self._home.end_without_turn(source, record.answer, batch)
+            batch.commit(self._home.journal)

@@ -140,10 +140,14 @@ class Outcome(msgspec.Struct, array_like=True, tag=2):
 
 
 class Perform(msgspec.Struct, array_like=True, tag=22):
-    """The effect that was output (turn, k) has no outcome, and all that precedes it is safe: perform it."""
+    """The effect that was output (turn, k) has no outcome, and all that precedes it is safe: perform it.
+
+    `token` is the fencing token of whoever is ordered to.
+    """
 
     turn: int
     k: int
+    token: int
 
 
 class Go(msgspec.Struct, array_like=True, tag=3):
@@ -236,10 +240,16 @@ class Respec(msgspec.Struct, array_like=True, tag=10):
     limits: dict[str, Any] = {}
 
 
+class Glance(msgspec.Struct, array_like=True, tag=24):
+    """An ask that changes nothing, and has been fed or will be: answer it beside the turn in hand while that rests."""
+
+    feed: Feed
+
+
 PastInputs = Outcome | Perform | SnapshotNow
 """What a home says to a life beside its inputs: it overtakes those that wait."""
 
-ToLife = Feed | Outcome | Perform | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec
+ToLife = Feed | Outcome | Perform | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec | Glance
 
 
 # -- life to home ----------------------------------------------------------------------------------------------------
@@ -336,6 +346,13 @@ class Performed(msgspec.Struct, array_like=True, tag=23):
     answer: Answer
 
 
+class Glanced(msgspec.Struct, array_like=True, tag=25):
+    """The input `id`, an ask that changes nothing, has this answer, and is not handled in a turn."""
+
+    id: int
+    answer: Answer
+
+
 class Unsaved(msgspec.Struct, array_like=True, tag=16):
     """The state could not be saved: no snapshot came of it."""
 
@@ -383,7 +400,19 @@ class Ignored(msgspec.Struct, array_like=True, tag=19):
 
 
 ToHome = (
-    Ignored | Released | TurnEnd | Hooked | Live | Snapshot | PipeDone | Performed | Unsaved | Wanted | Closed | Marked
+    Ignored
+    | Released
+    | TurnEnd
+    | Hooked
+    | Live
+    | Snapshot
+    | PipeDone
+    | Performed
+    | Glanced
+    | Unsaved
+    | Wanted
+    | Closed
+    | Marked
 )
 
 

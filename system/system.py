@@ -183,6 +183,7 @@ class ActorSystem(Recorded, Controls):
                 respec=respec,
                 outside=self._homes.addresses.find,
                 keeper=self._homes,
+                run_in_process=self._workers.effects.run,
             )
         )
         self._body = asyncio.current_task()

@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable, Coroutine
 from contextvars import ContextVar, copy_context
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, TypeVarTuple, cast, overload
 
-from ..effects import EffectCall, Retry, effect_of
+from ..effects import EffectCall, Isolation, Retry, effect_of
 from ..errors import ActorStopped, AskDeadlock, HoldfastError, SpecError, remote_crash
 from ..exit_reasons import NORMAL, ExitReason
 from ..seconds import check_seconds
@@ -51,10 +51,13 @@ class Borrowed(list["Ask"]):
 class ActorContext:
     """An actor's view of the runtime. It belongs to one life: after that life's end it refuses to send."""
 
-    __slots__ = ("_asking", "_cell", "_closed", "_owes", "_random", "_turn")
+    __slots__ = ("_asking", "_cell", "_closed", "_owes", "_random", "_token", "_turn")
 
     _may_fail_fast: ClassVar[bool] = True
     """Whether an ask may end by what the receiver happens to be doing; a replay could not repeat that."""
+
+    _may_rest: ClassVar[bool] = False
+    """Whether a turn may wait for days, and be run again elsewhere."""
 
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
@@ -63,6 +66,7 @@ class ActorContext:
         self._turn = 0
         self._random: random.Random | None = None
         self._owes: list[Ask] | None = None  # asks that may be answered later
+        self._token = 0  # of its effects; it gets one with the first
 
     # -- who, when --------------------------------------------------------------------------------------------------
 
@@ -338,6 +342,7 @@ class ActorContext:
         timeout: float | None = None,
         retry: Retry | None = None,
         at_most_once: bool = False,
+        isolation: Isolation = "thread",
     ) -> asyncio.Future[T]: ...
 
     @overload
@@ -349,6 +354,7 @@ class ActorContext:
         timeout: float | None = None,
         retry: Retry | None = None,
         at_most_once: bool = False,
+        isolation: Isolation = "thread",
     ) -> asyncio.Future[T]: ...
 
     def effect(  # type: ignore[misc]  # whatever the two above have found to fit
@@ -359,6 +365,7 @@ class ActorContext:
         timeout: float | None = None,
         retry: Retry | None = None,
         at_most_once: bool = False,
+        isolation: Isolation = "thread",
     ) -> asyncio.Future[Any]:
         """Do something to the outside world, such as a payment, once: an actor with recovery has its outcome journaled.
 
@@ -369,12 +376,14 @@ class ActorContext:
         itself, and `await asyncio.gather(...)` what they return.
 
         Args:
-            function: is awaited if it is async, and runs in a thread otherwise. It may not use `ctx`.
+            function: is awaited if it is async, and runs in a thread otherwise, or in a process. It may not use `ctx`.
             args: its arguments.
             key: names the effect, where a replay is compared, and in errors; left out, the function's name does.
             timeout: seconds that one attempt may take. A thread cannot be stopped: it is left behind.
             retry: how often it is attempted; left out, once.
             at_most_once: a crash while it is out raises EffectInDoubt instead of calling it again.
+            isolation: "process" runs a plain function of a module in a process of its own, which is killed when its
+                time is over or its life ends. Arguments are values that a snapshot can hold, too.
 
         Returns:
             A future of what the function returns; that must be a value that a snapshot can hold (`UnsavableValue` says
@@ -389,13 +398,22 @@ class ActorContext:
             HoldfastError: the function itself has raised that, a Refusal for instance: it is an outcome too.
         """
         self._alive()
-        effect = effect_of(function, args, key, timeout, retry, at_most_once=at_most_once, is_async=is_async(function))
-        return self._performed(effect, at_most_once)
+        runs = is_async(function)
+        effect = effect_of(
+            function, args, key, timeout, retry, at_most_once=at_most_once, is_async=runs, isolation=isolation
+        )
+        return self._performed(effect)
 
-    def _performed(self, effect: EffectCall, at_most_once: bool) -> asyncio.Future[object]:
+    def _performed(self, effect: EffectCall) -> asyncio.Future[object]:
         """The outcome of an effect: without recovery, whatever it comes to now."""
+        self._token = self._token or self._cell.node.numbers.next_token()
+        return self._beside(self._perform(effect), "effect")
+
+    def _perform(self, effect: EffectCall) -> Coroutine[Any, Any, object]:
+        """Perform it here and now."""
         node = self._cell.node
-        return self._beside(effect.perform(node.threads.run, node.numbers.next_seed()), "effect")
+        run = node.threads.run if effect.isolation == "thread" else node.ports.run_in_process
+        return effect.perform(self.path, run, node.numbers.next_seed(), self._token)
 
     def sleep_until(self, when: float) -> asyncio.Future[None]:
         """Have the turn in hand wait until a moment, be it days away.
@@ -442,7 +460,7 @@ class ActorContext:
             A future of the message.
 
         Raises:
-            HoldfastError: the actor has no recovery, or lives behind a mechanism; or this is no turn.
+            HoldfastError: the actor has no recovery, or this is no turn.
 
         Raises (by the future):
             WaitTimeout: none has come in time.
@@ -574,6 +592,15 @@ class ActorContext:
         actor = self._cell.actor
         assert actor is not None
         return StatePacker(actor, owe).pack()
+
+    @property
+    def _is_adrift(self) -> bool:
+        """Whether a turn was left in the middle: this life handles nothing any more."""
+        return False
+
+    def _leaves_turn(self) -> bool:
+        """Leave the turn in hand, if it rests (for days, perhaps) and the next life runs it again from its start."""
+        return False
 
     def _postpones(self, call: Item) -> bool:
         """Whether an order has to wait (a journaled actor takes none before it has caught up); it comes again then."""

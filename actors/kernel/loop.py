@@ -14,7 +14,7 @@ import types
 from asyncio.tasks import _enter_task, _leave_task  # the documented hooks for stepping coroutines in a task's name
 from collections import deque
 from collections.abc import Callable, Generator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..errors import WrongThread
 from ..ordered import Ordered
@@ -36,6 +36,7 @@ STRIDE = 16
 RUNNERS = 8
 """Idle runner tasks kept for the next turns."""
 
+T = TypeVar("T")
 Coroutine_ = types.CoroutineType
 
 
@@ -229,6 +230,17 @@ class RunLoop:
         self.hold(cell, item, turn, waiting)
         return False
 
+    def step_beside(self, context: Context, work: Callable[[], T]) -> T:
+        """Call something in a runner's name, while no slice runs: it may need a current task, as turns have one."""
+        self.enter()
+        try:
+            return context.run(work)
+        finally:
+            if self.entered is not None:
+                self._leave()
+            else:
+                self._leave_struck()
+
     def hold(self, cell: Cell, item: Any, turn: Any, waiting: Any) -> None:
         """A coroutine has suspended in its first step: its runner stays with it."""
         runner = self.entered or self._struck
@@ -252,7 +264,7 @@ class RunLoop:
             more.bindings.update(turn.rebinds)
         if turn.then is not None and not (turn.killed and cell.children):
             turn.then()
-        elif turn.killed or error is not None:
+        elif turn.killed or (error is not None and not turn.is_left):
             # What follows is again user code, maybe: it runs on the run queue, not in this runner's name.
             turn.item = turn.item if cell.ctx is None else cell.item  # It may have been forwarded or stashed.
             mailbox.queue_of(cell).appendleft(TurnRemains(turn, error))
@@ -368,11 +380,11 @@ class TurnRemains(Item):
 class Suspended:
     """A turn that waits for something, and the runner that waits with it."""
 
-    __slots__ = ("cell", "coroutine", "item", "killed", "rebinds", "runner", "since", "then", "waiting")
+    __slots__ = ("cell", "coroutine", "is_left", "item", "killed", "rebinds", "runner", "since", "then", "waiting")
 
     def __init__(self, cell: Cell, item: Any, coroutine: Any, waiting: Any, runner: Runner) -> None:
         self.cell, self.item, self.coroutine, self.waiting, self.runner = cell, item, coroutine, waiting, runner
-        self.killed = False
+        self.killed = self.is_left = False  # (left: cancelled, and it does not matter how it ends)
         self.since: float = cell.node.now  # on the loop's clock, of the slice it began in
         self.rebinds: dict[str, Cell] | None = None  # bindings that change when this turn is over
         self.then: Callable[[], None] | None = None  # set when the coroutine is no turn but a winding down

@@ -7,9 +7,10 @@ import contextvars
 import dataclasses
 import itertools
 import random
+import sys
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
@@ -62,6 +63,11 @@ def begin_with(cell: Cell, start: Start[Any]) -> None:
     cell.extra().start = start
 
 
+async def in_no_process(function: Callable[..., object], *args: object) -> object:
+    """Refuse to run a function in a process, where nobody has said how."""
+    raise HoldfastError("this node has no processes for effects")
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class Ports:
     """What a node asks of those around it; the composition root connects it once. By itself it answers like this."""
@@ -81,6 +87,8 @@ class Ports:
     """In an actor process: the guest, through which the root is reached."""
     overdue: Overdue | None = None
     """In an actor process: who ends it when it is blocked."""
+    run_in_process: Callable[..., Awaitable[object]] = in_no_process
+    """Runs a function with its arguments in a process of its own."""
 
 
 class Clock:
@@ -104,6 +112,10 @@ class Clock:
         return deadline if self.is_monotonic else monotonic() + deadline - self._loop.time()
 
 
+TOKENS = 1 << 16
+"""Fencing tokens that the actors of one process may use up; they keep the last one then."""
+
+
 class Numbers:
     """What a node counts, and the numbers that it gives out."""
 
@@ -111,6 +123,7 @@ class Numbers:
         self._seeds = random.Random(seed)
         self._names = itertools.count(1)
         self._turns = itertools.count(1)
+        self._token, self._last_token = 0, sys.maxsize
         self.dead_letters = 0
         self.late_replies = 0
 
@@ -125,6 +138,21 @@ class Numbers:
     def next_turn(self) -> int:
         """A number for a turn that asks."""
         return next(self._turns)
+
+    def next_token(self) -> int:
+        """A fencing token: larger than all that were given out before, unless a process has used up its own."""
+        self._token = min(self._token + 1, self._last_token)
+        return self._token
+
+    def tokens_for_process(self) -> int:
+        """Put fencing tokens aside for the actors of a process; returns the one before the first of them."""
+        before = self._token
+        self._token += TOKENS
+        return before
+
+    def begin_tokens(self, before: int, last: int = sys.maxsize) -> None:
+        """Give out the fencing tokens that follow this one, up to the last one."""
+        self._token, self._last_token = before, last
 
 
 class Node(RunLoop):

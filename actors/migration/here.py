@@ -44,6 +44,7 @@ class FromHere(Leaving):
         self._rested: asyncio.Future[None] = move.node.loop.create_future()
         take = self._take = PackLife(entering.owe, self._at_rest, move.give_up, self._ignored, stays=move.stays)
         lifecycle.urge(move.cell, take)
+        take.hurry(move.cell)
         await move.within(self._rested, move.timeout, lambda: f"{take.why}, and that did not change")
 
     def _at_rest(self, actor: Actor, state: bytes) -> None:

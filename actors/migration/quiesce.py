@@ -64,9 +64,12 @@ class PackLife(Item):
         take: PackLife = item
         ctx = actor.ctx
         cell: Cell = ctx._cell
+        is_adrift = ctx._is_adrift
         if take.is_void or ctx._postpones(take) or any(map(_ends, cell.extra().urgent or ())):
-            return None
+            return TurnLeft.run(actor, item) if is_adrift else None
         take.why = _busy(cell)
+        if take.why and is_adrift:
+            return TurnLeft.run(actor, item)
         if take.why:
             cell.node.loop.call_later(LOOK_AGAIN, take._again, cell, cell.life)
             return None
@@ -80,15 +83,42 @@ class PackLife(Item):
             take._taken(actor, state)
         except BaseException as error:  # The user's own code, such as `get_state`: no reason to end the actor.
             take._refused(str(error) if isinstance(error, HoldfastError) else error_text(error))
-            return None
+            return TurnLeft.run(actor, item) if is_adrift else None
         take.is_done = True
         for timer in cell.extra().belongings.timers:
             timer.pause()
         return LEAVE  # And stays `scheduled`, so that nobody puts it on the run queue.
 
+    def hurry(self, cell: Cell) -> None:
+        """Do not wait for a turn that rests, which may be for days: it is left, and run again at the new place.
+
+        Not while other commands come first, or something is out that would end with the life.
+        """
+        ctx, more = cell.ctx, cell.extra()
+        if ctx is None or not ctx._may_rest or self._stays or self.is_void or self.is_done:
+            return
+        if cell.state is not RUNNING:
+            return
+        is_next = more.urgent is not None and next(iter(more.urgent), None) is self
+        stays_behind = any(name not in self._ignored for name in cell.children or ())
+        if is_next and not stays_behind and not _busy(cell) and ctx._leaves_turn():
+            return
+        cell.node.loop.call_later(LOOK_AGAIN, self.hurry, cell)
+
     def _again(self, cell: Cell, life: int) -> None:
         if not self.is_void and cell.state is RUNNING and cell.life == life:
             lifecycle.urge(cell, self)
+
+
+class TurnLeft(Item):
+    """A command: end as if killed, for the turn in hand was left for a move that has not come about."""
+
+    is_command = True
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        lifecycle.killed(actor.ctx._cell)
+        return LEAVE
 
 
 def _ends(command: Item) -> bool:
@@ -117,6 +147,8 @@ def resume(cell: Cell) -> None:
     """The life that had been brought to rest goes on where it was."""
     for timer in cell.extra().belongings.timers:
         timer.resume()
+    if cell.ctx is not None and cell.ctx._is_adrift:
+        mailbox.queue_of(cell).appendleft(TurnLeft())
     lifecycle.up(cell)
 
 

@@ -122,6 +122,7 @@ class GuestMove:
                 self._take = PackLife(_number, self._taken, self._refused, stays=bool(told.get("stays")))
                 if cell.state is RUNNING:
                     lifecycle.urge(cell, self._take)
+                    self._take.hurry(cell)
             case "pack":
                 self._pack(cell)
             case "back":

@@ -27,11 +27,12 @@ from ..kernel.cell import RUNNING, Cell
 from ..kernel.envelope import AnyTable
 from ..kernel.lifecycle import HERE, MAILBOX
 from ..kernel.message import Message, RuntimeOrder, message_name
-from ..kernel.node import Node, Ports
+from ..kernel.node import TOKENS, Node, Ports
 from ..kernel.ref import current
 from ..kernel.topics import Topics
 from ..migration.worker_moves import Attempt, GuestMoves, Replaced, hand_on_stash
 from ..persistence import Keeper
+from .effect_processes import EffectProcesses
 from .wire import frames
 from .wire.connection import Connection
 from .wire.frames import BadFrame
@@ -188,6 +189,7 @@ class Guest(Peer):
                 keeper=composition.keeper,
                 uplink=self,
                 overdue=overdue,
+                run_in_process=EffectProcesses(self.node.codec).run,  # They are killed when this process ends.
             )
         )
         self.node.events.add_sink(self._on_event)
@@ -368,7 +370,8 @@ class Guest(Peer):
         return cell
 
     def _launch(self, frame: frames.Launch) -> None:
-        path = self.connection.names.from_wire(frame.to)
+        path, before = self.connection.names.from_wire(frame.to), int(frame.options["tokens"])
+        self.node.numbers.begin_tokens(before, before + TOKENS)
         if frame.options.get("prepare"):
             self._prepare(frame)
             return

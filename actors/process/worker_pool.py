@@ -18,6 +18,7 @@ from ..exit_reasons import KILLED, ExitReason, Hung, TrustBreach, pack_exit, unp
 from ..kernel.cell import Cell
 from ..migration.words import NO_ATTEMPT, say
 from ..streams import check_can_watch
+from .effect_processes import EffectProcesses
 from .fork.fork_server import ForkServer
 from .fork.forked_process import Forked, has_ended
 from .fork.launch import keep_large_memory, why_not_importable
@@ -133,6 +134,7 @@ class Worker(Peer):
             raise StartFailed(cell.path, "its process has ended")
         up = self._launches[key] = self.node.loop.create_future()
         connection = self.connection
+        options = dict(options, tokens=self.node.numbers.tokens_for_process())
         connection.send(frames.Launch(key, connection.names.to_wire(cell.path), cell.life, recipe, options), cell.path)
         if "prepare" not in options:
             self._order_again(cell)
@@ -434,6 +436,7 @@ class Workers:
         self.node = node
         self.on_frame = on_frame
         self.by_cell: dict[Cell, Worker] = {}
+        self.effects = EffectProcesses(node.codec)
         self._entry, self._preload, self._warm = entry, list(preload), warm
         self._server: ForkServer | None = None
         self._servers: list[ForkServer] = []  # all that live, also one that does not answer
@@ -579,6 +582,7 @@ class Workers:
     async def close(self) -> None:
         """End every process and the fork server."""
         self._closed = True
+        self.effects.close()
         if self._refilling is not None:
             self._refilling.cancel()
             with contextlib.suppress(asyncio.CancelledError):

@@ -20,8 +20,12 @@ if TYPE_CHECKING:
 def end_begun(home: Switch, source: Input, error: HoldfastError, batch: Batch) -> None:
     """End the turn that was in hand when the life ended: it is not gone on with.
 
-    It uses up its number: what that turn has sent, and asks it has out, are not another's.
+    It uses up its number: what that turn has sent, and asks it has out, are not another's. What was looked at beside
+    another turn has none, and that turn goes on.
     """
+    if home.ledger.released and source.id != home.ledger.begun:
+        home.end_without_turn(source, _failure(home, error), batch)
+        return
     home.end_turn(source, home.ledger.turn + 1, DROPPED, batch)
     home.give(source, _failure(home, error), batch)
 

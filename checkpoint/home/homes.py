@@ -36,6 +36,10 @@ ENDED = "it ended before it was live"
 ERASED = "what was recorded of it has been erased"
 ERASING = "erasing"
 """The fact that names the address whose tree is being erased."""
+OPENED = "opened"
+"""The fact that says when the root was begun whose fencing tokens were the largest: a whole number, of seconds."""
+TOKEN_BITS = 31
+"""Of the part of a fencing token that counts within a second; in front of it are whole seconds."""
 
 
 class Homes:
@@ -62,6 +66,7 @@ class Homes:
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
         self.file = file
         self.planted: dict[str, Saved] = {}  # what the next life at an address begins with, whatever is recorded
+        node.numbers.begin_tokens(_first_token(journal, node.clock.wall()))
         unfinished = journal.notes(ERASING).get(ERASING)
         self._stored = set(journal.addresses()) - {PLACE}
         self.groups = Groups(self)
@@ -358,3 +363,15 @@ def _bind(switch: Switch, chosen: Bound) -> None:
     bound = intake.bound = HomeBound(switch, chosen)
     if before is not None:
         bound.waiting, bound.senders = before.waiting, before.senders
+
+
+def _first_token(journal: StoreEngine, now: float) -> int:
+    """The token behind which those of a new root begin: they are larger than those of all roots before it.
+
+    They begin with the wall clock, so that they also rise without a store, and where one is begun anew. What a store
+    knows sees to it that they do if the clock was set back: no root gives out as many as there are for a second.
+    """
+    known = journal.noted(OPENED)
+    seconds = max(int(now), int(known) + 2 if known is not None else 0)
+    journal.note(OPENED, str(seconds).encode())
+    return max(int(now * 2**TOKEN_BITS), seconds << TOKEN_BITS)

@@ -203,7 +203,7 @@ class PendingCalls:
     def order(self, turn: int, k: int) -> None:
         """Have the present life perform an effect: all that precedes it is safe."""
         if self._home.life.port is not None:
-            self._home.life.port.to_life(Perform(turn, k))
+            self._home.life.port.to_life(Perform(turn, k, self._home.life.token))
 
     def performed(self, record: Performed) -> None:
         """An effect of the turn in hand has come to something; what it comes to later, or once more, is of no use."""
@@ -212,15 +212,15 @@ class PendingCalls:
         if is_out and place not in self.asks:
             self.outcome(*place, timed(record.answer, self._home.node.clock.wall()), None)
 
-    def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None, taken: int = -1) -> None:
-        """An ask of ours has its outcome: journal it, then tell the turn that waits. `taken`: the input that it was."""
+    def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None) -> None:
+        """An ask of ours has its outcome: journal it, then tell the turn that waits."""
         own = batch if batch is not None else Batch()
         self.asks.pop((turn, k), None)
         if self._home.ledger.note_outcome(turn, k, answer):
             if self._home.journal.durable:
                 self._home.note_shape(shape_name(answer), own)
             self._home.note(turn, outcome_entry(turn, k, answer), own)
-        own.after.append(lambda: self._tell(turn, k, answer, taken))
+        own.after.append(lambda: self._tell(turn, k, answer))
         if batch is None:
             own.commit(self._home.journal)
 
@@ -243,6 +243,7 @@ class PendingCalls:
         else:
             self.outcome(turn, k, Answer(*self._home.node.codec.encode_error(error)), None)
 
-    def _tell(self, turn: int, k: int, answer: Answer, taken: int = -1) -> None:
+    def _tell(self, turn: int, k: int, answer: Answer) -> None:
         if self._home.life.port is not None:
+            taken = self.rests.taken.get((turn, k), -1)  # Whoever leads now may have been given that by the last one.
             self._home.life.port.to_life(Outcome(turn, k, answer, taken, self._home.ledger.digest_of(turn, k)))

@@ -28,6 +28,7 @@ class PresentLife:
         is_void: whether a state was put in place from outside and could not be saved: nothing that it says counts.
         seen_turn: the last turn that it has handled again.
         seen_k: how many outputs of that turn have come again.
+        token: the fencing token of its effects; a replica that leads after another one has one of its own.
     """
 
     port: LifePort | None = None
@@ -41,6 +42,7 @@ class PresentLife:
     is_void: bool = False
     seen_turn: int = -1
     seen_k: int = 0
+    token: int = 0
 
     @property
     def is_awaited(self) -> bool:

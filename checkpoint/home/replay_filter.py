@@ -79,10 +79,13 @@ def choose(turns: dict[int, Turn], kind: type[Actor], codec: Codec) -> Skipped:
 
 def _declared(kind: type[Actor], turn: Turn) -> Handles | None:
     """What the handler of a turn has declared; None if it was no message, or was put aside."""
-    if turn.status != OK or turn.input.kind != MESSAGE:
-        return None
+    return None if turn.status != OK or turn.input.kind != MESSAGE else declared(kind, turn.input.name)
+
+
+def declared(kind: type[Actor], name: str) -> Handles | None:
+    """What the handler of messages of this type has declared, in an actor of this class."""
     try:
-        message = kind._table.kind_named(turn.input.name)
+        message = kind._table.kind_named(name)
     except UnknownMessage:  # The code has changed since; the life will say so.
         return None
     return next((kind._declared[base] for base in message.__mro__ if base in kind._declared), None)

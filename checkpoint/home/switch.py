@@ -19,6 +19,7 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, Envelope, Item
 from ...actors.kernel.message import message_name
+from ...actors.kernel.node import cell_kind
 from ..durable_links import DurableTies
 from ..durable_timers import Timers
 from ..inputs import Batch, HomeJournal, Input, Turn
@@ -36,6 +37,7 @@ from ..protocol import (
     STASHED,
     Answer,
     Closed,
+    Glanced,
     Go,
     Hooked,
     Ignored,
@@ -71,7 +73,7 @@ from .outputs import Outputs
 from .pending_asks import PendingCalls, SwitchAsk, answer_ask, origin_of
 from .present_life import PresentLife
 from .replay import PacedReplay, is_as_before, is_same_reply
-from .replay_filter import turns_to_replay
+from .replay_filter import declared, turns_to_replay
 
 if TYPE_CHECKING:
     from .homes import Homes
@@ -242,13 +244,23 @@ class Switch:
         """Feed an input that is safe, unless they are held."""
         if source.held:
             return
-        life, bound = self.life, self.intake.bound
-        if self.calls.rests.wanted and self.calls.rests.takes(source):
+        life, bound, rests = self.life, self.intake.bound, self.calls.rests
+        if rests.wanted and rests.takes(source):
             return
         if life.is_released and life.port is not None and (bound is None or bound.may_feed(source)):
             if source.ask is not None and life.port.begins:
                 source.ask.started = True
             life.port.to_life(source.feed())
+        if rests.wanted:
+            rests.show((source,))
+
+    def changes_nothing(self, source: Input) -> bool:
+        """Whether an input is a message that waits, and whose handler is declared to change nothing."""
+        kind = None if self.cell is None else cell_kind(self.cell)
+        if kind is None or source.kind != MESSAGE or source.held or source.id == self.ledger.begun:
+            return False
+        handles = declared(kind, source.name)
+        return handles is not None and handles.readonly and source.id not in self.ledger.stashed()
 
     def push(self, item: Item) -> None:
         """An EXIT or DOWN is an input too."""
@@ -274,6 +286,7 @@ class Switch:
         self.timers.claimed.clear()
         live: asyncio.Future[float] = self.node.loop.create_future()
         self.life.expect(live)
+        self.life.token = self.node.numbers.next_token()
         return live
 
     def restore_records(self) -> list[Restore]:
@@ -373,6 +386,8 @@ class Switch:
                     self.outputs.work_done(record)
                 case Performed():
                     self.calls.performed(record)
+                case Glanced():
+                    self.calls.rests.glanced(record)
                 case Hooked():
                     self.outputs.hooked(record)
                 case Unsaved():

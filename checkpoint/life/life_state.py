@@ -145,6 +145,7 @@ class LifeStage:
         is_cut_off: whether it ends by an EXIT that it does not trap.
         ignored_why: why the actor does not want to be started.
         is_over: whether it has ended.
+        is_adrift: whether a turn of it was left in the middle, so that its state is that of no turn.
     """
 
     has_replayed: bool = False
@@ -155,3 +156,4 @@ class LifeStage:
     is_cut_off: bool = False
     ignored_why: str | None = None
     is_over: bool = False
+    is_adrift: bool = False

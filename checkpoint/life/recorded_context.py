@@ -32,7 +32,7 @@ from ...actors.kernel.message import Message, message_name, require_message
 from ...actors.kernel.ref import ActorRef, current
 from ...actors.seconds import check_seconds
 from ...actors.values import encode_value
-from ..protocol import REPLY, SINCE_THEN, Answer, Feed, Performed, PipeDone
+from ..protocol import REPLY, SINCE_THEN, Answer, Feed, Perform, Performed, PipeDone
 from .recorded_inbox import INIT, STARTED, Fed
 
 if TYPE_CHECKING:
@@ -106,6 +106,7 @@ class RecordedContext(ActorContext):
     __slots__ = ("_drawn", "recorded")
 
     _may_fail_fast = False
+    _may_rest = True
 
     recorded: Life
     _drawn: int  # the turn that `_random` belongs to
@@ -284,11 +285,11 @@ class RecordedContext(ActorContext):
         said = f"{self.path}|{feed.id}|{feed.time}"
         return hashlib.blake2b(said.encode(), digest_size=16).hexdigest()
 
-    def _performed(self, effect: EffectCall, at_most_once: bool) -> asyncio.Future[object]:
+    def _performed(self, effect: EffectCall) -> asyncio.Future[object]:
         if not self._in_turn():
             self._outside()
-            return super()._performed(effect, at_most_once)
-        return self._awaited("effect", effect.key, "at most once" if at_most_once else "", 0.0, effect)
+            return super()._performed(effect)
+        return self._awaited("effect", effect.key, "at most once" if effect.at_most_once else "", 0.0, effect)
 
     def _awaited(self, verb: str, to: str, name: str, until: float, kind: Awaited) -> asyncio.Future[Any]:
         """An output of the turn in hand, and a future of what comes of it; the turn need not wait for that."""
@@ -320,18 +321,18 @@ class RecordedContext(ActorContext):
         names = {message_name(kind): kind for kind in kinds}
         return self._rest("wait", "|".join(names), timeout or 0.0, names)
 
-    def perform(self, turn: int, k: int, effect: EffectCall, outcome: Pending) -> None:
+    def perform(self, order: Perform, effect: EffectCall, outcome: Pending) -> None:
         """Perform an effect of the turn in hand, in a task of its own, and have the home journal what it comes to."""
         if outcome.is_out:
             return  # Whoever led before has been told so, too.
-        outcome.is_out = True
-        task = self._beside(self._carried_out(turn, k, effect), "effect")
+        outcome.is_out, self._token = True, order.token
+        task = self._beside(self._carried_out(order.turn, order.k, effect), "effect")
         outcome.add_done_callback(lambda _: task.cancel())  # The handler does not wait for it any more.
 
     async def _carried_out(self, turn: int, k: int, effect: EffectCall) -> None:
-        node, life = self._cell.node, self.recorded
+        life = self.recorded
         try:
-            value = await effect.perform(node.threads.run, node.numbers.next_seed())
+            value = await self._perform(effect)
             answer = Answer(REPLY, "", encode_value(value, where=f"the result of {effect.key}"))
         except Exception as error:
             answer = self._kept(effect, error)
@@ -397,6 +398,19 @@ class RecordedContext(ActorContext):
     def _depart(self, owe: Callable[[Ask], int]) -> bytes:
         self.recorded.last_snapshot()
         return b""
+
+    @property
+    def _is_adrift(self) -> bool:
+        return self.recorded.stage.is_adrift
+
+    def _leaves_turn(self) -> bool:
+        more = self._cell.more
+        turn = None if more is None else more.turn
+        if turn is None or turn.killed or turn.then is not None or not self.recorded.leave_turn():
+            return False
+        turn.is_left = True
+        turn.runner.task.cancel()
+        return True
 
     def _postpones(self, call: Item) -> bool:
         if self.recorded.is_live:

@@ -243,7 +243,7 @@ class StopRecorded(lifecycle.Stop):
         life: Life = item.life
         life.take_snapshot(is_last=True)
         life.enter(STOP)
-        if life.stage.is_cut_off:
+        if life.stage.is_cut_off or life.stage.is_adrift:
             lifecycle.finish(life.cell, item.reason, is_orderly=False)
         else:
             lifecycle.stop(life.cell, item.reason, item)

@@ -46,6 +46,7 @@ from ..protocol import (
     TICK,
     Answer,
     Feed,
+    Glance,
     Go,
     Hooked,
     Ignored,
@@ -69,6 +70,7 @@ from ..snapshot.image_writer import Imaging
 from ..snapshot.key_variables import StateMismatch, check_keys, restore_state, save_state, variables
 from ..turn_word import WAITS
 from .determinism_guard import DeterminismGuard
+from .glances import answer_beside
 from .life_state import Awaited, HookTimers, LifeStage, RestoredState, SnapshotState, TurnWaits
 from .readonly_guard import check_readonly
 from .recorded_context import Pending, RecordedContext
@@ -197,7 +199,9 @@ class Life:
             case Outcome():
                 self._outcome(record)
             case Perform():
-                self._perform(record.turn, record.k)
+                self._perform(record)
+            case Glance():  # Not here and now: this may be called in a turn of the very actor.
+                self.cell.node.loop.call_soon(answer_beside, self, record.feed)
             case Go():
                 self._queue(GoLive(self, record))
             case SnapshotNow(urgent=True):
@@ -238,7 +242,7 @@ class Life:
 
     def _outcome(self, record: Outcome) -> None:
         if record.taken >= 0:
-            self._drop(lambda feed: feed.id == record.taken)
+            self.drop_queued(record.taken)
         waiting = self.waits.outcomes.pop((record.turn, record.k), None)
         if waiting is None:
             return
@@ -267,19 +271,22 @@ class Life:
             return decode_value(answer.body)
         return self.cell.node.codec.decode(awaited[answer.name], answer.body)
 
-    def _perform(self, turn: int, k: int) -> None:
+    def _perform(self, order: Perform) -> None:
         """An effect of the turn in hand has no outcome yet."""
-        outcome, effect = self.waits.outcomes.get((turn, k), (None, None))
+        outcome, effect = self.waits.outcomes.get((order.turn, order.k), (None, None))
         ctx = self.cell.ctx
         if isinstance(outcome, Pending) and isinstance(effect, EffectCall) and isinstance(ctx, RecordedContext):
-            ctx.perform(turn, k, effect, outcome)
+            ctx.perform(order, effect, outcome)
 
     # -- turns ------------------------------------------------------------------------------------------------------
 
     def open_turn(self, feed: Feed) -> None:
         """A turn begins; a replayed one gets the number it had."""
         if feed.turn >= 0:
-            self.turn, self.stage.has_replayed = feed.turn, True
+            self.turn = feed.turn
+            kind: Any = type(self.cell.actor)
+            if feed.kind != START or kind.on_start is not Actor.on_start:  # Else nothing is run again.
+                self.stage.has_replayed = True
         else:
             self.turn += 1
         if self.returned:
@@ -354,6 +361,14 @@ class Life:
         turn.then = functools.partial(lifecycle.finish, self.cell, reason, is_orderly=False)
         turn.runner.task.cancel()
 
+    def leave_turn(self) -> bool:
+        """Leave the turn in hand for the next life, which runs it again from its start; False if it does not rest."""
+        if not self.waits.resting or self.feed is None or not self.is_live or not self.method.replays:
+            return False
+        self.feed, self.outs = None, []  # What its handler says while it is cancelled does not count.
+        self.stage.is_adrift = True
+        return True
+
     def ignore(self, why: str) -> None:
         """The actor does not want to be started: turn 0 stays open for the next start."""
         self.feed, self.outs, self.stage.ignored_why = None, [], why
@@ -420,6 +435,10 @@ class Life:
         self.put("cancel", key)
         self.timers.cancelled.add(key)
         self._drop(lambda feed: feed.kind == TICK and feed.origin == key and feed.turn < 0)
+
+    def drop_queued(self, number: int) -> None:
+        """An input is none any more."""
+        self._drop(lambda feed: feed.id == number)
 
     def _drop(self, is_over: Callable[[Feed], bool]) -> None:
         """Forget inputs that are queued, and are none any more."""
@@ -491,7 +510,7 @@ class Life:
 
     def take_snapshot(self, *, is_last: bool = False) -> None:
         """Save the state after the last turn; while background work is out, its turn must stay in the journal."""
-        if not self.method.snapshots:
+        if not self.method.snapshots or self.stage.is_adrift:
             return
         if self.pipes:
             self.saving.is_postponed = True
@@ -561,6 +580,8 @@ class Life:
         actor = self.cell.actor
         assert actor is not None
         begin = time.perf_counter()
+        if self.stage.is_adrift:
+            return  # All is replayed up to the turn that was left.
         if self.method.snapshots and (self.turn != self.saving.turn or self.images.is_busy):  # Else all is replayed.
             self._send_snapshot(save_state(actor), begin)
 

@@ -66,6 +66,7 @@ class Detached:
             switch.life.is_released = False
         else:
             switch.life.die()
+            switch.calls.rests.abandon()  # The next life's turn waits again.
         if bound is not None:
             bound.restart()
 

@@ -154,6 +154,16 @@ class EndTurn(Message[None]):
     again: bool
 
 
+class Withdraw(Message[bool]):
+    """Give back what is inside, if that is a turn which only rests (for days, perhaps), and go back to before it.
+
+    The reply is False if more than that is out: nothing has happened then. What is given back is sent again.
+    """
+
+    epoch: int
+    config: int
+
+
 class ReplicaBeat(Message):
     """This replica's bricks are running. Goes as it is, over secured links too: see there."""
 

@@ -58,6 +58,7 @@ from .replica_orders import (
     Rehearse,
     SetPeer,
     Stand,
+    Withdraw,
 )
 from .sealed_frames import Opened, Refused
 from .state_images import image_from
@@ -99,6 +100,7 @@ class RequestProtocol(Transfer):
         self._held: deque[Work] = deque()
         self._current: int | None = None  # the batch that is inside
         self._holds = 0  # who wants nothing to go in
+        self._is_leaving = False  # a turn that rests: the next life does not stand before it yet
         self._idle: list[asyncio.Future[None]] = []
         self._pieces: list[bytes] = []
         self._lock = asyncio.Lock()
@@ -129,7 +131,7 @@ class RequestProtocol(Transfer):
             self._flush_known(self._wanted)
 
     def _go_on(self) -> None:
-        while self._held and self._current is None and not self._holds:
+        while self._held and self._current is None and not (self._holds or self._is_leaving):
             self._begin(self._held.popleft())
         if self._current is None:
             idle, self._idle = self._idle, []
@@ -293,7 +295,7 @@ class RequestProtocol(Transfer):
 
     async def _quiet(self) -> None:
         """Wait until nothing is inside, or another epoch has begun. Whoever calls has raised `_holds`."""
-        while self._current is not None:
+        while self._current is not None or self._is_leaving:
             idle: asyncio.Future[None] = self._standing.node.loop.create_future()
             self._idle.append(idle)
             await idle
@@ -438,6 +440,35 @@ class RequestProtocol(Transfer):
             self._holds -= 1
             self._go_on()
 
+    @on(Withdraw)
+    def _withdraw(self, message: Withdraw) -> Any:
+        self._check(message.epoch, message.config)
+        handle = self.ctx.reply_handle()
+        self.ctx.create_task(self._give_back(handle))  # Not in line with other orders: one of them may wait for this.
+        return handle
+
+    async def _give_back(self, handle: ReplyHandle[bool]) -> None:
+        self._is_leaving = True
+        try:
+            handle.reply(await self._has_given_back())
+        except HoldfastError as error:
+            handle.fail(error)
+        finally:
+            self._is_leaving = False
+            self._go_on()
+
+    async def _has_given_back(self) -> bool:
+        standing, server = self._standing, self._standing.server
+        life = server.life
+        if life is None or life.feed is None:
+            return self._current is None or not standing.leads
+        if standing.leads and not (server.state.has_access and life.only_rests):
+            return False
+        await server.withdraw()
+        await self.proceed.ask(Flush(), timeout=FOREVER)
+        await server.ensure_as_given()
+        return True
+
     def _befores(self) -> list[Cell]:
         """What a batch passes on its way to Proceed, outermost first."""
         return [one for slot, one in self._standing.bricks.items() if slot.endswith(".before")]
@@ -510,6 +541,7 @@ RequestProtocol.handlers = {
     Join: "_join",
     Export: "_export",
     Quiesce: "_quiesce",
+    Withdraw: "_withdraw",
     Computes: "_computes",
     Rehearse: "_rehearse",
     Finish: "_finish",

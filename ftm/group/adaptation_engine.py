@@ -28,6 +28,7 @@ from ..bricks.replica_orders import Abort, Commit, PrepareStack, Quiesce, Stand
 from .membership import LookAgain
 from .reconfiguration import names_for, still_silent, what_is_wrong
 from .replicas import GroupPart
+from .resting_turns import past_resting_turns
 from .trial import TRIAL, TrialFailed, removed, tried, until_given_up
 from .trial import ended as ended_trial
 
@@ -150,7 +151,7 @@ class AdaptationEngine(GroupPart):
             return group.is_steady()  # Whoever is not there comes with bricks that are not wanted.
         while not self._replicas.whole_since()[0] and self._now() < end and not change.why:
             await self._wait_for_change()
-        if not change.why:
+        if not change.why and not group.switch.calls.rests.is_busy:  # Else nothing is copied, perhaps for days.
             copied = group.keep_copy(change)
             await asyncio.wait((copied, change.given_up), timeout=COPIED_WITHIN, return_when=asyncio.FIRST_COMPLETED)
         return group.is_steady() and not change.why
@@ -245,7 +246,9 @@ class AdaptationEngine(GroupPart):
         asked = {name: replicas.ask(name, order, seconds) for name in lives}
         for future in asked.values():
             future.add_done_callback(_heard)  # If this is given up, nobody looks at it.
-        if not await self._ends(self._group.quiet(), change, end, "a turn of it has not ended"):
+        quiet = self.ctx.create_task(past_resting_turns(self._group, self._group.quiet()))
+        if not await self._ends(quiet, change, end, "a turn of it has not ended"):
+            quiet.cancel()
             return False
         for name, future in asked.items():
             if change.is_back and name != primary:  # What keeps it may be what is to go: it is replaced.

@@ -97,6 +97,8 @@ class Delivery:
                 self.waiting.append(record)
             case Outcome() | Perform() | SnapshotNow():
                 self.inward.append(record)
+                if isinstance(record, Outcome) and self.fed.pop(record.taken, None) is not None:
+                    self.inside.discard(record.taken)  # It is none any more: a turn has waited for it.
             case _:
                 return False
         return True
@@ -189,6 +191,12 @@ class Delivery:
             gone = [out.go]
         self.waiting = deque([*left, *gone])
         self.out, self.is_again = None, True
+
+    def withdraw(self, open_inputs: Container[int], begun: int) -> None:
+        """Nothing is inside any more: all that has no end yet is sent again when something may go in."""
+        self.send_again(open_inputs, begun)
+        self.inside.clear()
+        self.is_again = False
 
     def only_suspect_input(self) -> int:
         """The input in whose turn a replica must have died, if only one was inside; else -1."""

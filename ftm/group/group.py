@@ -190,8 +190,16 @@ class Group:
         self.delivery.send_again(self.switch.open, ledger.begun if ledger.released else -1, careful=careful)
         self.poke()
 
+    def withdraw(self) -> None:
+        """The replicas have given back what was inside, a turn that rests: it is run again when something may go in."""
+        switch = self.switch
+        switch.calls.rests.abandon()
+        self.delivery.withdraw(switch.open, switch.ledger.begun if switch.ledger.released else -1)
+        self._settle(True)
+
     def forget_answers(self) -> None:
-        """Another one is to lead: what it asks again is answered again."""
+        """Another one is to lead: what it asks again is answered again, and its effects have a token of their own."""
+        self.switch.life.token = self.replicas.node.numbers.next_token()
         self.delivery.inward.clear()
         self.delivery.finished.clear()
         self.copies.restart()

@@ -13,6 +13,7 @@ from ..bricks.sealed_frames import Refused
 from ..events import ReplicaJoined
 from .membership import LookAgain
 from .replicas import GroupPart
+from .resting_turns import past_resting_turns
 from .steering import bind_again
 
 if TYPE_CHECKING:
@@ -94,7 +95,9 @@ class Joiner(GroupPart):
         known.joining[name] = life
         replicas.watch(name)
         strayed = group.strays.count
-        turn = await replicas.ask(primary, Join(epoch, replicas.place(name)), JOINED_WITHIN)
+        joined = replicas.ask(primary, Join(epoch, replicas.place(name)), JOINED_WITHIN)
+        await past_resting_turns(group, joined)
+        turn = await joined
         if group.strays.count != strayed:
             return  # What it had joined with is lost already; whoever has heard of that wakes us.
         if known.epoch != epoch or known.primary != primary or known.is_over:

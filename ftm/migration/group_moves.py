@@ -32,6 +32,7 @@ from ..bricks.replica_orders import EXPORTED_WITHIN, Export, Quiesce
 from ..group.group import Group
 from ..group.group_place import GroupPlace
 from ..group.membership import LookAgain
+from ..group.resting_turns import past_resting_turns
 from ..group.steering import AGAIN_AFTER
 from ..group.trial import rehearsed
 from .unrecorded_luggage import restore_owing, save_owing
@@ -211,7 +212,11 @@ class FromRecordedGroup(Leaving):
         move.rest_at = now()
         end = move.rest_at + move.timeout
         while True:
-            await move.within(group.quiet(), end - now(), lambda: "a turn of it has not ended")
+            quiet = asyncio.ensure_future(past_resting_turns(group, group.quiet()))
+            try:
+                await move.within(quiet, end - now(), lambda: "a turn of it has not ended")
+            finally:
+                quiet.cancel()
             if move.given_up.done():
                 raise CannotMove(self.cell.path, move.given_up.result())
             epoch = known.epoch

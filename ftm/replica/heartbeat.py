@@ -79,7 +79,9 @@ class Heart(Actor):
                 continue
             turn = standing.epoch, life, feed.id
             known, seconds = before.get(server, (None, 0.0))
-            seconds = seconds + gap if known == turn else 0.0
+            if not life.waits.resting:  # Else nothing of it is at work.
+                seconds += gap
+            seconds = seconds if known == turn else 0.0
             if seconds > self._longest:
                 seconds /= 2  # It is said again then, if that has not helped.
                 if server is standing.server:

@@ -382,6 +382,11 @@ class Server(lifecycle.HerePlace):
         self.kill(cell)
         await gone
 
+    async def withdraw(self) -> None:
+        """What is being run has not happened: the next life stands before it."""
+        self.part.begun, self.traces.withheld = [], []
+        await self.drop_life()
+
     def _note_work(self, life: ServerLife | None) -> None:
         """A life has ended; its background work has ended with it, and nobody runs its turns again to begin it anew."""
         if life is not None and life.pipes and self.standing.leads:
@@ -616,7 +621,11 @@ class Server(lifecycle.HerePlace):
         """Run requests until enough are done; returns their ends. What has not been run is left in `pending`."""
         begin, state, attempts = time.perf_counter(), self.state, self.attempts
         part = self.part = BatchPart(pending)
-        while pending and not state.is_over:
+        while not state.is_over:
+            if self.traces.taken:
+                part.leave_out(self.traces.taken)
+            if not pending:
+                break
             is_new = self.life is None
             if self.only_computes:  # Hooks have counted in the first run, if they have.
                 await self.ensure_as_given()
@@ -822,9 +831,12 @@ class Server(lifecycle.HerePlace):
                 self.state.begun = one.feed.id
 
     def has_taken(self, request: Request) -> bool:
-        """Whether the life has a request without an end: its stash has it, or it is the tick of a cancelled timer."""
+        """Whether the life has a request without an end: its stash has it, a turn has waited for it, or it is a tick.
+
+        (Of a cancelled timer.)
+        """
         life, number = self.life, request.feed.id
-        if life is None or request.feed.kind == TICK:
+        if life is None or request.feed.kind == TICK or number in self.traces.taken:
             return True
         return number in life.returned or any(fed.feed.id == number for fed in life.stash)
 
@@ -1014,7 +1026,7 @@ class Server(lifecycle.HerePlace):
     def inward(self, record: PastInputs) -> None:
         """Take what came from home past the bricks."""
         if isinstance(record, Outcome):
-            self.traces.heard[record.turn, record.k] = record
+            self.traces.hear(record)
         if isinstance(record, SnapshotNow):
             self.want_snapshot()
         elif self.life is not None:

@@ -7,10 +7,8 @@ import inspect
 from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from ...actors.errors import HoldfastError
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.envelope import Item
-from ...actors.kernel.message import Message
 from ...actors.kernel.ref import ActorRef
 from ...checkpoint.life.recorded_context import RecordedContext
 from ...checkpoint.life.recorded_inbox import RECOVERED, STARTED, Fed, Hook
@@ -106,9 +104,6 @@ class ServerContext(RecordedContext):
         self._server.begins_task()
         return super().create_task(work)
 
-    def _signal(self, kinds: tuple[type[Message[Any]], ...], timeout: float | None) -> asyncio.Future[Message[Any]]:
-        raise HoldfastError(f"{self.path}: a turn cannot wait for a message behind a mechanism; use a turn for each")
-
     def waits_for_room(self, topic: str) -> bool:
         """What is published leaves when the turn's result has been compared, voted on or copied, and not before."""
         return False
@@ -137,6 +132,12 @@ class ServerLife(Life):
         made = self._context_made = ServerContext(cell, self.server)
         made.recorded = self
         return made
+
+    @property
+    def only_rests(self) -> bool:
+        """Whether the turn in hand waits for moments or messages, and nothing that would end with this life is out."""
+        waits = self.waits
+        return 0 < waits.resting == len(waits.outcomes) and not (self.pipes or self.has_begun_tasks)
 
     def rewind(self, turn: int, stash: list[Fed], returned: dict[int, Fed]) -> None:
         """Go on from after an earlier turn: what was run since is run again, or something else is."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from typing import Final
 
 from ...checkpoint.protocol import AWAITED, DOWN, EXIT, PIPE, START, Feed, Out, Outcome, PipeDone, TurnEnd
@@ -16,6 +16,8 @@ from .replica_life import ABANDONED
 
 PART: Final = 0.001
 """Seconds of work after which the outcomes so far are handed over: a slow request does not hold up quick ones."""
+MOST_TAKEN: Final = 4096
+"""Requests that are remembered because a turn has waited for them: more than can be inside a replica."""
 MOST_AT_ONCE: Final = 256
 """Requests that are given to the life at once."""
 
@@ -75,6 +77,12 @@ class BatchPart:
         self.begun = [one for one in self.begun if one.feed.id not in known]
         return handed, ends
 
+    def leave_out(self, numbers: Container[int]) -> None:
+        """These are requests no more: a turn that has waited for them has them."""
+        left = [one for one in self.pending if one.feed.id not in numbers]
+        self.pending.clear()  # It is the same deque for whoever has given it.
+        self.pending.extend(left)
+
     def send_back(self, numbers: set[int]) -> None:
         """These requests were given to the life, and taken from it before it began them."""
         self.pending.extendleft(reversed([one for one in self.begun if one.feed.id in numbers]))
@@ -102,6 +110,15 @@ class Traces:
     inputs: dict[int, Request] = dataclasses.field(default_factory=dict)  # as they came in, for other runs of them
     objections: dict[int, str] = dataclasses.field(default_factory=dict)  # what hooks have against requests
     results: set[tuple[int, int]] = dataclasses.field(default_factory=set)  # of background work, by turn and output
+    taken: dict[int, None] = dataclasses.field(default_factory=dict)  # requests that turns have waited for, in order
+
+    def hear(self, outcome: Outcome) -> None:
+        """Take down what an ask has come to, and the request that a turn has waited for."""
+        self.heard[outcome.turn, outcome.k] = outcome
+        if outcome.taken >= 0:  # It may be on its way still, in a batch from whoever leads.
+            self.taken[outcome.taken] = None
+            if len(self.taken) > MOST_TAKEN:
+                del self.taken[next(iter(self.taken))]
 
     def begin_anew(self, heard: Iterable[Outcome]) -> None:
         """Nothing is known but what asks came to elsewhere."""

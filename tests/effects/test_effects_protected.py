@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import math
+import os
+import signal
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import holdfast as hf
-from holdfast.ftm import LFR, NVP, PBR, RB, TMR, TR
+from holdfast.ftm import AD, LFR, NVP, PBR, RB, TMR, TR
 from tests.effects.clerk import IN_TIME, Clerk, Do, Done, deed, lines, words
-from tests.effects.patient import Go, Patient
+from tests.effects.patient import Call, Count, Go, Look, Patient
+from tests.effects.test_long_waits import waits
+from tests.ftm.campaign import injecting
+from tests.ftm.injection import Fault
+from tests.ftm.test_failover import pid_of
 
 
 class Second(Clerk):
@@ -135,7 +142,7 @@ def is_accepted(reply: object) -> bool:
     return reply is not None
 
 
-async def whole(system: hf.ActorSystem, ref: hf.ActorRef[Clerk]) -> None:
+async def whole(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
     """Wait until all replicas count."""
     async with asyncio.timeout(IN_TIME):
         while not (await system.protection(ref)).is_whole:
@@ -153,3 +160,163 @@ async def test_a_turn_that_rests_is_not_taken_for_one_that_hangs(mechanism: Any)
         with system.events() as stream:
             assert await ref.ask(Go(["s1.5"]), IN_TIME) == "slept"
             assert not [event for event in stream.take() if isinstance(event, hf.events.TurnHung)]
+
+
+async def test_a_turn_that_has_rested_does_not_hang_when_it_goes_on() -> None:
+    """What it has rested does not count when its effect takes a while."""
+    async with hf.ActorSystem("app", log=False, intensity=99) as system:
+        spec = hf.child("late", hf.start(Late), recovery=hf.hybrid(), mechanism=PBR(detection=LONGER))
+        ref = await system.start(spec)
+        await whole(system, ref)
+        with system.events() as stream:
+            for _ in range(2):
+                await ref.ask(Count(), IN_TIME)
+            assert not [event for event in stream.take() if isinstance(event, hf.events.TurnHung)]
+
+
+LONGER = hf.ftm.Detection(interval=0.02, watch_turns=1.0)
+
+
+class Late(hf.Actor):
+    @hf.on(Count)
+    async def rest(self, message: Count) -> int:
+        await self.ctx.sleep(1.2)
+        await self.ctx.effect(asyncio.sleep, 0.7)
+        return 1
+
+
+class Deaf(Patient):
+    """Another version of it, which takes the same."""
+
+
+ALL: dict[str, tuple[Any, ...]] = {
+    **STACKS,
+    "rb": (RB(alternates=(Deaf,), test=(is_accepted,)),),
+    "nvp": (NVP(versions=(Deaf, Deaf)),),
+    "ad + pbr": (AD(assertions=(is_accepted,)), PBR()),
+    "ad + lfr": (AD(assertions=(is_accepted,)), LFR()),
+}
+
+
+@pytest.mark.parametrize("recovery", [hf.hybrid(), hf.fresh()], ids=["hybrid", "fresh"])
+@pytest.mark.parametrize("name", ALL)
+async def test_what_a_turn_waits_for_is_taken_once(name: str, recovery: Any) -> None:
+    """Also if it was on its way to the replicas in the same batch, behind the turn that waits for it."""
+    async with hf.ActorSystem("app", log=False, intensity=99) as system:
+        ref = await system.start(hf.child("patient", hf.start(Patient), recovery=recovery, mechanism=ALL[name]))
+        await whole(system, ref)
+        with system.events() as stream:
+            for _ in range(3):
+                ref.tell(Go(["s0.03"]))  # All that comes meanwhile is in one batch.
+                asked = ref.ask(Go(["c", "s0.01", "c"]), IN_TIME)
+                counts = [ref.ask(Count(), IN_TIME)]
+                ref.tell(Call("a"))
+                counts.append(ref.ask(Count(), IN_TIME))
+                await ref.ask(Call("b"), IN_TIME)
+                assert await asked == "call a, slept, call b"
+                first = await counts[0]
+                assert await counts[1] == first + 1
+            ref.tell(Call("late"))
+            said = [*["slept", "call a, slept, call b"] * 3, "no turn has waited for late"]
+            assert await ref.ask(Look(), IN_TIME) == said
+            bad = (hf.events.ActorCrashed, hf.events.RequestsDropped, hf.events.Diverged, hf.events.Masked)
+            assert not [event for event in stream.take() if isinstance(event, bad)]
+
+
+@pytest.mark.parametrize("name", ["pbr", "lfr", "tmr", "lfr + tr", "ad + lfr"])
+@pytest.mark.parametrize("when", ["before", "with it", "behind"])
+async def test_whoever_leads_next_waits_for_it_or_has_it(tmp_path: Path, name: str, when: str) -> None:
+    world = str(tmp_path / "world")
+    async with hf.ActorSystem("app", log=False, intensity=99) as system:
+        ref = await system.start(hf.child("patient", hf.start(Patient), recovery=hf.hybrid(), mechanism=ALL[name]))
+        for number in range(3):
+            await whole(system, ref)
+            asked = ref.ask(Go(["e", "c", "e", "c"], world), IN_TIME)
+            calls = [ref.ask(Call(f"a{number}"), IN_TIME)] if when == "with it" else []
+            await waits(system)
+            if when != "before" and not calls:
+                await ref.ask(Call(f"a{number}"), IN_TIME)
+                await waits(system)
+            await leader_dies(system, ref)
+            if when == "before":
+                await ref.ask(Call(f"a{number}"), IN_TIME)
+            await ref.ask(Call(f"b{number}"), IN_TIME)
+            assert (await asked).split(", ")[1::2] == [f"call a{number}", f"call b{number}"]
+            await asyncio.gather(*calls)
+        seen = await ref.ask(Look(), IN_TIME)
+        assert len(seen) == 3
+        assert len(lines(world)) == 6
+
+
+@pytest.mark.parametrize("name", ["lfr", "pbr", "lfr + tr"])
+@pytest.mark.parametrize("step", ["protocol", "proceed"])
+async def test_what_was_taken_is_handled_by_nobody_if_the_leader_dies_with_that_news(name: str, step: str) -> None:
+    """The follower was given it in the same batch, and hears when it leads that its turn has it already."""
+    with injecting() as page:
+        async with hf.ActorSystem("app", log=False, intensity=99) as system:
+            spec = hf.child("patient", hf.start(Patient), recovery=hf.hybrid(), mechanism=ALL[name])
+            ref = await system.start(spec)
+            await whole(system, ref)
+            ref.tell(Go(["s0.1"]))  # All that comes meanwhile is in one batch.
+            asked, call = ref.ask(Go(["c", "c"]), IN_TIME), ref.ask(Call("a"), IN_TIME)
+            count = ref.ask(Count(), IN_TIME)
+            await waits(system)
+            page.arm(Fault("crash", step, "Inward", nth=2, leads=True))  # The first one ends the wait before.
+            await call
+            await ref.ask(Call("b"), IN_TIME)
+            assert await asked == "call a, call b"
+            assert page.has_fired
+            assert await count == 1
+            assert await ref.ask(Look(), IN_TIME) == ["slept", "call a, call b"]
+            await whole(system, ref)
+            await leader_dies(system, ref)
+            assert await ref.ask(Look(), IN_TIME) == ["slept", "call a, call b"]
+
+
+class Fail(hf.Message[None]): ...
+
+
+class Frail(Patient):
+    @hf.on(Fail)
+    def fail(self, message: Fail) -> None:
+        raise RuntimeError("as it was told to")
+
+
+@pytest.mark.parametrize("late", ["batch", "nothing"])
+async def test_a_follower_does_not_handle_what_a_turn_has_waited_for(late: str) -> None:
+    """Whichever comes first, the batch or the news; nor does it when its life begins anew, or when it leads."""
+    with injecting() as page:
+        async with hf.ActorSystem("app", log=False, intensity=99) as system:
+            spec = hf.child("patient", hf.start(Frail), recovery=hf.hybrid(), mechanism=LFR(compare_every=math.inf))
+            ref = await system.start(spec)
+            await whole(system, ref)
+            with system.events() as stream:
+                ref.tell(Go(["s0.05"]))  # All that comes meanwhile is in one batch.
+                asked, call = ref.ask(Go(["c"]), IN_TIME), ref.ask(Call("a"), IN_TIME)
+                count = ref.ask(Count(), IN_TIME)
+                if late == "batch":
+                    await waits(system)
+                    page.arm(Fault("delay", "proceed", "Work", leads=False))
+                await asyncio.gather(asked, call, count)
+                assert page.has_fired or late == "nothing"
+                for number in range(2):
+                    with pytest.raises(hf.RemoteCrash, match="as it was told"):
+                        await ref.ask(Fail(), IN_TIME)
+                    assert await ref.ask(Count(), IN_TIME) == 2 + number
+                await leader_dies(system, ref)
+                assert await ref.ask(Look(), IN_TIME) == ["slept", "call a"]
+                assert await ref.ask(Count(), IN_TIME) == 4
+                await whole(system, ref)
+                assert not [event for event in stream.take() if isinstance(event, hf.events.Diverged)]
+
+
+async def leader_dies(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
+    """Kill the process of the replica that leads, and wait until another one does."""
+    leader = (await system.protection(ref)).leader
+    assert leader is not None
+    with system.events() as stream:
+        os.kill(pid_of(system, ref, leader), signal.SIGKILL)
+        async with asyncio.timeout(IN_TIME):
+            async for event in stream:
+                if isinstance(event, hf.events.FailedOver):
+                    return

@@ -33,13 +33,13 @@ async def waits(system: hf.ActorSystem, path: str = "/app/patient") -> None:
             await asyncio.sleep(0.001)
 
 
-async def end_of(system: hf.ActorSystem, isolation: str) -> None:
+async def end_of(system: hf.ActorSystem, isolation: str, path: str = "/app/patient") -> None:
     """End the life in the middle of its turn, and wait until the next one is there."""
     with system.events() as stream:
         if isolation == "process":
-            os.kill(system.pid_of(system.ref("/app/patient", hf.Actor)), signal.SIGKILL)
+            os.kill(system.pid_of(system.ref(path, hf.Actor)), signal.SIGKILL)
         else:
-            system.ref("/app/patient", hf.Actor).kill()
+            system.ref(path, hf.Actor).kill()
         async with asyncio.timeout(IN_TIME):
             async for event in stream:
                 if isinstance(event, hf.events.Recovered):
@@ -346,12 +346,31 @@ async def test_what_is_wrong_is_said_at_the_call(which: int, says: str) -> None:
         assert says in await ref.ask(Wrong(which))
 
 
-@pytest.mark.parametrize("mechanism", [None, hf.ftm.TR()])
-async def test_where_no_home_can_hold_a_message_for_it_a_turn_does_not_wait(mechanism: Any) -> None:
-    recovery = hf.fresh() if mechanism is None else hf.hybrid()
+async def test_where_no_home_can_hold_a_message_for_it_a_turn_does_not_wait() -> None:
     async with hf.ActorSystem("app", log=False, intensity=99) as system:
-        spec = hf.child("patient", hf.start(Patient), recovery=recovery, mechanism=mechanism)
-        ref = await system.start(spec)
-        with pytest.raises(hf.RemoteCrash, match=r"recovery|mechanism"):
+        ref = await system.start(hf.child("patient", hf.start(Patient), recovery=hf.fresh()))
+        with pytest.raises(hf.RemoteCrash, match="recovery"):
             await ref.ask(Go(["c"]), IN_TIME)
         assert await ref.ask(Go(["s0.01"]), IN_TIME) == "slept"
+
+
+class Starting(Patient):
+    async def on_start(self, restored: bool) -> None:
+        self.count += 1
+
+
+@pytest.mark.parametrize("kind", [Patient, Starting])
+async def test_a_start_that_does_nothing_is_not_worth_a_snapshot(tmp_path: Path, kind: type[Patient]) -> None:
+    """Ten thousand turns that rest would each wait for one, when a program begins."""
+    spec = hf.child("patient", hf.start(kind), recovery=hf.hybrid(interval=1000.0))
+    async with running(tmp_path, "os") as system:
+        (await system.start(spec)).tell(Go(["c"]))
+        await waits(system)
+    async with running(tmp_path, "os") as system:
+        with system.events() as stream:
+            ref = await system.start(spec)
+            await waits(system)
+            taken = [event for event in stream.take() if isinstance(event, hf.events.SnapshotTaken)]
+        assert bool(taken) is (kind is Starting)
+        await ref.ask(Call("a"), IN_TIME)
+        assert await ref.ask(Look(), IN_TIME) == ["call a"]

@@ -16,6 +16,48 @@ SPOILED = "tests/ftm/test_spoiled_states.py"
 RANDOM_HOOKS = "tests/ftm/test_random_hooks.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 CHECKS = {
+    "whoever leads next hears which message its turn has waited for": Check(
+        "checkpoint/home/pending_asks.py",
+        "taken = self.rests.taken.get((turn, k), -1)",
+        "taken = -1",
+        "tests/effects/test_effects_protected.py",
+        "test_what_was_taken_is_handled_by_nobody",
+    ),
+    "a message that a turn has waited for is run by no replica": Check(
+        "ftm/replica/protected_actor.py",
+        "            if self.traces.taken:\n",
+        "            if False:\n",
+        "tests/effects/test_effects_protected.py",
+        "test_what_a_turn_waits_for_is_taken_once",
+    ),
+    "a message that a turn has waited for is no request that was dropped": Check(
+        "ftm/replica/protected_actor.py",
+        " or number in self.traces.taken:\n",
+        ":\n",
+        "tests/effects/test_effects_protected.py",
+        "test_what_a_turn_waits_for_is_taken_once",
+    ),
+    "what is left by a turn that rests is sent again": Check(
+        "ftm/group/group.py",
+        "        self.delivery.withdraw(switch.open",
+        "        (switch.open",
+        "tests/effects/test_changes_while_resting.py",
+        "test_mechanisms_are_exchanged",
+    ),
+    "a turn is left only if nothing is out that would end with its life": Check(
+        "ftm/bricks/request_protocol.py",
+        "server.state.has_access and life.only_rests",
+        "server.state.has_access",
+        "tests/effects/test_changes_while_resting.py",
+        "test_an_effect_that_is_out_beside",
+    ),
+    "a turn that waits for days is not taken for one that hangs": Check(
+        "ftm/replica/heartbeat.py",
+        "            if not life.waits.resting:",
+        "            if True:",
+        "tests/effects/test_effects_protected.py",
+        "test_a_turn_that_has_rested",
+    ),
     "a turn that has failed has ended before anything is said of the life that it has ended": Check(
         "ftm/replica/protected_actor.py",
         " and pending[0].feed.id not in attempts.skips:\n                break",
