@@ -170,8 +170,19 @@ class SnapshotNow(msgspec.Struct, array_like=True, tag=4):
     urgent: bool = False
 
 
+class Lent(msgspec.Struct, array_like=True):
+    """An image in memory that a life may map: `segments` are (number, descriptor, inode) in process `pid`.
+
+    `places`: where its blocks are (segment, offset, length).
+    """
+
+    pid: int
+    segments: list[tuple[int, int, int]]
+    places: list[tuple[int, int, int]]
+
+
 class Restore(msgspec.Struct, array_like=True, tag=5):
-    """A piece of the state to begin with; the launch comes behind the last one.
+    """A piece of the state to begin with, or (`image`) where all of it is; the launch comes behind the last one.
 
     The first one also says which timers ran when that state was saved, whether the actor trapped exits, and which
     `variables` its class had.
@@ -181,6 +192,7 @@ class Restore(msgspec.Struct, array_like=True, tag=5):
     timers: dict[str, Clock] = {}
     traps: bool = False
     variables: list[str] = []
+    image: Lent | None = None
 
 
 class Begin(msgspec.Struct, array_like=True, tag=6):

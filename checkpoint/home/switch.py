@@ -56,6 +56,7 @@ from ..protocol import (
     pieces,
 )  # fmt: skip
 from ..schema import Shapes, start_name
+from ..snapshot.shared_blocks import can_lend
 from ..snapshot.snapshot_blocks import SnapshotImages
 from ..snapshot.snapshot_receiver import SnapshotReceiver
 from ..snapshot.snapshot_record import load
@@ -263,14 +264,21 @@ class Switch:
         self.life.expect(live)
         return live
 
-    def restore_records(self) -> list[Restore]:
-        """The state to begin with, in pieces; none if there is no snapshot."""
+    def restore_records(self, *, maps: bool = True) -> list[Restore]:
+        """The state to begin with; none if there is no snapshot.
+
+        With `maps` a large one is lent to a life that maps it; else, or if that cannot be, it comes in pieces.
+        """
         newest = self.ledger.newest
         if newest is None or not newest.has_state:
             return []
-        parts = (
-            list(self.images.restore(newest.blocks)) if newest.blocks else [Restore(p) for p in pieces(newest.state)]
-        )
+        lent = self.images.lend(newest.blocks) if maps and newest.blocks and can_lend() else None
+        if lent is not None:
+            parts = [Restore(b"", image=lent)]
+        elif newest.blocks:
+            parts = list(self.images.restore(newest.blocks))
+        else:
+            parts = [Restore(piece) for piece in pieces(newest.state)]
         parts[0].timers, parts[0].traps = self.timers.at(newest), newest.traps
         parts[0].variables = newest.variables
         return parts

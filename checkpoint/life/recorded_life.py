@@ -153,7 +153,7 @@ class Life:
         if restored.has_state:
             begin = time.perf_counter()
             try:
-                data = restored.joined()
+                data = self.images.mapped(restored.image) if restored.image is not None else restored.joined()
                 self.images.last_bytes = len(data)
                 restore_state(actor, data, (restored.variables, self.saving.variables))
             except BaseException as error:
@@ -161,7 +161,8 @@ class Life:
                 self._give_up(f"{why}: {error}", error)
             restored.seconds = time.perf_counter() - begin
             self.saving.turn = turn
-            if start.kind.on_recovered is not Actor.on_recovered and self._is_replayed_from_snapshots:
+            hooks = start.kind.on_recovered is not Actor.on_recovered and self._is_replayed_from_snapshots
+            if hooks and isinstance(data, bytes):  # An image is not compared with what the hook leaves.
                 self.saving.begun_with = turn, _digest(data)
         restored.stash_ids = frozenset(stash)
         cell.state = RUNNING
@@ -181,6 +182,7 @@ class Life:
         assert cell.ctx is not None
         cell.ctx._close()
         cell.actor = cell.ctx = None
+        self.images.close()
         raise StartFailed(cell.path, why) from error
 
     # -- records from home ------------------------------------------------------------------------------------------

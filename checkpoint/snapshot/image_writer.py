@@ -20,14 +20,17 @@ import msgspec
 
 from ...actors.process.fork.boot import PR_SET_PDEATHSIG, bind_prctl
 from ...actors.streams import check_can_watch
-from ..protocol import Kept, Marked, Shared, Snapshot, Unsaved
+from ...actors.values import ByteParts
+from ..protocol import Kept, Lent, Marked, Shared, Snapshot, Unsaved
 from .key_variables import state_of, variables
+from .mapped_image import map_image
 from .shared_blocks import (
     Layout,
     Place,
     Segment,
     by_segment,
     can_share,
+    layout_of,
     memory_file,
     new_number,
     places_of,
@@ -61,6 +64,7 @@ class Imaging:
         self._life, self._may_fork = life, may_fork
         self._imager = Imager()
         self._layout: Layout = {}
+        self._begun_with: list[Place] = []  # the blocks of the state that the life has begun with, in order
         self._segments: dict[int, Segment] = {}
         self._written: tuple[Segment, Layout] | None = None  # what the home has not acknowledged yet
         self._writer: Writer | None = None
@@ -69,9 +73,23 @@ class Imaging:
         self.last_bytes = 0
 
     @property
+    def files(self) -> list[int]:
+        """The descriptors of the segments that the next image is compared with."""
+        return [segment.file for segment in self._segments.values()]
+
+    @property
     def is_busy(self) -> bool:
         """Whether an image is being written or kept."""
         return self._writer is not None or self._written is not None
+
+    def mapped(self, lent: Lent) -> ByteParts:
+        """The state that a home lends; what does not change of it is not written again.
+
+        Raises:
+            HoldfastError: it is not there any more. OSError: there is no room for it.
+        """
+        data, self._begun_with, self._segments = map_image(lent)
+        return data
 
     def suits(self) -> bool:
         """Whether the state is large enough."""
@@ -123,7 +141,8 @@ class Imaging:
     def write(self, job: _Job, state: Any) -> Layout:
         """Write what differs from the last image that is kept."""
         pieces = self._imager.image(state.version, state.form, state.value, self._life.cell.path)
-        return write_changed(job.file, job.number, pieces, self._layout, self._segments)
+        known = self._layout or layout_of(pieces, self._begun_with)
+        return write_changed(job.file, job.number, pieces, known, self._segments)
 
     def written(self, job: _Job, layout: Layout) -> None:
         """A forked writer is ready."""
@@ -180,7 +199,7 @@ class Imaging:
             self._life.image_lost()
         else:
             self._segments[segment.number] = segment
-            self._layout = layout
+            self._layout, self._begun_with = layout, []
             self._forget()
             if record.is_full or len(self._segments) > MOST_SEGMENTS:
                 self.restart()
@@ -194,7 +213,7 @@ class Imaging:
 
     def restart(self) -> None:
         """Write the next image in full."""
-        self._layout = {}
+        self._layout, self._begun_with = {}, []
         for segment in self._segments.values():
             segment.close()
         self._segments.clear()
@@ -315,7 +334,7 @@ def _write_and_exit(imaging: Imaging, job: _Job, state: Any, out: int, parent: i
         _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:
             os._exit(1)
-        _close_all_but({out, job.file})
+        _close_all_but({out, job.file, *imaging.files})
         try:
             layout = imaging.write(job, state)
             report = Written(list(layout.items()))

@@ -7,6 +7,7 @@ is the journal cut. Until then the older snapshot and the whole journal stand, a
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
@@ -14,7 +15,7 @@ import msgspec
 
 from ...actors.errors import HoldfastError
 from ...actors.events import SnapshotTaken
-from ..protocol import PIECE, Kept, Marked, Restore, Shared, Snapshot
+from ..protocol import PIECE, Kept, Lent, Marked, Restore, Shared, Snapshot
 from .shared_blocks import Place, Segment, by_segment, open_segment
 from .snapshot_record import IMAGES, Meta, keep, made_by, meta_now
 
@@ -161,6 +162,16 @@ class SnapshotImages:
                 self._segments.pop(number).close()
             elif not self.is_saving:
                 self._segments[number].keep(wanted[number])
+
+    def lend(self, blocks: list[Place]) -> Lent | None:
+        """An image for a life that maps it; None if that cannot be."""
+        segments = [self._segments[number] for number in by_segment(blocks)]
+        try:
+            for segment in segments:
+                segment.lend()
+        except OSError:  # The system is too old for it.
+            return None
+        return Lent(os.getpid(), [(one.number, one.file, one.inode) for one in segments], blocks)
 
     def restore(self, blocks: list[Place]) -> Iterator[Restore]:
         """An image, in pieces for a life."""

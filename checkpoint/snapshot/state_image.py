@@ -19,7 +19,7 @@ import msgspec
 
 from ...actors.errors import DamagedValue
 from ...actors.kernel.actor import Actor
-from ...actors.values import decode_value, walked_pieces
+from ...actors.values import ByteParts, decode_value, in_one, walked_pieces
 
 IMAGE: Final = 2
 """The first byte of an image. (A state that was saved as one value begins with the format of values, 1.)"""
@@ -152,26 +152,24 @@ def is_image(data: bytes | memoryview) -> bool:
 
 
 def read_image(
-    data: bytes | memoryview, read: Callable[[memoryview], object] = decode_value
+    data: bytes | memoryview | ByteParts, read: Callable[[Any], object] = decode_value
 ) -> tuple[int, str, object]:
     """Schema version, form and state of an image; `read` makes the variables of their bytes.
 
     Raises:
         DamagedValue: whatever is wrong with the bytes.
     """
-    view = memoryview(data).cast("B")
+    left = data if isinstance(data, ByteParts) else ByteParts((memoryview(data).cast("B"),))
     try:
-        _, length = HEAD.unpack_from(view)
-        head = msgspec.msgpack.decode(view[HEAD.size : HEAD.size + length], type=Head)
-    except (struct.error, msgspec.DecodeError, msgspec.ValidationError) as error:
+        _, length = HEAD.unpack(in_one(left.take(HEAD.size)))
+        head = msgspec.msgpack.decode(in_one(left.take(length)), type=Head)
+    except (msgspec.DecodeError, msgspec.ValidationError) as error:
         raise DamagedValue(f"its head cannot be read: {error}") from error
-    at = HEAD.size + length
-    if at + sum(size for _, size in head.sections) != len(view):
+    if sum(size for _, size in head.sections) != len(left):
         raise DamagedValue("its sections are not as long as its head says")
     state: dict[str, Any] = {}
     for names, size in head.sections:
-        value = read(view[at : at + size])
-        at += size
+        value = read(left.take(size))
         if not names:
             return head.version, head.form, value
         if not isinstance(value, dict) or list(value) != names:
