@@ -222,12 +222,14 @@ class Started(msgspec.Struct, array_like=True, tag=7):
 class Kept(msgspec.Struct, array_like=True, tag=8):
     """The home has the image that was written into this segment: what follows may refer to it. Or (not `is_safe`) not.
 
-    `is_full`: the next image should be written anew.
+    `is_full`: the next image should be written anew. `digests`: of its blocks there, in order, if a store has them, so
+    that their memory is needed no more.
     """
 
     segment: int
     is_safe: bool
     is_full: bool = False
+    digests: list[bytes] = []
 
 
 class Over(msgspec.Struct, array_like=True, tag=9):
@@ -292,7 +294,8 @@ class Live(msgspec.Struct, array_like=True, tag=13):
 class Shared(msgspec.Struct, array_like=True):
     """An image in memory that its home can open: segment `number` is descriptor `file` of process `pid`.
 
-    `places`: where its blocks are, in this segment and earlier ones (segment, offset, length).
+    `places`: where its blocks are, in this segment and earlier ones (segment, offset, length). `is_forked`: a copy of
+    the process has written it, so that the next one may take the time to compare digests.
     """
 
     number: int
@@ -301,6 +304,7 @@ class Shared(msgspec.Struct, array_like=True):
     inode: int
     size: int
     places: list[tuple[int, int, int]]
+    is_forked: bool = False
 
 
 class Snapshot(msgspec.Struct, array_like=True, tag=14):
@@ -405,6 +409,11 @@ class LifePort(Protocol):
     @property
     def begins(self) -> bool:
         """Whether what is handed to it may be begun at any time from then on. If not, it says itself when."""
+        ...
+
+    @property
+    def is_far(self) -> bool:
+        """Whether that life is in another process."""
         ...
 
     def to_life(self, record: ToLife) -> None:

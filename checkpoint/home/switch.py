@@ -363,6 +363,8 @@ class Switch:
                     self.arrival.take(record)
                 case Live():
                     life.come_up(record.restore_seconds)
+                    if life.port is not None and life.port.is_far:
+                        self.images.let_go_of_stored()
                     self.let_at()
                 case PipeDone():
                     self.outputs.work_done(record)

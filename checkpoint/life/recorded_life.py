@@ -100,6 +100,7 @@ class Life:
     """One recorded life: the turn in hand, its outputs, and when the next snapshot is due."""
 
     begins = True  # what is handed to it, whenever it has come to that
+    is_far = False
 
     def __init__(
         self, cell: Cell, port: HomePort, method: Method, page: memoryview | None, *, may_fork: bool = False

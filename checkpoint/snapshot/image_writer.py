@@ -25,6 +25,7 @@ from ..protocol import Kept, Lent, Marked, Shared, Snapshot, Unsaved
 from .key_variables import state_of, variables
 from .mapped_image import map_image
 from .shared_blocks import (
+    Digests,
     Layout,
     Place,
     Segment,
@@ -66,6 +67,7 @@ class Imaging:
         self._layout: Layout = {}
         self._begun_with: list[Place] = []  # the blocks of the state that the life has begun with, in order
         self._segments: dict[int, Segment] = {}
+        self._digests: Digests = {}  # of the blocks that are in none of these
         self._written: tuple[Segment, Layout] | None = None  # what the home has not acknowledged yet
         self._writer: Writer | None = None
         self._is_again = False
@@ -118,6 +120,7 @@ class Imaging:
         writer: Writer | None = None
         try:
             if self._may_fork and self._should_fork(estimate(actor, variables(actor))) and is_alone():
+                job.is_forked = True
                 writer = Writer(self, job, state)
                 life.port.to_home(Marked(life.turn))
                 self._writer = writer
@@ -142,7 +145,7 @@ class Imaging:
         """Write what differs from the last image that is kept."""
         pieces = self._imager.image(state.version, state.form, state.value, self._life.cell.path)
         known = self._layout or layout_of(pieces, self._begun_with)
-        return write_changed(job.file, job.number, pieces, known, self._segments)
+        return write_changed(job.file, job.number, pieces, known, self._segments, self._digests)
 
     def written(self, job: _Job, layout: Layout) -> None:
         """A forked writer is ready."""
@@ -184,7 +187,7 @@ class Imaging:
         self.last_bytes = sum(length for _, _, length in places)
         new = sum(length for number, _, length in places if number == job.number)
         self._last_share = new / max(1, self.last_bytes)
-        shared = Shared(job.number, os.getpid(), job.file, segment.inode, segment.size, places)
+        shared = Shared(job.number, os.getpid(), job.file, segment.inode, segment.size, places, job.is_forked)
         life.image_taken(job.turn)
         said = life.made_by()
         life.port.to_home(Snapshot(job.turn, b"", True, job.stash, job.pause, False, shared, job.traps, *said))
@@ -198,18 +201,26 @@ class Imaging:
             segment.close()
             self._life.image_lost()
         else:
-            self._segments[segment.number] = segment
+            if record.digests:
+                own = [place for place in places_of(layout) if place[0] == segment.number]
+                self._digests.update(zip(own, record.digests, strict=True))
+                segment.close()
+            else:
+                self._segments[segment.number] = segment
             self._layout, self._begun_with = layout, []
-            self._forget()
-            if record.is_full or len(self._segments) > MOST_SEGMENTS:
+            if self._forget() > MOST_SEGMENTS or record.is_full:
                 self.restart()
         self._once_more()
 
-    def _forget(self) -> None:
+    def _forget(self) -> int:
+        """Let go of what the last image does not need; returns over how many segments it is spread."""
         wanted = by_segment(places_of(self._layout))
         for number in list(self._segments):
             if number not in wanted:
                 self._segments.pop(number).close()
+        for place in [place for place in self._digests if place[1:] not in wanted.get(place[0], ())]:
+            del self._digests[place]
+        return len(wanted)
 
     def restart(self) -> None:
         """Write the next image in full."""
@@ -217,6 +228,7 @@ class Imaging:
         for segment in self._segments.values():
             segment.close()
         self._segments.clear()
+        self._digests.clear()
 
     def _once_more(self) -> None:
         again, self._is_again = self._is_again, False
@@ -245,6 +257,7 @@ class _Job:
     def __init__(self, turn: int, stash: list[int], number: int, file: int, traps: bool) -> None:
         self.turn, self.stash, self.number, self.file, self.traps = turn, stash, number, file, traps
         self.pause = 0.0
+        self.is_forked = False
 
 
 class Writer:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import hashlib
 import mmap
 import os
 import sys
@@ -31,6 +32,8 @@ Place = tuple[int, int, int]
 """Where a block is: segment, offset, length."""
 Layout = dict[Key, list[Place]]
 """Where the pieces of an image are, in its order."""
+Digests = dict[Place, bytes]
+"""Of blocks that are in a store, and in memory no more."""
 
 
 def can_share() -> bool:
@@ -128,9 +131,16 @@ def new_number() -> int:
 
 
 def write_changed(
-    file: int, number: int, image: list[tuple[Key, Any]], known: Layout, segments: dict[int, Segment]
+    file: int,
+    number: int,
+    image: list[tuple[Key, Any]],
+    known: Layout,
+    segments: dict[int, Segment],
+    digests: Digests,
 ) -> Layout:
     """Write into `file` the blocks that differ from the known ones; returns where all blocks of the image are.
+
+    A known block is compared where it lies in one of the segments, or else by its digest.
 
     Raises:
         OSError: there is no memory for it.
@@ -145,9 +155,15 @@ def write_changed(
         places = layout[key] = []
         for index, begin in enumerate(range(0, len(view), BLOCK)):
             block = view[begin : begin + BLOCK]
-            if index < len(before) and _is_same(block, address + begin if address else 0, before[index], segments):
-                places.append(before[index])
-                continue
+            place = before[index] if index < len(before) else None
+            if place is not None and place[2] == len(block):
+                if place[0] in segments:
+                    is_same = _is_same(block, address + begin if address else 0, place, segments[place[0]])
+                else:
+                    is_same = place in digests and digests[place] == digest(block)
+                if is_same:
+                    places.append(place)
+                    continue
             places.append((number, end, len(block)))
             out.append(block)
             end += len(block)
@@ -189,15 +205,17 @@ def _address(view: memoryview) -> int:
     return int(numpy.frombuffer(view, numpy.uint8).ctypes.data) if numpy is not None and len(view) else 0
 
 
-def _is_same(block: memoryview, address: int, place: Place, segments: dict[int, Segment]) -> bool:
-    segment, offset, length = place
-    other = segments.get(segment)
-    if other is None or length != len(block):
-        return False
-    kept = other.block(offset, length)
+def _is_same(block: memoryview, address: int, place: Place, segment: Segment) -> bool:
+    _, offset, length = place
+    kept = segment.block(offset, length)
     if address:
         return bool(_memcmp(address, _address(kept), length) == 0)
     return bytes(block) == bytes(kept)
+
+
+def digest(block: memoryview) -> bytes:
+    """By which a block is known that is in memory no more."""
+    return hashlib.blake2b(block, digest_size=16).digest()
 
 
 def open_segment(number: int, pid: int, file: int, inode: int, *, is_lent: bool = False) -> Segment:

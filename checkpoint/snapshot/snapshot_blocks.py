@@ -15,12 +15,14 @@ import msgspec
 
 from ...actors.errors import HoldfastError
 from ...actors.events import SnapshotTaken
+from ..journal import DamagedStore
 from ..protocol import PIECE, Kept, Lent, Marked, Restore, Shared, Snapshot
-from .shared_blocks import Place, Segment, by_segment, open_segment
-from .snapshot_record import IMAGES, Meta, keep, made_by, meta_now
+from .shared_blocks import Place, Segment, by_segment, digest, open_segment
+from .snapshot_record import IMAGES, Meta, begin_with_older, keep, made_by, meta_now
 
 if TYPE_CHECKING:
     from ..home.switch import Switch
+    from ..inputs import HomeJournal
 
 MOST_GARBAGE: Final = 3
 """How many times the size of an image its packs may take before it is written anew."""
@@ -31,7 +33,8 @@ class SnapshotImages:
 
     def __init__(self, home: Switch) -> None:
         self._home = home
-        self._segments: dict[int, Segment] = {}
+        self._segments: dict[int, Segment] = {}  # what is in memory; a store may have it instead
+        self._sizes: dict[int, int] = {}  # of all that the newest snapshot needs
         self._history: list[set[int]] = []  # segments of the snapshots that are kept, newest first
         self._packs: set[int] = set()  # what the store may have
         self._marked: Meta | None = None
@@ -55,7 +58,7 @@ class SnapshotImages:
             self.refuse(shared, str(error))
             return
         if not home.journal.durable:
-            self._finish(meta, record, shared)
+            self._finish(meta, record, shared, [])
             return
         saving = home.node.loop.create_task(self._save(meta, record, shared), name=f"snapshot of {home.path}")
         self._saving = saving
@@ -73,10 +76,13 @@ class SnapshotImages:
         if self._saving is not None:
             raise HoldfastError("the snapshot before it is still on its way")
         segment = open_segment(shared.number, shared.pid, shared.file, shared.inode)
-        if {number for number, _, _ in shared.places} - {shared.number, *self._segments}:
+        newest = self._home.ledger.newest
+        known = by_segment(newest.blocks) if newest is not None else {}
+        if {number for number, _, _ in shared.places} - {shared.number, *known}:
             segment.close()
             raise HoldfastError("a snapshot refers to blocks that are not here")
         self._segments[shared.number] = segment
+        self._sizes[shared.number] = segment.size
         return msgspec.structs.replace(
             marked,
             format=IMAGES,
@@ -90,17 +96,20 @@ class SnapshotImages:
     async def _save(self, meta: Meta, record: Snapshot, shared: Shared) -> None:
         home, own = self._home, [place for place in meta.blocks if place[0] == shared.number]
         segment, journal, me = self._segments[shared.number], home.journal, asyncio.current_task()
+        digests: list[bytes] = []
         try:
             if own:
                 blocks = [(offset, segment.block(offset, length)) for _, offset, length in own]
                 try:
                     await asyncio.to_thread(journal.keep_blocks, home.path, shared.number, blocks, home.method.compress)
+                    if shared.is_forked:
+                        digests = await asyncio.to_thread(lambda: [digest(block) for _, block in blocks])
                 finally:  # Not before: whoever removes it while it is written has removed nothing.
                     self._packs.add(shared.number)
             if self._saving is not me:
                 return  # Its pack goes with those that the next snapshot does not need.
             self._saving = None
-            if not self._finish(meta, record, shared):
+            if not self._finish(meta, record, shared, digests):
                 return  # The one before it stands, and needs its packs.
             # By number: the next snapshot may be on its way before the thread has come to that.
             unneeded = self._packs.difference(meta.earlier, [number for number, _, _ in meta.blocks])
@@ -112,7 +121,7 @@ class SnapshotImages:
                 self._saving = None
                 self.refuse(shared, str(error))
 
-    def _finish(self, meta: Meta, record: Snapshot, shared: Shared) -> bool:
+    def _finish(self, meta: Meta, record: Snapshot, shared: Shared, digests: list[bytes]) -> bool:
         """Whether it is kept now."""
         home = self._home
         try:
@@ -121,9 +130,11 @@ class SnapshotImages:
             self.refuse(shared, str(error))
             return False
         size = sum(length for _, _, length in meta.blocks)
-        is_full = home.journal.durable and sum(one.size for one in self._segments.values()) > MOST_GARBAGE * size
+        is_full = home.journal.durable and sum(self._sizes.values()) > MOST_GARBAGE * size
+        if digests:
+            self._let_go(shared.number)
         if home.life.port is not None:
-            home.life.port.to_life(Kept(shared.number, True, is_full))
+            home.life.port.to_life(Kept(shared.number, True, is_full, digests))
         home.limit.cut()
         home.due.kept(meta.turn)
         if home.node.events.has_listeners:
@@ -134,9 +145,8 @@ class SnapshotImages:
     def refuse(self, shared: Shared, why: str) -> None:
         """It could not be kept: what was there before is still there."""
         home = self._home
-        segment = self._segments.pop(shared.number, None)
-        if segment is not None:
-            segment.close()
+        self._let_go(shared.number)
+        self._sizes.pop(shared.number, None)
         if home.life.port is not None:
             home.life.port.to_life(Kept(shared.number, False))
         home.due.failed(why)
@@ -157,14 +167,68 @@ class SnapshotImages:
         newest = ledger.newest.blocks if ledger.newest is not None else []
         self._history = [set(by_segment(newest)), *self._history][: self._home.method.keep]
         wanted = by_segment([*newest, *(ledger.older.blocks if ledger.older is not None else ())])
+        self._sizes = {number: size for number, size in self._sizes.items() if number in wanted}
         for number in list(self._segments):
             if number not in wanted:
-                self._segments.pop(number).close()
+                self._let_go(number)
             elif not self.is_saving:
                 self._segments[number].keep(wanted[number])
 
+    def _let_go(self, number: int) -> None:
+        """Give back the memory of a segment."""
+        segment = self._segments.pop(number, None)
+        if segment is not None:
+            segment.close()
+
+    def let_go_of_stored(self) -> None:
+        """A life elsewhere has its state: what the store has needs no memory here."""
+        if not self._home.journal.durable:
+            return
+        for number in self._packs.intersection(self._segments):
+            self._let_go(number)
+
+    @property
+    def are_here(self) -> bool:
+        """Whether the newest snapshot can be handed to a life without a look into the store."""
+        return not self._missing()
+
+    def _missing(self) -> dict[int, set[tuple[int, int]]]:
+        newest = self._home.ledger.newest
+        blocks = newest.blocks if newest is not None else []
+        return {number: places for number, places in by_segment(blocks).items() if number not in self._segments}
+
+    async def bring(self) -> None:
+        """Have the newest snapshot here, while others go on; if it is damaged, an older one.
+
+        Raises:
+            HoldfastError: none can be had.
+        """
+        home, missing = self._home, self._missing()
+        if not missing:
+            return
+        reading = asyncio.ensure_future(asyncio.to_thread(read_segments, home.journal, home.path, missing))
+        try:
+            made = await asyncio.shield(reading)
+        except DamagedStore:
+            begin_with_older(home)
+        except asyncio.CancelledError:
+            reading.add_done_callback(_close_read)
+            raise
+        else:
+            if home.cell is None:  # Its address was erased meanwhile.
+                _close(made)
+                raise HoldfastError(f"{home.path} was erased while its state was read")
+            self._take_in(made)
+
+    def _take_in(self, made: dict[int, Segment]) -> None:
+        for number, segment in made.items():
+            self._let_go(number)
+            self._segments[number] = segment
+            self._sizes[number] = segment.size
+
     def lend(self, blocks: list[Place]) -> Lent | None:
-        """An image for a life that maps it; None if that cannot be."""
+        """The newest image for a life that maps it; None if that cannot be."""
+        self._take_in(read_segments(self._home.journal, self._home.path, self._missing()))
         segments = [self._segments[number] for number in by_segment(blocks)]
         try:
             for segment in segments:
@@ -174,7 +238,8 @@ class SnapshotImages:
         return Lent(os.getpid(), [(one.number, one.file, one.inode) for one in segments], blocks)
 
     def restore(self, blocks: list[Place]) -> Iterator[Restore]:
-        """An image, in pieces for a life."""
+        """The newest image, in pieces for a life."""
+        self._take_in(read_segments(self._home.journal, self._home.path, self._missing()))
         batch: list[memoryview] = []
         size = 0
         for number, offset, length in blocks:
@@ -192,17 +257,9 @@ class SnapshotImages:
         Raises:
             DamagedStore: one of them is missing or damaged.
         """
-        home = self._home
-        made: dict[int, Segment] = {}
-        try:
-            for number, places in by_segment(meta.blocks).items():
-                if number not in self._segments:
-                    made[number] = home.journal.read_blocks(home.path, number, places)
-        except BaseException:
-            for segment in made.values():
-                segment.close()
-            raise
-        self._segments.update(made)
+        home, places = self._home, by_segment(meta.blocks)
+        missing = {number: places[number] for number in places if number not in self._segments}
+        self._take_in(read_segments(home.journal, home.path, missing))
 
     def loaded(self, meta: Meta) -> None:
         """The store was read: these are the packs it needs."""
@@ -217,3 +274,30 @@ class SnapshotImages:
         for segment in self._segments.values():
             segment.close()
         self._segments.clear()
+
+
+def read_segments(journal: HomeJournal, path: str, wanted: dict[int, set[tuple[int, int]]]) -> dict[int, Segment]:
+    """Read these blocks of an address from the store, and verify them.
+
+    Raises:
+        DamagedStore: one of them is missing or damaged.
+    """
+    made: dict[int, Segment] = {}
+    try:
+        for number, places in wanted.items():
+            made[number] = journal.read_blocks(path, number, places)
+    except BaseException:
+        _close(made)
+        raise
+    return made
+
+
+def _close(segments: dict[int, Segment]) -> None:
+    for segment in segments.values():
+        segment.close()
+
+
+def _close_read(reading: asyncio.Future[dict[int, Segment]]) -> None:
+    """Nobody waits any more for what was read."""
+    if not reading.cancelled() and reading.exception() is None:
+        _close(reading.result())

@@ -11,6 +11,7 @@ from ...actors.events import SnapshotDamaged
 from ..compression import PLAIN, compressor, decompress
 from ..durable_links import Tie
 from ..durable_timers import Saved
+from ..home.input_ledger import InputLedger
 from ..journal import DamagedStore, Entry
 from ..journal import Saved as Journaled
 from ..protocol import DOWN, EXIT, TICK, Snapshot
@@ -248,6 +249,27 @@ def load_newest(home: Switch) -> tuple[Journaled, Meta | None]:
         home.images.loaded(meta)
         return saved, meta
     raise DamagedStore(home.path, home.path, None, f"no snapshot is left: {reason}")
+
+
+def begin_with_older(home: Switch) -> None:
+    """The newest snapshot turns out to be damaged: have the next life begin with the one before it, and replay more.
+
+    Raises:
+        DamagedStore: none can be used. StoreFailed: the store has failed.
+    """
+    home.journal.barrier()  # From here on all that is known stands there.
+    saved, newest = load_newest(home)
+    before, ledger = home.ledger, InputLedger(home.path)
+    if newest is not None:
+        ledger.begin_after(newest)
+    for position, entry in saved.entries:
+        values: tuple[Any, ...] = entry
+        if not ledger.read_entry(position, values) and values[0] in ("tie", "later", "replied", "op"):
+            ledger.positions_of(values[1]).append(position)
+    # Whoever waits for an answer waits at the input that is known here.
+    ledger.open = {key: before.open.get(key, source) for key, source in ledger.open.items()}
+    ledger.next_id, ledger.dropped = before.next_id, before.dropped
+    home.ledger = ledger
 
 
 def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved]) -> None:

@@ -129,7 +129,7 @@ class GroupPlace(Place):
 
     async def _recover(self, cell: Cell, entered: Entered) -> None:
         home, switch = self.home, entered.switch
-        await home.gate("restart")
+        await home.let_begin()
         if not home.is_gated:
             home.isolated()
         if cell.state is not DOWN:
