@@ -222,14 +222,14 @@ class Started(msgspec.Struct, array_like=True, tag=7):
 class Kept(msgspec.Struct, array_like=True, tag=8):
     """The home has the image that was written into this segment: what follows may refer to it. Or (not `is_safe`) not.
 
-    `is_full`: the next image should be written anew. `digests`: of its blocks there, in order, if a store has them, so
-    that their memory is needed no more.
+    `is_full`: the next image should be written anew. `digests`: of those blocks of the image that a store has, and that
+    need no memory any more; by their place in the order of the image.
     """
 
     segment: int
     is_safe: bool
     is_full: bool = False
-    digests: list[bytes] = []
+    digests: dict[int, bytes] = {}
 
 
 class Over(msgspec.Struct, array_like=True, tag=9):
@@ -294,8 +294,8 @@ class Live(msgspec.Struct, array_like=True, tag=13):
 class Shared(msgspec.Struct, array_like=True):
     """An image in memory that its home can open: segment `number` is descriptor `file` of process `pid`.
 
-    `places`: where its blocks are, in this segment and earlier ones (segment, offset, length). `is_forked`: a copy of
-    the process has written it, so that the next one may take the time to compare digests.
+    `places`: where its blocks are, in this segment and earlier ones (segment, offset, length). `is_idle`: a copy of the
+    process will compare the next one, which may take its time for that.
     """
 
     number: int
@@ -304,7 +304,7 @@ class Shared(msgspec.Struct, array_like=True):
     inode: int
     size: int
     places: list[tuple[int, int, int]]
-    is_forked: bool = False
+    is_idle: bool = False
 
 
 class Snapshot(msgspec.Struct, array_like=True, tag=14):

@@ -20,6 +20,11 @@ class ByteParts:
     def __len__(self) -> int:
         return self._size
 
+    @property
+    def first(self) -> int:
+        """The next byte, if there is one."""
+        return self._parts[0][0]
+
     def take(self, size: int) -> memoryview | ByteParts:
         """Take the next bytes: a view where they lie in one piece, else a value of their own.
 

@@ -61,6 +61,7 @@ from ..snapshot.snapshot_blocks import SnapshotImages
 from ..snapshot.snapshot_receiver import SnapshotReceiver
 from ..snapshot.snapshot_record import load
 from ..snapshot.snapshot_schedule import SnapshotSchedule
+from ..snapshot.state_image import IMAGE_BYTES
 from .admission import submit, taken_up
 from .disposal import lose, put_into_quarantine, undo_begun
 from .held_messages import Intake, let_go
@@ -255,6 +256,7 @@ class Switch:
 
     def prepare(self) -> asyncio.Future[float]:
         """A new life begins: hold what comes. The future ends when it is live, with the seconds its restore took."""
+        self.images.mapped()
         self.replay.cancel()
         self.arrival.cancel()  # The last life may have died in the middle of a snapshot.
         self.due.restarted()
@@ -272,7 +274,9 @@ class Switch:
         newest = self.ledger.newest
         if newest is None or not newest.has_state:
             return []
-        lent = self.images.lend(newest.blocks) if maps and newest.blocks and can_lend() else None
+        lent = None
+        if maps and (newest.blocks or len(newest.state) >= IMAGE_BYTES) and can_lend():
+            lent = self.images.lend(newest.blocks) if newest.blocks else self.images.lend_value(newest.state)
         if lent is not None:
             parts = [Restore(b"", image=lent)]
         elif newest.blocks:
@@ -363,6 +367,7 @@ class Switch:
                     self.arrival.take(record)
                 case Live():
                     life.come_up(record.restore_seconds)
+                    self.images.mapped()
                     if life.port is not None and life.port.is_far:
                         self.images.let_go_of_stored()
                     self.let_at()

@@ -37,7 +37,7 @@ from .shared_blocks import (
     places_of,
     write_changed,
 )
-from .state_image import IMAGE_BYTES, Imager, Key, estimate
+from .state_image import IMAGE_BYTES, Imager, Key, estimate, is_image
 
 if TYPE_CHECKING:
     from ..life.recorded_life import Life
@@ -91,6 +91,8 @@ class Imaging:
             HoldfastError: it is not there any more. OSError: there is no room for it.
         """
         data, self._begun_with, self._segments = map_image(lent)
+        if not is_image(data):  # The home has no such blocks.
+            self.restart()
         return data
 
     def suits(self) -> bool:
@@ -119,8 +121,7 @@ class Imaging:
         job = _Job(life.turn, [fed.feed.id for fed in life.stash], number, file, life.traps)
         writer: Writer | None = None
         try:
-            if self._may_fork and self._should_fork(estimate(actor, variables(actor))) and is_alone():
-                job.is_forked = True
+            if self._will_fork(estimate(actor, variables(actor))):
                 writer = Writer(self, job, state)
                 life.port.to_home(Marked(life.turn))
                 self._writer = writer
@@ -136,10 +137,12 @@ class Imaging:
         job.pause = time.perf_counter() - begin
         self._hand_over(job, layout)
 
-    def _should_fork(self, arrays: int) -> bool:
+    def _will_fork(self, arrays: int) -> bool:
+        """Whether a copy of the process is to write an image of the state, so many bytes of which are arrays."""
         size = max(self.last_bytes, arrays)
         is_rewritten = self._last_share > 0.5 and arrays > 0.9 * size
-        return size >= FORK_BYTES and not (is_rewritten and size <= MOST_COPIED)
+        should = size >= FORK_BYTES and not (is_rewritten and size <= MOST_COPIED)
+        return self._may_fork and should and is_alone()
 
     def write(self, job: _Job, state: Any) -> Layout:
         """Write what differs from the last image that is kept."""
@@ -187,7 +190,10 @@ class Imaging:
         self.last_bytes = sum(length for _, _, length in places)
         new = sum(length for number, _, length in places if number == job.number)
         self._last_share = new / max(1, self.last_bytes)
-        shared = Shared(job.number, os.getpid(), job.file, segment.inode, segment.size, places, job.is_forked)
+        actor = life.cell.actor
+        assert actor is not None
+        is_idle = self._will_fork(estimate(actor, variables(actor)))
+        shared = Shared(job.number, os.getpid(), job.file, segment.inode, segment.size, places, is_idle)
         life.image_taken(job.turn)
         said = life.made_by()
         life.port.to_home(Snapshot(job.turn, b"", True, job.stash, job.pause, False, shared, job.traps, *said))
@@ -201,12 +207,12 @@ class Imaging:
             segment.close()
             self._life.image_lost()
         else:
-            if record.digests:
-                own = [place for place in places_of(layout) if place[0] == segment.number]
-                self._digests.update(zip(own, record.digests, strict=True))
-                segment.close()
-            else:
-                self._segments[segment.number] = segment
+            self._segments[segment.number] = segment
+            places = places_of(layout)
+            for index, digest in record.digests.items():
+                self._digests[places[index]] = digest
+            for number in {places[index][0] for index in record.digests} & self._segments.keys():
+                self._segments.pop(number).close()
             self._layout, self._begun_with = layout, []
             if self._forget() > MOST_SEGMENTS or record.is_full:
                 self.restart()
@@ -257,7 +263,6 @@ class _Job:
     def __init__(self, turn: int, stash: list[int], number: int, file: int, traps: bool) -> None:
         self.turn, self.stash, self.number, self.file, self.traps = turn, stash, number, file, traps
         self.pause = 0.0
-        self.is_forked = False
 
 
 class Writer:

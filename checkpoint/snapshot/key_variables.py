@@ -93,17 +93,15 @@ def restore_state(
 
     Args:
         actor: constructed, and nothing more.
-        data: the state; parts are an image, in memory that becomes the actor's own.
+        data: the state; parts are in memory that becomes the actor's own.
         variables: those that the class had that has saved it, and that it has now, after `__init__` alone.
         meant: gives what is meant by a saved value.
 
     Raises:
         DamagedValue, StateMismatch: the data is damaged, or of another class or schema version.
     """
-    if isinstance(data, ByteParts):
-        saved: Any = read_image(data, adopt_value)
-    else:
-        saved = read_image(data) if is_image(data) else decode_value(data)
+    read: Callable[[Any], object] = adopt_value if isinstance(data, ByteParts) else decode_value
+    saved: Any = read_image(data, read) if is_image(data) else read(data)
     refuse_renamed(actor, saved, *variables)
     put_back(actor, meant(saved))
 

@@ -61,7 +61,7 @@ class Segment:
         self._freed: dict[int, int] = {}  # what has been given back, by offset
 
     @classmethod
-    def of(cls, number: int, blocks: Iterable[tuple[int, bytes]]) -> Segment:
+    def of(cls, number: int, blocks: Iterable[tuple[int, bytes | memoryview]]) -> Segment:
         """Blocks in memory of their own, each at its offset: for engines that have read them."""
         file, end = memory_file(number), 0
         try:

@@ -17,7 +17,7 @@ from ...actors.errors import HoldfastError
 from ...actors.events import SnapshotTaken
 from ..journal import DamagedStore
 from ..protocol import PIECE, Kept, Lent, Marked, Restore, Shared, Snapshot
-from .shared_blocks import Place, Segment, by_segment, digest, open_segment
+from .shared_blocks import Place, Segment, by_segment, digest, new_number, open_segment
 from .snapshot_record import IMAGES, Meta, begin_with_older, keep, made_by, meta_now
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ class SnapshotImages:
     def __init__(self, home: Switch) -> None:
         self._home = home
         self._segments: dict[int, Segment] = {}  # what is in memory; a store may have it instead
+        self._value: Segment | None = None  # a copy of a state that was saved as one value, until it is mapped
         self._sizes: dict[int, int] = {}  # of all that the newest snapshot needs
         self._history: list[set[int]] = []  # segments of the snapshots that are kept, newest first
         self._packs: set[int] = set()  # what the store may have
@@ -58,7 +59,7 @@ class SnapshotImages:
             self.refuse(shared, str(error))
             return
         if not home.journal.durable:
-            self._finish(meta, record, shared, [])
+            self._finish(meta, record, shared, {})
             return
         saving = home.node.loop.create_task(self._save(meta, record, shared), name=f"snapshot of {home.path}")
         self._saving = saving
@@ -96,16 +97,16 @@ class SnapshotImages:
     async def _save(self, meta: Meta, record: Snapshot, shared: Shared) -> None:
         home, own = self._home, [place for place in meta.blocks if place[0] == shared.number]
         segment, journal, me = self._segments[shared.number], home.journal, asyncio.current_task()
-        digests: list[bytes] = []
+        digests: dict[int, bytes] = {}
         try:
             if own:
                 blocks = [(offset, segment.block(offset, length)) for _, offset, length in own]
                 try:
                     await asyncio.to_thread(journal.keep_blocks, home.path, shared.number, blocks, home.method.compress)
-                    if shared.is_forked:
-                        digests = await asyncio.to_thread(lambda: [digest(block) for _, block in blocks])
                 finally:  # Not before: whoever removes it while it is written has removed nothing.
                     self._packs.add(shared.number)
+            if shared.is_idle:
+                digests = await asyncio.to_thread(digests_of, self._in_memory(meta.blocks))
             if self._saving is not me:
                 return  # Its pack goes with those that the next snapshot does not need.
             self._saving = None
@@ -121,7 +122,15 @@ class SnapshotImages:
                 self._saving = None
                 self.refuse(shared, str(error))
 
-    def _finish(self, meta: Meta, record: Snapshot, shared: Shared, digests: list[bytes]) -> bool:
+    def _in_memory(self, blocks: list[Place]) -> dict[int, memoryview]:
+        """Those blocks that need memory here, by their place among all."""
+        return {
+            index: self._segments[number].block(offset, length)
+            for index, (number, offset, length) in enumerate(blocks)
+            if number in self._segments
+        }
+
+    def _finish(self, meta: Meta, record: Snapshot, shared: Shared, digests: dict[int, bytes]) -> bool:
         """Whether it is kept now."""
         home = self._home
         try:
@@ -131,8 +140,8 @@ class SnapshotImages:
             return False
         size = sum(length for _, _, length in meta.blocks)
         is_full = home.journal.durable and sum(self._sizes.values()) > MOST_GARBAGE * size
-        if digests:
-            self._let_go(shared.number)
+        for number in {meta.blocks[index][0] for index in digests}:
+            self._let_go(number)
         if home.life.port is not None:
             home.life.port.to_life(Kept(shared.number, True, is_full, digests))
         home.limit.cut()
@@ -237,6 +246,23 @@ class SnapshotImages:
             return None
         return Lent(os.getpid(), [(one.number, one.file, one.inode) for one in segments], blocks)
 
+    def lend_value(self, state: bytes) -> Lent | None:
+        """A state that was saved as one value, for a life that maps it; None if that cannot be."""
+        number, view = new_number(), memoryview(state)
+        try:
+            segment = Segment.of(number, ((at, view[at : at + PIECE]) for at in range(0, len(state), PIECE)))
+            segment.lend()
+        except OSError:
+            return None
+        self._value = segment
+        return Lent(os.getpid(), [(number, segment.file, segment.inode)], [(number, 0, len(state))])
+
+    def mapped(self) -> None:
+        """A life has mapped what it was lent."""
+        value, self._value = self._value, None
+        if value is not None:
+            value.close()
+
     def restore(self, blocks: list[Place]) -> Iterator[Restore]:
         """The newest image, in pieces for a life."""
         self._take_in(read_segments(self._home.journal, self._home.path, self._missing()))
@@ -271,6 +297,7 @@ class SnapshotImages:
     def close(self) -> None:
         """The home is given up."""
         self.cancel()
+        self.mapped()
         for segment in self._segments.values():
             segment.close()
         self._segments.clear()
@@ -290,6 +317,11 @@ def read_segments(journal: HomeJournal, path: str, wanted: dict[int, set[tuple[i
         _close(made)
         raise
     return made
+
+
+def digests_of(blocks: dict[int, memoryview]) -> dict[int, bytes]:
+    """By which blocks are known that are in memory no more."""
+    return {index: digest(block) for index, block in blocks.items()}
 
 
 def _close(segments: dict[int, Segment]) -> None:

@@ -146,9 +146,9 @@ def joined(pieces: Iterable[Any]) -> Iterator[Any]:
         yield b"".join(small)
 
 
-def is_image(data: bytes | memoryview) -> bool:
+def is_image(data: bytes | memoryview | ByteParts) -> bool:
     """Whether a saved state is an image."""
-    return len(data) > 0 and data[0] == IMAGE
+    return len(data) > 0 and (data.first if isinstance(data, ByteParts) else data[0]) == IMAGE
 
 
 def read_image(
