@@ -11,7 +11,6 @@ from ...actors.events import SnapshotDamaged
 from ..compression import PLAIN, compressor, decompress
 from ..durable_links import Tie
 from ..durable_timers import Saved
-from ..home.input_ledger import InputLedger
 from ..journal import DamagedStore, Entry
 from ..journal import Saved as Journaled
 from ..protocol import DOWN, EXIT, TICK, Snapshot
@@ -259,17 +258,7 @@ def begin_with_older(home: Switch) -> None:
     """
     home.journal.barrier()  # From here on all that is known stands there.
     saved, newest = load_newest(home)
-    before, ledger = home.ledger, InputLedger(home.path)
-    if newest is not None:
-        ledger.begin_after(newest)
-    for position, entry in saved.entries:
-        values: tuple[Any, ...] = entry
-        if not ledger.read_entry(position, values) and values[0] in ("tie", "later", "replied", "op"):
-            ledger.positions_of(values[1]).append(position)
-    # Whoever waits for an answer waits at the input that is known here.
-    ledger.open = {key: before.open.get(key, source) for key, source in ledger.open.items()}
-    ledger.next_id, ledger.dropped = before.next_id, before.dropped
-    home.ledger = ledger
+    home.ledger = home.ledger.read_anew(newest, saved.entries)
 
 
 def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved]) -> None:

@@ -636,8 +636,8 @@ CHECKS = {
         "test_an_actor_that_replays_nothing",
     ),
     "asks go on waiting behind an older snapshot": Check(
-        "checkpoint/snapshot/snapshot_record.py",
-        "    ledger.open = {key: before.open.get(key, source) for key, source in ledger.open.items()}\n",
+        "checkpoint/home/input_ledger.py",
+        "        ledger.open = {key: self.open.get(key, source) for key, source in ledger.open.items()}\n",
         "",
         LARGE,
         "test_a_snapshot_that_is_damaged_meanwhile and byte and process",
