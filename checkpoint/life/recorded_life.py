@@ -183,7 +183,6 @@ class Life:
         assert cell.ctx is not None
         cell.ctx._close()
         cell.actor = cell.ctx = None
-        self.images.close()
         raise StartFailed(cell.path, why) from error
 
     # -- records from home ------------------------------------------------------------------------------------------

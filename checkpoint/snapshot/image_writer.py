@@ -101,7 +101,7 @@ class Imaging:
         assert actor is not None
         if not can_share():
             return False
-        return max(self.last_bytes, estimate(actor, variables(actor))) >= IMAGE_BYTES
+        return max(self.last_bytes, estimate(actor, variables(actor), below=True)) >= IMAGE_BYTES
 
     def take(self) -> None:
         """Write an image of the state after the last turn; one that is under way is waited for, then one more follows.
@@ -121,7 +121,7 @@ class Imaging:
         job = _Job(life.turn, [fed.feed.id for fed in life.stash], number, file, life.traps)
         writer: Writer | None = None
         try:
-            if self._will_fork(estimate(actor, variables(actor))):
+            if self._will_fork():
                 writer = Writer(self, job, state)
                 life.port.to_home(Marked(life.turn))
                 self._writer = writer
@@ -137,9 +137,12 @@ class Imaging:
         job.pause = time.perf_counter() - begin
         self._hand_over(job, layout)
 
-    def _will_fork(self, arrays: int) -> bool:
-        """Whether a copy of the process is to write an image of the state, so many bytes of which are arrays."""
-        size = max(self.last_bytes, arrays)
+    def _will_fork(self) -> bool:
+        """Whether a copy of the process is to write the next image of the state."""
+        actor = self._life.cell.actor
+        assert actor is not None
+        names = variables(actor)
+        arrays, size = estimate(actor, names), max(self.last_bytes, estimate(actor, names, below=True))
         is_rewritten = self._last_share > 0.5 and arrays > 0.9 * size
         should = size >= FORK_BYTES and not (is_rewritten and size <= MOST_COPIED)
         return self._may_fork and should and is_alone()
@@ -190,9 +193,7 @@ class Imaging:
         self.last_bytes = sum(length for _, _, length in places)
         new = sum(length for number, _, length in places if number == job.number)
         self._last_share = new / max(1, self.last_bytes)
-        actor = life.cell.actor
-        assert actor is not None
-        is_idle = self._will_fork(estimate(actor, variables(actor)))
+        is_idle = self._will_fork()
         shared = Shared(job.number, os.getpid(), job.file, segment.inode, segment.size, places, is_idle)
         life.image_taken(job.turn)
         said = life.made_by()

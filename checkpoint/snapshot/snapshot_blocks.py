@@ -34,6 +34,7 @@ class SnapshotImages:
     def __init__(self, home: Switch) -> None:
         self._home = home
         self._segments: dict[int, Segment] = {}  # what is in memory; a store may have it instead
+        self._held: dict[int, set[tuple[int, int]]] = {}  # which blocks of these (offset, length) are really there
         self._value: Segment | None = None  # a copy of a state that was saved as one value, until it is mapped
         self._sizes: dict[int, int] = {}  # of all that the newest snapshot needs
         self._history: list[set[int]] = []  # segments of the snapshots that are kept, newest first
@@ -83,6 +84,7 @@ class SnapshotImages:
             segment.close()
             raise HoldfastError("a snapshot refers to blocks that are not here")
         self._segments[shared.number] = segment
+        self._held[shared.number] = by_segment(shared.places).get(shared.number, set())
         self._sizes[shared.number] = segment.size
         return msgspec.structs.replace(
             marked,
@@ -182,10 +184,12 @@ class SnapshotImages:
                 self._let_go(number)
             elif not self.is_saving:
                 self._segments[number].keep(wanted[number])
+                self._held[number] &= wanted[number]
 
     def _let_go(self, number: int) -> None:
         """Give back the memory of a segment."""
         segment = self._segments.pop(number, None)
+        self._held.pop(number, None)
         if segment is not None:
             segment.close()
 
@@ -199,12 +203,14 @@ class SnapshotImages:
     @property
     def are_here(self) -> bool:
         """Whether the newest snapshot can be handed to a life without a look into the store."""
-        return not self._missing()
-
-    def _missing(self) -> dict[int, set[tuple[int, int]]]:
         newest = self._home.ledger.newest
-        blocks = newest.blocks if newest is not None else []
-        return {number: places for number, places in by_segment(blocks).items() if number not in self._segments}
+        return newest is None or not self._missing(newest.blocks)
+
+    def _missing(self, blocks: list[Place]) -> dict[int, set[tuple[int, int]]]:
+        """The segments that lack some of these blocks, with all that they are to have then."""
+        held = self._held
+        wanted = by_segment(blocks).items()
+        return {one: places | held.get(one, set()) for one, places in wanted if not places <= held.get(one, set())}
 
     async def bring(self) -> None:
         """Have the newest snapshot here, while others go on; if it is damaged, an older one.
@@ -212,7 +218,8 @@ class SnapshotImages:
         Raises:
             HoldfastError: none can be had.
         """
-        home, missing = self._home, self._missing()
+        home = self._home
+        missing = {} if home.ledger.newest is None else self._missing(home.ledger.newest.blocks)
         if not missing:
             return
         reading = asyncio.ensure_future(asyncio.to_thread(read_segments, home.journal, home.path, missing))
@@ -227,17 +234,26 @@ class SnapshotImages:
             if home.cell is None:  # Its address was erased meanwhile.
                 _close(made)
                 raise HoldfastError(f"{home.path} was erased while its state was read")
-            self._take_in(made)
+            self._take_in(made, missing)
 
-    def _take_in(self, made: dict[int, Segment]) -> None:
+    def _take_in(self, made: dict[int, Segment], held: dict[int, set[tuple[int, int]]]) -> None:
         for number, segment in made.items():
             self._let_go(number)
-            self._segments[number] = segment
+            self._segments[number], self._held[number] = segment, held[number]
             self._sizes[number] = segment.size
+
+    def _read(self, blocks: list[Place]) -> None:
+        """Have these blocks here, now.
+
+        Raises:
+            DamagedStore: one of them is missing or damaged.
+        """
+        missing = self._missing(blocks)
+        self._take_in(read_segments(self._home.journal, self._home.path, missing), missing)
 
     def lend(self, blocks: list[Place]) -> Lent | None:
         """The newest image for a life that maps it; None if that cannot be."""
-        self._take_in(read_segments(self._home.journal, self._home.path, self._missing()))
+        self._read(blocks)
         segments = [self._segments[number] for number in by_segment(blocks)]
         try:
             for segment in segments:
@@ -248,6 +264,7 @@ class SnapshotImages:
 
     def lend_value(self, state: bytes) -> Lent | None:
         """A state that was saved as one value, for a life that maps it; None if that cannot be."""
+        self.mapped()
         number, view = new_number(), memoryview(state)
         try:
             segment = Segment.of(number, ((at, view[at : at + PIECE]) for at in range(0, len(state), PIECE)))
@@ -265,7 +282,7 @@ class SnapshotImages:
 
     def restore(self, blocks: list[Place]) -> Iterator[Restore]:
         """The newest image, in pieces for a life."""
-        self._take_in(read_segments(self._home.journal, self._home.path, self._missing()))
+        self._read(blocks)
         batch: list[memoryview] = []
         size = 0
         for number, offset, length in blocks:
@@ -283,9 +300,7 @@ class SnapshotImages:
         Raises:
             DamagedStore: one of them is missing or damaged.
         """
-        home, places = self._home, by_segment(meta.blocks)
-        missing = {number: places[number] for number in places if number not in self._segments}
-        self._take_in(read_segments(home.journal, home.path, missing))
+        self._read(meta.blocks)
 
     def loaded(self, meta: Meta) -> None:
         """The store was read: these are the packs it needs."""
@@ -301,6 +316,7 @@ class SnapshotImages:
         for segment in self._segments.values():
             segment.close()
         self._segments.clear()
+        self._held.clear()
 
 
 def read_segments(journal: HomeJournal, path: str, wanted: dict[int, set[tuple[int, int]]]) -> dict[int, Segment]:

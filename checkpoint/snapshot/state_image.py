@@ -13,6 +13,7 @@ from __future__ import annotations
 import struct
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from typing import Any, Final
 
 import msgspec
@@ -26,6 +27,8 @@ IMAGE: Final = 2
 HEAD: Final = struct.Struct(">BQ")
 LARGE: Final = 64 * 1024
 """Buffers from this size on are pieces of their own."""
+LOOKED_AT: Final = 1000
+"""Members of a list or dict that are looked at for an estimate."""
 IMAGE_BYTES: Final = 1024 * 1024
 """States from this size on are saved as images: below, a snapshot is one record and one row."""
 _UNCHANGING: Final = frozenset({int, float, complex, bool, str, bytes, type(None)})
@@ -178,17 +181,23 @@ def read_image(
     return head.version, head.form, state
 
 
-def estimate(actor: Actor, names: Iterable[str]) -> int:
-    """Bytes of the state that are seen at a glance: arrays, and texts of bytes."""
-    numpy: Any = sys.modules.get("numpy")
+def estimate(actor: Actor, names: Iterable[str], *, below: bool = False) -> int:
+    """Bytes of the state seen at a glance: arrays, and texts of bytes; with `below` also in lists and dicts."""
     root: Any = actor._state_root()
     total = 0
     for name in names:
         value: Any = root
         for part in name.split("."):
             value = getattr(value, part, None)
-        if isinstance(value, bytes | bytearray):
-            total += len(value)
-        elif numpy is not None and isinstance(value, numpy.ndarray):
-            total += value.nbytes
+        total += _weight(value)
+        if below and isinstance(value, list | tuple | dict):
+            inner: Any = value.values() if isinstance(value, dict) else value
+            total += sum(map(_weight, islice(inner, LOOKED_AT)))
     return total
+
+
+def _weight(value: Any) -> int:
+    numpy: Any = sys.modules.get("numpy")
+    if isinstance(value, bytes | bytearray):
+        return len(value)
+    return int(value.nbytes) if numpy is not None and isinstance(value, numpy.ndarray) else 0
