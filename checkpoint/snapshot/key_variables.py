@@ -100,8 +100,11 @@ def restore_state(
     Raises:
         DamagedValue, StateMismatch: the data is damaged, or of another class or schema version.
     """
-    read: Callable[[Any], object] = adopt_value if isinstance(data, ByteParts) else decode_value
-    saved: Any = read_image(data, read) if is_image(data) else read(data)
+    saved: Any
+    if isinstance(data, ByteParts):
+        saved = read_image(data, adopt_value) if is_image(data) else adopt_value(data)
+    else:
+        saved = read_image(data) if is_image(data) else decode_value(data)
     refuse_renamed(actor, saved, *variables)
     put_back(actor, meant(saved))
 
