@@ -7,6 +7,10 @@ before it is mapped: from then on nobody can make it shorter, not even a process
 from __future__ import annotations
 
 import os
+from typing import Final
+
+F_SEAL_FUTURE_WRITE: Final = 0x10
+"""As in Linux's fcntl.h; Python has no name for it."""
 
 
 def unnamed(name: str) -> int:
@@ -25,3 +29,15 @@ def keep_size(file: int) -> None:
     wanted = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
     if fcntl.fcntl(file, fcntl.F_GET_SEALS) & wanted != wanted:
         fcntl.fcntl(file, fcntl.F_ADD_SEALS, wanted)
+
+
+def keep_contents(file: int) -> None:
+    """Let what is in a file of `unnamed` stay as it is, for everybody who opens it; private mappings are their own.
+
+    Raises:
+        OSError: it is no such file, or the system is too old (Linux 5.1 has it).
+    """
+    import fcntl
+
+    keep_size(file)
+    fcntl.fcntl(file, fcntl.F_ADD_SEALS, F_SEAL_FUTURE_WRITE)

@@ -174,8 +174,19 @@ class SnapshotNow(msgspec.Struct, array_like=True, tag=4):
     urgent: bool = False
 
 
+class Lent(msgspec.Struct, array_like=True):
+    """An image in memory that a life may map: `segments` are (number, descriptor, inode) in process `pid`.
+
+    `places`: where its blocks are (segment, offset, length).
+    """
+
+    pid: int
+    segments: list[tuple[int, int, int]]
+    places: list[tuple[int, int, int]]
+
+
 class Restore(msgspec.Struct, array_like=True, tag=5):
-    """A piece of the state to begin with; the launch comes behind the last one.
+    """A piece of the state to begin with, or (`image`) where all of it is; the launch comes behind the last one.
 
     The first one also says which timers ran when that state was saved, whether the actor trapped exits, and which
     `variables` its class had.
@@ -185,6 +196,7 @@ class Restore(msgspec.Struct, array_like=True, tag=5):
     timers: dict[str, Clock] = {}
     traps: bool = False
     variables: list[str] = []
+    image: Lent | None = None
 
 
 class Begin(msgspec.Struct, array_like=True, tag=6):
@@ -214,12 +226,14 @@ class Started(msgspec.Struct, array_like=True, tag=7):
 class Kept(msgspec.Struct, array_like=True, tag=8):
     """The home has the image that was written into this segment: what follows may refer to it. Or (not `is_safe`) not.
 
-    `is_full`: the next image should be written anew.
+    `is_full`: the next image should be written anew. `digests`: of those blocks of the image that a store has, and that
+    need no memory any more; by their place in the order of the image.
     """
 
     segment: int
     is_safe: bool
     is_full: bool = False
+    digests: dict[int, bytes] = {}
 
 
 class Over(msgspec.Struct, array_like=True, tag=9):
@@ -290,7 +304,8 @@ class Live(msgspec.Struct, array_like=True, tag=13):
 class Shared(msgspec.Struct, array_like=True):
     """An image in memory that its home can open: segment `number` is descriptor `file` of process `pid`.
 
-    `places`: where its blocks are, in this segment and earlier ones (segment, offset, length).
+    `places`: where its blocks are, in this segment and earlier ones (segment, offset, length). `is_idle`: a copy of the
+    process will compare the next one, which may take its time for that.
     """
 
     number: int
@@ -299,6 +314,7 @@ class Shared(msgspec.Struct, array_like=True):
     inode: int
     size: int
     places: list[tuple[int, int, int]]
+    is_idle: bool = False
 
 
 class Snapshot(msgspec.Struct, array_like=True, tag=14):
@@ -422,6 +438,11 @@ class LifePort(Protocol):
     @property
     def begins(self) -> bool:
         """Whether what is handed to it may be begun at any time from then on. If not, it says itself when."""
+        ...
+
+    @property
+    def is_far(self) -> bool:
+        """Whether that life is in another process."""
         ...
 
     def to_life(self, record: ToLife) -> None:

@@ -33,6 +33,8 @@ class Child:
     state: str = STOPPED
     ignored_life: int = 0  # the end of this life is known already: its start failed, or we stopped it
     attempts: int = 0  # restarts in a row without a healthy life
+    restarts: tuple[float, ...] = ()  # its own recent ones, in seconds of the loop's clock without those in `away`
+    away: float = 0.0  # seconds that its restarts have taken so far
     up_since: float = 0.0
     due: ExitReason | None = None  # why it is restarted, if it waits for that; None: it does not wait
     hurried: int = 0  # for which move of its supervisor it did not wait to the end

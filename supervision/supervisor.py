@@ -430,12 +430,15 @@ class Supervisor(Inquiries):
     def _restart(self, one: Child, reason: ExitReason) -> None:
         """One attempt by the strategy, counted; gives up when there were too many."""
         node, flags = self.ctx._cell.node, self._flags
-        window = admit_restart(self._restarts, node.loop.time(), intensity=flags.intensity, period=flags.period)
-        if window is None:
-            why = f"restart intensity reached; the last to end was {self._path_of(one)}: {reason}"
+        now, intensity, period = node.loop.time(), flags.intensity, flags.period
+        window = admit_restart(self._restarts, now, intensity=intensity, period=period)
+        own = admit_restart(one.restarts, now - one.away, intensity=intensity, period=period)
+        if window is None or own is None:
+            slow = "" if window is None else f", not counting the {one.away:.0f} s that restarts have taken"
+            why = f"restart intensity reached{slow}; the last to end was {self._path_of(one)}: {reason}"
             self._give_up(one, reason, Shutdown(why))
             return
-        self._restarts = window
+        self._restarts, one.restarts = window, own
         if one.spec.is_supervisor:  # Perhaps it has ended because of somebody below it: that one comes back as it says.
             node.ports.keeper.returned(self._path_of(one))
         if node.events.has_listeners:
@@ -447,7 +450,7 @@ class Supervisor(Inquiries):
             for other in group
             if other is one or (other.state != STARTING and (other.spec.autostart or other.is_running))
         ]
-        self._errand(self._restart_group(one, wanted, reason))
+        self._errand(self._restart_group(one, wanted, now))
 
     def _give_up(self, one: Child, reason: ExitReason, told: ExitReason) -> None:
         """We end: too many restarts, or a rule says that this end is one for whoever is above us."""
@@ -480,7 +483,14 @@ class Supervisor(Inquiries):
             if erased is not None:
                 await erased
 
-    async def _restart_group(self, failed: Child, group: list[Child], reason: ExitReason) -> None:
+    async def _restart_group(self, failed: Child, group: list[Child], since: float) -> None:
+        """Restart these children because one has ended: how long that takes does not make its next end a rarer one."""
+        try:
+            await self._bring_back(failed, group)
+        finally:
+            failed.away += self.ctx._cell.node.loop.time() - since
+
+    async def _bring_back(self, failed: Child, group: list[Child]) -> None:
         """Stop the others newest first, then start all of them in order; siblings wait for one that takes its time."""
         running = [one for one in group if one is not failed and one.state != STOPPED]
         row = StartRow(group, RESTARTING)

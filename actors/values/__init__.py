@@ -19,18 +19,22 @@ from collections.abc import Callable
 
 from ..errors import DamagedValue, UnsavableValue
 from .budget import LargeInts, TooMany, check_containers
-from .forms import FORMAT, HEAD
+from .byte_parts import ByteParts, in_one
+from .forms import FORMAT, LENGTH
 from .value_describer import Describer, ValueDescription
 from .value_reader import Decoder, unpack
 from .value_writer import pieces, walked_pieces
 
 __all__ = [
+    "ByteParts",
     "DamagedValue",
     "ValueDescription",
     "UnsavableValue",
+    "adopt_value",
     "decode_value",
     "describe_value",
     "encode_value",
+    "in_one",
     "state_digest",
     "walked_pieces",
 ]
@@ -102,6 +106,17 @@ def decode_value(data: bytes | memoryview, *, imports: bool = True) -> object:
     return _read(data, lambda buffers: Decoder(buffers, imports=imports), is_checked=not imports)
 
 
+def adopt_value(data: memoryview | ByteParts) -> object:
+    """Read what `encode_value` wrote into memory that is the reader's own: large arrays stay where they lie in it.
+
+    Such an array is writable and keeps the memory alive; but it does not own it, so that it cannot be resized in place.
+
+    Raises:
+        DamagedValue: whatever is wrong with the bytes.
+    """
+    return _read(data, lambda buffers: Decoder(buffers, adopts=True), is_checked=False)
+
+
 def describe_value(data: bytes | memoryview) -> object:
     """Read what `encode_value` wrote without importing anything: each instance of a class is a `ValueDescription`.
 
@@ -111,21 +126,20 @@ def describe_value(data: bytes | memoryview) -> object:
     return _read(data, Describer, is_checked=False)
 
 
-def _read(data: bytes | memoryview, decoder: Callable[[memoryview], Decoder], *, is_checked: bool) -> object:
-    view = memoryview(data).cast("B")
-    if len(view) < 2:
+def _read(data: bytes | memoryview | ByteParts, decoder: Callable[[ByteParts], Decoder], *, is_checked: bool) -> object:
+    left = data if isinstance(data, ByteParts) else ByteParts((memoryview(data).cast("B"),))
+    if len(left) < 2:
         raise DamagedValue("it is cut short")
-    if view[0] != FORMAT or view[1] > 1:
-        raise DamagedValue(f"it has format {view[0]}.{view[1]}, and only format {FORMAT} is known")
+    version, flag = in_one(left.take(2))
+    if version != FORMAT or flag > 1:
+        raise DamagedValue(f"it has format {version}.{flag}, and only format {FORMAT} is known")
     try:
-        is_plain = view[1] == 0
-        begin, end = (2, len(view)) if is_plain else (HEAD.size, HEAD.size + HEAD.unpack_from(view)[2])
-        tree = view[begin:end]
+        tree = in_one(left.take(len(left) if flag == 0 else LENGTH.unpack(in_one(left.take(LENGTH.size)))[0]))
         if is_checked:
             check_containers(tree)
-        if is_plain:
+        if flag == 0:
             return unpack(tree, ext_hook=LargeInts().make)
-        return decoder(view[end:]).value(tree)
+        return decoder(left).value(tree)
     except TooMany as error:
         raise DamagedValue(str(error)) from error
     except (DamagedValue, MemoryError):  # Out of memory is no damage: the bytes may be good.

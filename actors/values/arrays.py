@@ -6,16 +6,20 @@ import functools
 import math
 import re
 import sys
+from collections.abc import Callable
 from itertools import accumulate
 from operator import attrgetter
 from typing import Any, Final, TypeAlias, cast
 
 from ..errors import DamagedValue, UnsavableValue
+from .byte_parts import ByteParts, in_one
 from .forms import ARRAY, ARRAYS, BITS, GENERATOR, RANDOM_STATE, SEED, TEXT, Blob, Make
 
 _LAST_POSITION: Final = {"MT19937": 624, "Philox": 4, "PCG64": 0, "PCG64DXSM": 0, "SFC64": 0}
 # Of numbers, text, bytes, times. Other names mean objects, or (a time unit of 0 seconds) end the process.
 _SMALL: Final = 1024  # bytes of an array that are copied at once
+ADOPTED: Final = 64 * 1024
+"""Bytes from which on an array may stay where it was read from: a small one would keep all that memory alive."""
 _DTYPE_OF: Final = attrgetter("dtype")
 _SHAPE_OF: Final = attrgetter("shape")
 _SIZE_OF: Final = attrgetter("nbytes")
@@ -164,11 +168,25 @@ def _make_dtype(parts: Any) -> Any:
     return dtype
 
 
-def _make_array(dtype: Any, shape: Any, order: Any, data: memoryview) -> Any:
+def copied(array: Any, order: str = "C") -> Any:
+    """An array that owns its memory."""
+    return array.copy(order)
+
+
+def kept(array: Any, order: str = "C") -> Any:
+    """A large array where it lies, if that is a place for one; of others a copy."""
+    return array if array.nbytes >= ADOPTED and array.flags.aligned else array.copy(order)
+
+
+Own: TypeAlias = Callable[..., Any]
+"""Makes of an array that lies in what is read one that stays."""
+
+
+def _make_array(dtype: Any, shape: Any, order: Any, data: memoryview | ByteParts, *, own: Own = copied) -> Any:
     made = _make_dtype(dtype)
     if _size(shape, made) != len(data):
         raise DamagedValue(f"it has {len(data)} bytes for an array of shape {shape} and dtype {made}")
-    array = _numpy().ndarray(shape, made, data, order=order or "C").copy(order or "C")
+    array = own(_numpy().ndarray(shape, made, in_one(data), order=order or "C"), order or "C")
     if array.shape != shape:
         raise DamagedValue(f"it has an array of shape {shape}")
     return array if order else array[()]
@@ -182,19 +200,28 @@ def _size(shape: Any, dtype: Any) -> int:
     return math.prod(sizes) * int(dtype.itemsize)
 
 
-def _make_arrays(dtype: str, shapes: Shapes, data: memoryview, *others: Any) -> list[Any]:
+def _make_arrays(
+    dtype: str, shapes: Shapes, data: memoryview | ByteParts, *others: Any, own: Own = copied
+) -> list[Any]:
     """The arrays of `arrays_parts`; `others` are positions, and what stands there instead."""
-    made, ndarray = _named_dtype(dtype), _numpy().ndarray
+    made, ndarray, size = _named_dtype(dtype), _numpy().ndarray, len(data)
+    each, views = shapes, iter(())
     if type(shapes) is list:
         ends = [*accumulate((_size(shape, made) for shape in shapes), initial=0)]
-        if ends[-1] != len(data):
-            raise DamagedValue(f"it has {len(data)} bytes for arrays of {ends[-1]}")
-        arrays = [ndarray(shape, made, data, begin).copy() for shape, begin in zip(shapes, ends, strict=False)]
+        if ends[-1] != size:
+            raise DamagedValue(f"it has {size} bytes for arrays of {ends[-1]}")
+        if not isinstance(data, ByteParts):
+            views = (ndarray(shape, made, data, begin) for shape, begin in zip(shapes, ends, strict=False))
     else:
-        size = _size(shapes, made)
-        if not shapes or not size or len(data) % size:  # Arrays of no bytes could be any number.
-            raise DamagedValue(f"it has {len(data)} bytes for arrays of shape {shapes} and dtype {made}")
-        arrays = [*map(ndarray.copy, ndarray((len(data) // size, *shapes), made, data))]
+        one = _size(shapes, made)
+        if not shapes or not one or size % one:  # Arrays of no bytes could be any number.
+            raise DamagedValue(f"it has {size} bytes for arrays of shape {shapes} and dtype {made}")
+        each = [cast("tuple[int, ...]", shapes)] * (size // one)
+        if not isinstance(data, ByteParts):
+            views = ndarray((len(each), *shapes), made, data)
+    if isinstance(data, ByteParts):
+        views = (ndarray(shape, made, in_one(data.take(_size(shape, made)))) for shape in each)
+    arrays = [*map(own, views)]
     for position, other in zip(others[::2], others[1::2], strict=True):
         arrays[position] = other
     return arrays
@@ -236,6 +263,10 @@ def _make_random_state(state: dict[str, Any]) -> Any:
     return made
 
 
+ADOPT_ARRAYS: Final[dict[int, Make]] = {
+    ARRAY.code: lambda parts: _make_array(*parts, own=kept),
+    ARRAYS.code: lambda parts: _make_arrays(*parts, own=kept),
+}
 MAKE_ARRAYS: Final[dict[int, Make]] = {
     ARRAY.code: lambda parts: _make_array(*parts),
     ARRAYS.code: lambda parts: _make_arrays(*parts),

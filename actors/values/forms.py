@@ -20,9 +20,11 @@ from zoneinfo import ZoneInfo
 from msgpack import ExtType
 
 from ..errors import DamagedValue, UnsavableValue
+from .byte_parts import in_one
 
 FORMAT: Final = 1
 HEAD: Final = struct.Struct(">BBQ")  # format, flag, length of the tree
+LENGTH: Final = struct.Struct(">Q")
 
 
 class Blob:
@@ -90,7 +92,7 @@ TYPES: Final[tuple[tuple[int, Any, Callable[[Any], Iterable[Any]], Make], ...]] 
     (5, OrderedDict, flat, lambda parts: OrderedDict(pairs(parts))),
     (6, Counter, flat, _make_counter),
     (7, deque, lambda x: (x.maxlen, *x), lambda parts: deque(parts[1:], parts[0])),
-    (8, bytearray, lambda x: (Blob(x),), lambda parts: bytearray(memoryview(*parts))),  # an int would be a length
+    (8, bytearray, lambda x: (Blob(x),), lambda parts: bytearray(in_one(*parts))),  # an int would be a length
     (9, complex, lambda x: (x.real, x.imag), lambda parts: complex(*parts)),
     (10, range, lambda x: (x.start, x.stop, x.step), lambda parts: range(*parts)),
     (11, Decimal, lambda x: (str(x),), lambda parts: Decimal(*parts)),

@@ -12,8 +12,9 @@ import msgpack
 from msgpack import ExtType
 
 from ..errors import DamagedValue
-from .arrays import MAKE_ARRAYS
+from .arrays import ADOPT_ARRAYS, MAKE_ARRAYS
 from .budget import MANY_KEYS, LargeInts, spread
+from .byte_parts import ByteParts
 from .classes import Defaults, class_mark, defaults_of, find_class, is_factory, slots_of
 from .forms import (
     AGAIN,
@@ -65,18 +66,19 @@ _MAKE: Final[dict[int, Make]] = {
     **MAKE_ARRAYS,
     TUPLES.code: _make_tuples,
 }
+_ADOPTS: Final[dict[int, Make]] = _MAKE | ADOPT_ARRAYS
 
 
 class Decoder:
     """What msgpack calls for each extension value and each list, inner ones first."""
 
-    def __init__(self, buffers: memoryview, *, imports: bool = True) -> None:
+    def __init__(self, buffers: ByteParts, *, imports: bool = True, adopts: bool = False) -> None:
         self._imports, self._make_int = imports, LargeInts().make
         self.buffers = buffers  # those not yet read: they lie in the order in which the tree names them
         self.open_marks = 0
         self.shared: dict[int, object] = {}
         self.classes: dict[str, tuple[Any, ExtType | None, dict[str, Any], Defaults]] = {}
-        self.make: dict[int, Make] = _MAKE | {
+        self.make: dict[int, Make] = (_ADOPTS if adopts else _MAKE) | {
             BUFFER.code: self.make_buffer,
             SHARED.code: self.make_shared,
             AGAIN.code: self.make_again,
@@ -107,12 +109,9 @@ class Decoder:
         self.open_marks -= 1
         return self.make[parts.pop(0)](parts)
 
-    def make_buffer(self, parts: list[Any]) -> memoryview:
+    def make_buffer(self, parts: list[Any]) -> memoryview | ByteParts:
         [n_bytes] = parts
-        if not 0 <= n_bytes <= len(self.buffers):
-            raise DamagedValue("it is cut short")
-        buffer, self.buffers = self.buffers[:n_bytes], self.buffers[n_bytes:]
-        return buffer
+        return self.buffers.take(n_bytes)
 
     def make_shared(self, parts: list[Any]) -> object:
         number, self.shared[number] = parts

@@ -325,6 +325,28 @@ class InputLedger:
         """Begin with a snapshot as the store has it; its entries follow."""
         self.newest, self.stash, self.turn, self.next_id = meta, meta.stash, meta.turn, meta.next_id
 
+    def read_anew(self, newest: Meta | None, entries: Sequence[tuple[int, Entry]]) -> InputLedger:
+        """The same from an older snapshot on, as the store has it; whoever waits for an answer goes on waiting."""
+        ledger = InputLedger(self.path)
+        if newest is not None:
+            ledger.begin_after(newest)
+        for position, entry in entries:
+            values: tuple[Any, ...] = entry
+            if ledger.read_entry(position, values):
+                continue
+            match values:
+                case ("shape", *_):
+                    ledger.drop([position])
+                case ("tie" | "later" | "replied" | "op", turn, *_):
+                    ledger.positions_of(turn).append(position)
+                case _:
+                    pass  # Whoever keeps it knows where it stands.
+        known = {position for sink in ledger.dropped for position in sink}
+        ledger.drop(*(sink for sink in self.dropped if known.isdisjoint(sink)))
+        ledger.open = {key: self.open.get(key, source) for key, source in ledger.open.items()}
+        ledger.next_id = self.next_id
+        return ledger
+
     def begin_with(self, meta: Meta) -> None:
         """Have the next life begin with this snapshot, and forget the turns that it contains."""
         self.dropped.clear()

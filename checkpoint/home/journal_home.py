@@ -102,7 +102,9 @@ class JournalHome(RecordedHome):
 
     @property
     def is_gated(self) -> bool:
-        """Whether the recovery of the life at hand waits for somebody on its way."""
+        """Whether the recovery of the life at hand waits for somebody on its way, or for the store."""
+        if self.switch is not None and not self.switch.images.are_here:
+            return True
         return self.recovery is not None and self.homes.recoveries.is_gated(self.recovery)
 
     async def gate(self, stage: str) -> None:
@@ -216,6 +218,21 @@ class JournalHome(RecordedHome):
 
     async def let_begin(self) -> None:
         await self.gate("restart")
+        await self.bring_state()
+
+    async def bring_state(self) -> None:
+        """Have the state here with which a life is to begin.
+
+        Raises:
+            StartFailed: it cannot be had.
+        """
+        assert self.switch is not None
+        try:
+            await self.switch.images.bring()
+        except HoldfastError as error:
+            raise StartFailed(self.switch.path, str(error)) from error
+        if not self.method.replays:  # It may be an older snapshot.
+            forget_turns(self.switch)
 
     def hand_to(self, cell: Cell, worker: Worker) -> dict[str, Any]:
         switch = self.switch

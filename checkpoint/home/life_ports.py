@@ -54,6 +54,7 @@ class RemoteLife:
     """From a home to its life, in another process."""
 
     begins = True
+    is_far = True
 
     def __init__(self, path: str, worker: Worker) -> None:
         self._worker, self._connection = worker, worker.connection

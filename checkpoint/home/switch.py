@@ -58,10 +58,12 @@ from ..protocol import (
     pieces,
 )  # fmt: skip
 from ..schema import Shapes, shape_name, start_name
+from ..snapshot.shared_blocks import can_lend
 from ..snapshot.snapshot_blocks import SnapshotImages
 from ..snapshot.snapshot_receiver import SnapshotReceiver
 from ..snapshot.snapshot_record import load
 from ..snapshot.snapshot_schedule import SnapshotSchedule
+from ..snapshot.state_image import IMAGE_BYTES
 from ..upgrade.present_classes import REPLY_TO
 from .admission import submit, taken_up
 from .disposal import lose, put_into_quarantine, undo_begun
@@ -279,6 +281,7 @@ class Switch:
 
     def prepare(self) -> asyncio.Future[float]:
         """A new life begins: hold what comes. The future ends when it is live, with the seconds its restore took."""
+        self.images.mapped()
         self.replay.cancel()
         self.arrival.cancel()  # The last life may have died in the middle of a snapshot.
         self.due.restarted()
@@ -289,14 +292,23 @@ class Switch:
         self.life.token = self.node.numbers.next_token()
         return live
 
-    def restore_records(self) -> list[Restore]:
-        """The state to begin with, in pieces; none if there is no snapshot."""
+    def restore_records(self, *, maps: bool = True) -> list[Restore]:
+        """The state to begin with; none if there is no snapshot.
+
+        With `maps` a large one is lent to a life that maps it; else, or if that cannot be, it comes in pieces.
+        """
         newest = self.ledger.newest
         if newest is None or not newest.has_state:
             return []
-        parts = (
-            list(self.images.restore(newest.blocks)) if newest.blocks else [Restore(p) for p in pieces(newest.state)]
-        )
+        lent = None
+        if maps and (newest.blocks or len(newest.state) >= IMAGE_BYTES) and can_lend():
+            lent = self.images.lend(newest.blocks) if newest.blocks else self.images.lend_value(newest.state)
+        if lent is not None:
+            parts = [Restore(b"", image=lent)]
+        elif newest.blocks:
+            parts = list(self.images.restore(newest.blocks))
+        else:
+            parts = [Restore(piece) for piece in pieces(newest.state)]
         parts[0].timers, parts[0].traps = self.timers.at(newest), newest.traps
         parts[0].variables = newest.variables
         return parts
@@ -381,6 +393,9 @@ class Switch:
                     self.arrival.take(record)
                 case Live():
                     life.come_up(record.restore_seconds)
+                    self.images.mapped()
+                    if life.port is not None and life.port.is_far:
+                        self.images.let_go_of_stored()
                     self.let_at()
                 case PipeDone():
                     self.outputs.work_done(record)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ...actors.exit_reasons import ExitReason
     from ...actors.kernel.envelope import Item
     from ...actors.kernel.message import Message
-    from ..protocol import Clock, Restore
+    from ..protocol import Clock, Lent, Restore
 
 Awaited: TypeAlias = "type[Message[Any]] | EffectCall | dict[str, type[Message[Any]]] | None"
 """What a turn waits for: the reply to a message of that class, an effect, a message of one of these types (none: a
@@ -26,6 +26,7 @@ class RestoredState:
 
     Attributes:
         pieces: what is not put back yet.
+        image: where it is, if it is to be mapped.
         has_state: whether there is one; else the actor begins afresh.
         traps: whether the actor trapped exits.
         variables: those that its class had when `__init__` had run.
@@ -35,6 +36,7 @@ class RestoredState:
     """
 
     pieces: list[bytes] = dataclasses.field(default_factory=list)
+    image: Lent | None = None
     has_state: bool = False
     traps: bool = False
     variables: list[str] = dataclasses.field(default_factory=list)
@@ -47,6 +49,7 @@ class RestoredState:
         self.has_state = True
         self.traps = self.traps or record.traps
         self.variables += record.variables
+        self.image = record.image
         self.pieces.append(record.data)
 
     def joined(self) -> bytes:

@@ -103,6 +103,7 @@ class Life:
     """One recorded life: the turn in hand, its outputs, and when the next snapshot is due."""
 
     begins = True  # what is handed to it, whenever it has come to that
+    is_far = False
 
     def __init__(
         self, cell: Cell, port: HomePort, method: Method, page: memoryview | None, *, may_fork: bool = False
@@ -156,7 +157,7 @@ class Life:
         if restored.has_state:
             begin = time.perf_counter()
             try:
-                data = restored.joined()
+                data = self.images.mapped(restored.image) if restored.image is not None else restored.joined()
                 self.images.last_bytes = len(data)
                 dropped = restore_state(actor, data, (restored.variables, self.saving.variables))
             except BaseException as error:
@@ -167,7 +168,8 @@ class Life:
                 said = f"{type_name(start.kind)} has no {', '.join(dropped)} any more: what was saved of it is dropped"
                 cell.node.emit(RecordsMapped(cell.path, said))
             self.saving.turn = turn
-            if start.kind.on_recovered is not Actor.on_recovered and self._is_replayed_from_snapshots:
+            hooks = start.kind.on_recovered is not Actor.on_recovered and self._is_replayed_from_snapshots
+            if hooks and isinstance(data, bytes):  # An image is not compared with what the hook leaves.
                 self.saving.begun_with = turn, _digest(data)
         restored.stash_ids = frozenset(stash)
         cell.state = RUNNING

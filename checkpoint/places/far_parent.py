@@ -430,7 +430,7 @@ class SlotPlace(Place):
 
     async def _step_by_step(self, cell: Cell, wanted: Wanted, entered: Entered) -> None:
         """A recovery on whose way others have something to do; it may be given up, or its process end, meanwhile."""
-        await self._home.gate("restart")
+        await self._home.let_begin()
         if self._parent.wanted is not wanted or cell.state is GONE:
             return
         self._launch(cell, wanted, entered)

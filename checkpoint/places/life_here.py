@@ -61,7 +61,7 @@ class LifeHere(LifePlace):
 
     async def _step_by_step(self, cell: Cell, entered: Entered) -> None:
         """A recovery on whose way others have something to do."""
-        await self.home.gate("restart")
+        await self.home.let_begin()
         if cell.state is not DOWN:
             raise StartFailed(cell.path, "it was stopped while it started")
         self._begin(cell, entered)

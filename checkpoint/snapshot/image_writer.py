@@ -20,20 +20,24 @@ import msgspec
 
 from ...actors.process.fork.boot import PR_SET_PDEATHSIG, bind_prctl
 from ...actors.streams import check_can_watch
-from ..protocol import Kept, Marked, Shared, Snapshot, Unsaved
+from ...actors.values import ByteParts
+from ..protocol import Kept, Lent, Marked, Shared, Snapshot, Unsaved
 from .key_variables import state_of, variables
+from .mapped_image import map_image
 from .shared_blocks import (
+    Digests,
     Layout,
     Place,
     Segment,
     by_segment,
     can_share,
+    layout_of,
     memory_file,
     new_number,
     places_of,
     write_changed,
 )
-from .state_image import IMAGE_BYTES, Imager, Key, estimate
+from .state_image import IMAGE_BYTES, Imager, Key, estimate, is_image
 
 if TYPE_CHECKING:
     from ..life.recorded_life import Life
@@ -61,7 +65,9 @@ class Imaging:
         self._life, self._may_fork = life, may_fork
         self._imager = Imager()
         self._layout: Layout = {}
+        self._begun_with: list[Place] = []  # the blocks of the state that the life has begun with, in order
         self._segments: dict[int, Segment] = {}
+        self._digests: Digests = {}  # of the blocks that are in none of these
         self._written: tuple[Segment, Layout] | None = None  # what the home has not acknowledged yet
         self._writer: Writer | None = None
         self._is_again = False
@@ -69,9 +75,25 @@ class Imaging:
         self.last_bytes = 0
 
     @property
+    def files(self) -> list[int]:
+        """The descriptors of the segments that the next image is compared with."""
+        return [segment.file for segment in self._segments.values()]
+
+    @property
     def is_busy(self) -> bool:
         """Whether an image is being written or kept."""
         return self._writer is not None or self._written is not None
+
+    def mapped(self, lent: Lent) -> ByteParts:
+        """The state that a home lends; what does not change of it is not written again.
+
+        Raises:
+            HoldfastError: it is not there any more. OSError: there is no room for it.
+        """
+        data, self._begun_with, self._segments = map_image(lent)
+        if not is_image(data):  # The home has no such blocks.
+            self.restart()
+        return data
 
     def suits(self) -> bool:
         """Whether the state is large enough."""
@@ -79,7 +101,7 @@ class Imaging:
         assert actor is not None
         if not can_share():
             return False
-        return max(self.last_bytes, estimate(actor, variables(actor))) >= IMAGE_BYTES
+        return max(self.last_bytes, estimate(actor, variables(actor), below=True)) >= IMAGE_BYTES
 
     def take(self) -> None:
         """Write an image of the state after the last turn; one that is under way is waited for, then one more follows.
@@ -99,7 +121,7 @@ class Imaging:
         job = _Job(life.turn, [fed.feed.id for fed in life.stash], number, file, life.traps)
         writer: Writer | None = None
         try:
-            if self._may_fork and self._should_fork(estimate(actor, variables(actor))) and is_alone():
+            if self._will_fork():
                 writer = Writer(self, job, state)
                 life.port.to_home(Marked(life.turn))
                 self._writer = writer
@@ -115,15 +137,21 @@ class Imaging:
         job.pause = time.perf_counter() - begin
         self._hand_over(job, layout)
 
-    def _should_fork(self, arrays: int) -> bool:
-        size = max(self.last_bytes, arrays)
+    def _will_fork(self) -> bool:
+        """Whether a copy of the process is to write the next image of the state."""
+        actor = self._life.cell.actor
+        assert actor is not None
+        names = variables(actor)
+        arrays, size = estimate(actor, names), max(self.last_bytes, estimate(actor, names, below=True))
         is_rewritten = self._last_share > 0.5 and arrays > 0.9 * size
-        return size >= FORK_BYTES and not (is_rewritten and size <= MOST_COPIED)
+        should = size >= FORK_BYTES and not (is_rewritten and size <= MOST_COPIED)
+        return self._may_fork and should and is_alone()
 
     def write(self, job: _Job, state: Any) -> Layout:
         """Write what differs from the last image that is kept."""
         pieces = self._imager.image(state.version, state.form, state.value, self._life.cell.path)
-        return write_changed(job.file, job.number, pieces, self._layout, self._segments)
+        known = self._layout or layout_of(pieces, self._begun_with)
+        return write_changed(job.file, job.number, pieces, known, self._segments, self._digests)
 
     def written(self, job: _Job, layout: Layout) -> None:
         """A forked writer is ready."""
@@ -165,7 +193,8 @@ class Imaging:
         self.last_bytes = sum(length for _, _, length in places)
         new = sum(length for number, _, length in places if number == job.number)
         self._last_share = new / max(1, self.last_bytes)
-        shared = Shared(job.number, os.getpid(), job.file, segment.inode, segment.size, places)
+        is_idle = self._will_fork()
+        shared = Shared(job.number, os.getpid(), job.file, segment.inode, segment.size, places, is_idle)
         life.image_taken(job.turn)
         said = life.made_by()
         life.port.to_home(Snapshot(job.turn, b"", True, job.stash, job.pause, False, shared, job.traps, *said))
@@ -180,24 +209,33 @@ class Imaging:
             self._life.image_lost()
         else:
             self._segments[segment.number] = segment
-            self._layout = layout
-            self._forget()
-            if record.is_full or len(self._segments) > MOST_SEGMENTS:
+            places = places_of(layout)
+            for index, digest in record.digests.items():
+                self._digests[places[index]] = digest
+            for number in {places[index][0] for index in record.digests} & self._segments.keys():
+                self._segments.pop(number).close()
+            self._layout, self._begun_with = layout, []
+            if self._forget() > MOST_SEGMENTS or record.is_full:
                 self.restart()
         self._once_more()
 
-    def _forget(self) -> None:
+    def _forget(self) -> int:
+        """Let go of what the last image does not need; returns over how many segments it is spread."""
         wanted = by_segment(places_of(self._layout))
         for number in list(self._segments):
             if number not in wanted:
                 self._segments.pop(number).close()
+        for place in [place for place in self._digests if place[1:] not in wanted.get(place[0], ())]:
+            del self._digests[place]
+        return len(wanted)
 
     def restart(self) -> None:
         """Write the next image in full."""
-        self._layout = {}
+        self._layout, self._begun_with = {}, []
         for segment in self._segments.values():
             segment.close()
         self._segments.clear()
+        self._digests.clear()
 
     def _once_more(self) -> None:
         again, self._is_again = self._is_again, False
@@ -315,7 +353,7 @@ def _write_and_exit(imaging: Imaging, job: _Job, state: Any, out: int, parent: i
         _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:
             os._exit(1)
-        _close_all_but({out, job.file})
+        _close_all_but({out, job.file, *imaging.files})
         try:
             layout = imaging.write(job, state)
             report = Written(list(layout.items()))

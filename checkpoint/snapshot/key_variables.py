@@ -10,7 +10,7 @@ from ...actors.control.live_state import attributes
 from ...actors.errors import HoldfastError, type_name
 from ...actors.kernel.actor import Actor
 from ...actors.state_hooks import state_getter, state_migrator, state_setter
-from ...actors.values import UnsavableValue, decode_value, encode_value
+from ...actors.values import ByteParts, UnsavableValue, adopt_value, decode_value, encode_value
 from ...actors.values.renamed import former_members
 from ..method import Method
 from .state_image import is_image, read_image
@@ -86,7 +86,7 @@ def _parts(actor: Actor, state: StateForm) -> list[tuple[str, object]]:
 
 def restore_state(
     actor: Actor,
-    data: bytes,
+    data: bytes | ByteParts,
     variables: tuple[list[str], list[str]] = ([], []),
     meant: Callable[[Any], Any] = as_it_is,
 ) -> list[str]:
@@ -94,7 +94,7 @@ def restore_state(
 
     Args:
         actor: constructed, and nothing more.
-        data: the state.
+        data: the state; parts are in memory that becomes the actor's own.
         variables: those that the class had that has saved it, and that it has now, after `__init__` alone.
         meant: gives what is meant by a saved value.
 
@@ -104,7 +104,11 @@ def restore_state(
     Raises:
         DamagedValue, StateMismatch: the data is damaged, or of another class or schema version.
     """
-    saved = read_image(data) if is_image(data) else decode_value(data)
+    saved: Any
+    if isinstance(data, ByteParts):
+        saved = read_image(data, adopt_value) if is_image(data) else adopt_value(data)
+    else:
+        saved = read_image(data) if is_image(data) else decode_value(data)
     dropped: list[str] = []
     if isinstance(saved, tuple) and len(saved) == 3 and saved[:2] == (actor.schema_version, "keys"):
         version, form, state = saved

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import hashlib
 import mmap
 import os
 import sys
@@ -16,7 +17,7 @@ from collections.abc import Iterable
 from typing import Any, Final
 
 from ...actors.errors import HoldfastError
-from ...actors.shared_memory import keep_size, unnamed
+from ...actors.shared_memory import keep_contents, keep_size, unnamed
 from .state_image import Key
 
 BLOCK: Final = 256 * 1024
@@ -31,6 +32,8 @@ Place = tuple[int, int, int]
 """Where a block is: segment, offset, length."""
 Layout = dict[Key, list[Place]]
 """Where the pieces of an image are, in its order."""
+Digests = dict[Place, bytes]
+"""Of blocks that are in a store, and in memory no more."""
 
 
 def can_share() -> bool:
@@ -39,7 +42,7 @@ def can_share() -> bool:
 
 
 class Segment:
-    """Some blocks, mapped; whoever holds `file` could write them, but nobody does.
+    """Some blocks; whoever holds `file` could write them, but nobody does.
 
     Nobody can make it shorter: whoever reads a mapping behind the end of its file dies of it (SIGBUS).
 
@@ -47,16 +50,18 @@ class Segment:
         OSError: the file is no memory that can be sealed.
     """
 
-    def __init__(self, number: int, file: int) -> None:
+    def __init__(self, number: int, file: int, *, is_lent: bool = False) -> None:
         keep_size(file)  # Before it is measured.
         self.number, self.file = number, file
         self.size = os.fstat(file).st_size
         self.inode = os.fstat(file).st_ino
-        self.map = mmap.mmap(file, self.size, mmap.MAP_SHARED) if self.size else None
+        self._access = mmap.PROT_READ if is_lent else mmap.PROT_READ | mmap.PROT_WRITE
+        self._map: mmap.mmap | None = None
+        self._is_lent = is_lent
         self._freed: dict[int, int] = {}  # what has been given back, by offset
 
     @classmethod
-    def of(cls, number: int, blocks: Iterable[tuple[int, bytes]]) -> Segment:
+    def of(cls, number: int, blocks: Iterable[tuple[int, bytes | memoryview]]) -> Segment:
         """Blocks in memory of their own, each at its offset: for engines that have read them."""
         file, end = memory_file(number), 0
         try:
@@ -71,28 +76,48 @@ class Segment:
 
     def block(self, offset: int, length: int) -> memoryview:
         """One block, where it lies."""
-        if self.map is None or not 0 <= offset <= offset + length <= self.size:
+        if not 0 <= offset < offset + length <= self.size:
             raise HoldfastError(f"segment {self.number:x} has no bytes {offset} to {offset + length}")
-        return memoryview(self.map)[offset : offset + length]
+        return memoryview(self._mapped())[offset : offset + length]
+
+    def _mapped(self) -> mmap.mmap:
+        """All of it, which takes room among the addresses of this process only once it is looked at."""
+        if self._map is None:
+            self._map = mmap.mmap(self.file, self.size, mmap.MAP_SHARED, self._access)
+        return self._map
+
+    def lend(self) -> None:
+        """Let others map it: what stands in it now stays, so that none of its memory is given back any more.
+
+        Raises:
+            OSError: the system cannot promise that.
+        """
+        keep_contents(self.file)
+        self._is_lent = True
 
     def keep(self, places: set[tuple[int, int]]) -> None:
         """Give back the memory of all blocks that are not among these (offset, length)."""
-        if self.map is None:
+        if self._is_lent or not self.size:
             return
         end = 0
         for offset, length in (*sorted(places), (self.size, 0)):
             if offset - end > self._freed.get(end, 0):
                 self._freed[end] = offset - end
                 with contextlib.suppress(OSError):  # It is only memory that could be free.
-                    self.map.madvise(mmap.MADV_REMOVE, end, offset - end)
+                    self._mapped().madvise(mmap.MADV_REMOVE, end, offset - end)
             end = offset + -(-length // PAGE) * PAGE
 
     def close(self) -> None:
         """Let go of it; views of its blocks stay valid."""
         os.close(self.file)
         with contextlib.suppress(BufferError):  # Then it goes with the last view.
-            if self.map is not None:
-                self.map.close()
+            if self._map is not None:
+                self._map.close()
+
+
+def can_lend() -> bool:
+    """Whether other processes of this user may open what this one holds. (One that may not be debugged is root's.)"""
+    return can_share() and os.stat("/proc/self/fd").st_uid == os.geteuid()
 
 
 def memory_file(number: int) -> int:
@@ -106,9 +131,16 @@ def new_number() -> int:
 
 
 def write_changed(
-    file: int, number: int, image: list[tuple[Key, Any]], known: Layout, segments: dict[int, Segment]
+    file: int,
+    number: int,
+    image: list[tuple[Key, Any]],
+    known: Layout,
+    segments: dict[int, Segment],
+    digests: Digests,
 ) -> Layout:
     """Write into `file` the blocks that differ from the known ones; returns where all blocks of the image are.
+
+    A known block is compared where it lies in one of the segments, or else by its digest.
 
     Raises:
         OSError: there is no memory for it.
@@ -123,9 +155,15 @@ def write_changed(
         places = layout[key] = []
         for index, begin in enumerate(range(0, len(view), BLOCK)):
             block = view[begin : begin + BLOCK]
-            if index < len(before) and _is_same(block, address + begin if address else 0, before[index], segments):
-                places.append(before[index])
-                continue
+            place = before[index] if index < len(before) else None
+            if place is not None and place[2] == len(block):
+                if place[0] in segments:
+                    is_same = _is_same(block, address + begin if address else 0, place, segments[place[0]])
+                else:
+                    is_same = place in digests and digests[place] == digest(block)
+                if is_same:
+                    places.append(place)
+                    continue
             places.append((number, end, len(block)))
             out.append(block)
             end += len(block)
@@ -134,6 +172,17 @@ def write_changed(
                 out.append(_ZEROS[:pad])
                 end += pad
     _write(file, out)
+    return layout
+
+
+def layout_of(image: list[tuple[Key, Any]], places: list[Place]) -> Layout:
+    """Where the pieces of an image may be among the places of an earlier one, which says no more than their order."""
+    layout: Layout = {}
+    at = 0
+    for key, piece in image:
+        count = -(-len(memoryview(piece).cast("B")) // BLOCK)
+        layout[key] = places[at : at + count]
+        at += count
     return layout
 
 
@@ -156,27 +205,29 @@ def _address(view: memoryview) -> int:
     return int(numpy.frombuffer(view, numpy.uint8).ctypes.data) if numpy is not None and len(view) else 0
 
 
-def _is_same(block: memoryview, address: int, place: Place, segments: dict[int, Segment]) -> bool:
-    segment, offset, length = place
-    other = segments.get(segment)
-    if other is None or length != len(block):
-        return False
-    kept = other.block(offset, length)
+def _is_same(block: memoryview, address: int, place: Place, segment: Segment) -> bool:
+    _, offset, length = place
+    kept = segment.block(offset, length)
     if address:
         return bool(_memcmp(address, _address(kept), length) == 0)
     return bytes(block) == bytes(kept)
 
 
-def open_segment(number: int, pid: int, file: int, inode: int) -> Segment:
-    """A segment that a life has written.
+def digest(block: memoryview) -> bytes:
+    """By which a block is known that is in memory no more."""
+    return hashlib.blake2b(block, digest_size=16).digest()
+
+
+def open_segment(number: int, pid: int, file: int, inode: int, *, is_lent: bool = False) -> Segment:
+    """A segment that another process holds: a life that has written it, or (`is_lent`) a home that lends it.
 
     Raises:
         HoldfastError: it is not there any more.
     """
     try:
-        own = os.open(f"/proc/{pid}/fd/{file}", os.O_RDWR | os.O_CLOEXEC)
+        own = os.open(f"/proc/{pid}/fd/{file}", (os.O_RDONLY if is_lent else os.O_RDWR) | os.O_CLOEXEC)
         try:
-            segment = Segment(number, own)
+            segment = Segment(number, own, is_lent=is_lent)
         except OSError:
             os.close(own)
             raise

@@ -7,6 +7,7 @@ is the journal cut. Until then the older snapshot and the whole journal stand, a
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
@@ -14,12 +15,14 @@ import msgspec
 
 from ...actors.errors import HoldfastError
 from ...actors.events import SnapshotTaken
-from ..protocol import PIECE, Kept, Marked, Restore, Shared, Snapshot
-from .shared_blocks import Place, Segment, by_segment, open_segment
-from .snapshot_record import IMAGES, Meta, keep, made_by, meta_now
+from ..journal import DamagedStore
+from ..protocol import PIECE, Kept, Lent, Marked, Restore, Shared, Snapshot
+from .shared_blocks import Place, Segment, by_segment, digest, new_number, open_segment
+from .snapshot_record import IMAGES, Meta, begin_with_older, keep, made_by, meta_now
 
 if TYPE_CHECKING:
     from ..home.switch import Switch
+    from ..inputs import HomeJournal
 
 MOST_GARBAGE: Final = 3
 """How many times the size of an image its packs may take before it is written anew."""
@@ -30,7 +33,10 @@ class SnapshotImages:
 
     def __init__(self, home: Switch) -> None:
         self._home = home
-        self._segments: dict[int, Segment] = {}
+        self._segments: dict[int, Segment] = {}  # what is in memory; a store may have it instead
+        self._held: dict[int, set[tuple[int, int]]] = {}  # which blocks of these (offset, length) are really there
+        self._value: Segment | None = None  # a copy of a state that was saved as one value, until it is mapped
+        self._sizes: dict[int, int] = {}  # of all that the newest snapshot needs
         self._history: list[set[int]] = []  # segments of the snapshots that are kept, newest first
         self._packs: set[int] = set()  # what the store may have
         self._marked: Meta | None = None
@@ -54,7 +60,7 @@ class SnapshotImages:
             self.refuse(shared, str(error))
             return
         if not home.journal.durable:
-            self._finish(meta, record, shared)
+            self._finish(meta, record, shared, {})
             return
         saving = home.node.loop.create_task(self._save(meta, record, shared), name=f"snapshot of {home.path}")
         self._saving = saving
@@ -72,10 +78,14 @@ class SnapshotImages:
         if self._saving is not None:
             raise HoldfastError("the snapshot before it is still on its way")
         segment = open_segment(shared.number, shared.pid, shared.file, shared.inode)
-        if {number for number, _, _ in shared.places} - {shared.number, *self._segments}:
+        newest = self._home.ledger.newest
+        known = by_segment(newest.blocks) if newest is not None else {}
+        if {number for number, _, _ in shared.places} - {shared.number, *known}:
             segment.close()
             raise HoldfastError("a snapshot refers to blocks that are not here")
         self._segments[shared.number] = segment
+        self._held[shared.number] = by_segment(shared.places).get(shared.number, set())
+        self._sizes[shared.number] = segment.size
         return msgspec.structs.replace(
             marked,
             format=IMAGES,
@@ -89,6 +99,7 @@ class SnapshotImages:
     async def _save(self, meta: Meta, record: Snapshot, shared: Shared) -> None:
         home, own = self._home, [place for place in meta.blocks if place[0] == shared.number]
         segment, journal, me = self._segments[shared.number], home.journal, asyncio.current_task()
+        digests: dict[int, bytes] = {}
         try:
             if own:
                 blocks = [(offset, segment.block(offset, length)) for _, offset, length in own]
@@ -96,10 +107,12 @@ class SnapshotImages:
                     await asyncio.to_thread(journal.keep_blocks, home.path, shared.number, blocks, home.method.compress)
                 finally:  # Not before: whoever removes it while it is written has removed nothing.
                     self._packs.add(shared.number)
+            if shared.is_idle:
+                digests = await asyncio.to_thread(digests_of, self._in_memory(meta.blocks))
             if self._saving is not me:
                 return  # Its pack goes with those that the next snapshot does not need.
             self._saving = None
-            if not self._finish(meta, record, shared):
+            if not self._finish(meta, record, shared, digests):
                 return  # The one before it stands, and needs its packs.
             # By number: the next snapshot may be on its way before the thread has come to that.
             unneeded = self._packs.difference(meta.earlier, [number for number, _, _ in meta.blocks])
@@ -111,7 +124,15 @@ class SnapshotImages:
                 self._saving = None
                 self.refuse(shared, str(error))
 
-    def _finish(self, meta: Meta, record: Snapshot, shared: Shared) -> bool:
+    def _in_memory(self, blocks: list[Place]) -> dict[int, memoryview]:
+        """Those blocks that need memory here, by their place among all."""
+        return {
+            index: self._segments[number].block(offset, length)
+            for index, (number, offset, length) in enumerate(blocks)
+            if number in self._segments
+        }
+
+    def _finish(self, meta: Meta, record: Snapshot, shared: Shared, digests: dict[int, bytes]) -> bool:
         """Whether it is kept now."""
         home = self._home
         try:
@@ -120,9 +141,11 @@ class SnapshotImages:
             self.refuse(shared, str(error))
             return False
         size = sum(length for _, _, length in meta.blocks)
-        is_full = home.journal.durable and sum(one.size for one in self._segments.values()) > MOST_GARBAGE * size
+        is_full = home.journal.durable and sum(self._sizes.values()) > MOST_GARBAGE * size
+        for number in {meta.blocks[index][0] for index in digests}:
+            self._let_go(number)
         if home.life.port is not None:
-            home.life.port.to_life(Kept(shared.number, True, is_full))
+            home.life.port.to_life(Kept(shared.number, True, is_full, digests))
         home.limit.cut()
         home.due.kept(meta.turn)
         if home.node.events.has_listeners:
@@ -133,9 +156,8 @@ class SnapshotImages:
     def refuse(self, shared: Shared, why: str) -> None:
         """It could not be kept: what was there before is still there."""
         home = self._home
-        segment = self._segments.pop(shared.number, None)
-        if segment is not None:
-            segment.close()
+        self._let_go(shared.number)
+        self._sizes.pop(shared.number, None)
         if home.life.port is not None:
             home.life.port.to_life(Kept(shared.number, False))
         home.due.failed(why)
@@ -156,14 +178,111 @@ class SnapshotImages:
         newest = ledger.newest.blocks if ledger.newest is not None else []
         self._history = [set(by_segment(newest)), *self._history][: self._home.method.keep]
         wanted = by_segment([*newest, *(ledger.older.blocks if ledger.older is not None else ())])
+        self._sizes = {number: size for number, size in self._sizes.items() if number in wanted}
         for number in list(self._segments):
             if number not in wanted:
-                self._segments.pop(number).close()
+                self._let_go(number)
             elif not self.is_saving:
                 self._segments[number].keep(wanted[number])
+                self._held[number] &= wanted[number]
+
+    def _let_go(self, number: int) -> None:
+        """Give back the memory of a segment."""
+        segment = self._segments.pop(number, None)
+        self._held.pop(number, None)
+        if segment is not None:
+            segment.close()
+
+    def let_go_of_stored(self) -> None:
+        """A life elsewhere has its state: what the store has needs no memory here."""
+        if not self._home.journal.durable:
+            return
+        for number in self._packs.intersection(self._segments):
+            self._let_go(number)
+
+    @property
+    def are_here(self) -> bool:
+        """Whether the newest snapshot can be handed to a life without a look into the store."""
+        newest = self._home.ledger.newest
+        return newest is None or not self._missing(newest.blocks)
+
+    def _missing(self, blocks: list[Place]) -> dict[int, set[tuple[int, int]]]:
+        """The segments that lack some of these blocks, with all that they are to have then."""
+        held = self._held
+        wanted = by_segment(blocks).items()
+        return {one: places | held.get(one, set()) for one, places in wanted if not places <= held.get(one, set())}
+
+    async def bring(self) -> None:
+        """Have the newest snapshot here, while others go on; if it is damaged, an older one.
+
+        Raises:
+            HoldfastError: none can be had.
+        """
+        home = self._home
+        missing = {} if home.ledger.newest is None else self._missing(home.ledger.newest.blocks)
+        if not missing:
+            return
+        reading = asyncio.ensure_future(asyncio.to_thread(read_segments, home.journal, home.path, missing))
+        try:
+            made = await asyncio.shield(reading)
+        except DamagedStore:
+            begin_with_older(home)
+        except asyncio.CancelledError:
+            reading.add_done_callback(_close_read)
+            raise
+        else:
+            if home.cell is None:  # Its address was erased meanwhile.
+                _close(made)
+                raise HoldfastError(f"{home.path} was erased while its state was read")
+            self._take_in(made, missing)
+
+    def _take_in(self, made: dict[int, Segment], held: dict[int, set[tuple[int, int]]]) -> None:
+        for number, segment in made.items():
+            self._let_go(number)
+            self._segments[number], self._held[number] = segment, held[number]
+            self._sizes[number] = segment.size
+
+    def _read(self, blocks: list[Place]) -> None:
+        """Have these blocks here, now.
+
+        Raises:
+            DamagedStore: one of them is missing or damaged.
+        """
+        missing = self._missing(blocks)
+        self._take_in(read_segments(self._home.journal, self._home.path, missing), missing)
+
+    def lend(self, blocks: list[Place]) -> Lent | None:
+        """The newest image for a life that maps it; None if that cannot be."""
+        self._read(blocks)
+        segments = [self._segments[number] for number in by_segment(blocks)]
+        try:
+            for segment in segments:
+                segment.lend()
+        except OSError:  # The system is too old for it.
+            return None
+        return Lent(os.getpid(), [(one.number, one.file, one.inode) for one in segments], blocks)
+
+    def lend_value(self, state: bytes) -> Lent | None:
+        """A state that was saved as one value, for a life that maps it; None if that cannot be."""
+        self.mapped()
+        number, view = new_number(), memoryview(state)
+        try:
+            segment = Segment.of(number, ((at, view[at : at + PIECE]) for at in range(0, len(state), PIECE)))
+            segment.lend()
+        except OSError:
+            return None
+        self._value = segment
+        return Lent(os.getpid(), [(number, segment.file, segment.inode)], [(number, 0, len(state))])
+
+    def mapped(self) -> None:
+        """A life has mapped what it was lent."""
+        value, self._value = self._value, None
+        if value is not None:
+            value.close()
 
     def restore(self, blocks: list[Place]) -> Iterator[Restore]:
-        """An image, in pieces for a life."""
+        """The newest image, in pieces for a life."""
+        self._read(blocks)
         batch: list[memoryview] = []
         size = 0
         for number, offset, length in blocks:
@@ -181,17 +300,7 @@ class SnapshotImages:
         Raises:
             DamagedStore: one of them is missing or damaged.
         """
-        home = self._home
-        made: dict[int, Segment] = {}
-        try:
-            for number, places in by_segment(meta.blocks).items():
-                if number not in self._segments:
-                    made[number] = home.journal.read_blocks(home.path, number, places)
-        except BaseException:
-            for segment in made.values():
-                segment.close()
-            raise
-        self._segments.update(made)
+        self._read(meta.blocks)
 
     def loaded(self, meta: Meta) -> None:
         """The store was read: these are the packs it needs."""
@@ -203,6 +312,40 @@ class SnapshotImages:
     def close(self) -> None:
         """The home is given up."""
         self.cancel()
+        self.mapped()
         for segment in self._segments.values():
             segment.close()
         self._segments.clear()
+        self._held.clear()
+
+
+def read_segments(journal: HomeJournal, path: str, wanted: dict[int, set[tuple[int, int]]]) -> dict[int, Segment]:
+    """Read these blocks of an address from the store, and verify them.
+
+    Raises:
+        DamagedStore: one of them is missing or damaged.
+    """
+    made: dict[int, Segment] = {}
+    try:
+        for number, places in wanted.items():
+            made[number] = journal.read_blocks(path, number, places)
+    except BaseException:
+        _close(made)
+        raise
+    return made
+
+
+def digests_of(blocks: dict[int, memoryview]) -> dict[int, bytes]:
+    """By which blocks are known that are in memory no more."""
+    return {index: digest(block) for index, block in blocks.items()}
+
+
+def _close(segments: dict[int, Segment]) -> None:
+    for segment in segments.values():
+        segment.close()
+
+
+def _close_read(reading: asyncio.Future[dict[int, Segment]]) -> None:
+    """Nobody waits any more for what was read."""
+    if not reading.cancelled() and reading.exception() is None:
+        _close(reading.result())

@@ -255,6 +255,17 @@ def load_newest(home: Switch) -> tuple[Journaled, Meta | None]:
     raise DamagedStore(home.path, home.path, None, f"no snapshot is left: {reason}")
 
 
+def begin_with_older(home: Switch) -> None:
+    """The newest snapshot turns out to be damaged: have the next life begin with the one before it, and replay more.
+
+    Raises:
+        DamagedStore: none can be used. StoreFailed: the store has failed.
+    """
+    home.journal.barrier()  # From here on all that is known stands there.
+    saved, newest = load_newest(home)
+    home.ledger = home.ledger.read_anew(newest, saved.entries)
+
+
 def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved]) -> None:
     """Take one journal entry up again, in order."""
     values: tuple[Any, ...] = entry

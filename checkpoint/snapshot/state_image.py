@@ -13,19 +13,22 @@ from __future__ import annotations
 import struct
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from typing import Any, Final
 
 import msgspec
 
 from ...actors.errors import DamagedValue
 from ...actors.kernel.actor import Actor
-from ...actors.values import decode_value, walked_pieces
+from ...actors.values import ByteParts, decode_value, in_one, walked_pieces
 
 IMAGE: Final = 2
 """The first byte of an image. (A state that was saved as one value begins with the format of values, 1.)"""
 HEAD: Final = struct.Struct(">BQ")
 LARGE: Final = 64 * 1024
 """Buffers from this size on are pieces of their own."""
+LOOKED_AT: Final = 1000
+"""Members of a list or dict that are looked at for an estimate."""
 IMAGE_BYTES: Final = 1024 * 1024
 """States from this size on are saved as images: below, a snapshot is one record and one row."""
 _UNCHANGING: Final = frozenset({int, float, complex, bool, str, bytes, type(None)})
@@ -146,32 +149,30 @@ def joined(pieces: Iterable[Any]) -> Iterator[Any]:
         yield b"".join(small)
 
 
-def is_image(data: bytes | memoryview) -> bool:
+def is_image(data: bytes | memoryview | ByteParts) -> bool:
     """Whether a saved state is an image."""
-    return len(data) > 0 and data[0] == IMAGE
+    return len(data) > 0 and (data.first if isinstance(data, ByteParts) else data[0]) == IMAGE
 
 
 def read_image(
-    data: bytes | memoryview, read: Callable[[memoryview], object] = decode_value
+    data: bytes | memoryview | ByteParts, read: Callable[[Any], object] = decode_value
 ) -> tuple[int, str, object]:
     """Schema version, form and state of an image; `read` makes the variables of their bytes.
 
     Raises:
         DamagedValue: whatever is wrong with the bytes.
     """
-    view = memoryview(data).cast("B")
+    left = data if isinstance(data, ByteParts) else ByteParts((memoryview(data).cast("B"),))
     try:
-        _, length = HEAD.unpack_from(view)
-        head = msgspec.msgpack.decode(view[HEAD.size : HEAD.size + length], type=Head)
-    except (struct.error, msgspec.DecodeError, msgspec.ValidationError) as error:
+        _, length = HEAD.unpack(in_one(left.take(HEAD.size)))
+        head = msgspec.msgpack.decode(in_one(left.take(length)), type=Head)
+    except (msgspec.DecodeError, msgspec.ValidationError) as error:
         raise DamagedValue(f"its head cannot be read: {error}") from error
-    at = HEAD.size + length
-    if at + sum(size for _, size in head.sections) != len(view):
+    if sum(size for _, size in head.sections) != len(left):
         raise DamagedValue("its sections are not as long as its head says")
     state: dict[str, Any] = {}
     for names, size in head.sections:
-        value = read(view[at : at + size])
-        at += size
+        value = read(left.take(size))
         if not names:
             return head.version, head.form, value
         if not isinstance(value, dict) or list(value) != names:
@@ -180,17 +181,23 @@ def read_image(
     return head.version, head.form, state
 
 
-def estimate(actor: Actor, names: Iterable[str]) -> int:
-    """Bytes of the state that are seen at a glance: arrays, and texts of bytes."""
-    numpy: Any = sys.modules.get("numpy")
+def estimate(actor: Actor, names: Iterable[str], *, below: bool = False) -> int:
+    """Bytes of the state seen at a glance: arrays, and texts of bytes; with `below` also in lists and dicts."""
     root: Any = actor._state_root()
     total = 0
     for name in names:
         value: Any = root
         for part in name.split("."):
             value = getattr(value, part, None)
-        if isinstance(value, bytes | bytearray):
-            total += len(value)
-        elif numpy is not None and isinstance(value, numpy.ndarray):
-            total += value.nbytes
+        total += _weight(value)
+        if below and isinstance(value, list | tuple | dict):
+            inner: Any = value.values() if isinstance(value, dict) else value
+            total += sum(map(_weight, islice(inner, LOOKED_AT)))
     return total
+
+
+def _weight(value: Any) -> int:
+    numpy: Any = sys.modules.get("numpy")
+    if isinstance(value, bytes | bytearray):
+        return len(value)
+    return int(value.nbytes) if numpy is not None and isinstance(value, numpy.ndarray) else 0

@@ -55,6 +55,7 @@ class Group:
     """A protected address: its replicas, who of them leads, and what is on its way to it."""
 
     begins = False  # What the proxy has not sent to any replica is not begun.
+    is_far = True
 
     def __init__(self, cell: Cell, switch: Switch, place: GroupPlace, known: Membership) -> None:
         self.switch, self.place = switch, place

@@ -129,7 +129,7 @@ class GroupPlace(Place):
 
     async def _recover(self, cell: Cell, entered: Entered) -> None:
         home, switch = self.home, entered.switch
-        await home.gate("restart")
+        await home.let_begin()
         if not home.is_gated:
             home.isolated()
         if cell.state is not DOWN:
@@ -385,7 +385,7 @@ class GroupPlace(Place):
         if not life:
             raise StartFailed(replicas.path, f"{first} has ended")
         try:
-            pieces = switch.restore_records()
+            pieces = switch.restore_records(maps=False)  # A replica takes its state as it takes that of its leader.
             if not pieces and switch.ledger.state_turn >= 0:
                 pieces = [Restore(b"")]  # It begins afresh, but its turns are counted on.
             traps = traps or any(piece.traps for piece in pieces)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from tests.removing import Check, as_tests
 
+LARGE = "tests/checkpoint/test_large_states.py"
+
 CHECKS = {
     "an ask that runs ahead overtakes nothing that waits until it is safe": Check(
         "checkpoint/home/admission.py",
@@ -375,8 +377,8 @@ CHECKS = {
     ),
     "a snapshot that was refused takes no packs with it": Check(
         "checkpoint/snapshot/snapshot_blocks.py",
-        "            if not self._finish(meta, record, shared):\n                return",
-        "            if not self._finish(meta, record, shared):\n                pass",
+        "            if not self._finish(meta, record, shared, digests):\n                return",
+        "            if not self._finish(meta, record, shared, digests):\n                pass",
         "tests/checkpoint/test_snapshots_damage.py",
         "test_a_snapshot_that_could_not_be_kept",
     ),
@@ -842,6 +844,90 @@ CHECKS = {
         "            pass\n",
         "tests/checkpoint/sqlite/test_parts.py",
         "test_a_copy_of_what_a_living_owner",
+    ),
+    "what a life does to the state that it has mapped is its own": Check(
+        "checkpoint/snapshot/mapped_image.py",
+        "mmap.MAP_PRIVATE | MAP_FIXED",
+        "mmap.MAP_SHARED | MAP_FIXED",
+        LARGE,
+        "test_an_image_is_put_together",
+    ),
+    "what is lent is not written to": Check(
+        "checkpoint/snapshot/shared_blocks.py",
+        "        keep_contents(self.file)\n",
+        "",
+        LARGE,
+        "test_what_is_lent_stays",
+    ),
+    "a block of another file is not taken for one": Check(
+        "checkpoint/snapshot/shared_blocks.py",
+        "    if segment.inode != inode:\n",
+        "    if False:\n",
+        LARGE,
+        "test_another_file_of_that_number",
+    ),
+    "a segment has the bytes that it is said to have": Check(
+        "checkpoint/snapshot/mapped_image.py",
+        "        if segment is None or offset % PAGE or not 0 <= offset < offset + length <= segment.size:\n",
+        "        if segment is None:\n",
+        LARGE,
+        "test_places_that_are_none",
+    ),
+    "a segment that cannot be mapped is closed": Check(
+        "checkpoint/snapshot/mapped_image.py",
+        "        for segment in segments.values():\n            segment.close()\n",
+        "",
+        LARGE,
+        "test_places_that_are_none",
+    ),
+    "a snapshot that is damaged in the middle of a run is passed over": Check(
+        "checkpoint/snapshot/snapshot_blocks.py",
+        "            begin_with_older(home)\n",
+        "            raise\n",
+        LARGE,
+        "test_a_snapshot_that_is_damaged_meanwhile and byte and process",
+    ),
+    "who replays nothing replays nothing behind an older snapshot either": Check(
+        "checkpoint/home/journal_home.py",
+        "        if not self.method.replays:  # It may be an older snapshot.\n            forget_turns(self.switch)\n",
+        "",
+        LARGE,
+        "test_an_actor_that_replays_nothing",
+    ),
+    "asks go on waiting behind an older snapshot": Check(
+        "checkpoint/home/input_ledger.py",
+        "        ledger.open = {key: self.open.get(key, source) for key, source in ledger.open.items()}\n",
+        "",
+        LARGE,
+        "test_a_snapshot_that_is_damaged_meanwhile and byte and process",
+    ),
+    "a forked writer can read what it compares with": Check(
+        "checkpoint/snapshot/image_writer.py",
+        "_close_all_but({out, job.file, *imaging.files})",
+        "_close_all_but({out, job.file})",
+        "tests/checkpoint/test_snapshots.py",
+        "test_what_has_not_changed and process and 3000000",
+    ),
+    "a segment whose memory was given back in part is read again": Check(
+        "checkpoint/snapshot/snapshot_blocks.py",
+        "if not places <= held.get(one, set())",
+        "if one not in held",
+        LARGE,
+        "test_an_older_snapshot_is_whole and sqlite",
+    ),
+    "a life lets go of what the store has": Check(
+        "checkpoint/snapshot/image_writer.py",
+        "                self._segments.pop(number).close()\n            self._layout, self._begun_with = layout, []\n",
+        "                self._segments.get(number)\n            self._layout, self._begun_with = layout, []\n",
+        LARGE,
+        "test_what_the_store_has and process",
+    ),
+    "a home lets go of what a life has mapped and the store has": Check(
+        "checkpoint/home/switch.py",
+        "                        self.images.let_go_of_stored()\n",
+        "                        pass\n",
+        LARGE,
+        "test_what_the_store_has and process",
     ),
 }
 

@@ -145,6 +145,18 @@ async def the_window_is_exact(system: hf.ActorSystem) -> None:
     assert (await family.states()) == {"a": "running"}
 
 
+@entry("restarts that take longer than the period")
+async def slow_restarts_add_up(system: hf.ActorSystem) -> None:
+    plan = Plan()
+    plan.todo["a"] = [0.0, 7.0, 7.0]
+    slow = kid(plan, "a", late=True)
+    family = await Family.start(system, plan, slow, intensity=1, period=5.0, restart="temporary")
+    for _ in range(2):
+        await family.after("a", Boom())
+        await asyncio.sleep(1.0)  # It is up again by now.
+    assert not family.is_alive
+
+
 @entry("the default intensity of a dynamic supervisor")
 async def one_default_intensity(system: hf.ActorSystem) -> None:
     plan = Plan()

@@ -23,6 +23,7 @@ KINDS = "tests/migration/test_moved_kinds.py"
 JOURNALS = "tests/supervision/test_dynamic_journal.py"
 LINES = "tests/supervision/test_program_lines.py"
 NAMED = "tests/control/test_named_children.py"
+SLOW = "tests/supervision/test_slow_restarts.py"
 
 CHECKS = {
     "the states are in the store together": Check(
@@ -902,6 +903,20 @@ CHECKS = {
         "        pass\n",
         NAMED,
         "test_transactions_know",
+    ),
+    "attempts that each outlast the period are counted": Check(
+        "supervision/supervisor.py",
+        "        if window is None or own is None:\n",
+        "        if window is None:\n",
+        SLOW,
+        "test_attempts_that_each_outlast and one_for_one",
+    ),
+    "the time that restarts take is left out": Check(
+        "supervision/supervisor.py",
+        "            failed.away += self.ctx._cell.node.loop.time() - since\n",
+        "            pass\n",
+        SLOW,
+        "test_attempts_that_each_outlast and one_for_one",
     ),
 }
 
