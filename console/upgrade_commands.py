@@ -164,5 +164,7 @@ def _had(command: str, work: Callable[[], Any]) -> Any:
     try:
         return work()
     except (HoldfastError, OSError) as error:
+        if isinstance(error, BrokenPipeError):  # Whoever reads it has enough, as `head` has.
+            raise
         typer.echo(f"holdfast {command}: {error}", err=True)
         raise typer.Exit(UNCHECKED) from error

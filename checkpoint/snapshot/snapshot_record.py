@@ -39,7 +39,8 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     whether it traps exits.
 
     `kind`: the class whose state it is, `variables` those that it had when `__init__` had run, and `shapes` the fields
-    of its messages (see `schema.py`); stores of before do not say.
+    of its messages (see `schema.py`); stores of before do not say. `is_replaced`: the state was put in place from
+    outside, so no replay of earlier turns leads to it.
     """
 
     format: int
@@ -62,6 +63,7 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     kind: str = ""
     variables: list[str] = []
     shapes: dict[str, list[Any]] = {}
+    is_replaced: bool = False
 
     @property
     def has_state(self) -> bool:
@@ -126,7 +128,8 @@ def cut(home: Switch, state: bytes, record: Snapshot) -> None:
     """
     meta = meta_now(home, record.turn, record.stash, state)
     more = made_by(home, record)
-    keep(home, msgspec.structs.replace(meta, earlier=home.images.earlier(), traps=record.traps, **more))
+    more |= {"traps": record.traps, "is_replaced": record.is_replaced}
+    keep(home, msgspec.structs.replace(meta, earlier=home.images.earlier(), **more))
 
 
 def keep(home: Switch, meta: Meta) -> None:

@@ -35,7 +35,7 @@ def kept_lives(homes: Homes, path: str) -> list[KeptLife]:
         DamagedStore: none can be trusted. HoldfastError: it is of a format that this holdfast does not know.
     """
     found: list[KeptLife] = []
-    while True:
+    while not found or found[-1].meta is not None:
         saved = homes.journal.load(path, older=len(found))
         if found and saved.snapshot == found[-1].saved.snapshot:
             break  # There is no older one.

@@ -16,6 +16,7 @@ from ...actors.errors import DIVERGES, HoldfastError, ReplayDiverged, StartFaile
 from ...actors.kernel.actor import Actor
 from ..home.homes import Homes
 from ..protocol import Feed
+from ..snapshot.snapshot_record import Meta
 from .kept_lives import KeptLife, kept_lives, state_differences
 from .rerun import LifeEnded, NotRecorded, Recipe, Rerun
 
@@ -123,28 +124,27 @@ class _Check:
             await rerun.live(turns)
             self.turns += len(turns)
             if meta is not None:
-                return self._compare(rerun, meta.turn, meta.state, is_of_turn=meta.base == meta.turn)
+                return self._compare(rerun, meta)
             if await rerun.live_begun():
                 self.note = f"turn {rerun.turn} has no end, and is checked as far as it had come"
         problem = rerun.unreadable()
         return AddressCheck(self._path, "refused", self.turns, problem=problem) if problem else None
 
-    def _compare(self, rerun: Rerun, turn: int, state: bytes, *, is_of_turn: bool) -> AddressCheck | None:
+    def _compare(self, rerun: Rerun, following: Meta) -> AddressCheck | None:
         """Compare the state with that of the following snapshot, to which the turns led."""
-        kind = type(rerun.actor)
-        if not is_of_turn or not state:
-            return None
-        if kind.on_recovered is not Actor.on_recovered:
+        if following.is_replaced or following.base != following.turn or not following.state:
+            return None  # It was put in place from outside, or turns were undone: these do not lead to it.
+        if type(rerun.actor).on_recovered is not Actor.on_recovered:
             self.note = "its states are not compared: on_recovered may have changed them, and is not called here"
             return None
         try:
-            found = state_differences(rerun.actor, state)
+            found = state_differences(rerun.actor, following.state)
         except HoldfastError as error:
             found = [f"it cannot be compared: {error}"]
         if not found:
             return None
         problem = f"the state after it is not that of the snapshot: {'; '.join(found)}"
-        return dataclasses.replace(self._differs(rerun, self.turns, problem), turns=self.turns, turn=turn)
+        return dataclasses.replace(self._differs(rerun, self.turns, problem), turns=self.turns, turn=following.turn)
 
 
 def _said(error: ReplayDiverged) -> str:

@@ -41,9 +41,10 @@ def load_specs(target: str) -> Named:
     module, _, name = target.rpartition(":")
     if not module or not name:
         raise SpecError(target, "name the specs as 'module:name' or 'program.py:name', such as 'shop.main:tree'")
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
     is_script = module.endswith(".py")
+    folder = os.path.dirname(os.path.abspath(module)) if is_script else os.getcwd()
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
     problem = attempt(lambda: load_main(module, True) if is_script else _import(module))
     if problem:
         where = "" if is_script else "; it is looked for in this folder, and where PYTHONPATH says"

@@ -28,6 +28,7 @@ class Progress:
 
     def __init__(self, page: mmap.mmap) -> None:
         self._page, self._address, self._begun = page, -1, 0
+        self._type, self._length = "", 0  # as they stand on the page
 
     def next_address(self) -> None:
         """Another address is looked at."""
@@ -36,9 +37,12 @@ class Progress:
 
     def turn(self, turn: int, feed: Feed) -> None:
         """Another turn begins."""
-        name = (feed.name or feed.kind).encode()[:_MOST]
-        self._page[_HEAD.size : _HEAD.size + len(name)] = name
-        _HEAD.pack_into(self._page, 0, self._address, self._begun, turn + 1, len(name))
+        kind = feed.name or feed.kind
+        if kind != self._type:
+            name = kind.encode()[:_MOST]
+            self._page[_HEAD.size : _HEAD.size + len(name)] = name
+            self._type, self._length = kind, len(name)
+        _HEAD.pack_into(self._page, 0, self._address, self._begun, turn + 1, self._length)
         self._begun += 1
 
 

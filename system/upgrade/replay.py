@@ -12,7 +12,7 @@ import types
 from collections.abc import Callable
 from typing import Any, Final, cast
 
-from ...actors.errors import ReplayDiverged, SpecError
+from ...actors.errors import DamagedValue, ReplayDiverged, SpecError
 from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.message import Message, reply_type
 from ...actors.kernel.node import Node
@@ -156,11 +156,12 @@ def _recorded(address: str, lives: list[KeptLife]) -> Recipe:
         if entry[0] == "in" and entry[2] == START:
             name = name or cast("bytes", entry[4]).decode()
     hint = "name the specs of its program with --spec"
-    if not name or name.startswith("__main__:"):
-        raise SpecError(address, f"its class is recorded as {name or 'unknown'!r}, which cannot be imported; {hint}")
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
-    kind = find_class(name)
+    try:
+        kind = find_class(name)
+    except DamagedValue as error:
+        raise SpecError(address, f"{error.args[0]}; {hint}") from error
     if not issubclass(kind, Actor):
         raise SpecError(address, f"{name} is no actor class; {hint}")
     start: Start[Any] = Start(kind, (), {})
@@ -173,6 +174,8 @@ def _recorded(address: str, lives: list[KeptLife]) -> Recipe:
 
 class Debugger(pdb.Pdb):
     """Stops where a function begins."""
+
+    quitting = False
 
     def stop_in(self, code: types.CodeType) -> None:
         """Stop when this function is called next."""
@@ -188,7 +191,8 @@ class _Replay:
         self, homes: Homes, address: str, recipe: Recipe, told: Callable[[ReplayedTurn], None], *, breaks: bool
     ) -> None:
         self._homes, self._address, self._recipe, self._told = homes, address, recipe, told
-        self._breaks = breaks
+        self._breaks, self._debugger = breaks, Debugger()
+        self._turn, self._state = -1, dict[str, Any]()
 
     async def lived(self, lives: list[KeptLife], since: int | None, until: int | None) -> ReplayedState:
         """Live the turns of the latest life from which those that are wanted can be reached."""
@@ -202,40 +206,35 @@ class _Replay:
             raise SpecError(self._address, f"there is no turn {until}: {gone}the last one that is recorded is {last}")
         try:
             rerun.begin()
-            problem, turn = await self._live(rerun, first, first + 1 if since is None else since, until)
-            state = self._state(rerun)
+            self._turn, self._state = first, _state(rerun)
+            problem = await self._live(rerun, first + 1 if since is None else since, until)
         finally:
             await rerun.close()
-        return ReplayedState(self._address, kept[0], last, turn, state, problem)
+        return ReplayedState(self._address, kept[0], last, self._turn, self._state, problem)
 
-    async def _live(self, rerun: Rerun, first: int, since: int, until: int) -> tuple[str, int]:
-        """Why it has ended early, and after which turn it has ended."""
-        turns = [one for one in rerun.ledger.turns.items() if one[0] <= until]
+    async def _live(self, rerun: Rerun, since: int, until: int) -> str:
+        """Why it has ended early; "" if it has not."""
         again = dict(rerun.turns)
-        reached = first
-        before = [one for one in turns if one[0] < since and one[0] in again]
+        before = [one for one in rerun.turns if one[0] < since]
+        wanted = [one for one in rerun.ledger.turns.items() if since <= one[0] <= until]
         try:
             await rerun.live(before)
-            reached = max(reached, *(number for number, _ in turns if number < since), first)
-            for number, turn in turns:
-                if number < since:
-                    continue
+            self._turn, self._state = min(since - 1, until), _state(rerun)
+            for number, turn in wanted:
                 if number in again:
                     await self._step(rerun, number, turn, breaks=self._breaks and number == until)
                 else:
-                    self._told(_input(rerun, number, turn))
-                reached = number
+                    self._told(_input(number, turn))
+                self._turn = number
         except (ReplayDiverged, LifeEnded) as error:
-            return str(error), reached
+            return "the debugger was left" if self._debugger.quitting else str(error)
         except TimeoutError:
-            return f"turn {rerun.turn} has not come to its end within {TURN_TIMEOUT:g} s", reached
-        return "", max(reached, until)
+            return f"turn {rerun.turn} has not come to its end within {TURN_TIMEOUT:g} s"
+        return ""
 
     async def _step(self, rerun: Rerun, number: int, turn: Turn, *, breaks: bool) -> None:
-        before = self._state(rerun)
         if breaks:
-            debugger = Debugger()
-            debugger.stop_in(_code(rerun.actor, turn))
+            self._debugger.stop_in(_code(rerun.actor, turn))
             try:
                 await rerun.live([(number, turn)])
             finally:
@@ -243,7 +242,8 @@ class _Replay:
         else:
             async with asyncio.timeout(TURN_TIMEOUT):
                 await rerun.live([(number, turn)])
-        after = self._state(rerun)
+        before, after = self._state, _state(rerun)
+        self._state = after
         changes = {
             name: (before.get(name), after.get(name))
             for name in {**before, **after}
@@ -251,12 +251,14 @@ class _Replay:
         }
         reply = None if rerun.end is None else _outcome(rerun, rerun.end.answer, turn.input.name)
         outputs = [_output(rerun, number, out) for out in rerun.outs]
-        self._told(dataclasses.replace(_input(rerun, number, turn), reply=reply, outputs=outputs, changes=changes))
+        self._told(dataclasses.replace(_input(number, turn), reply=reply, outputs=outputs, changes=changes))
 
-    def _state(self, rerun: Rerun) -> dict[str, Any]:
-        plain = plain_state(save_state(rerun.actor))
-        variables = plain.get("variables")
-        return variables if isinstance(variables, dict) else {"state": plain.get("state")}
+
+def _state(rerun: Rerun) -> dict[str, Any]:
+    """The state of the actor as plain data, by variable."""
+    plain = plain_state(save_state(rerun.actor))
+    variables = plain.get("variables")
+    return variables if isinstance(variables, dict) else {"state": plain.get("state")}
 
 
 def _code(actor: Actor, turn: Turn) -> types.CodeType:
@@ -268,7 +270,7 @@ def _code(actor: Actor, turn: Turn) -> types.CodeType:
     return cast("types.CodeType", handler.__code__)
 
 
-def _input(rerun: Rerun, number: int, turn: Turn) -> ReplayedTurn:
+def _input(number: int, turn: Turn) -> ReplayedTurn:
     source = turn.input
     message = plain_message(source.body, _shape(source.name)) if source.name else None
     return ReplayedTurn(number, source.kind, source.name, message, source.sender, source.time, turn.status)

@@ -50,6 +50,22 @@ class Came(hf.Message):
     text: str
 
 
+def done(what: str) -> str:
+    with DONE.open("a") as file:
+        file.write(what + "\\n")
+    return what
+
+
+async def slow(what: str) -> str:
+    done(what)
+    await asyncio.sleep(3600.0)
+    return what
+
+
+def emptied(state):
+    return {**state, "balance": 0}
+
+
 class Ledger(hf.Actor):
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -68,6 +84,15 @@ class Account(hf.Actor):
         self.balance = balance
         self.memos: list[str] = []
 
+    def on_start(self, restored: bool) -> None:
+        if restored:
+            self.ctx.find("/app/ledger", Ledger).tell(Note("back"))
+            self.ctx.pipe_to_self(slow("begun by a hook"), Came)
+            self.ctx.every(0.01, Came("a tick"))
+
+    @hf.on(Came)
+    def came(self, message: Came) -> None: ...
+
     @hf.on(Pay)
     async def pay(self, message: Pay) -> int:
         ledger = self.ctx.find("/app/ledger", Ledger)
@@ -77,25 +102,12 @@ class Account(hf.Actor):
         return self.balance
 
 
-def done(what: str) -> str:
-    with DONE.open("a") as file:
-        file.write(what + "\\n")
-    return what
-
-
-async def slow(what: str) -> str:
-    done(what)
-    await asyncio.sleep(3600.0)
-    return what
-
-
 class Trip(hf.Actor):
     def __init__(self) -> None:
         self.seen: list[str] = []
 
     def on_start(self, restored: bool) -> None:
         self.ctx.find("/app/ledger", Ledger).tell(Note("trip"))
-        self.ctx.pipe_to_self(slow("begun by a hook"), Came)
 
     @hf.on(Book)
     async def book(self, message: Book) -> None:
@@ -124,7 +136,7 @@ class Search(hf.Actor):
 SLOW = hf.hybrid(interval=1000.0)
 tree = [
     hf.child("ledger", hf.start(Ledger), recovery=hf.replay_only()),
-    hf.supervisor("bank", children=[hf.child("alice", hf.start(Account, 100), recovery=SLOW)]),
+    hf.supervisor("bank", children=[hf.child("alice", hf.start(Account, 100), isolation="process", recovery=SLOW)]),
     hf.child("trip", hf.start(Trip), recovery=SLOW),
     hf.child("search", hf.start(Search), recovery=SLOW),
     hf.dynamic("rooms", journal=True),
@@ -143,6 +155,8 @@ async def main(store: str, what: str) -> None:
             await alice.ask(Pay(10 * number, f"m{number}"), timeout=60.0)
             if number in (3, 6):
                 await system.checkpoint(alice)
+            elif number == 7 and what == "waits":
+                await system.replace_state(alice, emptied)
         system.ref("/app/search", Search).tell(Book())
         trip.tell(Book())
         switches = system._homes._switches

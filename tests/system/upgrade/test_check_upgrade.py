@@ -36,9 +36,6 @@ CHANGES = {
     "another reply": Change(
         "return self.balance", "return self.balance + 1", ALICE, "differs", 4, "the reply to shop:Pay is not what"
     ),
-    "another output": Change(
-        "tell(Note(message.memo))", "tell(Note('new'))", ALICE, "differs", 4, "output 2 (tell of shop:Note to /app/l"
-    ),
     "one more output": Change(
         "        return self.balance\n", "        ledger.tell(Note(''))\n        return self.balance\n",
         ALICE, "differs", 4, "output 3 (tell of shop:Note to /app/ledger) is not",
@@ -51,9 +48,6 @@ CHANGES = {
         "        self.memos: list[str] = []\n", "", ALICE, "refused", -1, "memos would be lost"
     ),
     "it raises": Change(PAID, PAID + "        1 / 0\n", ALICE, "differs", 4, "handling it again raised"),
-    "late only": Change(
-        PAID, PAID + "        assert message.cents < 80\n", ALICE, "differs", 8, "handling it again raised"
-    ),
     "no handler": Change("    @hf.on(Note)\n", "", LEDGER, "differs", -2, "it cannot be handled any more"),
     "another class": Change("Account", "Konto", ALICE, "refused", -1, "it was recorded by shop:Account"),
     "fields in another order": Change(
@@ -62,13 +56,11 @@ CHANGES = {
     ),
     "no such address": Change('hf.child("alice"', 'hf.child("bob"', ALICE, "missing", -1, "starts nobody there"),
     "no recovery": Change(
-        "100), recovery=SLOW", "100)", ALICE, "refused", -1, "starts it without a recovery method"
+        'isolation="process", recovery=SLOW', 'isolation="process"',
+        ALICE, "refused", -1, "starts it without a recovery method",
     ),
     "it exits": Change(
         PAID, PAID + "        os._exit(message.cents)\n", ALICE, "differs", 4, "process has ended with status 40"
-    ),
-    "it is killed": Change(
-        PAID, PAID + "        os.kill(os.getpid(), 9)\n", ALICE, "differs", 4, "process was ended by SIGKILL"
     ),
     "it hangs": Change(
         PAID, PAID + "        while True: pass\n", ALICE, "differs", 4, "process has not come to an end within 2 s"
@@ -156,10 +148,10 @@ def test_an_address_can_be_named_that_the_program_starts_later(
     later = '\n\ndef later():\n    return [*tree[:1], *tree[2:], {"/app/bank/alice": tree[1].below().__next__()}]\n'
     code = newer(tmp_path, ("async def main", f"{later}\n\nasync def main"))
     status, found, _ = check(monkeypatch, store, code, spec="shop:later")
-    assert (status, found.keys()) == (0, ALL)
+    assert (status, set(found)) == (0, ALL)
 
 
-def test_a_store_that_a_system_has_open_is_checked_and_the_system_goes_on(
+def test_a_store_that_a_system_has_open_is_checked_and_a_state_put_in_place_is_no_difference(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with begin(tmp_path / "old", "waits") as process:
@@ -167,8 +159,8 @@ def test_a_store_that_a_system_has_open_is_checked_and_the_system_goes_on(
         assert process.stdout.readline() == "up\n"
         status, found, _ = check(monkeypatch, tmp_path / "old" / "app.db", newer(tmp_path / "new"))
         said, _ = process.communicate("go on\n", timeout=60.0)
-    assert (status, found.keys()) == (0, ALL)
-    assert said == "452\n"
+    assert (status, set(found)) == (0, ALL)
+    assert said == "79\n"
 
 
 def test_a_program_that_is_a_script_is_named_by_its_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
