@@ -67,7 +67,7 @@ async def check_address(
         return AddressCheck(path, "unchecked", problem=str(error))
     if not recipe.method.replays:
         lives = lives[-1:]
-    check = _Check(homes, path, recipe, on_turn)
+    check = _Checking(homes, path, recipe, on_turn)
     for number, life in enumerate(lives):
         following = lives[number + 1] if number + 1 < len(lives) else None
         found = await check.from_snapshot(life, following)
@@ -76,7 +76,7 @@ async def check_address(
     return AddressCheck(path, "fine", check.turns, note=check.note)
 
 
-class _Check:
+class _Checking:
     def __init__(self, homes: Homes, path: str, recipe: Recipe, on_turn: Callable[[int, Feed], None]) -> None:
         self._homes, self._path, self._recipe, self._on_turn = homes, path, recipe, on_turn
         self.turns = 0

@@ -25,7 +25,7 @@ from ...actors.exit_reasons import Signal
 from ...actors.seconds import check_seconds
 from ...checkpoint.store_tools.copies import back_up_store
 from ...checkpoint.store_tools.upgrade_check import DIFFERENT, AddressCheck
-from .page import PAGE_BYTES, Place, read_place
+from .page import PAGE_BYTES, WorkerPosition, read_place
 
 LOOK_SECONDS: Final = 0.2
 """How often is looked whether the process has come further."""
@@ -64,7 +64,7 @@ class UpgradeCheck:
 class CheckLost(Exception):
     """The process is over before it had checked everything."""
 
-    def __init__(self, why: str, place: Place) -> None:
+    def __init__(self, why: str, place: WorkerPosition) -> None:
         super().__init__(why)
         self.place = place
 
@@ -151,7 +151,7 @@ def _records(order: dict[str, Any], folder: str, seconds: float) -> Iterator[dic
             _lost(process.wait(), errors, read_place(page))
 
 
-def _lost(status: int, errors: IO[bytes], place: Place) -> NoReturn:
+def _lost(status: int, errors: IO[bytes], place: WorkerPosition) -> NoReturn:
     errors.seek(0)
     last = errors.read().decode(errors="replace").strip().rpartition("\n")[2]
     how = f"was ended by {Signal(-status)}" if status < 0 else f"has ended with status {status}"

@@ -14,7 +14,7 @@ _HEAD: Final = struct.Struct("<qqqH")  # address, turns handled, turn + 1, bytes
 _MOST: Final = 1000
 
 
-class Place(NamedTuple):
+class WorkerPosition(NamedTuple):
     """Where the process is: number of the address, turns handled there, the turn in hand (-1: none), its message."""
 
     address: int
@@ -46,8 +46,8 @@ class Progress:
         self._begun += 1
 
 
-def read_place(page: mmap.mmap) -> Place:
+def read_place(page: mmap.mmap) -> WorkerPosition:
     """Where the process is, or was."""
     address, handled, turn, length = _HEAD.unpack_from(page, 0)
     name = page[_HEAD.size : _HEAD.size + min(length, _MOST)]
-    return Place(address, handled, turn - 1, name.decode(errors="replace"))
+    return WorkerPosition(address, handled, turn - 1, name.decode(errors="replace"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import inspect
 import os
 import pdb  # noqa: T100  # it is what the user has asked for
 import sys
@@ -265,9 +266,7 @@ def _code(actor: Actor, turn: Turn) -> types.CodeType:
     """The code of the handler, or of the hook, that handles an input."""
     name, kind = turn.input.name, type(actor)
     handler: Any = kind._table[kind._table.kind_named(name)] if name else getattr(kind, f"on_{turn.input.kind}")
-    while hasattr(handler, "__wrapped__"):
-        handler = handler.__wrapped__
-    return cast("types.CodeType", handler.__code__)
+    return cast("types.CodeType", inspect.unwrap(handler).__code__)
 
 
 def _input(number: int, turn: Turn) -> ReplayedTurn:
