@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from .. import HoldfastError, run
-from . import operate
+from . import operate, upgrade_commands
 from .store_commands import store
 
 commands = typer.Typer(
@@ -74,4 +74,6 @@ def demo(
 commands.command()(operate.apply)
 commands.command()(operate.tree)
 commands.command()(operate.status)
+commands.command("check-upgrade")(upgrade_commands.check)
+commands.command("replay")(upgrade_commands.replay)
 commands.add_typer(store)

@@ -94,13 +94,7 @@ class DynamicSupervisor(Supervisor):
 
     def _noted(self, name: str, data: bytes) -> ChildSpec:
         """A child as the journal has it. Raises HoldfastError if it can not be made any more."""
-        what = unpack_data(data)
-        if isinstance(what, ChildSpec):
-            return dataclasses.replace(what, id=name)
-        if self._template is None:
-            raise SpecError(self.ctx.path, f"{name!r} was started from a template, and there is none now")
-        args, kwargs, *made_up = what
-        return dataclasses.replace(_filled(self._template, args, kwargs), id=name, made_up=made_up == [True])
+        return noted_child(self.ctx.path, self._template, name, data)
 
     def _enlist(self, one: Child) -> None:
         # First: what is started must come back, also if we die in the middle of the start. But of two, of which one is
@@ -293,6 +287,17 @@ def _kill_all(cells: list[Cell]) -> None:
     for cell in cells:
         if cell.state not in (DOWN, GONE):
             cell.kill()
+
+
+def noted_child(supervisor: str, template: ChildSpec | None, name: str, data: bytes) -> ChildSpec:
+    """A child of a dynamic supervisor as its journal has it. Raises HoldfastError if it can not be made any more."""
+    what = unpack_data(data)
+    if isinstance(what, ChildSpec):
+        return dataclasses.replace(what, id=name)
+    if template is None:
+        raise SpecError(supervisor, f"{name!r} was started from a template, and there is none now")
+    args, kwargs, *made_up = what
+    return dataclasses.replace(_filled(template, args, kwargs), id=name, made_up=made_up == [True])
 
 
 def _filled(template: ChildSpec, args: tuple[Any, ...], kwargs: dict[str, Any]) -> ChildSpec:

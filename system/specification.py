@@ -143,6 +143,14 @@ class Specifications:
             why = f"what transactions have made of it cannot be had any more: {error}"
             raise SpecError(address, f"{why}; start it with fresh=True to begin anew") from error
 
+    def added(self) -> dict[str, ChildSpec]:
+        """Those that transactions have added below the root, and that are not started yet, by address.
+
+        Raises:
+            SpecError: one cannot be had any more.
+        """
+        return {address: self._revived(address, data) for address, (digest, data) in self._loaded.items() if not digest}
+
     async def start_added(self, start: Callable[[ChildSpec], Awaitable[Any]]) -> None:
         """Start those that transactions have added below the root, as soon as all are there to whom they are bound."""
         while await self._start_some(start):

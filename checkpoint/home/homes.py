@@ -158,9 +158,13 @@ class Homes:
         wanted = method.durability or self.journal.durability
         return self._unkept if self.journal.durable and wanted == "memory" else self.journal
 
-    def made(self, cell: Cell, method: Method) -> Switch:
-        """A home for an actor that has none, which nothing reaches before it is adopted."""
-        return Switch(self, cell, method, self._journal_of(method))
+    def made(self, cell: Cell, method: Method, planted: Saved | None = None) -> Switch:
+        """A home for an actor that has none, which nothing reaches before it is adopted.
+
+        It begins with what is `planted`, if that is given, and then keeps nothing beyond this process.
+        """
+        journal = self._journal_of(method) if planted is None else self._unkept
+        return Switch(self, cell, method, journal, planted)
 
     def adopt(self, cell: Cell, switch: Switch, method: Method) -> None:
         """From here on what is sent to the address goes there."""

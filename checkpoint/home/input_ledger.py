@@ -344,6 +344,8 @@ class InputLedger:
         known = {position for sink in ledger.dropped for position in sink}
         ledger.drop(*(sink for sink in self.dropped if known.isdisjoint(sink)))
         ledger.open = {key: self.open.get(key, source) for key, source in ledger.open.items()}
+        for turn in ledger.turns.values():
+            turn.input = ledger.open.get(turn.input.id, turn.input)
         ledger.next_id = self.next_id
         return ledger
 

@@ -16,7 +16,7 @@ from ..durable_timers import Saved
 from ..journal import DamagedStore, Entry
 from ..journal import Saved as Journaled
 from ..protocol import DOWN, EXIT, OK, STASHED, TICK, TIMED, Answer, Snapshot, timed, untimed
-from ..schema import as_shape, kind_in, shape_name
+from ..schema import as_shape, first_of, kind_in, shape_name
 from ..upgrade.mapping import BodyMapper, NotMapped
 from ..upgrade.old_records import OldRecords
 from .shared_blocks import Place
@@ -43,7 +43,8 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     whether it traps exits.
 
     `kind`: the class whose state it is, `variables` those that it had when `__init__` had run, and `shapes` the fields
-    of its messages (see `schema.py`); stores of before do not say.
+    of its messages (see `schema.py`); stores of before do not say. `is_replaced`: the state was put in place from
+    outside, so no replay of earlier turns leads to it.
     """
 
     format: int
@@ -66,6 +67,7 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     kind: str = ""
     variables: list[str] = []
     shapes: dict[str, list[Any]] = {}
+    is_replaced: bool = False
 
     @property
     def has_state(self) -> bool:
@@ -130,7 +132,8 @@ def cut(home: Switch, state: bytes, record: Snapshot) -> None:
     """
     meta = meta_now(home, record.turn, record.stash, state)
     more = made_by(home, record)
-    keep(home, msgspec.structs.replace(meta, earlier=home.images.earlier(), traps=record.traps, **more))
+    more |= {"traps": record.traps, "is_replaced": record.is_replaced}
+    keep(home, msgspec.structs.replace(meta, earlier=home.images.earlier(), **more))
 
 
 def keep(home: Switch, meta: Meta) -> None:
@@ -264,6 +267,18 @@ def begin_with_older(home: Switch) -> None:
     home.journal.barrier()  # From here on all that is known stands there.
     saved, newest = load_newest(home)
     home.ledger = home.ledger.read_anew(newest, saved.entries)
+    old = home.shapes.old  # What is open was mapped when the home was read.
+    for name, rows in ({} if newest is None else newest.shapes).items():
+        old.read(name, first_of([as_shape(row) for row in rows]))
+    for _, entry in saved.entries:
+        match entry:
+            case ("shape", str() as name, shape):
+                old.read(name, as_shape(shape))
+            case ("in", int() as key, *_) if key in home.ledger.open:
+                pass
+            case _:
+                _note_old(old, entry)
+    take_over(home)
 
 
 def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved]) -> None:
@@ -272,9 +287,8 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
     ledger = home.ledger
     known = ledger.read_entry(position, values)
     match values:
-        case ("in", key, kind, name, body, _, _, origin, *_):
-            if name and (mapper := home.shapes.old.mapper(name)) is not None:
-                home.shapes.old.inputs[key] = mapper
+        case ("in", _, kind, _, body, _, _, origin, *_):
+            _note_old(home.shapes.old, entry)
             if kind == TICK and origin in timers and not timers[origin][3]:
                 del timers[origin]
             if kind in (EXIT, DOWN):
@@ -283,10 +297,8 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
                     home.ties.over(told.get("verb", "link"), told["source"])
         case ("shape", name, shape):
             home.shapes.read(name, as_shape(shape), position)
-        case ("got", turn, k, kind, name, body):
-            name = shape_name(Answer(kind, name))
-            if name and (mapper := home.shapes.old.mapper(name)) is not None:
-                home.shapes.old.outcomes[turn, k] = mapper
+        case ("got", *_):
+            _note_old(home.shapes.old, entry)
         case ("kept", origin, name, body, sender):
             if (mapper := home.shapes.old.mapper(name)) is not None:
                 home.shapes.old.kept[origin] = mapper
@@ -320,6 +332,21 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
         case _:
             if not known:
                 raise HoldfastError(f"{home.path}: journal entry {position} is of an unknown kind {entry[0]!r}")
+
+
+def _note_old(old: OldRecords, entry: Entry) -> None:
+    """Note what maps an input or an outcome, if it was written otherwise than it would be now."""
+    values: tuple[Any, ...] = entry
+    match values:
+        case ("in", key, _, name, *_):
+            if name and (mapper := old.mapper(name)) is not None:
+                old.inputs[key] = mapper
+        case ("got", turn, k, kind, name, _):
+            name = shape_name(Answer(kind, name))
+            if name and (mapper := old.mapper(name)) is not None:
+                old.outcomes[turn, k] = mapper
+        case _:
+            pass
 
 
 def take_over(home: Switch) -> str:

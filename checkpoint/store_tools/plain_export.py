@@ -134,12 +134,17 @@ class _Export:
             "stashed": meta.stash,
             "topics": meta.topics,
             "timers": self._timers(meta, newest),
-            **_state(data),
+            **plain_state(data),
         }
 
     def _timers(self, meta: Meta, tables: Mapping[str, Shape]) -> Record:
         return {
-            key: {"type": name, "message": _content(tables, name, body), "left": left, "interval": interval}
+            key: {
+                "type": name,
+                "message": plain_message(body, tables.get(name, ())),
+                "left": left,
+                "interval": interval,
+            }
             for key, (name, body, left, interval) in meta.timers.items()
         }
 
@@ -182,7 +187,7 @@ class _Export:
                 answer, when = untimed(Answer(kind, name, body))
                 value = self._message(key, shape_name(answer), answer.body) if answer.body else None
                 if when and answer.kind == REPLY:
-                    value = _result(answer.body)
+                    value = plain_result(answer.body)
                 came = {"time": when} if when else {}
                 return {**_named_values("got", entry[1:]), "outcome": answer.kind, "value": value, **came}
             case ("op", _, _, _, str() as name, bytes() as body, *_):
@@ -193,16 +198,15 @@ class _Export:
                 return {"record": "unknown", "values": as_plain(entry)}
 
     def _message(self, key: int, name: str, body: bytes) -> Any:
-        return _content(self._shapes.get(key, {}), name, body)
+        return plain_message(body, self._shapes.get(key, {}).get(name, ()))
 
 
-def _content(tables: Mapping[str, Shape], name: str, body: bytes) -> Any:
-    """The content of a message: its fields by name, if the store has these."""
+def plain_message(body: bytes, shape: Shape) -> Any:
+    """The content of a message as plain data: its fields by name, if their names are known."""
     try:
         value = msgpack.unpackb(body, ext_hook=_special, strict_map_key=False, timestamp=3)
     except (ValueError, TypeError, msgpack.UnpackException):
         return as_plain(body)
-    shape = tables.get(name, ())
     return _named(value, "", {row.place: row.fields for row in shape if row.by_position})
 
 
@@ -235,7 +239,7 @@ def _named(value: Any, place: str, fields: Mapping[str, tuple[str, ...]]) -> Any
     return as_plain(value)
 
 
-def _state(data: bytes) -> Record:
+def plain_state(data: bytes) -> Record:
     """The state of a snapshot: the variables of an actor, or what its `get_state` has returned."""
     if not data:
         return {"schema_version": None, "variables": {}}
@@ -249,7 +253,7 @@ def _state(data: bytes) -> Record:
     return {"schema_version": version, "variables" if form == "keys" else "state": as_plain(state)}
 
 
-def _result(data: bytes) -> Any:
+def plain_result(data: bytes) -> Any:
     """What an effect has returned."""
     try:
         return as_plain(describe_value(data))

@@ -11,6 +11,13 @@ from tests.removing import Check, as_tests
 LARGE = "tests/checkpoint/test_large_states.py"
 
 CHECKS = {
+    "what is read once more for an older snapshot is mapped": Check(
+        "checkpoint/snapshot/snapshot_record.py",
+        "                _note_old(old, entry)\n",
+        "                pass\n",
+        "tests/upgrades/test_where_records_are_read.py",
+        "test_what_is_read_once_more",
+    ),
     "an ask that runs ahead overtakes nothing that waits until it is safe": Check(
         "checkpoint/home/admission.py",
         "(last is not None and last.held and last.id in home.ledger.open)",

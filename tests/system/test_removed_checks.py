@@ -24,8 +24,44 @@ JOURNALS = "tests/supervision/test_dynamic_journal.py"
 LINES = "tests/supervision/test_program_lines.py"
 NAMED = "tests/control/test_named_children.py"
 SLOW = "tests/supervision/test_slow_restarts.py"
+UPGRADE = "tests/system/upgrade/test_check_upgrade.py"
 
 CHECKS = {
+    "background work of a turn that is checked is not begun": Check(
+        "checkpoint/store_tools/rerun.py",
+        '        """Whether background work is not begun: never again."""\n        return True\n',
+        "        return super().has_result(k)\n",
+        UPGRADE,
+        "test_what_goes_on_as_before_is_fine and none",
+    ),
+    "background work of a hook is not begun by a check": Check(
+        "checkpoint/store_tools/rerun.py",
+        "        if asyncio.iscoroutine(work):\n            work.close()\n",
+        "        super().pipe_to_self(work, then, failed)\n",
+        UPGRADE,
+        "test_what_goes_on_as_before_is_fine and none",
+    ),
+    "an effect of a hook is not performed by a check": Check(
+        "checkpoint/store_tools/rerun.py",
+        ' if self._in_turn() else self._refuse(f"effect {effect.key}")',
+        "",
+        UPGRADE,
+        "test_a_hook_that_waits_for_others_cannot_be_checked",
+    ),
+    "a life that went another way handles nothing more": Check(
+        "checkpoint/store_tools/rerun.py",
+        "            self._cell.kill()  # What follows",
+        "            pass  # What follows",
+        UPGRADE,
+        "test_a_change_is_told and another and reply",
+    ),
+    "a state that was put in place is not compared": Check(
+        "checkpoint/store_tools/upgrade_check.py",
+        "following.is_replaced or ",
+        "",
+        UPGRADE,
+        "test_a_store_that_a_system_has_open",
+    ),
     "the states are in the store together": Check(
         "system/transaction/transaction.py",
         "            with self._system._homes.journal.together():\n",

@@ -11,6 +11,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.checkpoint import schema
+from holdfast.checkpoint.snapshot.snapshot_record import begin_with_older
 from holdfast.ftm.mechanisms.lfr import LFR
 from tests.upgrades.generations import LONG, Generations, program
 
@@ -469,3 +470,19 @@ async def test_code_that_is_loaded_once_more_has_its_own_table(store: Generation
             await actor.ask(new.Get(), timeout=LONG)
     async with store.run(newer) as (_, actor, new):
         assert await actor.ask(new.Get(), timeout=LONG) == [{"n": 1, "why": "old"}, {"why": "new", "n": 2}]
+
+
+async def test_what_is_read_once_more_for_an_older_snapshot_is_mapped_too(tmp_path: Path) -> None:
+    """The newest snapshot is damaged in the middle of a run: what follows the one before it was recorded long ago."""
+    generations = Generations(tmp_path)
+    async with generations.run(PROGRAM, method=hf.replay_only) as (_, actor, old):
+        for n in range(3):
+            await actor.ask(old.Add(n=n, why="old"), LONG)
+    async with generations.run(NEWER, method=hf.replay_only) as (system, actor, new):
+        await actor.ask(new.Add(n=3, why="new"), LONG)
+        home = system._homes.at("/app/a")
+        assert home is not None
+        actor.kill()
+        begin_with_older(home)
+        expected = [*(said(n, "old") for n in range(3)), said(3, "new")]
+        assert await actor.ask(new.Get(), LONG) == expected

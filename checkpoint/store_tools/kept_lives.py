@@ -1,0 +1,110 @@
+"""What a store has kept of one address: from each kept snapshot on, the turns that follow it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import msgspec
+
+from ...actors.kernel.actor import Actor
+from ...actors.kernel.node import Node, Ports
+from ...actors.values import decode_value, state_digest
+from ..home.homes import Homes
+from ..journal import Saved
+from ..snapshot.key_variables import migrated, save_state
+from ..snapshot.shared_blocks import by_segment
+from ..snapshot.snapshot_record import Meta, decode_meta, encode_meta
+from ..snapshot.state_image import is_image, read_image
+
+if TYPE_CHECKING:
+    from ...actors.kernel.cell import Cell
+    from ..journal import StoreEngine
+
+
+class KeptLife(NamedTuple):
+    """A snapshot and all that follows it; `meta` is None if there is none."""
+
+    saved: Saved
+    meta: Meta | None
+
+
+def kept_lives(homes: Homes, path: str) -> list[KeptLife]:
+    """What is kept of an address, from each snapshot on, the oldest first.
+
+    Raises:
+        DamagedStore: none can be trusted. HoldfastError: it is of a format that this holdfast does not know.
+    """
+    found: list[KeptLife] = []
+    while not found or found[-1].meta is not None:
+        saved = homes.journal.load(path, older=len(found))
+        if found and saved.snapshot == found[-1].saved.snapshot:
+            break  # There is no older one.
+        found.append(_whole(homes, path, saved))
+    return found[::-1]
+
+
+def _whole(homes: Homes, path: str, saved: Saved) -> KeptLife:
+    """The same with the state in one piece."""
+    if saved.snapshot is None:
+        return KeptLife(saved, None)
+    meta = decode_meta(saved.snapshot)
+    if not meta.blocks:
+        return KeptLife(saved, meta)
+    segments = {number: homes.journal.read_blocks(path, number, at) for number, at in by_segment(meta.blocks).items()}
+    try:
+        state = b"".join(segments[number].block(offset, length) for number, offset, length in meta.blocks)
+    finally:
+        for segment in segments.values():
+            segment.close()
+    meta = msgspec.structs.replace(meta, state=state, blocks=[])
+    return KeptLife(saved._replace(snapshot=encode_meta(meta, compress=False)), meta)
+
+
+def apart(node: Node, engine: StoreEngine) -> Homes:
+    """The homes of a store by themselves: at all addresses there are stand-ins, one for each."""
+    homes = Homes(node, engine)
+    cells: dict[str, Cell] = {}
+
+    def stand_in(path: str) -> Cell:
+        cell = cells.get(path)
+        if cell is None:
+            cell = cells[path] = node.nowhere(homes.addresses.now(path))
+        return cell
+
+    node.connect(Ports(outside=stand_in, keeper=homes))
+    return homes
+
+
+def state_differences(actor: Actor, saved: bytes) -> list[str]:
+    """In which variables an actor's state is not the saved one, in words; what only its class now has does not count.
+
+    Raises:
+        DamagedValue, StateMismatch, UnsavableValue: the two cannot be compared.
+    """
+    was, now = _read(actor, saved), _read(actor, save_state(actor))
+    if not isinstance(was, dict) or not isinstance(now, dict):
+        was, now = {"the state": was}, {"the state": now}
+    found: list[str] = []
+    for name, value in was.items():
+        if name not in now:
+            found.append(f"{name} was {cut(repr(value))}, and is not there now")
+        elif state_digest(value) != state_digest(now[name]):
+            found.append(f"{name} was {cut(repr(value))}, now it is {cut(repr(now[name]))}")
+    return found
+
+
+def _read(actor: Actor, data: bytes) -> Any:
+    """A saved state as the actor's class now wants it."""
+    saved: Any = read_image(data) if is_image(data) else decode_value(data)
+    version, _, state = saved
+    kind = type(actor)
+    return state if version == kind.schema_version else migrated(kind, state, version, actor.ctx.path)
+
+
+def cut(text: str, most: int = 120) -> str:
+    """A text, not too long.
+
+    >>> cut("0123456789", 4)
+    '0123... (10 characters)'
+    """
+    return text if len(text) <= most else f"{text[:most]}... ({len(text)} characters)"

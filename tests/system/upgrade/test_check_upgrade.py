@@ -1,0 +1,207 @@
+"""`holdfast check-upgrade`: new code handles again what an old program has recorded, and every difference is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from tests.checkpoint.store_tools.writing import everything
+from tests.system.upgrade.shops import begin, check, killed, newer
+
+ALICE, LEDGER, TRIP, SEARCH, ROOM = "/app/bank/alice", "/app/ledger", "/app/trip", "/app/search", "/app/rooms/one"
+ALL = {ALICE, LEDGER, TRIP, SEARCH, ROOM}
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Snapshots after turns 3 and 6 of Alice, eight turns in all; a trip that waits; a search that is not over."""
+    return killed(tmp_path_factory.mktemp("old"))
+
+
+class Change(NamedTuple):
+    """A change of the code, and what is said of which address."""
+
+    old: str
+    new: str
+    address: str
+    verdict: str
+    turn: int
+    problem: str
+
+
+PAID = "        self.memos.append(message.memo)\n"
+CHANGES = {
+    "another reply": Change(
+        "return self.balance", "return self.balance + 1", ALICE, "differs", 4, "the reply to shop:Pay is not what"
+    ),
+    "one more output": Change(
+        "        return self.balance\n", "        ledger.tell(Note(''))\n        return self.balance\n",
+        ALICE, "differs", 4, "output 3 (tell of shop:Note to /app/ledger) is not",
+    ),
+    "an output less": Change("        ledger.tell(Note(message.memo))\n", "", ALICE, "differs", 4, "output 2 is not"),
+    "another state": Change(
+        PAID, PAID * 2, ALICE, "differs", 6, "memos was ['m1', 'm2', 'm3', 'm4', 'm5', 'm6'], now it is ['m1', 'm2', "
+    ),
+    "a variable less": Change(
+        "        self.memos: list[str] = []\n", "", ALICE, "refused", -1, "memos would be lost"
+    ),
+    "it raises": Change(PAID, PAID + "        1 / 0\n", ALICE, "differs", 4, "handling it again raised"),
+    "no handler": Change("    @hf.on(Note)\n", "", LEDGER, "differs", -2, "it cannot be handled any more"),
+    "another class": Change("Account", "Konto", ALICE, "refused", -1, "it was recorded by shop:Account"),
+    "fields in another order": Change(
+        "    cents: int\n    memo: str = \"\"\n", "    memo: str\n    cents: int = 0\n",
+        ALICE, "refused", -1, "its fields were (cents, memo), now they are (memo, cents)",
+    ),
+    "no such address": Change('hf.child("alice"', 'hf.child("bob"', ALICE, "missing", -1, "starts nobody there"),
+    "no recovery": Change(
+        'isolation="process", recovery=SLOW', 'isolation="process"',
+        ALICE, "refused", -1, "starts it without a recovery method",
+    ),
+    "it exits": Change(
+        PAID, PAID + "        os._exit(message.cents)\n", ALICE, "differs", 4, "process has ended with status 40"
+    ),
+    "it hangs": Change(
+        PAID, PAID + "        while True: pass\n", ALICE, "differs", 4, "process has not come to an end within 2 s"
+    ),
+    "it waits for ever": Change(
+        PAID, PAID + "        await asyncio.Event().wait()\n", ALICE, "differs", 4, "not come to an end within 2 s"
+    ),
+    "an effect less": Change(
+        'await self.ctx.effect(done, "seat")', '"seat"', TRIP, "differs", 1, "output 1 (pipe) is not"
+    ),
+    "a turn in hand that raises": Change(
+        "        self.ctx.tell_after(", "        1 / 0\n        self.ctx.tell_after(",
+        TRIP, "differs", 1, "ZeroDivisionError",
+    ),
+    "a room": Change(
+        "        self.lines.append(message.text)\n", "        self.lines.append(self.none)\n",
+        ROOM, "differs", 1, "AttributeError",
+    ),
+    "its start raises": Change(
+        "        self.balance = balance\n", "        raise ValueError('no')\n", ALICE, "refused", -1, "ValueError: no"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_change_is_told_with_its_turn_and_the_others_are_checked(
+    name: str, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old, new, address, verdict, turn, problem = CHANGES[name]
+    before = everything(store.parent)
+    code = newer(tmp_path, (old, new))
+    limit = ("--turn-timeout", "2") if "within 2 s" in problem else ()
+    status, found, _ = check(monkeypatch, store, code, *limit)
+    assert found.keys() == ALL
+    one = found[address]
+    assert one["verdict"] == verdict, one
+    assert problem in one["problem"]
+    if turn >= -1:
+        assert one["turn"] == turn
+    assert status == (verdict != "fine")
+    others = {one["verdict"] for one in found.values() if one["address"] not in (address, ROOM, LEDGER)}
+    assert others == {"fine"}
+    assert everything(store.parent) == before  # Neither the store nor the effects of the program.
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ("", ""),
+        ('    memo: str = ""\n', '    memo: str = ""\n    why: str = ""\n'),
+        ("        self.memos: list[str] = []\n", "        self.memos: list[str] = []\n        self.more = 1\n"),
+        ('self.seen.append("gone")', 'self.seen.append("left")'),
+    ],
+    ids=["none", "a field at the end", "one more variable", "behind the wait"],
+)
+def test_what_goes_on_as_before_is_fine(
+    change: tuple[str, str], store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = everything(store.parent)
+    status, found, errors = check(monkeypatch, store, newer(tmp_path, change))
+    assert (status, errors) == (0, "")
+    assert {one["verdict"] for one in found.values()} == {"fine"}
+    turns = {address: one["turns"] for address, one in found.items()}
+    assert turns == {ALICE: 5, LEDGER: 18, TRIP: 1, SEARCH: 2, ROOM: 2}
+    assert found[TRIP]["note"] == "turn 1 has no end, and is checked as far as it had come"
+    assert everything(store.parent) == before
+
+
+def test_a_hook_that_waits_for_others_cannot_be_checked(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hook = "    async def on_start(self, restored: bool) -> None:\n        await self.ctx.effect(done, 'hook')\n\n"
+    code = newer(tmp_path, ("    @hf.on(Pay)\n", f"{hook}    @hf.on(Pay)\n"))
+    before = everything(store.parent)
+    status, found, _ = check(monkeypatch, store, code)
+    assert status == 2
+    assert found[ALICE]["verdict"] == "unchecked"
+    assert "start of /app/bank/alice waits for effect done" in found[ALICE]["problem"]
+    assert everything(store.parent) == before
+
+
+def test_an_address_can_be_named_that_the_program_starts_later(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    later = '\n\ndef later():\n    return [*tree[:1], *tree[2:], {"/app/bank/alice": tree[1].below().__next__()}]\n'
+    code = newer(tmp_path, ("async def main", f"{later}\n\nasync def main"))
+    status, found, _ = check(monkeypatch, store, code, spec="shop:later")
+    assert (status, set(found)) == (0, ALL)
+
+
+def test_a_store_that_a_system_has_open_is_checked_and_a_state_put_in_place_is_no_difference(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with begin(tmp_path / "old", "waits") as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        status, found, _ = check(monkeypatch, tmp_path / "old" / "app.db", newer(tmp_path / "new"))
+        said, _ = process.communicate("go on\n", timeout=60.0)
+    assert (status, set(found)) == (0, ALL)
+    assert said == "79\n"
+
+
+def test_a_program_that_is_a_script_is_named_by_its_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, code = killed(tmp_path / "old", script=True), newer(tmp_path / "new")
+    assert check(monkeypatch, store, code, spec="shop.py:tree")[0] == 0
+    status, found, _ = check(monkeypatch, store, code)
+    assert status == 1
+    assert "it was recorded by __main__:Account" in found[ALICE]["problem"]
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ("tree", "name the specs as 'module:name' or 'program.py:name'"),
+        ("shopping:tree", "No module named 'shopping'"),
+        ("shop:trees", "shop has no trees"),
+        ("shop:SHOP", "shop has no SHOP"),
+        ("shop:DONE", "it must be a spec, some specs, or a function that returns them"),
+        ("broken:tree", "ValueError: not today"),
+        ("exits:tree", "its process has ended with status 7"),
+        ("raises:tree", "it raised ValueError: no tree"),
+    ],
+)
+def test_specs_that_cannot_be_had_are_refused_in_words(
+    spec: str, said: str, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = newer(tmp_path)
+    (code / "broken.py").write_text("raise ValueError('not today')\n")
+    (code / "exits.py").write_text("import os\nos._exit(7)\n")
+    (code / "raises.py").write_text("def tree():\n    raise ValueError('no tree')\n")
+    status, found, errors = check(monkeypatch, store, code, spec=spec)
+    assert (status, found) == (2, {})
+    assert errors.startswith("holdfast check-upgrade: ")
+    assert said in errors
+    assert errors.count("\n") == 1
+
+
+def test_a_store_that_cannot_be_read_is_refused_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = newer(tmp_path)
+    (tmp_path / "app.db").write_bytes(b"no store" * 1000)
+    for name in ("app.db", "none.db"):
+        status, _, errors = check(monkeypatch, tmp_path / name, code)
+        assert status == 2
+        assert errors.startswith(f"holdfast check-upgrade: store {tmp_path / name} ")
