@@ -15,6 +15,7 @@ from typing import Final, Literal
 from ...actors.errors import DIVERGES, HoldfastError, ReplayDiverged, StartFailed
 from ...actors.kernel.actor import Actor
 from ..home.homes import Homes
+from ..journal import Entry
 from ..protocol import Feed
 from ..snapshot.snapshot_record import Meta
 from .kept_lives import KeptLife, kept_lives, state_differences
@@ -76,6 +77,15 @@ async def check_address(
     return AddressCheck(path, "fine", check.turns, note=check.note)
 
 
+def _has_digest(place: tuple[int, Entry]) -> bool:
+    """Whether an entry says what state a turn has left."""
+    match place[1]:
+        case ("end", _, _, _, _, digest, *_) | ("in", _, _, _, _, _, _, _, _, _, digest, *_):
+            return bool(digest)
+        case _:
+            return False
+
+
 class _Checking:
     def __init__(self, homes: Homes, path: str, recipe: Recipe, on_turn: Callable[[int, Feed], None]) -> None:
         self._homes, self._path, self._recipe, self._on_turn = homes, path, recipe, on_turn
@@ -86,7 +96,7 @@ class _Checking:
         """Check the turns behind one snapshot, up to the following one; None: all is fine."""
         self.note = life.saved.passed_over or self.note
         recipe = self._recipe
-        has_digests = any(entry[0] == "end" and len(entry) > 5 and entry[5] for _, entry in life.saved.entries)
+        has_digests = any(map(_has_digest, life.saved.entries))
         if recipe.method.replays and has_digests != recipe.method.check_replay:
             recipe = recipe._replace(method=dataclasses.replace(recipe.method, check_replay=has_digests))
         try:

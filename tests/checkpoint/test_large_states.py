@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import mmap
 import os
 import random
@@ -56,7 +57,8 @@ def end(system: hf.ActorSystem, ref: hf.ActorRef[Canvas]) -> None:
     """Kill the process of an actor, if there is one just now, or the actor."""
     pid = process_of(system, ref)
     if pid != os.getpid():
-        os.kill(pid, signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):  # It has just ended.
+            os.kill(pid, signal.SIGKILL)
     elif ref.path in system.tree():
         ref.kill()
 
@@ -327,8 +329,8 @@ async def test_a_restore_that_fails_closes_what_it_has_opened(tmp_path: Path) ->
         await system.checkpoint(ref, timeout=25.0)
         await ref.ask(Spoil(True))  # No snapshot is taken at the end.
 
+    @hf.renamed("tests.checkpoint.image_player:Canvas")
     class Unfit(Canvas):
-        formerly = ("tests.checkpoint.image_player:Canvas",)
         schema_version = -1
 
     async with hf.ActorSystem("app", store=store, log=False) as system:

@@ -45,14 +45,14 @@ CHANGES = {
         PAID, PAID * 2, ALICE, "differs", 6, "memos was ['m1', 'm2', 'm3', 'm4', 'm5', 'm6'], now it is ['m1', 'm2', "
     ),
     "a variable less": Change(
-        "        self.memos: list[str] = []\n", "", ALICE, "refused", -1, "memos would be lost"
+        "        self.memos: list[str] = []\n", "", ALICE, "differs", 4, "no attribute 'memos'"
     ),
+    "a variable of another name": Change("memos", "texts", ALICE, "refused", -1, "memos would be lost"),
     "it raises": Change(PAID, PAID + "        1 / 0\n", ALICE, "differs", 4, "handling it again raised"),
     "no handler": Change("    @hf.on(Note)\n", "", LEDGER, "differs", -2, "it cannot be handled any more"),
     "another class": Change("Account", "Konto", ALICE, "refused", -1, "it was recorded by shop:Account"),
-    "fields in another order": Change(
-        "    cents: int\n    memo: str = \"\"\n", "    memo: str\n    cents: int = 0\n",
-        ALICE, "refused", -1, "its fields were (cents, memo), now they are (memo, cents)",
+    "a field that nothing is known of": Change(
+        "    cents: int\n    memo: str", "    why: str\n    cents: int\n    memo: str", ALICE, "refused", -1, "why"
     ),
     "no such address": Change('hf.child("alice"', 'hf.child("bob"', ALICE, "missing", -1, "starts nobody there"),
     "no recovery": Change(
@@ -111,10 +111,11 @@ def test_a_change_is_told_with_its_turn_and_the_others_are_checked(
     [
         ("", ""),
         ('    memo: str = ""\n', '    memo: str = ""\n    why: str = ""\n'),
+        ('    cents: int\n    memo: str = ""\n', '    memo: str = ""\n    cents: int = 0\n'),
         ("        self.memos: list[str] = []\n", "        self.memos: list[str] = []\n        self.more = 1\n"),
         ('self.seen.append("gone")', 'self.seen.append("left")'),
     ],
-    ids=["none", "a field at the end", "one more variable", "behind the wait"],
+    ids=["none", "a field at the end", "fields in another order", "one more variable", "behind the wait"],
 )
 def test_what_goes_on_as_before_is_fine(
     change: tuple[str, str], store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
