@@ -145,7 +145,7 @@ class EffectProcesses:
         return process
 
     def close(self) -> None:
-        """Kill them."""
+        """Kill the processes that compute, and those that are idle."""
         for process in self._all:
             process.end()
         self._all.clear()

@@ -92,7 +92,7 @@ def defaults_of(kind: Any) -> Defaults:
 
 
 def as_it_is(value: Any) -> Any:
-    """Return the value."""
+    """Return the value itself: a default that needs not be made anew."""
     return value
 
 

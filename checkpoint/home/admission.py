@@ -108,14 +108,14 @@ class QuietEnds:
         self._home.outputs.rows.closed(self)
 
     def safe(self) -> None:
-        """Nothing follows from it."""
+        """Do nothing: quiet turns have let nothing out."""
 
     def refused(self, error: HoldfastError) -> bool:
         """It has happened: it waits."""
         return False
 
     def abandoned(self, error: HoldfastError) -> None:
-        """Nobody waits for it."""
+        """Tell nobody, for nobody waits for a quiet turn."""
 
 
 class TurnRows:

@@ -157,7 +157,7 @@ class _CopyUnderWay:
         self._account = StoreCopy(dest, self._identity, "", 0, 0, 0)
 
     def make(self) -> StoreCopy:
-        """Do it."""
+        """Make the copy, and return an account of it."""
         self.refuse_dest()
         try:
             look(self._path, self._write, self._key)

@@ -297,7 +297,7 @@ class Rerun:
         then()
 
     def closed(self) -> None:
-        """The life is over."""
+        """Tell whoever waits for a turn that the life is over."""
         self._fail(self._life.refused or LifeEnded(self._cell.path, str(self._cell.extra().reason)))
 
     def _fail(self, error: HoldfastError) -> None:

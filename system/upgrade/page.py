@@ -36,7 +36,7 @@ class Progress:
         _HEAD.pack_into(self._page, 0, self._address, 0, 0, 0)
 
     def turn(self, turn: int, feed: Feed) -> None:
-        """Another turn begins."""
+        """Say on the page which turn begins."""
         kind = feed.name or feed.kind
         if kind != self._type:
             name = kind.encode()[:_MOST]
