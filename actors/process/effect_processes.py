@@ -62,7 +62,8 @@ class EffectProcess:
                 await loop.sock_sendall(self._socket, len(message).to_bytes(HEADER, "little") + message)
             return await self._read(loop, int.from_bytes(await self._read(loop, HEADER), "little"))
         except (OSError, EOFError):
-            raise FunctionDied(f"its process has ended (exit code {self._ended()})") from None
+            code = await asyncio.to_thread(self._ended)  # It may take its time, and others want the loop.
+            raise FunctionDied(f"its process has ended (exit code {code})") from None
 
     async def _read(self, loop: asyncio.AbstractEventLoop, count: int) -> bytes:
         read = bytearray()

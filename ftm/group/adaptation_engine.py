@@ -28,7 +28,7 @@ from ..bricks.replica_orders import Abort, Commit, PrepareStack, Quiesce, Stand
 from .membership import LookAgain
 from .reconfiguration import names_for, still_silent, what_is_wrong
 from .replicas import GroupPart
-from .resting_turns import past_resting_turns
+from .steering import past_resting_turns
 from .trial import TRIAL, TrialFailed, removed, tried, until_given_up
 from .trial import ended as ended_trial
 

@@ -13,8 +13,7 @@ from ..bricks.sealed_frames import Refused
 from ..events import ReplicaJoined
 from .membership import LookAgain
 from .replicas import GroupPart
-from .resting_turns import past_resting_turns
-from .steering import bind_again
+from .steering import bind_again, past_resting_turns
 
 if TYPE_CHECKING:
     from .group import Group

@@ -32,8 +32,7 @@ from ..bricks.replica_orders import EXPORTED_WITHIN, Export, Quiesce
 from ..group.group import Group
 from ..group.group_place import GroupPlace
 from ..group.membership import LookAgain
-from ..group.resting_turns import past_resting_turns
-from ..group.steering import AGAIN_AFTER
+from ..group.steering import AGAIN_AFTER, past_resting_turns
 from ..group.trial import rehearsed
 from .unrecorded_luggage import restore_owing, save_owing
 
