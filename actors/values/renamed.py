@@ -32,7 +32,8 @@ def renamed(*formerly: str, **members: str | tuple[str, ...]) -> Callable[[K], K
         members: earlier names of a field or variable, newest first; the keyword is its present name.
 
     Raises:
-        TypeError: the class has no field of that name, or still has one of the old name that is said to be renamed too.
+        TypeError: the class has no field of that name; or one old name is said of two, or is the present name of
+            another one that was renamed: what a record has under it could be either.
 
     >>> from holdfast import Message
     >>> @renamed("Bought", amount="euros")
@@ -51,10 +52,28 @@ def renamed(*formerly: str, **members: str | tuple[str, ...]) -> Callable[[K], K
         module = "__main__" if kind.__module__ == "__mp_main__" else kind.__module__  # As `message_name` has it.
         own = tuple(name if ":" in name else f"{module}:{name}" for name in formerly)
         before = own_renames(kind)  # Several of them may stand above one class.
+        refuse_shifts(kind, {**former_members(kind), **said})
         setattr(kind, NOTED, Renames((*own, *before.names), {**before.members, **said}))
         return kind
 
     return note
+
+
+def refuse_shifts(kind: type, members: dict[str, tuple[str, ...]]) -> None:
+    """Refuse names that were swapped, or handed on: of a record nobody can tell which of the two it means.
+
+    Raises:
+        TypeError: saying which name is meant twice.
+    """
+    meant: dict[str, str] = {}
+    for now, olds in members.items():
+        for old in olds:
+            if old in members and old != now:
+                why = f"{old!r} was renamed too: names cannot be swapped or handed on; give {old!r} a name that is new"
+                raise TypeError(f"@renamed({now}={old!r}): {kind.__qualname__}.{why}")
+            if meant.setdefault(old, now) != now:
+                why = f"{old!r} is said to be what {meant[old]!r} was called, and {now!r} too; say it of one of them"
+                raise TypeError(f"@renamed({now}={old!r}): {kind.__qualname__}: {why}")
 
 
 def fields_of(kind: type) -> tuple[str, ...] | None:

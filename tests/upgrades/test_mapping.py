@@ -62,7 +62,7 @@ class Words(TypedDict):
     a: int
 
 
-@hf.renamed(here="there", there="where")
+@hf.renamed(here="there")
 class Mixed(hf.Message, kw_only=True):
     pair: Pair
     words: Words
@@ -126,3 +126,39 @@ def test_what_loses_nothing_is_mapped_back_as_it_was(seed: int, tmp_path: Any) -
 def test_a_rename_of_what_is_not_there_is_an_error() -> None:
     with pytest.raises(TypeError, match="Leaf has no field 'm'"):
         hf.renamed(m="n")(Leaf)
+
+
+@pytest.mark.parametrize(
+    ("renames", "problem"),
+    [
+        ({"a": "b", "b": "a"}, "names cannot be swapped"),
+        ({"b": "a", "c": "b"}, "names cannot be swapped or handed on"),
+        ({"b": "a", "c": ("older", "b")}, "names cannot be swapped or handed on"),
+        ({"b": "old", "c": "old"}, "say it of one of them"),
+    ],
+)
+def test_names_that_were_swapped_handed_on_or_said_twice_are_refused(renames: Any, problem: str) -> None:
+    """A record could mean either: mapped by guess, values would stand under the wrong names."""
+
+    class Fields(msgspec.Struct):
+        a: int = 0
+        b: int = 0
+        c: int = 0
+
+    with pytest.raises(TypeError, match=problem):
+        hf.renamed(**renames)(Fields)
+
+    class Base(hf.Actor): ...
+
+    with pytest.raises(TypeError, match=problem):
+        hf.renamed(**renames)(Base)
+
+
+def test_a_rename_that_a_base_says_counts_too() -> None:
+    @hf.renamed(b="a")
+    class Base(hf.Actor): ...
+
+    with pytest.raises(TypeError, match="names cannot be swapped or handed on"):
+
+        @hf.renamed(c="b")
+        class Derived(Base): ...
