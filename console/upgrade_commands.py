@@ -13,7 +13,7 @@ import typer
 
 from ..actors.errors import HoldfastError
 from ..system.upgrade import AddressCheck, ReplayedState, ReplayedTurn, UpgradeCheck, check_upgrade, replay_actor
-from ..system.upgrade.check import TURN_TIMEOUT
+from ..system.upgrade.checked_upgrade import TURN_TIMEOUT
 
 DIFFERS: Final = 1
 UNCHECKED: Final = 2

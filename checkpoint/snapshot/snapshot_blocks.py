@@ -90,7 +90,6 @@ class SnapshotImages:
             marked,
             format=IMAGES,
             stash=record.stash,
-            traps=record.traps,
             blocks=shared.places,
             earlier=self.earlier(),
             **made_by(self._home, record),

@@ -29,6 +29,10 @@ IMAGES = 2
 """The format of snapshots that an older holdfast would take for empty: in blocks, or compressed."""
 
 
+TRAPS, REPLACED = 1, 2
+"""What may be true of a snapshot: the actor traps exits; its state was put in place from outside."""
+
+
 class Meta(msgspec.Struct, array_like=True, frozen=True):
     """A snapshot, with what the home knew when it came.
 
@@ -39,12 +43,11 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     answered later, with the address that has asked and their origin.
 
     `turn` is the one it is restored after; its state is that after `base`, which is earlier if the turns in between
-    were undone (stores of before do not say). An empty `state` stands for none: the actor begins afresh. `traps`:
-    whether it traps exits.
+    were undone (stores of before do not say). An empty `state` stands for none: the actor begins afresh. `marks`:
+    what is true of it, TRAPS and REPLACED (a bool in stores of before, which is the former).
 
     `kind`: the class whose state it is, `variables` those that it had when `__init__` had run, and `shapes` the fields
-    of its messages (see `schema.py`); stores of before do not say. `is_replaced`: the state was put in place from
-    outside, so no replay of earlier turns leads to it.
+    of its messages (see `schema.py`); stores of before do not say.
     """
 
     format: int
@@ -63,11 +66,20 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     time: float = 0.0
     owed: dict[int, tuple[str, str]] = {}
     ties: list[Tie] = []
-    traps: bool = False
+    marks: int | bool = 0
     kind: str = ""
     variables: list[str] = []
     shapes: dict[str, list[Any]] = {}
-    is_replaced: bool = False
+
+    @property
+    def traps(self) -> bool:
+        """Whether the actor traps exits."""
+        return bool(self.marks & TRAPS)
+
+    @property
+    def is_replaced(self) -> bool:
+        """Whether the state was put in place from outside: no replay of earlier turns leads to it."""
+        return bool(self.marks & REPLACED)
 
     @property
     def has_state(self) -> bool:
@@ -131,9 +143,7 @@ def cut(home: Switch, state: bytes, record: Snapshot) -> None:
         HoldfastError: it could not be kept; the older snapshot and the whole journal are still there.
     """
     meta = meta_now(home, record.turn, record.stash, state)
-    more = made_by(home, record)
-    more |= {"traps": record.traps, "is_replaced": record.is_replaced}
-    keep(home, msgspec.structs.replace(meta, earlier=home.images.earlier(), **more))
+    keep(home, msgspec.structs.replace(meta, earlier=home.images.earlier(), **made_by(home, record)))
 
 
 def keep(home: Switch, meta: Meta) -> None:
@@ -153,7 +163,12 @@ def made_by(home: Switch, record: Snapshot) -> dict[str, Any]:
     """Whose state a snapshot is, as the life says that has made it."""
     if record.kind:
         home.shapes.kind = record.kind
-    return {"kind": home.shapes.kind, "variables": record.variables}
+    return {"kind": home.shapes.kind, "variables": record.variables, "marks": marks_of(record)}
+
+
+def marks_of(record: Snapshot) -> int:
+    """What a life says is true of its snapshot."""
+    return TRAPS * record.traps | REPLACED * record.is_replaced
 
 
 def outlasting(home: Switch) -> tuple[dict[str, Saved], list[str]]:

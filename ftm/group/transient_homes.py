@@ -12,7 +12,7 @@ import msgspec
 from ...actors.errors import AskFailed
 from ...checkpoint.home.journal_home import Entered, JournalHome
 from ...checkpoint.method import Method
-from ...checkpoint.snapshot.snapshot_record import meta_now, put
+from ...checkpoint.snapshot.snapshot_record import marks_of, meta_now, put
 from .replicas import finish
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class StateCopies:
         if record.is_last:
             state, self._pieces = b"".join(self._pieces), []
             meta = meta_now(self._switch, record.turn, record.stash, state)
-            self.newest = msgspec.structs.replace(meta, traps=record.traps)
+            self.newest = msgspec.structs.replace(meta, marks=marks_of(record))
             put(self._switch, self.newest, 1)
 
     def restart(self) -> None:

@@ -6,7 +6,7 @@ Both work with a copy of the store. Nothing of the program gets out: see `checkp
 from __future__ import annotations
 
 from ...checkpoint.store_tools.upgrade_check import AddressCheck
-from .check import UpgradeCheck, check_upgrade
-from .replay import ReplayedState, ReplayedTurn, replay_actor
+from .checked_upgrade import UpgradeCheck, check_upgrade
+from .replayed_actor import ReplayedState, ReplayedTurn, replay_actor
 
 __all__ = ["AddressCheck", "ReplayedState", "ReplayedTurn", "UpgradeCheck", "check_upgrade", "replay_actor"]

@@ -33,7 +33,7 @@ TURN_TIMEOUT: Final = 30.0
 """Seconds a turn may take if the user does not say."""
 START_TIMEOUT: Final = 60.0
 """Seconds that what comes before the first turn may take at least: an import, or reading what is recorded."""
-WORKER: Final = f"from {__package__}.worker import main; main()"
+PROCESS: Final = f"from {__package__}.checking_process import main; main()"
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -167,7 +167,7 @@ def _running(
     with open(read, "rb") as said:
         try:
             process = subprocess.Popen(
-                [sys.executable, "-c", WORKER, json.dumps(order), str(write)],
+                [sys.executable, "-c", PROCESS, json.dumps(order), str(write)],
                 stdin=subprocess.PIPE,  # Its end tells the process that this one is gone.
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
