@@ -53,8 +53,12 @@ class Outputs:
             case "tell":
                 self._deliver(node.cell_at(out.to), out, batch, origin_kept(home, turn, key, out))
             case "send":
+                target, sent = node.cell_at(out.to), functools.partial(home.calls.sent, turn, out.k)
                 home.calls.sends.add((turn, out.k))
-                self._send(node.cell_at(out.to), out, batch, functools.partial(home.calls.sent, turn, out.k))
+                if self._keeps(target, out, batch, origin_kept(home, turn, key, out), home.path):
+                    batch.after.append(functools.partial(sent, None))
+                else:
+                    self._send(target, out, batch, sent)
             case "ask":
                 self._ask(turn, key, out, batch)
             case "effect" | "sleep" | "wait":
@@ -166,7 +170,7 @@ class Outputs:
             except MailboxFull as error:  # Its turn has gone on: there is nobody to raise this to.
                 home.node.dead_letter(target, Parcel(out.name, out.body), str(error))
             return
-        if target.is_dead and home.homes.rejoin.keep(home, origin, out, cell.path, batch):
+        if self._keeps(target, out, batch, origin, cell.path):
             return
 
         def send() -> None:
@@ -176,6 +180,10 @@ class Outputs:
                 home.node.dead_letter(target, Parcel(out.name, out.body), str(error))
 
         batch.after.append(send)
+
+    def _keeps(self, target: Cell, out: Out, batch: Batch, origin: str, sender: str) -> bool:
+        """Whether a message is kept for a recorded actor that this program has not started yet."""
+        return target.is_dead and self._home.homes.rejoin.keep(self._home, origin, out, sender, batch)
 
     def _publish(self, turn: int, out: Out, batch: Batch) -> None:
         """A message to each subscriber, when it has room; the publisher waits until the last one has accepted it."""

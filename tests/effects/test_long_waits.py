@@ -202,31 +202,37 @@ async def test_a_turn_that_was_asked_goes_on_too(tmp_path: Path, isolation: Any,
         assert len(lines(world)) == 2
 
 
-class Tell(hf.Message): ...
+class Tell(hf.Message):
+    waits: bool = False
 
 
 class Teller(hf.Actor):
     @hf.on(Tell)
     async def tell_other(self, message: Tell) -> None:
         await self.ctx.wait_for(Never)
-        self.ctx.find("/app/other", Patient).tell(Call("hello"))
+        other = self.ctx.find("/app/other", Patient)
+        if message.waits:
+            await other.send(Call("hello"))
+        else:
+            other.tell(Call("hello"))
 
     @hf.on(Never)
     def never(self, message: Never) -> None: ...
 
 
+@pytest.mark.parametrize("waits_for_room", [False, True])
 @pytest.mark.parametrize("ends", [0, 1])
 @pytest.mark.parametrize("method", [hf.hybrid(interval=1000.0), hf.replay_only()])
 async def test_what_is_told_to_somebody_who_is_not_started_yet_waits_for_that(
-    tmp_path: Path, method: Any, ends: int
+    tmp_path: Path, method: Any, ends: int, waits_for_room: bool
 ) -> None:
-    """Over the end of one more program, too; and it comes once, also if no snapshot cuts the journal."""
+    """By tell or send. Over the end of one more program, too; and it comes once, also if no snapshot cuts the journal."""
     teller = hf.child("patient", hf.start(Teller), recovery=hf.hybrid(interval=1000.0))
     other = hf.child("other", hf.start(Patient), recovery=method)
     async with running(tmp_path, "os") as system:
         await system.start(other)
         ref = await system.start(teller)
-        ref.tell(Tell())
+        ref.tell(Tell(waits_for_room))
         await waits(system)
     async with running(tmp_path, "os") as system:
         ref = await system.start(teller)
