@@ -5,8 +5,8 @@ answers to whoever that is: to the asker's home if that is open, else into the a
 What the receiver never had (its mailbox was full, say) ends at its deadline: it may have been forwarded, so it is not
 asked again.
 
-Whom a turn tells something may not have been started by the new program yet. The message is kept for it in its journal,
-and becomes an input when its home is opened.
+Whom a turn tells or asks something may not have been started by the new program yet. The message is kept for it in its
+journal, and becomes an input when its home is opened.
 """
 
 from __future__ import annotations
@@ -97,11 +97,16 @@ class Rejoin:
 
     def _hand_over(self, home: Switch) -> None:
         """What was kept for an address becomes inputs, each once: the journal may have it as one already."""
-        known = {source.origin for source in home.ledger.handled_and_open()}
+        known = {(source.sender, source.origin) for source in home.ledger.handled_and_open()}
         for origin, kept in self._kept.pop(home.path, {}).items():
             home.ledger.drop(kept.positions)
-            if origin not in known:
-                home.forward(home.record(MESSAGE, kept.name, kept.body, kept.sender, origin=origin))
+            is_ask = origin.startswith(MARK)
+            own = " ".join(origin.split(" ", 2)[:2]) if is_ask else origin
+            if (kept.sender, own) not in known:
+                source = home.record(MESSAGE, kept.name, kept.body, kept.sender, origin=own)
+                if is_ask:
+                    self._owed(home, source)
+                home.forward(source)
 
     def loaded(self, home: Switch) -> None:
         """A home was taken up from what is stored: what it owes an answer."""
@@ -163,6 +168,11 @@ def origin_kept(home: Switch, turn: int, key: int, out: Out) -> str:
     What a hook (without input, `key` is -1) tells has no number of its own.
     """
     return f"kept {home.path}|{turn}.{out.k}" + ("" if key >= 0 else f" {home.node.numbers.next_seed():x}")
+
+
+def origin_asked(home: Switch, turn: int, out: Out) -> str:
+    """The same of what was asked: the origin of the input that it becomes, and who has asked."""
+    return f"{MARK}{turn}.{out.k} {home.path}"
 
 
 def _numbers(origin: str) -> tuple[int, int]:

@@ -17,7 +17,7 @@ from ..inputs import Batch
 from ..life.recorded_inbox import STARTED
 from ..protocol import MESSAGE, PIPE, Answer, Hooked, LifePort, Out, PipeDone
 from .admission import TurnRows
-from .ask_recovery import origin_kept
+from .ask_recovery import origin_asked, origin_kept
 from .held_messages import Inlet, inlet
 from .pending_asks import SwitchAsk, answer_ask, origin_of
 from .recorded_home import switch_of
@@ -284,6 +284,9 @@ class Outputs:
     def _ask(self, turn: int, key: int, out: Out, batch: Batch) -> None:
         home = self._home
         target = home.node.cell_at(out.to)
+        if switch_of(target) is None and self._keeps(target, out, batch, origin_asked(home, turn, out), home.path):
+            home.homes.rejoin.joins(home, turn, key, out)  # It is as if it had been asked before this program began.
+            return
         source = home.ledger.open.get(key)
         chain = ((home.path, key), *(source.chain if source is not None else ()))
         ask = SwitchAsk.made(home, turn, out, chain, target)

@@ -11,6 +11,20 @@ from tests.removing import Check, as_tests
 LARGE = "tests/checkpoint/test_large_states.py"
 
 CHECKS = {
+    "who has asked somebody who was not started is answered": Check(
+        "checkpoint/home/ask_recovery.py",
+        "                    self._owed(home, source)\n                home.forward",
+        "                    pass\n                home.forward",
+        "tests/effects/test_long_waits.py",
+        "test_what_is_asked_of_somebody",
+    ),
+    "what is sent to somebody who is not started is kept": Check(
+        "checkpoint/home/outputs.py",
+        "                if self._keeps(target, out, batch, origin_kept(home, turn, key, out), home.path):\n",
+        "                if False:\n",
+        "tests/effects/test_long_waits.py",
+        "test_what_is_told_to_somebody",
+    ),
     "names that were swapped or handed on are not mapped by guess": Check(
         "actors/values/renamed.py",
         "        refuse_shifts(kind, {**former_members(kind), **said})\n",
@@ -83,7 +97,7 @@ CHECKS = {
     ),
     "what was kept for somebody who was not up becomes an input once": Check(
         "checkpoint/home/ask_recovery.py",
-        "            if origin not in known:\n",
+        "            if (kept.sender, own) not in known:\n",
         "            if True:\n",
         "tests/effects/test_long_waits.py",
         "test_what_is_told_to_somebody_who_is_not_started",

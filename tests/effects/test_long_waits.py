@@ -203,36 +203,49 @@ async def test_a_turn_that_was_asked_goes_on_too(tmp_path: Path, isolation: Any,
 
 
 class Tell(hf.Message):
-    waits: bool = False
+    verb: str = "tell"
+
+
+class Heard(hf.Message[list[int]]): ...
 
 
 class Teller(hf.Actor):
+    def __init__(self) -> None:
+        self.heard: list[int] = []
+
     @hf.on(Tell)
     async def tell_other(self, message: Tell) -> None:
         await self.ctx.wait_for(Never)
         other = self.ctx.find("/app/other", Patient)
-        if message.waits:
-            await other.send(Call("hello"))
-        else:
-            other.tell(Call("hello"))
+        match message.verb:
+            case "tell":
+                other.tell(Call("hello"))
+            case "send":
+                await other.send(Call("hello"))
+            case _:
+                self.heard.append(await other.ask(Count(), timeout=60.0))
 
     @hf.on(Never)
     def never(self, message: Never) -> None: ...
 
+    @hf.on(Heard)
+    def tell_heard(self, message: Heard) -> list[int]:
+        return self.heard
 
-@pytest.mark.parametrize("waits_for_room", [False, True])
+
+@pytest.mark.parametrize("verb", ["tell", "send"])
 @pytest.mark.parametrize("ends", [0, 1])
 @pytest.mark.parametrize("method", [hf.hybrid(interval=1000.0), hf.replay_only()])
 async def test_what_is_told_to_somebody_who_is_not_started_yet_waits_for_that(
-    tmp_path: Path, method: Any, ends: int, waits_for_room: bool
+    tmp_path: Path, method: Any, ends: int, verb: str
 ) -> None:
-    """By tell or send. Over the end of one more program, too; and it comes once, also if no snapshot cuts the journal."""
+    """Over the end of one more program, too; and it comes once, also if no snapshot cuts the journal."""
     teller = hf.child("patient", hf.start(Teller), recovery=hf.hybrid(interval=1000.0))
     other = hf.child("other", hf.start(Patient), recovery=method)
     async with running(tmp_path, "os") as system:
         await system.start(other)
         ref = await system.start(teller)
-        ref.tell(Tell(waits_for_room))
+        ref.tell(Tell(verb))
         await waits(system)
     async with running(tmp_path, "os") as system:
         ref = await system.start(teller)
@@ -248,6 +261,40 @@ async def test_what_is_told_to_somebody_who_is_not_started_yet_waits_for_that(
             assert await found.ask(Look(), IN_TIME) == ["no turn has waited for hello"]
             found.kill()
             assert await found.ask(Look(), IN_TIME) == ["no turn has waited for hello"]
+
+
+@pytest.mark.parametrize(("ends", "is_first"), [(0, False), (1, False), (1, True), (2, True)])
+async def test_what_is_asked_of_somebody_who_is_not_started_yet_is_answered_then(
+    tmp_path: Path, ends: int, is_first: bool
+) -> None:
+    """Over so many ends of the program; `is_first`: in the last one, whoever was asked is started first."""
+    teller = hf.child("patient", hf.start(Teller), recovery=hf.hybrid(interval=1000.0), shutdown=0.1)
+    other = hf.child("other", hf.start(Patient), recovery=hf.hybrid(interval=1000.0))
+    async with running(tmp_path, "os") as system:
+        found, ref = await system.start(other), await system.start(teller)
+        assert await found.ask(Count(), IN_TIME) == 1
+        ref.tell(Tell("ask"))
+        await waits(system)
+    for program in range(ends + 1):
+        async with running(tmp_path, "os") as system:
+            if program == ends and is_first:
+                await system.start(other)
+            ref = await system.start(teller)
+            if not program:
+                await ref.send(Never())
+                home = switch_of(system._node.cell_at("/app/patient"))
+                async with asyncio.timeout(IN_TIME):
+                    while home is None or not home.calls.asks:
+                        await asyncio.sleep(0.001)
+            if program == ends:
+                found = system.ref("/app/other", Patient) if is_first else await system.start(other)
+                assert await ref.ask(Heard(), IN_TIME) == [2]
+                assert await found.ask(Count(), IN_TIME) == 3
+            assert system.dead_letters == 0
+    async with running(tmp_path, "os") as system:
+        ref, found = await system.start(teller), await system.start(other)
+        assert await ref.ask(Heard(), IN_TIME) == [2]
+        assert await found.ask(Count(), IN_TIME) == 4
 
 
 class Begin(hf.Message[list[str]]): ...
