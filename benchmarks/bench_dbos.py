@@ -9,18 +9,16 @@ Command: python benchmarks/bench_dbos.py [--quick]
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import functools
 import tempfile
-import time
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from harness import Run, main
+from harness import Run, main, rate
 
 import holdfast as hf
 
@@ -103,16 +101,6 @@ def theirs(folder: str, durability: str) -> Any:
     finally:
         dbos.DBOS.destroy()
         sqlalchemy.event.remove(sqlalchemy.Engine, "connect", connected)
-
-
-async def rate(call: Callable[[], Awaitable[object]], callers: int, count: int) -> float:
-    async def caller() -> None:
-        for _ in range(max(1, count // callers)):
-            await call()
-
-    began = time.perf_counter()
-    await asyncio.gather(*[caller() for _ in range(callers)])
-    return max(1, count // callers) * callers / (time.perf_counter() - began)
 
 
 async def workflows(run: Run) -> None:

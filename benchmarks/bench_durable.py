@@ -11,12 +11,12 @@ import asyncio
 import contextlib
 import tempfile
 import time
-from collections.abc import AsyncGenerator, Awaitable, Callable
+from collections.abc import AsyncGenerator
 from pathlib import Path
 from typing import Any
 
 import limits
-from harness import BURST, Run, main
+from harness import BURST, Run, main, rate
 from workload import Data, Echo, Told
 
 import holdfast as hf
@@ -56,16 +56,6 @@ async def os_level(run: Run) -> None:
             run.bound("an admission that outlives the root, pipelined", min(spent), unit="us", target=10.0)
 
 
-async def _callers(accept: Callable[[], Awaitable[object]], count: int) -> float:
-    async def caller() -> None:
-        for _ in range(count // CALLERS):
-            await accept()
-
-    began = time.perf_counter()
-    await asyncio.gather(*[caller() for _ in range(CALLERS)])
-    return count / (time.perf_counter() - began)
-
-
 async def fsync(run: Run) -> None:
     """Each waits until its message would outlive the machine."""
     count = run.size(20_000)
@@ -75,15 +65,15 @@ async def fsync(run: Run) -> None:
 
             async def ours() -> float:
                 await system.suspend(echo)  # The limit handles nothing.
-                rate = await _callers(lambda: echo.send(DATA), count)
+                accepted = await rate(lambda: echo.send(DATA), CALLERS, count)
                 await system.resume(echo)
                 await echo.ask(Told(), timeout=600.0)
-                return rate
+                return accepted
 
             await run.compare(
                 "admissions that outlive the machine, 100 callers",
                 ours,
-                lambda: _callers(lambda: commit.append(DATA.data), count),
+                lambda: rate(lambda: commit.append(DATA.data), CALLERS, count),
                 unit="msg/s",
                 target=0.8,
             )
@@ -138,8 +128,8 @@ async def fsync_turns(run: Run) -> None:
 
             await run.compare(
                 "whole asks that outlive the machine, 100 callers",
-                lambda: _callers(lambda: echo.ask(DATA, timeout=600.0), count),
-                lambda: _callers(twice, count),
+                lambda: rate(lambda: echo.ask(DATA, timeout=600.0), CALLERS, count),
+                lambda: rate(twice, CALLERS, count),
                 unit="msg/s",
                 target=0.2,
             )

@@ -11,12 +11,12 @@ import asyncio
 import contextlib
 import tempfile
 import time
-from collections.abc import AsyncGenerator, Awaitable, Callable
+from collections.abc import AsyncGenerator
 from pathlib import Path
 from typing import Any
 
 import limits
-from harness import BURST, Run, main
+from harness import BURST, Run, main, rate
 from workload import Data, Echo, EchoData, Told
 
 import holdfast as hf
@@ -33,26 +33,14 @@ async def running(folder: str, durability: Any) -> AsyncGenerator[hf.ActorRef[Ec
         yield await system.start(hf.child("echo", hf.start(Echo), recovery=hf.hybrid(interval=1.0)))
 
 
-async def asked(ask: Callable[[], Awaitable[object]], callers: int, count: int) -> float:
-    """Turns per second, with so many asks outstanding."""
-
-    async def caller() -> None:
-        for _ in range(count // callers):
-            await ask()
-
-    began = time.perf_counter()
-    await asyncio.gather(*[caller() for _ in range(callers)])
-    return count / (time.perf_counter() - began)
-
-
 async def _asks(run: Run, durability: Any, callers: int, count: int, target: float) -> None:
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:  # /tmp may be in memory.
         limit = limits.SqliteLoop(f"{folder}/limit.db", is_synced=durability == "fsync")
         async with running(folder, durability) as echo:
             await run.compare(
                 f"recorded ask, {durability}, {callers} outstanding",
-                lambda: asked(lambda: echo.ask(ASKED, timeout=600.0), callers, count),
-                lambda: asked(lambda: limit.ask(BODY), callers, count),
+                lambda: rate(lambda: echo.ask(ASKED, timeout=600.0), callers, count),
+                lambda: rate(lambda: limit.ask(BODY), callers, count),
                 unit="turns/s",
                 target=target,
             )
@@ -116,7 +104,7 @@ async def written(run: Run) -> None:
             async with running(folder, durability) as echo:
                 await echo.ask(ASKED)
                 began = _written()
-                await asked(lambda: echo.ask(ASKED, timeout=600.0), CALLERS, count)  # it is awaited here
+                await rate(lambda: echo.ask(ASKED, timeout=600.0), CALLERS, count)  # it is awaited here
                 each = (_written() - began) / count
                 run.bound(f"bytes written per turn, {durability}", each, unit="bytes", target=3 * len(BODY) + 100)
 

@@ -58,6 +58,19 @@ async def pairs(ours: Measure, limit: Measure, n: int = 5) -> Pairs:
     return measured
 
 
+async def rate(call: Callable[[], Awaitable[object]], callers: int, count: int) -> float:
+    """Calls per second, made by so many callers at once, each of which waits for its last one."""
+    each = max(1, count // callers)
+
+    async def caller() -> None:
+        for _ in range(each):
+            await call()
+
+    began = time.perf_counter()
+    await asyncio.gather(*[caller() for _ in range(callers)])
+    return each * callers / (time.perf_counter() - began)
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class Run:
     """One run of one benchmark file: its options, and the lines it prints."""
