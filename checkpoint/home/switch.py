@@ -1,8 +1,9 @@
 """The message switch: the home of one recorded actor. It admits, records, holds, forwards and replays.
 
 It outlives every life of its actor. Orders that make "nothing lost, nothing twice" true:
-an input is journaled before it is fed; a turn's end, its outputs' numbers and the inputs they become at other recorded
-actors are one append; a reply leaves behind that append; the journal is cut only behind a snapshot that is safe.
+an input is journaled before it is fed, or (of an ask) before anything that comes of it leaves; a turn's end, its
+outputs' numbers and the inputs they become at other recorded actors are one append; a reply leaves behind that append;
+the journal is cut only behind a snapshot that is safe.
 
 What is known stands in `InputLedger` and `PresentLife`, with the decisions; here they are carried out.
 """
