@@ -446,7 +446,7 @@ class InputLedger:
     def read_entry(self, position: int, entry: tuple[Any, ...]) -> bool:
         """Take a journal entry up again, in order; False if it is of another kind."""
         match entry:
-            case ("in" | "ins", *_):
+            case ("in", _, _, _, _, _, _, _, *_) | ("ins", _, _, _, *_):
                 place = RowPlace([position], 0, [])
                 for one in spread(entry):
                     self._read_input(place, *one[1:])
