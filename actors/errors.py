@@ -148,9 +148,13 @@ class BadMessage(SendError, text="{message} to {actor}: {problem}"):
     problem: str
 
 
-class BadReply(HoldfastError, text="a reply could not be sent, though its turn has run: {message}: {problem}"):
-    """The reply, or a field of a refusal, cannot be coded as its type says. The turn has run: do not just ask again."""
+class BadReply(HoldfastError, text="{actor} has handled {message}, but its reply cannot be passed on: {problem}"):
+    """The reply, or a field of a refusal, cannot be coded as its type says. The turn has run: do not just ask again.
 
+    `actor` is who has replied, and `message` the type of what it was asked, or the key of an effect.
+    """
+
+    actor: str
     message: str
     problem: str
 
