@@ -340,7 +340,11 @@ class JournalStopped(Event, frozen=True, eq=False):
 
 
 class TurnSlow(Event, frozen=True, eq=False):
-    """A turn occupied the event loop for `seconds`: nothing else ran meanwhile; `message` is its type."""
+    """A turn occupied the event loop for at least `seconds`: nothing else ran meanwhile; `message` is its type.
+
+    It is looked at four times within `watch_turns` seconds: what it took before the first look that found it, and
+    behind the last one, is not counted.
+    """
 
     message: str
     seconds: float
