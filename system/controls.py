@@ -97,7 +97,8 @@ class Controls:
         a `functools.partial` of one. A recorded actor saves the new state before it handles anything else.
 
         Raises:
-            ControlFailed: `change` raised, or the state does not fit; the old one stays.
+            ControlFailed: `change` raised, or the state does not fit: a variable is missing that has no default in the
+                class's body, or there is one that the body does not declare. The old one stays.
             SpecError: another process cannot import `change`.
         """
         return await self._replace(ref, ReplaceState(change), timeout)

@@ -19,7 +19,7 @@ from ..kernel.message import message_name
 from ..process.wire.start_codec import imported, pack_recipe, unpack_recipe
 from ..state_hooks import state_migrator
 from ..values import UnsavableValue
-from .live_state import change_state, state_to_show, tried_state
+from .live_state import change_state, keeping_variables, state_to_show, tried_state
 from .tracing import Statistics, tap_of
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class ReplaceState(Order):
     change: Change
 
     def run(self, cell: Cell, actor: Actor) -> Any:
-        change_state(actor, self.change)
+        change_state(actor, keeping_variables(actor, self.change))
         return state_to_show(actor)
 
     def pack(self, where: str) -> dict[str, Any]:
@@ -218,7 +218,10 @@ class Prepare(Order):
         for one in self.wanted:
             if isinstance(one, ReplaceCode):
                 start = next_start(cell, one.start, keeps_arguments=one.keeps_arguments)
-        changes = [one.change if isinstance(one, ReplaceState) else one.becoming(actor) for one in self.wanted]
+        changes = [
+            keeping_variables(actor, one.change) if isinstance(one, ReplaceState) else one.becoming(actor)
+            for one in self.wanted
+        ]
         state, saved = tried_state(actor, changes, self.wanted[0].verb)
         hold.prepared = Prepared(state, start)
         if cell.node.ports.uplink is None:

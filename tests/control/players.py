@@ -202,7 +202,7 @@ def spoil(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def large(state: dict[str, Any]) -> dict[str, Any]:
-    return {**state, "total": 1000, "blob": b"x" * 3_000_000}
+    return {"total": 1000, "seen": [b"x" * 3_000_000]}
 
 
 def no_state(state: dict[str, Any]) -> list[int]:
