@@ -32,7 +32,7 @@ from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import message_name
 from ...actors.persistence import UNFIT
-from ...actors.state_hooks import state_getter
+from ...actors.state_hooks import StateMismatch, state_getter
 from ...actors.values import decode_value
 from ..method import Method
 from ..protocol import (
@@ -67,7 +67,7 @@ from ..protocol import (
     untimed,
 )
 from ..snapshot.image_writer import Imaging
-from ..snapshot.key_variables import StateMismatch, check_keys, restore_state, save_state, variables
+from ..snapshot.key_variables import check_keys, restore_state, save_state, variables
 from ..turn_word import WAITS
 from .determinism_guard import DeterminismGuard
 from .glances import answer_beside
