@@ -26,6 +26,7 @@ HoldfastError
 ├── NotGranted           an actor in a process gave an order to one that it has neither started nor is bound to
 ├── NameTaken            a living actor has this name already
 ├── NoSuchActor          nobody lives at this address
+├── NoSuchEvent          the event that was waited for has not come
 ├── WrongActor           another class lives at this address
 ├── SpecError            a child specification is not valid
 ├── UnsavableValue       a value that no snapshot can hold
@@ -377,6 +378,13 @@ class NoSuchActor(HoldfastError, text="there is no actor at {actor}"):
     """Nobody lives at this address."""
 
     actor: str
+
+
+class NoSuchEvent(HoldfastError, text="no {event} has come {when}"):
+    """`EventStream.until` has waited for an event of this class, and none has come."""
+
+    event: str
+    when: str
 
 
 class WrongActor(HoldfastError, text="{actor} is a {found}, not a {expected}"):
