@@ -229,7 +229,8 @@ class ChangeSupervisor(RuntimeOrder[None]):
     """Change a supervisor while it works. What is left out stays; with nothing given its `init` is asked anew.
 
     Flags hold at once. A child whose id is known gets its new spec and goes on; a new one is added and not started; one
-    that is not mentioned stays, behind the others. If anything is not valid, nothing changes.
+    that is not mentioned stays, behind the others. If anything is not valid, nothing changes. The next lives of the
+    supervisor begin with it too, unless its class has an `init` of its own, which is asked at each start.
     """
 
     flags: Any = None

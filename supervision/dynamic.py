@@ -173,6 +173,10 @@ class DynamicSupervisor(Supervisor):
         check_dynamic(self.ctx.path, plan)
         self._flags, self._template = plan.flags, plan.children[0] if plan.children else None
 
+    def _recipe_with(self, known: Any, given: tuple[ChildSpec, ...]) -> Any:
+        """The template, if there is one."""
+        return given[0] if given else None
+
     def _specs(self) -> tuple[ChildSpec, ...]:
         return () if self._template is None else (self._template,)
 

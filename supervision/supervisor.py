@@ -766,9 +766,12 @@ class Supervisor(Inquiries):
     @on(ChangeSupervisor)
     def _change(self, message: ChangeSupervisor) -> Any:
         """Take new flags and specs; nothing is started or stopped, and nothing changes if they are not valid."""
+        from .respec import keep_plan  # It asks here what a supervisor is.
+
         try:
             plan = new_plan(self, message)
             self._take(plan)
+            keep_plan(self, plan.flags, None if message.children is None else plan.children)
         except StartIgnored:
             return None
         except HoldfastError as error:
@@ -810,6 +813,11 @@ class Supervisor(Inquiries):
         """Follow another plan from now on; raises SpecError if that cannot be."""
         children = succession(self, self._children, plan)
         self._flags, self._children = plan.flags, children
+
+    def _recipe_with(self, known: Any, given: tuple[ChildSpec, ...]) -> Any:
+        """What our next lives begin with if they are given these specs beside those that are known."""
+        names = {spec.id for spec in given}
+        return (*given, *(spec for spec in known if spec.id not in names))
 
     def _specs(self) -> tuple[ChildSpec, ...]:
         """The specs as they are now."""

@@ -273,6 +273,25 @@ async def test_a_changed_template_is_for_those_to_come() -> None:
         assert (await old.ask(Sum()), await new.ask(Sum())) == (1, 2)
 
 
+@pytest.mark.parametrize("whose", ["its own", "its supervisor's"])
+async def test_a_changed_template_lasts_when_the_supervisor_is_restarted(whose: str) -> None:
+    async with hf.ActorSystem(log=False) as system:
+        inner = hf.dynamic("inner", template=hf.child(None, hf.start(Adder, 1)))
+        top = await system.start(hf.supervisor("top", children=[inner], intensity=9))
+        ref = system.ref(f"{top.path}/inner", hf.supervision.DynamicSupervisor)
+        flags = hf.supervision.Flags(max_children=2)
+        await ref.ask(hf.supervision.ChangeSupervisor(flags, [hf.child(None, hf.start(Adder, 2))]))
+        for _ in range(2):
+            with system.events() as events:
+                (ref if whose == "its own" else top).kill()
+                while (await events.until(hf.events.ActorStarted)).address != ref.path:
+                    pass
+            one = await ref.ask(hf.StartChild())
+            assert await one.ask(Sum()) == 2
+            await ref.ask(hf.StartChild())
+            assert isinstance(await refused(ref.ask(hf.StartChild())), hf.errors.MaxChildren)
+
+
 class Pool(hf.supervision.DynamicSupervisor):
     """A dynamic supervisor as a class."""
 
