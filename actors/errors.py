@@ -283,13 +283,15 @@ class ReplayDiverged(HoldfastError):
     what: str = ""
 
     def __str__(self) -> str:
-        where = f"replay of {self.actor} diverged at turn {self.turn}"
+        where = f"replay of {self.actor} {DIVERGED} {self.turn}"
         if self.cause:
             return f"{where}: {self.cause}"
         now = f" ({self.what})" if self.what else ""
         return f"{where}, output {self.output}{now}: it is not what it was before the crash; {DIVERGES}"
 
 
+DIVERGED = "diverged at turn"
+"""In the text of every divergence, and so in the reason of a start that has failed because of one."""
 DIVERGES = (
     "the handler's code was changed, or it reads what no snapshot holds (an attribute with a leading underscore that a "
     "turn has set, or the world): use ctx.now(), ctx.random and ctx.uuid(), or set deterministic = False"

@@ -17,7 +17,7 @@ from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Start, on
 from ..actors.kernel.cell import DOWN, GONE, Cell
 from ..actors.kernel.envelope import Item, ReplyHandle
-from ..actors.persistence import UNFIT
+from ..actors.persistence import UNFIT, is_in_vain
 from .admin import (
     AlreadyPresent,
     AlreadyStarted,
@@ -65,6 +65,11 @@ from .supervisor_changes import (
     why_occupied,
 )
 
+IN_VAIN = (
+    "nothing that is recorded of it is lost: start it with the code that has recorded it, with an older snapshot, or "
+    "afresh"
+)
+"""What is to be done about a child whose code does not fit what is recorded of it."""
 DISMISSED = 1000
 """Of the children that were stopped by order and whose specs are gone, so many are remembered, the newest."""
 
@@ -515,10 +520,11 @@ class Supervisor(Inquiries):
         if one.spec.backoff is not None:
             self._later(one, reason)
             return
-        if UNFIT in str(reason):
+        if is_in_vain(str(reason)):
             if one.cell is not None:
                 one.cell.extra().reason = reason  # Whoever waits there is told this, and not how its last life ended.
-            self._give_up(one, reason, Shutdown(f"{self._path_of(one)} cannot be started again: {reason}"))
+            why = Shutdown(f"{self._path_of(one)} cannot be started again: {reason}; {IN_VAIN}")
+            self._give_up(one, why, why)
             return
         one.retry += 1
         self.ctx._cell.push(RestartAgain(one, one.retry, reason))  # Through our own mailbox: we answer in between.
