@@ -206,6 +206,23 @@ class WhichChildren(Message[list[ChildInfo]]):
     """All children, in start order."""
 
 
+class EndedChild(Message[None]):
+    """A child that has ended and was not started again: why, in words, and whether anything recorded of it is kept."""
+
+    id: str
+    path: str
+    reason: str
+    is_recorded: bool
+
+
+class EndedChildren(Message[list[EndedChild]]):
+    """The children that have ended, or were stopped, and were not started again, the last one last.
+
+    Those whose spec is gone are among them (temporary ones, and all of a dynamic supervisor), until they are deleted
+    (`DeleteChild`). The newest 100 of this life of the supervisor are known.
+    """
+
+
 class ChildCounts(Message[None]):
     """The number of specs, how many of them run, and how many are supervisors and workers, running or not."""
 

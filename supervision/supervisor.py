@@ -70,6 +70,8 @@ IN_VAIN = (
     "afresh"
 )
 """What is to be done about a child whose code does not fit what is recorded of it."""
+ENDED = 100
+"""Of the children that have ended and were not started again, so many are told of, the newest."""
 DISMISSED = 1000
 """Of the children that were stopped by order and whose specs are gone, so many are remembered, the newest."""
 
@@ -153,7 +155,7 @@ class Supervisor(Inquiries):
         self._flags = plan.flags
         self._children = {spec.id: Child(spec) for spec in plan.children}
         self._planned, self._parked = frozenset(self._children), set[str]()
-        self._dismissed = {}
+        self._dismissed, self._ended = {}, {}
         self._restarts = ()
         self._early: list[lifecycle.ChildExit] = []
 
@@ -307,6 +309,7 @@ class Supervisor(Inquiries):
         one.state = UP
         self._parked.discard(one.spec.id)
         self._dismissed.pop(one.spec.id, None)
+        self._ended.pop(one.spec.id, None)
         one.row = None
         one.up_since = self.ctx._cell.node.loop.time()
 
@@ -383,10 +386,17 @@ class Supervisor(Inquiries):
     def _give_up_address(self, one: Child, reason: object) -> None:
         """The child is not restarted: its address goes, its spec too if it is temporary."""
         one.state = STOPPED
+        self._note_end(one, reason)
         if one.cell is not None:
             lifecycle.retire(one.cell, reason)
         if one.spec.restart == "temporary":
             self._forget(one)
+
+    def _note_end(self, one: Child, reason: object) -> None:
+        self._ended.pop(one.spec.id, None)
+        self._ended[one.spec.id] = reason
+        if len(self._ended) > ENDED:
+            del self._ended[next(iter(self._ended))]
 
     def _forget(self, one: Child) -> None:
         """The spec goes: the one way out of the list of children."""
@@ -688,6 +698,7 @@ class Supervisor(Inquiries):
         await self._stop(one, reason)
         if self._has_lost(one):
             raise NoSuchChild(message.id)
+        self._note_end(one, reason)
         if one.cell is not None:
             lifecycle.retire(one.cell, reason)
         if message.erase:
@@ -757,6 +768,7 @@ class Supervisor(Inquiries):
         one = self._child(message.id)
         if one.state != STOPPED:
             raise ChildBusy(message.id, one.state)
+        self._ended.pop(message.id, None)
         if one.cell is not None:
             lifecycle.retire(one.cell, "it was deleted")
         if message.erase:

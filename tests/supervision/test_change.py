@@ -128,6 +128,18 @@ async def test_a_change_lasts_when_the_supervisor_is_restarted() -> None:
         assert (shown["strategy"], shown["intensity"], shown["period"]) == ("one_for_all", 7, 9.0)
 
 
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_who_has_ended_and_has_a_spec_yet_is_listed_with_the_reason(isolation: Any) -> None:
+    async with hf.ActorSystem(log=False) as system:
+        children = [named("a", "a", restart="transient"), named("b", "b")]
+        top = await system.start(hf.supervisor("top", children=children, isolation=isolation))
+        await top.ask(hf.TerminateChild("a"))
+        [ended] = await top.ask(hf.supervision.EndedChildren())
+        assert ended == hf.supervision.EndedChild("a", f"{top.path}/a", "shutdown", is_recorded=False)
+        await top.ask(hf.RestartChild("a"))
+        assert await top.ask(hf.supervision.EndedChildren()) == []
+
+
 async def test_a_change_is_forgotten_with_the_process_of_the_supervisor() -> None:
     async with hf.ActorSystem(log=False) as system:
         top = await system.start(hf.supervisor("top", children=[named("a", "old")], isolation="process"))
