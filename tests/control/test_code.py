@@ -147,6 +147,29 @@ async def test_a_process_that_dies_before_it_has_answered_comes_back_with_its_ne
     assert await one.ask(Add(1), timeout=30.0) == 200
 
 
+async def test_below_a_supervisor_whose_process_dies_before_it_has_answered_the_old_class_is_back(
+    system: hf.ActorSystem,
+) -> None:
+    """A limit: the root has not heard of the new one, and the state of the new one is refused if it does not fit."""
+    child = hf.child("one", hf.start(Account))
+    top = await system.start(hf.supervisor("top", children=[child], isolation="process"))
+    one = system.ref("/app/top/one", Account)
+    await system.suspend(one)
+    worker: Any = system._workers.of(top._cell)
+
+    def dies(_: frames.Reply) -> None:
+        worker.forked.kill()
+
+    worker.connection.takers[frames.Reply] = dies
+    with pytest.raises(hf.HoldfastError):
+        await system.replace_code(one, Cents)
+    async with asyncio.timeout(30.0):
+        while top._cell.life < 2 or one.path not in system.tree():
+            await asyncio.sleep(0.005)
+    back = system.ref("/app/top/one", hf.Actor)
+    assert (await system.get_status(back)).kind == "tests.control.players.Account"
+
+
 async def test_code_of_a_recorded_actor_below_a_process_is_replaced(system: hf.ActorSystem) -> None:
     spec = hf.child("one", hf.start(Account), recovery=hf.hybrid(interval=3600.0))
     await system.start(hf.supervisor("top", children=[spec], intensity=1000, isolation="process"))
