@@ -17,6 +17,7 @@ from .actors.errors import (
     MailboxFull,
     NameTaken,
     NoSuchActor,
+    NoSuchEvent,
     NotGranted,
     NotSuspended,
     ProcessUnavailable,
@@ -39,6 +40,7 @@ from .actors.kernel.bindings import Unbound
 from .actors.kernel.context import StashError
 from .actors.kernel.message import Refusal, UnknownRefusal
 from .actors.process.program.external_program import ProgramFailed
+from .actors.state_hooks import StateMismatch
 from .checkpoint.home.quarantine import NotQuarantined
 from .checkpoint.journal import (
     DamagedStore,
@@ -52,7 +54,6 @@ from .checkpoint.journal import (
 from .checkpoint.life.determinism_guard import NotDeterministic
 from .checkpoint.life.readonly_guard import NotReadonly
 from .checkpoint.life.replay_guard import StateDiverged
-from .checkpoint.snapshot.key_variables import StateMismatch
 from .checkpoint.snapshot.snapshot_groups import NoSuchGroup
 from .checkpoint.snapshot.snapshot_schedule import CheckpointFailed
 from .checkpoint.upgrade.mapping import NotMapped
@@ -115,6 +116,7 @@ __all__ = [
     "NoRoute",
     "NoSuchActor",
     "NoSuchChild",
+    "NoSuchEvent",
     "NoSuchGroup",
     "NotAccepted",
     "NotAnActor",

@@ -26,6 +26,7 @@ HoldfastError
 ├── NotGranted           an actor in a process gave an order to one that it has neither started nor is bound to
 ├── NameTaken            a living actor has this name already
 ├── NoSuchActor          nobody lives at this address
+├── NoSuchEvent          the event that was waited for has not come
 ├── WrongActor           another class lives at this address
 ├── SpecError            a child specification is not valid
 ├── UnsavableValue       a value that no snapshot can hold
@@ -148,9 +149,13 @@ class BadMessage(SendError, text="{message} to {actor}: {problem}"):
     problem: str
 
 
-class BadReply(HoldfastError, text="a reply could not be sent, though its turn has run: {message}: {problem}"):
-    """The reply, or a field of a refusal, cannot be coded as its type says. The turn has run: do not just ask again."""
+class BadReply(HoldfastError, text="{actor} has handled {message}, but its reply cannot be passed on: {problem}"):
+    """The reply, or a field of a refusal, cannot be coded as its type says. The turn has run: do not just ask again.
 
+    `actor` is who has replied, and `message` the type of what it was asked, or the key of an effect.
+    """
+
+    actor: str
     message: str
     problem: str
 
@@ -278,13 +283,15 @@ class ReplayDiverged(HoldfastError):
     what: str = ""
 
     def __str__(self) -> str:
-        where = f"replay of {self.actor} diverged at turn {self.turn}"
+        where = f"replay of {self.actor} {DIVERGED} {self.turn}"
         if self.cause:
             return f"{where}: {self.cause}"
         now = f" ({self.what})" if self.what else ""
         return f"{where}, output {self.output}{now}: it is not what it was before the crash; {DIVERGES}"
 
 
+DIVERGED = "diverged at turn"
+"""In the text of every divergence, and so in the reason of a start that has failed because of one."""
 DIVERGES = (
     "the handler's code was changed, or it reads what no snapshot holds (an attribute with a leading underscore that a "
     "turn has set, or the world): use ctx.now(), ctx.random and ctx.uuid(), or set deterministic = False"
@@ -373,6 +380,13 @@ class NoSuchActor(HoldfastError, text="there is no actor at {actor}"):
     """Nobody lives at this address."""
 
     actor: str
+
+
+class NoSuchEvent(HoldfastError, text="no {event} has come {when}"):
+    """`EventStream.until` has waited for an event of this class, and none has come."""
+
+    event: str
+    when: str
 
 
 class WrongActor(HoldfastError, text="{actor} is a {found}, not a {expected}"):

@@ -7,14 +7,17 @@ import functools
 import typing
 from collections import deque
 from collections.abc import AsyncIterator, Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
-from .errors import portable
+from .errors import NoSuchEvent, portable
 from .exit_reasons import ExitReason, pack_exit, unpack_exit
 from .kernel.envelope import Item, item_name
 from .kernel.message import Message, MessageText, message_of
+from .seconds import check_seconds
+
+E = TypeVar("E", bound="Event")
 
 
 class Event(msgspec.Struct, frozen=True, eq=False):
@@ -340,7 +343,11 @@ class JournalStopped(Event, frozen=True, eq=False):
 
 
 class TurnSlow(Event, frozen=True, eq=False):
-    """A turn occupied the event loop for `seconds`: nothing else ran meanwhile; `message` is its type."""
+    """A turn occupied the event loop for at least `seconds`: nothing else ran meanwhile; `message` is its type.
+
+    It is looked at four times within `watch_turns` seconds: what it took before the first look that found it, and
+    behind the last one, is not counted.
+    """
 
     message: str
     seconds: float
@@ -436,6 +443,25 @@ class EventStream:
             self._wake = asyncio.get_running_loop().create_future()
             await self._wake
         return self._events.popleft()
+
+    async def until(self, kind: type[E], *, timeout: float = 30.0) -> E:
+        """Wait for the next event of a class, and return it; those before it are passed over.
+
+        Args:
+            kind: the class.
+            timeout: seconds, finite and > 0.
+
+        Raises:
+            NoSuchEvent: none has come in time, or before the stream was closed.
+        """
+        try:
+            async with asyncio.timeout(check_seconds("until", "timeout", timeout)):
+                async for event in self:
+                    if isinstance(event, kind):
+                        return event
+        except TimeoutError:
+            raise NoSuchEvent(kind.__name__, f"within {timeout:g} s") from None
+        raise NoSuchEvent(kind.__name__, "before the stream was closed")
 
     def take(self) -> list[Event]:
         """Return all events that wait, without waiting for more."""

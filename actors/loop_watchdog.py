@@ -36,6 +36,17 @@ def check_limits(lag: float | None, turns: float | None) -> None:
             check_seconds("ActorSystem", name, limit)
 
 
+class Sighting:
+    """A turn that the watching thread has found, and for how long it has been seen to go on."""
+
+    __slots__ = ("address", "frame", "is_told", "message", "since", "until")
+
+    def __init__(self, frame: types.FrameType, address: str, message: str) -> None:
+        self.frame, self.address, self.message = frame, address, message
+        self.since = self.until = monotonic()
+        self.is_told = False
+
+
 class LoopWatch:
     """Tells of turns that occupy the loop, and of a loop that lags. Off unless it is asked for.
 
@@ -86,41 +97,44 @@ class LoopWatch:
     def _look(self) -> None:
         limit = self._turns
         assert limit is not None
-        seen: types.FrameType | None = None
-        since = 0.0
-        is_told = False
+        seen: Sighting | None = None
         while not self._over.wait(limit / LOOKS):
+            now = monotonic()  # Before the look: what is seen there has gone on until then.
             found = _running(sys._current_frames().get(self._loop_thread))
-            now, let_go, self._let_go = monotonic(), self._let_go, found is None
-            if found is not None:
-                self._node.loop.call_soon_threadsafe(self._lets_go)
-            if found is None or let_go or found[0] is not seen:
-                seen, since, is_told = (None if found is None else found[0]), now, False
-            elif not is_told and now - since >= limit:
-                is_told = True
-                self._node.loop.call_soon_threadsafe(self._tell, found[1], found[2], since)
+            let_go, self._let_go = self._let_go, found is None
+            if found is None:
+                seen = None
+                continue
+            self._node.loop.call_soon_threadsafe(self._lets_go)
+            if seen is None or let_go or found.frame is not seen.frame:
+                seen = found
+                continue
+            seen.until = now
+            if not seen.is_told and now - seen.since >= limit:
+                seen.is_told = True
+                self._node.loop.call_soon_threadsafe(self._tell, seen)
 
     def _lets_go(self) -> None:
         self._let_go = True
 
-    def _tell(self, address: str, message: str, since: float) -> None:
-        """Comes to run when the turn lets the loop go: then it is known how long it took."""
-        self._node.emit(TurnSlow(address, message, monotonic() - since))
+    def _tell(self, seen: Sighting) -> None:
+        """Comes to run when the turn has let the loop go, behind what else was due: that time is none of the turn's."""
+        self._node.emit(TurnSlow(seen.address, seen.message, seen.until - seen.since))
 
 
-def _running(frame: types.FrameType | None) -> tuple[types.FrameType, str, str] | None:
-    """The turn in a stack: the frame that stands for it, the actor's address, the type of what it handles."""
+def _running(frame: types.FrameType | None) -> Sighting | None:
+    """The turn in a stack."""
     above: types.FrameType | None = None
     while frame is not None:
         code = frame.f_code
         if code is TURN and above is not None:
             cell, item = frame.f_locals.get("cell"), frame.f_locals.get("item")
-            return (above, *_named(cell, item)) if cell is not None else None
+            return Sighting(above, *_named(cell, item)) if cell is not None else None
         if code is RUNNER and above is not None:
             turn = frame.f_locals.get("turn")
             if turn is None:
                 return None
-            return (above, *_named(turn.cell, turn.item))
+            return Sighting(above, *_named(turn.cell, turn.item))
         above, frame = frame, frame.f_back
     return None
 

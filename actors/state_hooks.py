@@ -2,8 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from .errors import HoldfastError, type_name
+
+if TYPE_CHECKING:
+    from .kernel.actor import Actor
+
+
+class StateMismatch(HoldfastError, text="the state of {actor} does not fit: {problem}"):
+    """A saved state does not fit the class that shall take it back."""
+
+    actor: str
+    problem: str
 
 
 def state_getter(actor: object) -> Callable[[], Any] | None:
@@ -16,9 +29,24 @@ def state_setter(actor: object) -> Callable[[Any], Any] | None:
     return getattr(actor, "set_state", None)
 
 
-def state_migrator(kind: type) -> Callable[[Any, Any], Any] | None:
-    """What makes the state of a class of one that an older version of it, or another class, has had."""
-    return getattr(kind, "migrate", None)
+def migrated(kind: type[Actor], state: Any, version: int, where: str) -> Any:
+    """A state of an older version of the class, as this one wants it: what its classmethod `migrate` makes of it.
+
+    Raises:
+        StateMismatch: the class does not know that version, or says that it cannot.
+    """
+    known = f"it has schema version {version}, {type_name(kind)} {kind.schema_version}"
+    if not isinstance(version, int) or version > kind.schema_version:
+        raise StateMismatch(where, f"{known}: an older class cannot read the state of a newer one")
+    migrate = getattr(kind, "migrate", None)
+    if migrate is None:
+        raise StateMismatch(where, f"{known}, which has no classmethod migrate(state, from_version)")
+    if inspect.iscoroutinefunction(migrate):
+        raise StateMismatch(where, f"{known}, whose migrate is `async def`: it must be plain")
+    try:
+        return migrate(state, version)
+    except BaseException as error:
+        raise StateMismatch(where, f"{known}, and its migrate failed: {type(error).__name__}: {error}") from error
 
 
 def gives_deltas(kind: type) -> bool:

@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any
 
 from ..actors.control.orders import Change as StateChange
-from ..actors.control.orders import Migrate, Status
+from ..actors.control.orders import Status
 from ..actors.control.tracing import Statistics
 from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.actor import Actor, Start
@@ -215,12 +215,12 @@ class RemoteSystem:
         self,
         ref: RemoteTarget,
         new: type[Actor] | Start[Any],
-        migrate: Migrate | None = None,
+        change: StateChange | None = None,
         *,
         timeout: float = 5.0,
     ) -> None:
         """Have a suspended actor go on as another class."""
-        await self._control("replace_code", ref, timeout, new, migrate, changes=True)
+        await self._control("replace_code", ref, timeout, new, change, changes=True)
 
     async def terminate(self, ref: RemoteTarget, *, timeout: float = 5.0) -> str:
         """End a life in good order; its supervisor then does as its spec says. Returns its exit reason in words."""
@@ -348,9 +348,11 @@ class RemoteChange:
         """Put `change(state)` in the place of an actor's state."""
         self._put("replace_state", target, change)
 
-    def replace_code(self, target: RemoteTarget, new: type[Actor] | Start[Any], migrate: Migrate | None = None) -> None:
+    def replace_code(
+        self, target: RemoteTarget, new: type[Actor] | Start[Any], change: StateChange | None = None
+    ) -> None:
         """Go on as another class."""
-        self._put("replace_code", target, new, migrate)
+        self._put("replace_code", target, new, change)
 
     def stop(self, target: RemoteTarget) -> None:
         """Stop a child, and keep its spec."""

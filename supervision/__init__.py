@@ -1,6 +1,6 @@
 """Supervisors: who restarts whom, when and how often; with pools, partitions, registries, jobs and programs."""
 
-from .admin import ChangeSupervisor, ChildCounts, ChildInfo, CountChildren, GetChildSpec
+from .admin import ChangeSupervisor, ChildCounts, ChildInfo, CountChildren, EndedChild, EndedChildren, GetChildSpec
 from .config import tree_from
 from .dynamic import DynamicSupervisor
 from .rules import Rule
@@ -22,6 +22,8 @@ __all__ = [
     "CountChildren",
     "CountPartitions",
     "DynamicSupervisor",
+    "EndedChild",
+    "EndedChildren",
     "Failed",
     "Flags",
     "GetChildSpec",

@@ -206,6 +206,23 @@ class WhichChildren(Message[list[ChildInfo]]):
     """All children, in start order."""
 
 
+class EndedChild(Message[None]):
+    """A child that has ended and was not started again: why, in words, and whether anything recorded of it is kept."""
+
+    id: str
+    path: str
+    reason: str
+    is_recorded: bool
+
+
+class EndedChildren(Message[list[EndedChild]]):
+    """The children that have ended, or were stopped, and were not started again, the last one last.
+
+    Those whose spec is gone are among them (temporary ones, and all of a dynamic supervisor), until they are deleted
+    (`DeleteChild`). The newest 100 of this life of the supervisor are known.
+    """
+
+
 class ChildCounts(Message[None]):
     """The number of specs, how many of them run, and how many are supervisors and workers, running or not."""
 
@@ -229,7 +246,8 @@ class ChangeSupervisor(RuntimeOrder[None]):
     """Change a supervisor while it works. What is left out stays; with nothing given its `init` is asked anew.
 
     Flags hold at once. A child whose id is known gets its new spec and goes on; a new one is added and not started; one
-    that is not mentioned stays, behind the others. If anything is not valid, nothing changes.
+    that is not mentioned stays, behind the others. If anything is not valid, nothing changes. The next lives of the
+    supervisor begin with it too, unless its class has an `init` of its own, which is asked at each start.
     """
 
     flags: Any = None

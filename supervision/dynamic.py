@@ -173,6 +173,10 @@ class DynamicSupervisor(Supervisor):
         check_dynamic(self.ctx.path, plan)
         self._flags, self._template = plan.flags, plan.children[0] if plan.children else None
 
+    def _recipe_with(self, known: Any, given: tuple[ChildSpec, ...]) -> Any:
+        """The template, if there is one."""
+        return given[0] if given else None
+
     def _specs(self) -> tuple[ChildSpec, ...]:
         return () if self._template is None else (self._template,)
 
@@ -252,6 +256,8 @@ class DynamicSupervisor(Supervisor):
         """A stopped child is forgotten here by itself; what was recorded of it is forgotten now."""
         path, keeper = f"{self.ctx.path}/{message.id}", self.ctx._cell.node.ports.keeper
         is_there = message.id in self._children or message.id in (self.ctx._cell.children or ())
+        if not is_there:
+            self._ended.pop(message.id, None)
         if not is_there and "/" not in message.id and message.erase and keeper.knows(path):
             return self._answered(self._erase_below(path))  # If the store refuses, it can be deleted again.
         self._child(message.id)

@@ -8,7 +8,17 @@ from typing import Any
 from ..actors.errors import HoldfastError
 from ..actors.kernel.actor import Actor, on
 from ..actors.kernel.envelope import ReplyHandle
-from .admin import Boxed, ChildCounts, ChildInfo, CountChildren, GetChildSpec, NoSuchChild, WhichChildren
+from .admin import (
+    Boxed,
+    ChildCounts,
+    ChildInfo,
+    CountChildren,
+    EndedChild,
+    EndedChildren,
+    GetChildSpec,
+    NoSuchChild,
+    WhichChildren,
+)
 from .children import Child
 from .intensity import recent_restarts
 from .spec import Flags
@@ -20,6 +30,7 @@ class Inquiries(Actor):
     _children: dict[str, Child]
     _flags: Flags
     _restarts: tuple[float, ...]
+    _ended: dict[str, object]  # why each child has ended that has not been started since
 
     def _overview(self) -> dict[str, Any]:
         """Flags, restarts within the period, and children; nothing before our start has come so far."""
@@ -33,6 +44,14 @@ class Inquiries(Actor):
     def _which_children(self, message: WhichChildren) -> list[ChildInfo]:
         """What there is, in start order."""
         return [one.info(self.ctx.path) for one in self._children.values()]
+
+    @on(EndedChildren, readonly=True)
+    def _ended_children(self, message: EndedChildren) -> list[EndedChild]:
+        """Who has ended, the last one last."""
+        path, knows = self.ctx.path, self.ctx._cell.node.ports.keeper.knows
+        return [
+            EndedChild(name, f"{path}/{name}", str(why), knows(f"{path}/{name}")) for name, why in self._ended.items()
+        ]
 
     @on(CountChildren, readonly=True)
     def _count_children(self, message: CountChildren) -> ChildCounts:

@@ -8,7 +8,7 @@ from typing import Any
 
 from ..actors.kernel.actor import Start
 from ..actors.kernel.cell import Cell
-from .spec import ChildSpec
+from .spec import ChildSpec, Flags
 from .supervisor import Supervisor
 
 Change = Callable[[ChildSpec], ChildSpec]
@@ -65,6 +65,20 @@ def rebind(cell: Cell, port: str, target: str | None) -> None:
         return dataclasses.replace(known, bindings={**left, port: target}, late=known.late | {port})
 
     _change(cell, change(cell.spec) if isinstance(cell.spec, ChildSpec) else cell.spec, change)
+
+
+def keep_plan(supervisor: Supervisor, flags: Flags, given: tuple[ChildSpec, ...] | None) -> None:
+    """The next lives of a supervisor begin with flags and children that it was given while it worked.
+
+    Not if its class has an `init` of its own: that is asked anew at each start. None: its children are as before.
+    """
+    cell = supervisor.ctx._cell
+    start = cell.extra().start
+    if start is None or not issubclass(start.kind, Supervisor) or start.kind.init is not Supervisor.init:
+        return
+    if len(start.args) == 2 and isinstance(start.args[0], Flags):
+        children = start.args[1] if given is None else supervisor._recipe_with(start.args[1], given)
+        respec(cell, Start(start.kind, (flags, children), start.kwargs))
 
 
 def _change(cell: Cell, spec: ChildSpec | None, change: Change) -> None:

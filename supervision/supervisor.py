@@ -17,7 +17,7 @@ from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Start, on
 from ..actors.kernel.cell import DOWN, GONE, Cell
 from ..actors.kernel.envelope import Item, ReplyHandle
-from ..actors.persistence import UNFIT
+from ..actors.persistence import UNFIT, is_in_vain
 from .admin import (
     AlreadyPresent,
     AlreadyStarted,
@@ -65,6 +65,13 @@ from .supervisor_changes import (
     why_occupied,
 )
 
+IN_VAIN = (
+    "nothing that is recorded of it is lost: start it with the code that has recorded it, with an older snapshot, or "
+    "afresh"
+)
+"""What is to be done about a child whose code does not fit what is recorded of it."""
+ENDED = 100
+"""Of the children that have ended and were not started again, so many are told of, the newest."""
 DISMISSED = 1000
 """Of the children that were stopped by order and whose specs are gone, so many are remembered, the newest."""
 
@@ -148,7 +155,7 @@ class Supervisor(Inquiries):
         self._flags = plan.flags
         self._children = {spec.id: Child(spec) for spec in plan.children}
         self._planned, self._parked = frozenset(self._children), set[str]()
-        self._dismissed = {}
+        self._dismissed, self._ended = {}, {}
         self._restarts = ()
         self._early: list[lifecycle.ChildExit] = []
 
@@ -302,6 +309,7 @@ class Supervisor(Inquiries):
         one.state = UP
         self._parked.discard(one.spec.id)
         self._dismissed.pop(one.spec.id, None)
+        self._ended.pop(one.spec.id, None)
         one.row = None
         one.up_since = self.ctx._cell.node.loop.time()
 
@@ -378,10 +386,17 @@ class Supervisor(Inquiries):
     def _give_up_address(self, one: Child, reason: object) -> None:
         """The child is not restarted: its address goes, its spec too if it is temporary."""
         one.state = STOPPED
+        self._note_end(one, reason)
         if one.cell is not None:
             lifecycle.retire(one.cell, reason)
         if one.spec.restart == "temporary":
             self._forget(one)
+
+    def _note_end(self, one: Child, reason: object) -> None:
+        self._ended.pop(one.spec.id, None)
+        self._ended[one.spec.id] = reason
+        if len(self._ended) > ENDED:
+            del self._ended[next(iter(self._ended))]
 
     def _forget(self, one: Child) -> None:
         """The spec goes: the one way out of the list of children."""
@@ -515,10 +530,11 @@ class Supervisor(Inquiries):
         if one.spec.backoff is not None:
             self._later(one, reason)
             return
-        if UNFIT in str(reason):
+        if is_in_vain(str(reason)):
             if one.cell is not None:
                 one.cell.extra().reason = reason  # Whoever waits there is told this, and not how its last life ended.
-            self._give_up(one, reason, Shutdown(f"{self._path_of(one)} cannot be started again: {reason}"))
+            why = Shutdown(f"{self._path_of(one)} cannot be started again: {reason}; {IN_VAIN}")
+            self._give_up(one, why, why)
             return
         one.retry += 1
         self.ctx._cell.push(RestartAgain(one, one.retry, reason))  # Through our own mailbox: we answer in between.
@@ -682,6 +698,7 @@ class Supervisor(Inquiries):
         await self._stop(one, reason)
         if self._has_lost(one):
             raise NoSuchChild(message.id)
+        self._note_end(one, reason)
         if one.cell is not None:
             lifecycle.retire(one.cell, reason)
         if message.erase:
@@ -751,6 +768,7 @@ class Supervisor(Inquiries):
         one = self._child(message.id)
         if one.state != STOPPED:
             raise ChildBusy(message.id, one.state)
+        self._ended.pop(message.id, None)
         if one.cell is not None:
             lifecycle.retire(one.cell, "it was deleted")
         if message.erase:
@@ -766,9 +784,12 @@ class Supervisor(Inquiries):
     @on(ChangeSupervisor)
     def _change(self, message: ChangeSupervisor) -> Any:
         """Take new flags and specs; nothing is started or stopped, and nothing changes if they are not valid."""
+        from .respec import keep_plan  # It asks here what a supervisor is.
+
         try:
             plan = new_plan(self, message)
             self._take(plan)
+            keep_plan(self, plan.flags, None if message.children is None else plan.children)
         except StartIgnored:
             return None
         except HoldfastError as error:
@@ -810,6 +831,11 @@ class Supervisor(Inquiries):
         """Follow another plan from now on; raises SpecError if that cannot be."""
         children = succession(self, self._children, plan)
         self._flags, self._children = plan.flags, children
+
+    def _recipe_with(self, known: Any, given: tuple[ChildSpec, ...]) -> Any:
+        """What our next lives begin with if they are given these specs beside those that are known."""
+        names = {spec.id for spec in given}
+        return (*given, *(spec for spec in known if spec.id not in names))
 
     def _specs(self) -> tuple[ChildSpec, ...]:
         """The specs as they are now."""

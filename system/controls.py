@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 from ..actors.control.orders import (
     Change,
     GetState,
-    Migrate,
     ObserveTurns,
     Order,
     ReplaceCode,
@@ -97,7 +96,8 @@ class Controls:
         a `functools.partial` of one. A recorded actor saves the new state before it handles anything else.
 
         Raises:
-            ControlFailed: `change` raised, or the state does not fit; the old one stays.
+            ControlFailed: `change` raised, or the state does not fit: a variable is missing that has no default in the
+                class's body, or there is one that the body does not declare. The old one stays.
             SpecError: another process cannot import `change`.
         """
         return await self._replace(ref, ReplaceState(change), timeout)
@@ -106,7 +106,7 @@ class Controls:
         self,
         ref: ActorRef[Any],
         new: type[Actor] | Start[Any],
-        migrate: Migrate | None = None,
+        change: Change | None = None,
         *,
         timeout: float = DEFAULT_TIMEOUT,
     ) -> None:
@@ -115,12 +115,13 @@ class Controls:
         Args:
             ref: the actor.
             new: the class, or `start(Class, ...)` if its arguments are to change too.
-            migrate: `migrate(state, old_class)` gives the state as the new class wants it; left out, the new class's
-                own classmethod `migrate` is called if it has one.
+            change: `change(state)` gives the state as the new class wants it. Left out, the new class's classmethod
+                `migrate(state, from_version)` does, as for a saved state, if its `schema_version` is higher.
             timeout: seconds.
 
         Raises:
-            NotSuspended: suspend it first. ControlFailed: the migration raised; the old class stays.
+            NotSuspended: suspend it first. ControlFailed: `change` or `migrate` raised, or the class needs a `migrate`
+                and has none; the old class stays.
             SpecError: the class does not take the arguments, or cannot be imported by the actor's process.
         """
         cell = self._living(ref)
@@ -136,7 +137,7 @@ class Controls:
             if switch is not None and isinstance(cell.spec, ChildSpec):
                 switch.arrival.becomes = becomes
         try:
-            recipe = await self._replace(ref, ReplaceCode(start, keeps, migrate), timeout)
+            recipe = await self._replace(ref, ReplaceCode(start, keeps, change), timeout)
         finally:
             if switch is not None:
                 switch.arrival.becomes = None

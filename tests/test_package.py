@@ -116,6 +116,14 @@ def test_a_bare_install_has_all_public_names() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_an_import_brings_nothing_that_few_programs_use() -> None:
+    heavy = {"cryptography", "difflib", "email", "http", "importlib.metadata", "lzma", "multiprocessing", "psutil"}
+    heavy |= {"shutil", "sqlite3", "statistics", "structlog", "tempfile", "uvloop"}
+    program = f"import sys, holdfast; print(sorted(set({sorted(heavy)}) & sys.modules.keys()))"
+    done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("[]\n", "")
+
+
 def test_what_needs_an_extra_says_which_one() -> None:
     program = "import sys; sys.modules['cryptography'] = None; import holdfast.ftm.sec.authority"
     done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True, timeout=60)

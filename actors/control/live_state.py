@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import inspect
 import operator
 from collections.abc import Callable, Generator, Iterable
 from typing import TYPE_CHECKING, Any, cast
@@ -97,6 +98,45 @@ def put_state(actor: Actor, state: Any) -> None:
             delattr(*_holder(root, name))
     for name, value in state.items():
         setattr(*_holder(root, name), value)
+
+
+def keeping_variables(actor: Actor, change: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """`change`, refusing what it returns if that has other variables than the state that it was given.
+
+    A class that makes its state itself (`get_state`) says itself what is one. Of any other a variable may be left out
+    that has a default in the class's body, and one may be added that the body declares.
+    """
+
+    def changed(state: Any) -> Any:
+        known = list(state) if state_getter(actor) is None else None
+        after = change(state)
+        if known is not None and isinstance(after, dict):
+            given = cast("dict[object, Any]", after)
+            _check_variables(actor, known, [name for name in given if isinstance(name, str)])
+        return after
+
+    return changed
+
+
+def _check_variables(actor: Actor, known: list[str], given: list[str]) -> None:
+    kind, is_fixed = type(actor._state_root()), actor.key_variables is not None
+    declared = {name for base in kind.__mro__ for name in inspect.get_annotations(base)}
+    missing = [name for name in known if name not in given and not _has_default(kind, name)]
+    surplus = [
+        name for name in given if name not in known and (is_fixed or not (name in declared or _has_default(kind, name)))
+    ]
+    lacks = [f"lacks {', '.join(missing)}"] if missing else []
+    adds = [f"has {', '.join(surplus)}, which {type_name(kind)} has not"] if surplus else []
+    if lacks or adds:
+        problem = f"the new state {' and '.join(lacks + adds)}: return all of its variables ({', '.join(known)})"
+        raise ControlFailed(actor.ctx.path, "replace_state", problem)
+
+
+def _has_default(kind: type, name: str) -> bool:
+    """Whether an object of a class has this variable without its having been set."""
+    value = inspect.getattr_static(kind, name, inspect.Parameter.empty)
+    is_other = inspect.isroutine(value) or inspect.isdatadescriptor(value)
+    return value is not inspect.Parameter.empty and not is_other
 
 
 def change_state(actor: Actor, change: Callable[[Any], Any]) -> None:

@@ -17,9 +17,9 @@ from ..kernel.actor import Actor, Start
 from ..kernel.envelope import message_in
 from ..kernel.message import message_name
 from ..process.wire.start_codec import imported, pack_recipe, unpack_recipe
-from ..state_hooks import state_migrator
+from ..state_hooks import migrated
 from ..values import UnsavableValue
-from .live_state import change_state, state_to_show, tried_state
+from .live_state import change_state, keeping_variables, state_to_show, tried_state
 from .tracing import Statistics, tap_of
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 Change = Callable[[Any], Any]
 """Takes a state and returns the one that shall be in its place."""
-Migrate = Callable[[Any, type[Actor]], Any]
 """Takes a state and the class it is of, and returns it as the new class wants it."""
 
 
@@ -85,7 +84,7 @@ class ReplaceState(Order):
     change: Change
 
     def run(self, cell: Cell, actor: Actor) -> Any:
-        change_state(actor, self.change)
+        change_state(actor, keeping_variables(actor, self.change))
         return state_to_show(actor)
 
     def pack(self, where: str) -> dict[str, Any]:
@@ -98,7 +97,7 @@ class ReplaceState(Order):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ReplaceCode(Order):
-    """Go on as another class, with the state that `migrate` makes of the present one.
+    """Go on as another class, with the state that `change` makes of the present one, or else the class's `migrate`.
 
     Returns the recipe of the next lives, packed, if it is carried out in another process than it was given in.
     """
@@ -106,7 +105,7 @@ class ReplaceCode(Order):
     verb: ClassVar[str] = "replace_code"
     start: Start[Any]
     keeps_arguments: bool  # those of the old recipe, which only the actor's supervisor knows
-    migrate: Migrate | None
+    change: Change | None
 
     def run(self, cell: Cell, actor: Actor) -> bytes | None:
         if not cell.extra().suspended:
@@ -121,12 +120,13 @@ class ReplaceCode(Order):
     def becoming(self, actor: Actor) -> Change:
         """Takes the actor's state, makes the actor one of the new class, and returns the state as that wants it."""
         new = self.start.kind
-        migrate = self.migrate or state_migrator(new)
 
         def become(state: Any) -> Any:
-            old = type(actor)
-            if migrate is not None:
-                state = migrate(state, old)
+            version = actor.schema_version
+            if self.change is not None:
+                state = self.change(state)
+            elif version != new.schema_version:
+                state = migrated(new, state, version, actor.ctx.path)
             cast("Any", actor).__class__ = new
             return state
 
@@ -140,13 +140,13 @@ class ReplaceCode(Order):
         return {
             "start": start,
             "keeps": self.keeps_arguments,
-            "migrate": None if self.migrate is None else pack_function(self.migrate, where, self.verb),
+            "change": None if self.change is None else pack_function(self.change, where, self.verb),
         }
 
     @classmethod
     def unpack(cls, data: dict[str, Any]) -> ReplaceCode:
-        migrate = data["migrate"]
-        return cls(unpack_recipe(data["start"]), data["keeps"], None if migrate is None else unpack_function(migrate))
+        change = data["change"]
+        return cls(unpack_recipe(data["start"]), data["keeps"], None if change is None else unpack_function(change))
 
 
 def has_become(cell: Cell, old: type[Actor], start: Start[Any]) -> bytes | None:
@@ -218,7 +218,10 @@ class Prepare(Order):
         for one in self.wanted:
             if isinstance(one, ReplaceCode):
                 start = next_start(cell, one.start, keeps_arguments=one.keeps_arguments)
-        changes = [one.change if isinstance(one, ReplaceState) else one.becoming(actor) for one in self.wanted]
+        changes = [
+            keeping_variables(actor, one.change) if isinstance(one, ReplaceState) else one.becoming(actor)
+            for one in self.wanted
+        ]
         state, saved = tried_state(actor, changes, self.wanted[0].verb)
         hold.prepared = Prepared(state, start)
         if cell.node.ports.uplink is None:

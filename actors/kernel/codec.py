@@ -213,12 +213,14 @@ class Codec:
         crash = remote_crash(error)
         return "crash", "", self.encode((crash.type_name, crash.text, crash.traceback), "")
 
-    def decode_error(self, kind: str, name: str, body: Any) -> HoldfastError:
-        """The error that another process sent; if it is none that can be made here, that is said."""
+    def decode_error(
+        self, kind: str, name: str, body: Any, actor: str = "another process", message: str = "what it was asked"
+    ) -> HoldfastError:
+        """The error by which `actor` has answered `message`; if it is none that can be made here, that is said."""
         try:
             return self._decode_error(kind, name, body)
         except Exception as error:  # It is made of what another process says: the parameters need not fit.
-            return BadReply(name or kind, f"an error that cannot be made: {error_text(error)}")
+            return BadReply(actor, message, f"an error ({name or kind}) that cannot be made: {error_text(error)}")
 
     def _decode_error(self, kind: str, name: str, body: Any) -> HoldfastError:
         if kind == "refusal":

@@ -12,7 +12,6 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
-from multiprocessing.spawn import get_preparation_data
 from typing import Any, Final
 
 import msgspec
@@ -46,6 +45,8 @@ class EffectProcess:
             )
         ours.setblocking(False)
         self._socket = ours
+        from multiprocessing.spawn import get_preparation_data  # only now: it brings pickle and more
+
         told: dict[str, Any] = get_preparation_data("effect")
         self._first = msgspec.msgpack.encode({key: told[key] for key in PREPARED if key in told})
 

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ...actors.errors import AskTimeout, BadMessage, BadReply, EffectInDoubt, HoldfastError
+from ...actors.errors import AskTimeout, BadMessage, BadReply, EffectInDoubt, HoldfastError, type_name
 from ...actors.events import EffectRepeated
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import NO_DEADLINE, Ask, ReplyHandle
-from ...actors.process.wire.peer import RelayedAsk
+from ...actors.process.wire.peer import RelayedAsk, asked
 from ..inputs import Batch, Input
 from ..long_waits import LongWaits
 from ..protocol import REPLY, Answer, Out, Outcome, Perform, Performed, timed
@@ -76,7 +76,7 @@ class SwitchAsk(RelayedAsk, eq=False):
         try:
             body = self.codec.encode(reply, self.asker)
         except BadMessage as error:
-            self.fail(BadReply(error.message, error.problem))
+            self.fail(BadReply(*asked(self), error.problem))
         else:
             self.give(Answer(REPLY, "", body))
 
@@ -116,12 +116,12 @@ def answer_ask(home: Switch, ask: Ask, answer: Answer) -> None:
         return
     codec = home.node.codec
     if answer.kind != REPLY:
-        ask.fail(codec.decode_error(answer.kind, answer.name, answer.body))
+        ask.fail(codec.decode_error(answer.kind, answer.name, answer.body, *asked(ask)))
         return
     try:
         reply = codec.decode_reply(type(ask.message), answer.body)
     except msgspec.DecodeError as error:
-        ask.fail(HoldfastError(f"the reply of {home.path} does not fit its type: {error}"))
+        ask.fail(BadReply(home.path, type_name(type(ask.message)), str(error)))
     else:
         ask.answer(reply)
 

@@ -417,8 +417,9 @@ class Switch:
                     pass  # for whoever begins lives, or hands them over
         except ReplayDiverged as error:
             life.diverged = error
-            if not life.fail(error):  # Else whoever waits for it tells of it.
-                self.node.emit(RecoveryFailed(self.path, str(error)))
+            if life.fail(error):
+                return  # Whoever waits for it tells of it, and ends the life: its supervisor is not to hear of a kill.
+            self.node.emit(RecoveryFailed(self.path, str(error)))
             if self.cell is not None:
                 self.cell.kill()
 

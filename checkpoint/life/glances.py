@@ -5,6 +5,7 @@ from __future__ import annotations
 import types
 from typing import TYPE_CHECKING, Any
 
+from ...actors.errors import type_name
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message, Refusal, reply_type
 from ...actors.kernel.ref import current
@@ -102,7 +103,7 @@ def _answered(life: Life, feed: Feed) -> Answer:
         return life.answer_error(no)
     if isinstance(result, ReplyHandle):
         raise NeedsTurn
-    return life.answer_value(result, reply_type(type(message)))
+    return life.answer_value(result, reply_type(type(message)), type_name(type(message)))
 
 
 def _returned(running: types.CoroutineType[Any, Any, Any]) -> Any:

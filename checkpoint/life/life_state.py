@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from ..durable_timers import said_by
 
@@ -15,7 +15,15 @@ if TYPE_CHECKING:
     from ...actors.kernel.message import Message
     from ..protocol import Clock, Lent, Restore
 
-Awaited: TypeAlias = "type[Message[Any]] | EffectCall | dict[str, type[Message[Any]]] | None"
+
+class Asked(NamedTuple):
+    """Whose reply to what a turn waits for."""
+
+    actor: str
+    message: type[Message[Any]]
+
+
+Awaited: TypeAlias = "Asked | EffectCall | dict[str, type[Message[Any]]] | None"
 """What a turn waits for: the reply to a message of that class, an effect, a message of one of these types (none: a
 moment), or that a `send` is accepted."""
 

@@ -33,6 +33,7 @@ from ...actors.kernel.ref import ActorRef, current
 from ...actors.seconds import check_seconds
 from ...actors.values import encode_value
 from ..protocol import REPLY, SINCE_THEN, Answer, Feed, Perform, Performed, PipeDone
+from .life_state import Asked
 from .recorded_inbox import INIT, STARTED, Fed
 
 if TYPE_CHECKING:
@@ -53,7 +54,8 @@ class RecordedReplyHandle(ReplyHandle[R]):
     def reply(self, value: R) -> None:
         """Answer, from a turn of the same actor."""
         life = _own_life("answers later")
-        answer = life.answer_value(value, set)  # What was declared is not known here: sets are looked for.
+        # What was declared is not known here: sets are looked for.
+        answer = life.answer_value(value, set, "what it has answered later")
         life.put("reply", str(self.id), f"{answer.kind}|{answer.name}", answer.body)
 
     def fail(self, error: HoldfastError) -> None:
@@ -200,7 +202,7 @@ class RecordedContext(ActorContext):
         life = self.recorded
         k = self._put("ask", cell, message, seconds=check_seconds(cell.path, "timeout", timeout))
         future: asyncio.Future[R] = self._cell.node.loop.create_future()
-        life.waits.outcomes[life.turn, k] = future, type(message)
+        life.waits.outcomes[life.turn, k] = future, Asked(cell.path, type(message))
         life.release()
         return future
 
@@ -342,7 +344,7 @@ class RecordedContext(ActorContext):
             life.port.to_home(Performed(turn, k, answer))
         except BadMessage as error:
             why = f"what it has returned is too large to leave its process: {error.problem}; return where it is instead"
-            life.port.to_home(Performed(turn, k, self._kept(effect, BadReply(effect.key, why))))
+            life.port.to_home(Performed(turn, k, self._kept(effect, BadReply(self.path, effect.key, why))))
 
     def _kept(self, effect: EffectCall, error: Exception) -> Answer:
         """An error as the outcome of an effect, or why it cannot be one."""

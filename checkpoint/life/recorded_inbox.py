@@ -5,7 +5,7 @@ from __future__ import annotations
 import types
 from typing import TYPE_CHECKING, Any
 
-from ...actors.errors import HoldfastError, RemoteCrash, StartFailed
+from ...actors.errors import HoldfastError, RemoteCrash, StartFailed, type_name
 from ...actors.exit_reasons import NORMAL, ExitReason, unpack_exit
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Actor
@@ -118,7 +118,7 @@ class Fed(Item):
             self.end(Answer(LATER))
         else:
             kind: type[Message[Any]] = type(self.message)
-            self.end(self.life.answer_value(result, reply_type(kind)))
+            self.end(self.life.answer_value(result, reply_type(kind), type_name(kind)))
 
     def end(self, answer: Answer) -> None:
         """The turn is over; a stashed message stays open."""

@@ -32,7 +32,7 @@ from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import message_name
 from ...actors.persistence import UNFIT
-from ...actors.state_hooks import state_getter
+from ...actors.state_hooks import StateMismatch, state_getter
 from ...actors.values import decode_value
 from ..method import Method
 from ..protocol import (
@@ -67,11 +67,11 @@ from ..protocol import (
     untimed,
 )
 from ..snapshot.image_writer import Imaging
-from ..snapshot.key_variables import StateMismatch, check_keys, restore_state, save_state, variables
+from ..snapshot.key_variables import check_keys, restore_state, save_state, variables
 from ..turn_word import WAITS
 from .determinism_guard import DeterminismGuard
 from .glances import answer_beside
-from .life_state import Awaited, HookTimers, LifeStage, RestoredState, SnapshotState, TurnWaits
+from .life_state import Asked, Awaited, HookTimers, LifeStage, RestoredState, SnapshotState, TurnWaits
 from .readonly_guard import check_readonly
 from .recorded_context import Pending, RecordedContext
 from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
@@ -248,7 +248,7 @@ class Life:
         waiting = self.waits.outcomes.pop((record.turn, record.k), None)
         if waiting is None:
             return
-        future, kind = waiting
+        future, awaited = waiting
         if future.done():
             return
         try:
@@ -256,19 +256,25 @@ class Life:
             if when:
                 future.when = when  # type: ignore[attr-defined]  # only what has a time is `Pending`
             if answer.kind in (REPLY, MESSAGE, MOMENT):
-                future.set_result(self._result(answer, kind))
+                future.set_result(self._result(answer, awaited))
             else:
-                future.set_exception(self.cell.node.codec.decode_error(answer.kind, answer.name, answer.body))
+                error = self.cell.node.codec.decode_error(answer.kind, answer.name, answer.body, *self._asked(awaited))
+                future.set_exception(error)
         except Exception as error:
-            name = type_name(kind) if isinstance(kind, type) else kind.key if isinstance(kind, EffectCall) else "send"
-            future.set_exception(BadReply(name, str(error)))
+            future.set_exception(BadReply(*self._asked(awaited), str(error)))
+
+    def _asked(self, awaited: Awaited) -> tuple[str, str]:
+        """Who was to do what, as errors name it."""
+        if isinstance(awaited, Asked):
+            return awaited.actor, type_name(awaited.message)
+        return self.cell.path, awaited.key if isinstance(awaited, EffectCall) else "what it has waited for"
 
     def _result(self, answer: Answer, awaited: Awaited) -> object:
         """What a turn gets that has waited."""
         if awaited is None or answer.kind == MOMENT:
             return None
-        if isinstance(awaited, type):
-            return self.cell.node.codec.decode_reply(awaited, answer.body)
+        if isinstance(awaited, Asked):
+            return self.cell.node.codec.decode_reply(awaited.message, answer.body)
         if isinstance(awaited, EffectCall):
             return decode_value(answer.body)
         return self.cell.node.codec.decode(awaited[answer.name], answer.body)
@@ -398,12 +404,12 @@ class Life:
         """An error as the asker will get it."""
         return Answer(*self.cell.node.codec.encode_error(error))
 
-    def answer_value(self, value: object, declared: Any) -> Answer:
-        """A reply as the asker will get it; one that cannot be coded becomes the asker's error."""
+    def answer_value(self, value: object, declared: Any, asked: str) -> Answer:
+        """A reply to a message of type `asked` as the asker will get it; one that cannot be coded becomes an error."""
         try:
             return Answer(REPLY, "", self.cell.node.codec.encode_alike(value, self.cell.path, declared))
         except BadMessage as error:
-            return self.answer_error(BadReply(error.message, error.problem))
+            return self.answer_error(BadReply(self.cell.path, asked, error.problem))
 
     def put(
         self, verb: str, to: str, name: str = "", body: bytes = b"", *, seconds: float = 0.0, interval: float = 0.0

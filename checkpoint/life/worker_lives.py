@@ -226,6 +226,7 @@ class ChildHere(ChildPlace):
     """The event loop of the supervisor's process."""
 
     is_here = True
+    _problem = ""  # why the home does not take the life that lives
 
     def start(self, cell: Cell) -> asyncio.Future[None]:
         """Ask the home to bring the actor back."""
@@ -275,16 +276,19 @@ class ChildHere(ChildPlace):
         elif cell.state is DOWN:
             self.fail(StartFailed(cell.path, record.problem))
         else:  # Its replay diverged: the next life begins when this one is over.
-            cell.ended().add_done_callback(lambda _: self.fail(StartFailed(cell.path, record.problem)))
+            self._problem = record.problem
             cell.kill()
 
     def closed_here(self) -> None:
         life, cell, self.home.life = self.home.life, self.cell, None
         if life is None:
             return  # It has not begun yet, or is not the address's any more.
+        problem, self._problem = self._problem, ""
         self.say_closed(cell, cell.extra().reason)
         if life.stage.ignored_why is not None:
             self.fail(StartIgnored(cell.path, life.stage.ignored_why))
+        elif problem:
+            self.fail(StartFailed(cell.path, problem))
         elif life.is_live:
             self.came_up()  # It was up, and has ended in a turn before its home could say so.
         else:

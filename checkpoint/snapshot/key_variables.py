@@ -7,20 +7,13 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from ...actors.control.live_state import attributes
-from ...actors.errors import HoldfastError, type_name
+from ...actors.errors import type_name
 from ...actors.kernel.actor import Actor
-from ...actors.state_hooks import state_getter, state_migrator, state_setter
+from ...actors.state_hooks import StateMismatch, migrated, state_getter, state_setter
 from ...actors.values import ByteParts, UnsavableValue, adopt_value, decode_value, encode_value
 from ...actors.values.renamed import former_members
 from ..method import Method
 from .state_image import is_image, read_image
-
-
-class StateMismatch(HoldfastError, text="the state of {actor} does not fit: {problem}"):
-    """A saved state does not fit the class that shall take it back."""
-
-    actor: str
-    problem: str
 
 
 class StateForm(NamedTuple):
@@ -258,24 +251,3 @@ def setter_of(actor: Actor) -> Callable[[Any], object]:
     if inspect.iscoroutinefunction(set_state):
         raise StateMismatch(actor.ctx.path, f"{type_name(type(actor))}.set_state is `async def`: it must be plain")
     return set_state
-
-
-def migrated(kind: type[Actor], state: Any, version: int, where: str) -> Any:
-    """A state that an older version of the class has saved, as this one wants it.
-
-    Raises:
-        StateMismatch: the class does not know that version, or says that it cannot. Nothing is lost: what was saved
-            stays as it is.
-    """
-    known = f"it has schema version {version}, {type_name(kind)} {kind.schema_version}"
-    if not isinstance(version, int) or version > kind.schema_version:
-        raise StateMismatch(where, f"{known}: an older class cannot read what a newer one has saved")
-    migrate = state_migrator(kind)
-    if migrate is None:
-        raise StateMismatch(where, f"{known}, which has no classmethod migrate(state, from_version)")
-    if inspect.iscoroutinefunction(migrate):
-        raise StateMismatch(where, f"{known}, whose migrate is `async def`: it must be plain")
-    try:
-        return migrate(state, version)
-    except BaseException as error:
-        raise StateMismatch(where, f"{known}, and its migrate failed: {type(error).__name__}: {error}") from error

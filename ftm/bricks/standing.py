@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Literal
 
 from ...actors.errors import HoldfastError
-from ...checkpoint.protocol import Feed, TurnEnd
+from ...checkpoint.protocol import START, Feed, TurnEnd
 from ..alarms import ProtectionLost
 from .brick_messages import FORWARDED, ConfigMismatch, Logged, Request, StaleLeader
 from .reply_log import ReplyLog
@@ -197,9 +198,13 @@ class Standing:
         """The address of the protected actor, by which it knows itself on every replica."""
         return protected_at(self.path)
 
-    def go_on_alone(self) -> None:
-        """A reply leaves that no other replica could give again. Told once, until there is another one."""
-        if self.other.missed_by != self.path:
+    def go_on_alone(self, numbers: Iterable[int]) -> None:
+        """What these requests came to leaves, and no other replica could give it again. Told once, until there is one.
+
+        What a start came to is no loss: whoever starts in its place begins with the same.
+        """
+        inside = (self.inside[number] for number in numbers if number in self.inside)
+        if self.other.missed_by != self.path and any(one.feed.kind != START for one in inside):
             self.other.missed_by = self.path
             self.node.emit(ProtectionLost(self.address, self.path, self.epoch))
 

@@ -180,7 +180,7 @@ class Notifying(After, Sender):
         if not done.ends:
             return done
         if standing.other.path is None:
-            standing.go_on_alone()
+            standing.go_on_alone(end.id for end in done.ends)
             return done
         if standing.other.state == "live":
             for task in list(standing.other.forwarded):

@@ -49,7 +49,7 @@ class Checkpointing(After):
         standing = self._standing
         if standing.other.path is None:
             self._forget_unheard(self._heard + len(self._unheard))  # Whoever joins is given all of them.
-            standing.go_on_alone()
+            standing.go_on_alone(end.id for end in done.ends)
             return done
         captured = await self.state.ask(Capture(standing.other.turn), timeout=FOREVER)
         state = captured.state

@@ -26,7 +26,6 @@ import importlib
 import os
 import re
 import stat
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -160,6 +159,8 @@ _FOLDER = re.compile(r"holdfast-sec-(\w+)-(\d+)-(\d+)-\w+")
 @functools.cache
 def _folder_of(process: int) -> str:
     """The directory for keys that end with this process; those of killed processes go."""
+    import tempfile  # only now: it brings every kind of compression
+
     from ...checkpoint.sqlite.ownership import boot_id, living, start_of
 
     boot, start = boot_id(), (start_of(process) or "").rpartition(":")[2]

@@ -99,7 +99,7 @@ class Voting(Deciding):
         runs: list[Run | None] = [Run(own.ends, None, digest), *others]
         present = sum(run is not None for run in runs)
         if present == 1:
-            standing.go_on_alone()
+            standing.go_on_alone(one.feed.id for one in requests)
             return own  # Nobody is left to vote with.
         standing.other.missed_by = ""
         decided = vote(mechanism.voter, runs)

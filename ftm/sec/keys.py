@@ -11,7 +11,6 @@ import glob
 import hashlib
 import os
 import stat
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
@@ -159,6 +158,8 @@ def write_own(path: Path, content: bytes, *, place: Callable[[str, Path], None])
     Raises:
         UnsafeKeyFile: it cannot be written. FileExistsError: of `place`.
     """
+    import tempfile  # only now: it brings every kind of compression
+
     try:
         descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
         try:

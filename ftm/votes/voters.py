@@ -13,7 +13,6 @@ Source: Lyu and Avizienis, *Assuring Design Diversity in N-Version Software* (in
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 from typing import Any, Final, Generic, Protocol, TypeVar, runtime_checkable
@@ -353,5 +352,6 @@ def _with_numbers(form: Any, numbers: Iterator[Any] | None) -> Any:
 
 
 def _middle(column: tuple[Any, ...]) -> Any:
-    low, high = statistics.median_low(column), statistics.median_high(column)
+    ordered = sorted(column)
+    low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
     return low if low == high else None

@@ -64,6 +64,11 @@ class UniformSupervisor(Supervisor):
     instead: ClassVar[str]
     """What to do instead."""
 
+    def _recipe_with(self, known: Any, given: tuple[ChildSpec, ...]) -> Any:
+        """As many as there were at first: how many there are now is for this life."""
+        specs = {spec.id: spec for spec in given}
+        return tuple(specs.get(spec.id, spec) for spec in known)
+
     @on(StartChild)
     def _start_child(self, message: StartChild) -> Any:
         """Refuse, because all are alike."""

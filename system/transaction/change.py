@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ...actors.control.orders import Change as StateChange
-from ...actors.control.orders import Migrate
 from ...actors.kernel.actor import Actor, Start
 from ...supervision.spec import ChildSpec, Isolation, Strategy
 from . import living
@@ -110,9 +109,9 @@ class Change:
         """Put `change(state)` in the place of an actor's state; its messages wait until the transaction is over."""
         self.step(living.ReplaceActorState(target, change))
 
-    def replace_code(self, target: Target, new: type[Actor] | Start[Any], migrate: Migrate | None = None) -> None:
+    def replace_code(self, target: Target, new: type[Actor] | Start[Any], change: StateChange | None = None) -> None:
         """Go on as another class; its messages wait until the transaction is over."""
-        self.step(living.ReplaceActorCode(target, new, migrate))
+        self.step(living.ReplaceActorCode(target, new, change))
 
     # -- fault tolerance ----------------------------------------------------------------------------------------------
 

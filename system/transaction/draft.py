@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -525,6 +524,8 @@ def difference(before: list[str], after: list[str]) -> list[str]:
     >>> difference(["a", "b: 1", "c: 1"], ["a", "b: 2", "c: 2"])
     ['- b: 1', '+ b: 2', '- c: 1', '+ c: 2']
     """
+    import difflib  # only now: most programs never ask
+
     told: list[str] = []
     for _, begin, end, begins, ends in difflib.SequenceMatcher(None, before, after, autojunk=False).get_opcodes():
         old, new = before[begin:end], after[begins:ends]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ...actors.control.orders import Change, Migrate, ReplaceCode, ReplaceState, next_start
+from ...actors.control.orders import Change, ReplaceCode, ReplaceState, next_start
 from ...actors.errors import SpecError, type_name
 from ...actors.kernel.actor import Actor, Start
 from .draft import Draft, DraftPlace, Target, is_elsewhere
@@ -114,9 +114,9 @@ class ReplaceActorCode(OnRework):
 
     verb: ClassVar[str] = "replace code of"
 
-    def __init__(self, target: Target, new: type[Actor] | Start[Any], migrate: Migrate | None) -> None:
+    def __init__(self, target: Target, new: type[Actor] | Start[Any], change: Change | None) -> None:
         super().__init__(target)
-        self._new, self._migrate = new, migrate
+        self._new, self._change = new, change
 
     @property
     def text(self) -> str:
@@ -133,7 +133,7 @@ class ReplaceActorCode(OnRework):
         cell, keeps = place.cell, not isinstance(new, Start)
         if cell is not None and not is_elsewhere(cell):
             next_start(cell, start, keeps_arguments=keeps)
-        place.rework_of().add(ReplaceCode(start, keeps, self._migrate))
+        place.rework_of().add(ReplaceCode(start, keeps, self._change))
         place.kind = start.kind
 
 

@@ -53,6 +53,21 @@ async def test_a_life_as_events(system: hf.ActorSystem) -> None:
     assert "ZeroDivisionError" in str(crashed.reason)
 
 
+async def test_an_event_of_a_class_is_waited_for(system: hf.ActorSystem) -> None:
+    with system.events() as stream:
+        one = await system.start(hf.child("one", hf.start(One)))
+        await crash(one)
+        assert (await stream.until(ChildRestarted)).address == one.path
+        await one.ask(Do(lambda _: None))
+        assert (await stream.until(ActorStarted)).life == 2
+        with pytest.raises(hf.errors.NoSuchEvent, match=r"no DeadLetter has come within 0\.01 s"):
+            await stream.until(DeadLetter, timeout=0.01)
+        with pytest.raises(hf.SpecError, match="timeout must be a finite number of seconds"):
+            await stream.until(DeadLetter, timeout=0)
+    with pytest.raises(hf.errors.NoSuchEvent, match="before the stream was closed"):
+        await stream.until(DeadLetter)
+
+
 async def test_every_listener_gets_every_event_from_its_beginning_on(system: hf.ActorSystem) -> None:
     first = system.events()
     system.spawn(hf.start(One), "a")

@@ -74,7 +74,7 @@ OUTCOMES = {
     "a reply": "7",
     "a refusal": "refused: not now",
     "a crash": "RemoteCrash: ValueError: boom",
-    "nonsense": "BadReply: a reply could not be sent, though its turn has run: object: "
+    "nonsense": f"BadReply: /app/giver has handled {__name__}.Give, but its reply cannot be passed on: "
     "a value of type object cannot be sent",
 }
 
@@ -106,8 +106,9 @@ class Careless(hf.Actor):
 async def test_a_reply_of_another_type_is_an_error(isolation: str) -> None:
     async with hf.ActorSystem("app", log=False) as system:
         ref = await start(system, isolation, "careless", hf.start(Careless), recovery=hf.hybrid())
-        with pytest.raises(hf.HoldfastError, match=f"the reply of {ref.path} does not fit its type: Expected `int`"):
+        with pytest.raises(hf.errors.BadReply, match="Expected `int`") as bad:
             await ref.ask(Count(), timeout=60.0)
+        assert (bad.value.actor, bad.value.message) == (ref.path, f"{__name__}.Count")
 
 
 async def test_what_an_unrecorded_actor_has_answered_is_known_after_a_restart_of_the_root(tmp_path: Path) -> None:

@@ -49,7 +49,8 @@ async def failure(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> str:
 
 
 async def player(system: hf.ActorSystem, isolation: str) -> hf.ActorRef[Player]:
-    return await start(system, isolation, "player", hf.start(Player), recovery=hf.hybrid(interval=NEVER))
+    recipe, method = hf.start(Player), hf.hybrid(interval=NEVER)
+    return await start(system, isolation, "player", recipe, recovery=method, backoff=hf.Backoff())
 
 
 async def test_a_reply_is_part_of_what_replay_compares(isolation: str, store: str | None) -> None:
@@ -80,7 +81,8 @@ async def test_replies_that_are_the_same_are_given_once(isolation: str, store: s
 
 async def test_an_exception_under_replay_is_named(isolation: str, tmp_path: Path) -> None:
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
-        ref = await start(system, isolation, "doer", hf.start(Doer), recovery=hf.hybrid(interval=NEVER))
+        recipe, method = hf.start(Doer), hf.hybrid(interval=NEVER)
+        ref = await start(system, isolation, "doer", recipe, recovery=method, backoff=hf.Backoff())
         ref.tell(Do([f"replayed {tmp_path / 'once'}"]))
         await ref.ask(Seen(), timeout=30.0)
         why = await failure(system, ref)

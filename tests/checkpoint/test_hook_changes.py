@@ -148,7 +148,8 @@ PLACES: dict[str, dict[str, Any]] = {
 
 
 async def started(system: hf.ActorSystem, place: str, kind: type[Hall] = Hall, *args: Any) -> hf.ActorRef[Any]:
-    spec = hf.child("hall", hf.start(kind, *args), recovery=hf.hybrid(interval=3600.0), **PLACES[place])
+    method = hf.hybrid(interval=3600.0)
+    spec = hf.child("hall", hf.start(kind, *args), recovery=method, backoff=hf.Backoff(), **PLACES[place])
     ref: hf.ActorRef[Any] = await system.start(spec)
     if "mechanism" in PLACES[place]:
         await two_again(ref)
@@ -321,7 +322,8 @@ async def test_a_recovery_that_fails_says_that_the_replay_went_elsewhere(
     system: hf.ActorSystem, tmp_path: Path, place: str
 ) -> None:
     note = tmp_path / "mood"
-    spec = hf.child("hall", hf.start(Moody, str(note)), recovery=hf.hybrid(interval=3600.0), **PLACES[place])
+    method = hf.hybrid(interval=3600.0)
+    spec = hf.child("hall", hf.start(Moody, str(note)), recovery=method, backoff=hf.Backoff(), **PLACES[place])
     ref: hf.ActorRef[Any] = await system.start(spec)
     assert await ref.ask(Enter(1), IN_TIME) == 1
     note.touch()

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 import holdfast as hf
+from holdfast.actors.state_hooks import StateMismatch
 from holdfast.actors.values import DamagedValue, UnsavableValue
-from holdfast.checkpoint.snapshot.key_variables import StateMismatch, restore_state, save_state
+from holdfast.checkpoint.snapshot.key_variables import restore_state, save_state
 
 
 class Place:

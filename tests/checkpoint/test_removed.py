@@ -11,6 +11,27 @@ from tests.removing import Check, as_tests
 LARGE = "tests/checkpoint/test_large_states.py"
 
 CHECKS = {
+    "what has diverged is not tried again": Check(
+        "actors/persistence.py",
+        " or DIVERGED in why\n",
+        "\n",
+        "tests/checkpoint/test_recovery_refused.py",
+        "test_replay_of_an_actor_that_is_not_deterministic and task",
+    ),
+    "a life below a supervisor in a process that has diverged is a start that has failed": Check(
+        "checkpoint/life/worker_lives.py",
+        "        elif problem:\n",
+        "        elif False:\n",
+        "tests/checkpoint/test_recovery_refused.py",
+        "test_replay_of_an_actor_that_is_not_deterministic and subtree",
+    ),
+    "whoever waits for a life that has diverged ends it, and nobody before": Check(
+        "checkpoint/home/switch.py",
+        "                return  # Whoever waits for it tells of it, and",
+        "                pass  # Whoever waits for it tells of it, and",
+        "tests/checkpoint/test_recovery_refused.py",
+        "test_replay_of_an_actor_that_is_not_deterministic and subtree",
+    ),
     "who has asked somebody who was not started is answered": Check(
         "checkpoint/home/ask_recovery.py",
         "                    self._owed(home, source)\n                home.forward",

@@ -91,7 +91,7 @@ async def test_an_older_state_is_migrated(tmp_path: Path, isolation: str) -> Non
     [
         (Old, Stubborn, "has no classmethod migrate"),
         (Stubborn, Old, "has schema version 2"),
-        (New, Never, "an older class cannot read what a newer one has saved"),
+        (New, Never, "an older class cannot read the state of a newer one"),
         (Never, New, "version 2 was never in use"),
     ],
 )

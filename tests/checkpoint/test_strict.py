@@ -194,7 +194,7 @@ async def test_the_first_turn_that_a_replay_handles_otherwise_is_named(
 ) -> None:
     quirk = tmp_path / "quirk"
     async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
-        ref = await start(system, isolation, "one", hf.start(Forgetful), recovery=CHECKED)
+        ref = await start(system, isolation, "one", hf.start(Forgetful), recovery=CHECKED, backoff=hf.Backoff())
         await ref.ask(Put("a"))
         await ref.ask(Put("b", str(quirk)))
         await ref.ask(Put("c"))

@@ -96,14 +96,15 @@ class Stops(Account):
 class Euros(hf.Message[int]): ...
 
 
+@hf.renamed(f"{__name__}:Account")
 class Cents(Account):
     """The next release of `Account`: the total in cents, and one more message."""
 
     schema_version = 2
 
     @classmethod
-    def migrate(cls, state: dict[str, Any], old: type[hf.Actor]) -> dict[str, Any]:
-        assert old is Account
+    def migrate(cls, state: dict[str, Any], from_version: int) -> dict[str, Any]:
+        assert from_version == 1
         return {"total": state["total"] * 100, "seen": state["seen"], "release": 2}
 
     @hf.on(Add)
@@ -114,6 +115,12 @@ class Cents(Account):
     @hf.on(Euros)
     def euros(self, message: Euros) -> int:
         return self.total // 100
+
+
+class Deaf(Account):
+    """A newer class that cannot read an older state."""
+
+    schema_version = 2
 
 
 class Whole(hf.Actor):
@@ -202,7 +209,7 @@ def spoil(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def large(state: dict[str, Any]) -> dict[str, Any]:
-    return {**state, "total": 1000, "blob": b"x" * 3_000_000}
+    return {"total": 1000, "seen": [b"x" * 3_000_000]}
 
 
 def no_state(state: dict[str, Any]) -> list[int]:
@@ -213,9 +220,9 @@ def reverse(state: list[int]) -> list[int]:
     return [*reversed(state), 7]
 
 
-def keep(state: Any, old: type[hf.Actor]) -> Any:
+def keep(state: Any) -> Any:
     return state
 
 
-def cannot(state: Any, old: type[hf.Actor]) -> Any:
+def cannot(state: Any) -> Any:
     raise RuntimeError("no way from there")

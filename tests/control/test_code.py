@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from tests.control.players import (
     Account,
     Add,
     Cents,
+    Deaf,
     Euros,
     Total,
     Whole,
@@ -57,6 +59,39 @@ async def test_a_migration_that_fails_leaves_the_old_class(system: hf.ActorSyste
     one.kill()
     assert await one.ask(Add(1), timeout=30.0) in (1, 2)
     assert (await system.get_status(one)).kind == "tests.control.players.Account"
+
+
+async def test_a_newer_class_that_cannot_read_the_state_is_refused(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    await system.suspend(one)
+    with pytest.raises(hf.errors.ControlFailed, match=r"schema version 1, .*Deaf 2, which has no classmethod migrate"):
+        await system.replace_code(one, Deaf)
+    await system.replace_code(one, Deaf, keep)
+    with pytest.raises(hf.errors.ControlFailed, match="an older class cannot read the state of a newer one"):
+        await system.replace_code(one, Account)
+    await system.resume(one)
+    assert await one.ask(Add(1)) == 1
+
+
+@pytest.mark.parametrize("replaces", [True, False])
+async def test_one_hook_reads_older_states_of_whatever_kind(tmp_path: Path, replaces: bool) -> None:
+    """The state that an actor has when it gets the class, and that which the last program has saved."""
+    store = f"sqlite:{tmp_path / 'app.db'}"
+
+    def account(kind: type[Account]) -> hf.ChildSpec[Any]:
+        return hf.child("one", hf.start(kind), recovery=hf.hybrid(interval=3600.0))
+
+    async with hf.ActorSystem("app", log=False, store=store) as system:
+        one = await system.start(account(Account))
+        assert await one.ask(Add(1)) == 1
+        if replaces:
+            await system.suspend(one)
+            await system.replace_code(one, Cents)
+            await system.resume(one)
+            assert await one.ask(Euros()) == 1
+    async with hf.ActorSystem("app", log=False, store=store) as system:
+        one = await system.start(account(Cents))
+        assert await one.ask(Euros()) == 1
 
 
 async def test_a_class_that_does_not_take_the_arguments_is_refused(system: hf.ActorSystem, start_one: Starter) -> None:
@@ -110,6 +145,29 @@ async def test_a_process_that_dies_before_it_has_answered_comes_back_with_its_ne
     assert (await system.get_status(one)).kind == "tests.control.players.Cents"
     one.kill()
     assert await one.ask(Add(1), timeout=30.0) == 200
+
+
+async def test_below_a_supervisor_whose_process_dies_before_it_has_answered_the_old_class_is_back(
+    system: hf.ActorSystem,
+) -> None:
+    """A limit: the root has not heard of the new one, and the state of the new one is refused if it does not fit."""
+    child = hf.child("one", hf.start(Account))
+    top = await system.start(hf.supervisor("top", children=[child], isolation="process"))
+    one = system.ref("/app/top/one", Account)
+    await system.suspend(one)
+    worker: Any = system._workers.of(top._cell)
+
+    def dies(_: frames.Reply) -> None:
+        worker.forked.kill()
+
+    worker.connection.takers[frames.Reply] = dies
+    with pytest.raises(hf.HoldfastError):
+        await system.replace_code(one, Cents)
+    async with asyncio.timeout(30.0):
+        while top._cell.life < 2 or one.path not in system.tree():
+            await asyncio.sleep(0.005)
+    back = system.ref("/app/top/one", hf.Actor)
+    assert (await system.get_status(back)).kind == "tests.control.players.Account"
 
 
 async def test_code_of_a_recorded_actor_below_a_process_is_replaced(system: hf.ActorSystem) -> None:

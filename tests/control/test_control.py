@@ -171,6 +171,51 @@ async def test_a_change_that_raises_leaves_the_state_alone(system: hf.ActorSyste
     assert await one.ask(Add(1)) == 2
 
 
+class Declares(hf.Actor):
+    """Does without `rate` until it is set, and knows a `label` that none of its lives begins with."""
+
+    rate = 0.5
+    label: str
+
+    def __init__(self) -> None:
+        self.total = 0
+        self.rate = 0.7
+
+
+def other_variables(state: dict[str, Any]) -> dict[str, Any]:
+    return {"sum": state["total"], "read": 1}
+
+
+def without_rate(state: dict[str, Any]) -> dict[str, Any]:
+    return {"total": 1, "label": "new"}
+
+
+def in_place(state: dict[str, Any]) -> dict[str, Any]:
+    del state["total"]
+    return state
+
+
+async def test_a_state_with_other_variables_is_refused_in_words(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    with pytest.raises(hf.errors.ControlFailed) as failed:
+        await system.replace_state(one, other_variables)
+    said = "lacks total, seen and has sum, read, which tests.control.players.Account has not"
+    assert failed.value.problem == f"the new state {said}: return all of its variables (total, seen)"
+    with pytest.raises(hf.errors.ControlFailed, match="the new state lacks total:"):
+        await system.replace_state(one, in_place)
+    with pytest.raises(hf.TransactionFailed, match="the new state lacks total:"):
+        async with system.transaction() as change:
+            change.replace_state(one, in_place)
+    assert await system.get_state(one) == {"total": 0, "seen": []}
+
+
+async def test_a_class_says_which_variables_may_go_and_come(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Declares))
+    assert await system.replace_state(one, without_rate) == {"total": 1, "label": "new"}
+    with pytest.raises(hf.errors.ControlFailed, match="the new state lacks total"):
+        await system.replace_state(one, in_place)
+
+
 async def test_hooks_give_and_take_the_state_as_one_value(system: hf.ActorSystem, start_one: Starter) -> None:
     one = await start_one(hf.start(Whole))
     assert await system.get_state(one) == [1, 2]

@@ -35,6 +35,12 @@ class Breathe(hf.Message):
 class Quick(hf.Message): ...
 
 
+class Crowd(hf.Message[float]):
+    """As Spin, and what is due behind the turn occupies the loop twice as long; the reply is when the turn ended."""
+
+    seconds: float
+
+
 class Spinner(hf.Actor):
     @hf.on(Spin)
     def spin(self, message: Spin) -> None:
@@ -51,6 +57,12 @@ class Spinner(hf.Actor):
         while time.monotonic() < end:
             time.sleep(0.0005)
             await asyncio.sleep(0)
+
+    @hf.on(Crowd)
+    def crowd(self, message: Crowd) -> float:
+        asyncio.get_running_loop().call_soon(time.sleep, message.seconds * 2)
+        time.sleep(message.seconds)
+        return time.monotonic()
 
     @hf.on(Quick)
     def quick(self, message: Quick) -> None:
@@ -80,6 +92,15 @@ async def test_a_turn_that_occupies_the_loop_is_told_of(system: hf.ActorSystem, 
     assert slow.address == "/app/one"
     assert slow.message.endswith(kind.__name__)
     assert LIMIT <= slow.seconds < LIMIT * 40
+
+
+async def test_what_comes_behind_a_turn_is_not_counted_to_it(system: hf.ActorSystem) -> None:
+    one = system.spawn(hf.start(Spinner), "one")
+    before = time.monotonic()
+    with system.events() as stream:
+        ends = await one.ask(Crowd(LIMIT * 4))
+        slow = await event(stream, hf.events.TurnSlow)
+    assert LIMIT <= slow.seconds <= ends - before
 
 
 async def test_a_loop_that_comes_late_is_told_of(system: hf.ActorSystem) -> None:

@@ -13,12 +13,15 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.events import TurnsLost
+from holdfast.ftm.alarms import ProtectionLost
 from holdfast.ftm.events import FailedOver, ReplicaJoined, ReplicaLost, WrongSuspicion
 from holdfast.ftm.group.group import Group
 from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.group.membership import Lives, Membership, Suspicion
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.mechanisms.tmr import TMR
 from tests.ftm.accounts import (
     Account,
     Add,
@@ -101,6 +104,16 @@ async def test_a_protected_actor_answers_as_an_ordinary_one(system: hf.ActorSyst
         await ref.ask(Boom())
     assert await ref.ask(Total()) == 15
     assert len(group_of(ref).membership.members) == 2
+
+
+@pytest.mark.parametrize("mechanism", [PBR(), LFR(), TMR()], ids=["pbr", "lfr", "tmr"])
+async def test_a_first_start_loses_no_protection(system: hf.ActorSystem, mechanism: Any) -> None:
+    """The first replica starts the actor before another one could have joined, but nobody is answered before that."""
+    with system.events() as events:
+        ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=mechanism))
+        assert await ref.ask(Add(1)) == 1
+        await two_again(ref)
+        assert not [one for one in events.take() if isinstance(one, ProtectionLost)]
 
 
 async def test_the_graph_of_the_mechanism_is_seen_in_the_tree(system: hf.ActorSystem) -> None:
@@ -193,13 +206,13 @@ async def test_killing_all_replicas_of_a_recorded_actor_loses_nothing(system: hf
 async def test_an_actor_without_recovery_begins_afresh_when_no_replica_is_left(system: hf.ActorSystem) -> None:
     ref = await started(system, hf.start(Counter, 10))
     assert await ref.ask(Add(0)) == 11
-    for pid in (pid_of(system, ref, "r1"), pid_of(system, ref, "r2")):
-        os.kill(pid, signal.SIGKILL)
-    async with asyncio.timeout(30):
-        while ref._cell.life < 2:
-            await asyncio.sleep(0.005)
-    assert await ref.ask(Add(1), timeout=30) == 11
-    assert await ref.ask(Tags()) == [1]
+    with system.events() as events:
+        for pid in (pid_of(system, ref, "r1"), pid_of(system, ref, "r2")):
+            os.kill(pid, signal.SIGKILL)
+        in_hand = [ref.ask(Add(tag), timeout=30) for tag in (1, 2)]
+        assert (await events.until(TurnsLost)).address == ref.path
+    assert await asyncio.gather(*in_hand) == [11, 12]
+    assert await ref.ask(Tags()) == [1, 2]
 
 
 @pytest.mark.parametrize("part", PARTS)

@@ -16,6 +16,13 @@ SPOILED = "tests/ftm/test_spoiled_states.py"
 RANDOM_HOOKS = "tests/ftm/test_random_hooks.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 CHECKS = {
+    "the start of an actor is nothing that could be lost": Check(
+        "ftm/bricks/standing.py",
+        " and any(one.feed.kind != START for one in inside):\n",
+        ":\n",
+        FAILOVER,
+        "test_a_first_start_loses_no_protection",
+    ),
     "whoever leads next hears which message its turn has waited for": Check(
         "checkpoint/home/pending_asks.py",
         "taken = self.rests.taken.get((turn, k), -1)",

@@ -1,5 +1,6 @@
 """A supervisor that is changed while it works (otp.md 1.10), and supervisors as classes."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -106,6 +107,48 @@ async def test_what_belongs_to_the_address_can_be_changed_when_the_child_is_stop
         await family.top.ask(hf.supervision.ChangeSupervisor(children=[kid(plan, "a", mailbox=hf.bounded(5))]))
         ref = await family.top.ask(hf.RestartChild("a"))
         assert ref._cell.more.bound is not None
+
+
+async def test_a_change_lasts_when_the_supervisor_is_restarted() -> None:
+    """Also that nothing is left of a child that was only started by request."""
+    async with hf.ActorSystem(log=False) as system:
+        top = await system.start(hf.supervisor("top", children=[named("a", "old"), named("b", "b")]))
+        await top.ask(hf.StartChild(named("d", "d")))
+        flags = hf.supervision.Flags("one_for_all", intensity=7)
+        await top.ask(hf.supervision.ChangeSupervisor(flags, [named("c", "c"), named("a", "new")]))
+        await top.ask(hf.supervision.ChangeSupervisor(dataclasses.replace(flags, period=9.0)))
+        with system.events() as events:
+            top.kill()
+            while (await events.until(hf.events.ActorStarted)).address != top.path:
+                pass
+        states = [(info.id, info.state) for info in await top.ask(hf.WhichChildren())]
+        assert states == [("c", "running"), ("a", "running"), ("b", "running")]
+        assert await system.ref(f"{top.path}/a", Named).ask(Name()) == "new"
+        shown = await system.get_state(top)
+        assert (shown["strategy"], shown["intensity"], shown["period"]) == ("one_for_all", 7, 9.0)
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_who_has_ended_and_has_a_spec_yet_is_listed_with_the_reason(isolation: Any) -> None:
+    async with hf.ActorSystem(log=False) as system:
+        children = [named("a", "a", restart="transient"), named("b", "b")]
+        top = await system.start(hf.supervisor("top", children=children, isolation=isolation))
+        await top.ask(hf.TerminateChild("a"))
+        [ended] = await top.ask(hf.supervision.EndedChildren())
+        assert ended == hf.supervision.EndedChild("a", f"{top.path}/a", "shutdown", is_recorded=False)
+        await top.ask(hf.RestartChild("a"))
+        assert await top.ask(hf.supervision.EndedChildren()) == []
+
+
+async def test_a_change_is_forgotten_with_the_process_of_the_supervisor() -> None:
+    async with hf.ActorSystem(log=False) as system:
+        top = await system.start(hf.supervisor("top", children=[named("a", "old")], isolation="process"))
+        await top.ask(hf.supervision.ChangeSupervisor(hf.supervision.Flags(intensity=7), [named("a", "new")]))
+        with system.events() as events:
+            top.kill()
+            while (await events.until(hf.events.ActorStarted)).address != top.path:
+                pass
+        assert await system.ref(f"{top.path}/a", Named).ask(Name()) == "old"
 
 
 # -- supervisors as classes -----------------------------------------------------------------------------------------

@@ -75,6 +75,44 @@ async def test_a_child_that_is_not_restarted_is_forgotten() -> None:
         assert await family.ref("permanent").ask(Life()) == 2
 
 
+async def test_those_that_have_ended_are_listed_until_they_are_started_again_or_deleted() -> None:
+    async with hf.ActorSystem(log=False) as system:
+        top = await begin(system)
+        options: dict[str, Any] = {"restart": "temporary", "recovery": hf.hybrid()}
+        specs = {name: hf.child(name, hf.start(Adder), **options) for name in ("a", "b", "c")}
+
+        async def ended() -> list[tuple[str, str, bool]]:
+            told = await top.ask(hf.supervision.EndedChildren())
+            assert [one.path for one in told] == [f"{top.path}/{one.id}" for one in told]
+            return [(one.id, one.reason, one.is_recorded) for one in told]
+
+        refs = {name: await top.ask(hf.StartChild(spec)) for name, spec in specs.items()}
+        assert await ended() == []
+        await top.ask(hf.TerminateChild("b"))
+        with pytest.raises(hf.RemoteCrash):
+            await refs["a"].ask(Boom())
+        while len(await ended()) < 2:
+            pass
+        refs["c"].kill()
+        while len(await ended()) < 3:
+            pass
+        crash = "ValueError: boom"
+        assert await ended() == [("b", "shutdown", True), ("a", crash, True), ("c", "killed", True)]
+        await top.ask(hf.StartChild(specs["b"]))
+        await top.ask(hf.DeleteChild("a"))
+        assert await ended() == [("c", "killed", True)]
+
+
+async def test_so_many_that_have_ended_are_listed_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("holdfast.supervision.supervisor.ENDED", 2)
+    async with hf.ActorSystem(log=False) as system:
+        top = await begin(system)
+        for name in "abc":
+            await top.ask(hf.StartChild(hf.child(name, hf.start(Adder))))
+            await top.ask(hf.TerminateChild(name))
+        assert [one.id for one in await top.ask(hf.supervision.EndedChildren())] == ["b", "c"]
+
+
 async def test_a_crash_restarts_that_child_only_with_its_arguments() -> None:
     async with hf.ActorSystem(log=False) as system:
         top = await begin(system)
@@ -271,6 +309,25 @@ async def test_a_changed_template_is_for_those_to_come() -> None:
         new = await top.ask(hf.StartChild())
         old.tell(Boom())
         assert (await old.ask(Sum()), await new.ask(Sum())) == (1, 2)
+
+
+@pytest.mark.parametrize("whose", ["its own", "its supervisor's"])
+async def test_a_changed_template_lasts_when_the_supervisor_is_restarted(whose: str) -> None:
+    async with hf.ActorSystem(log=False) as system:
+        inner = hf.dynamic("inner", template=hf.child(None, hf.start(Adder, 1)))
+        top = await system.start(hf.supervisor("top", children=[inner], intensity=9))
+        ref = system.ref(f"{top.path}/inner", hf.supervision.DynamicSupervisor)
+        flags = hf.supervision.Flags(max_children=2)
+        await ref.ask(hf.supervision.ChangeSupervisor(flags, [hf.child(None, hf.start(Adder, 2))]))
+        for _ in range(2):
+            with system.events() as events:
+                (ref if whose == "its own" else top).kill()
+                while (await events.until(hf.events.ActorStarted)).address != ref.path:
+                    pass
+            one = await ref.ask(hf.StartChild())
+            assert await one.ask(Sum()) == 2
+            await ref.ask(hf.StartChild())
+            assert isinstance(await refused(ref.ask(hf.StartChild())), hf.errors.MaxChildren)
 
 
 class Pool(hf.supervision.DynamicSupervisor):

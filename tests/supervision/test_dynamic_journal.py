@@ -55,8 +55,8 @@ class Student(hf.Actor):
         self.numbered = {0: f"{name} of {town}"}
 
     @classmethod
-    def migrate(cls, state: dict[str, Any], old: type[hf.Actor]) -> dict[str, Any]:
-        assert old is Pupil
+    def migrate(cls, state: dict[str, Any], from_version: int) -> dict[str, Any]:
+        assert from_version == 1
         return {"numbered": dict(enumerate(state["words"]))}
 
     @hf.on(Note)

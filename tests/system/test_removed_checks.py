@@ -27,6 +27,20 @@ SLOW = "tests/supervision/test_slow_restarts.py"
 UPGRADE = "tests/system/upgrade/test_check_upgrade.py"
 
 CHECKS = {
+    "a replaced state has the variables of the one before": Check(
+        "actors/control/live_state.py",
+        "    if lacks or adds:\n",
+        "    if False:\n",
+        "tests/control/test_control.py",
+        "test_a_state_with_other_variables",
+    ),
+    "what a supervisor is given lasts when it is restarted": Check(
+        "supervision/supervisor.py",
+        "            keep_plan(self, plan.flags, None if message.children is None else plan.children)\n",
+        "",
+        "tests/supervision/test_dynamic.py",
+        "test_a_changed_template_lasts",
+    ),
     "background work of a turn that is checked is not begun": Check(
         "checkpoint/store_tools/rerun.py",
         '        """Whether background work is not begun: never again."""\n        return True\n',

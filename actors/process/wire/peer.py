@@ -181,7 +181,7 @@ class Peer:
         try:
             reply = self.codec.reply_decoder(type(ask.message))(frame.body)
         except Exception as error:  # msgspec's own, or what a hook raised: all say that it does not fit.
-            ask.fail(BadReply(type_name(type(ask.message)), str(error)))
+            ask.fail(BadReply(*asked(ask), str(error)))
         else:
             ask.answer(reply)
 
@@ -199,7 +199,7 @@ class Peer:
         if isinstance(ask, RelayedAsk):
             ask.fail_raw(frame.kind, frame.name, bytes(frame.body))
         elif ask is not None:
-            ask.fail(self.codec.decode_error(frame.kind, frame.name, frame.body))
+            ask.fail(self.codec.decode_error(frame.kind, frame.name, frame.body, *asked(ask)))
 
     def _message_in(self, cell: Cell, frame: frames.Tell | frames.Ask) -> Any:
         """The message in a frame. Raises UnknownMessage or BadMessage."""
@@ -270,6 +270,14 @@ def ignored(path: str) -> frames.TakeRecord:
 
 
 NIL = Raw(msgspec.msgpack.encode(None))
+
+
+def asked(ask: Ask) -> tuple[str, str]:
+    """Who is asked, and what: the address and the type of the message, as errors name them."""
+    actor, message = "another process" if ask.to is None else ask.to.path, ask.message
+    if message is None:  # It was moved here with whoever is asked.
+        return actor, "what it was asked"
+    return actor, message.name.replace(":", ".") if type(message) is Parcel else type_name(type(message))
 
 
 class Accepted(Message[None]):
@@ -360,7 +368,7 @@ class RelayedAsk(Ask, eq=False):
             connection.send(frames.Reply(self.id, cast("Any", reply)))
         except BadMessage as error:
             self.is_over = False
-            self.fail(BadReply(error.message, error.problem))
+            self.fail(BadReply(*asked(self), error.problem))
 
     def answer_raw(self, body: bytes) -> None:
         """Pass an encoded reply on."""
@@ -373,7 +381,8 @@ class RelayedAsk(Ask, eq=False):
         try:
             kind, name, body = codec.encode_error(error)
         except BadMessage as bad:  # A Refusal with a field that cannot be sent is a reply that cannot.
-            kind, name, body = codec.encode_error(BadReply(type_name(type(error)), bad.problem))
+            why = f"{type_name(type(error))}: {bad.problem}"
+            kind, name, body = codec.encode_error(BadReply(*asked(self), why))
         self.fail_raw(kind, name, body)
 
     def fail_raw(self, kind: str, name: str, body: bytes) -> None:

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 
 import holdfast as hf
+from holdfast.actors.errors import type_name
 from holdfast.actors.events import DeadLetter
 from holdfast.actors.kernel.codec import MAX_BYTES
 from tests.actors.process.players import Account, Add, Fail, Note, Notebook, Notes, Run, Total, Worker
@@ -125,15 +126,17 @@ class Relay(hf.Actor):
 @pytest.mark.parametrize("what", ["wrong_reply", "huge_reply"])
 async def test_a_reply_that_cannot_be_sent_fails_the_ask(system: hf.ActorSystem, what: str) -> None:
     one = await start(system)
-    with pytest.raises(hf.errors.BadReply, match="reply"):
+    with pytest.raises(hf.errors.BadReply, match=r"/app/one has handled .*players\.Run, but its reply") as bad:
         await one.ask(Run(what, MAX_BYTES + 100_000), timeout=20)
+    assert (bad.value.actor, bad.value.message) == (one.path, type_name(Run))
     assert await one.ask(Add(1)) == 1
 
 
 async def test_a_reply_of_the_wrong_type_fails_the_ask(system: hf.ActorSystem) -> None:
     one = await start(system, Liar)
-    with pytest.raises(hf.errors.BadReply, match=r"players\.Total: Expected `int`, got `str`"):
+    with pytest.raises(hf.errors.BadReply) as bad:
         await one.ask(Total())
+    assert bad.value.args == (one.path, type_name(Total), "Expected `int`, got `str`")
 
 
 class Liar(hf.Actor):
