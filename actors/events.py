@@ -51,10 +51,11 @@ class LifeAbandoned(Event, frozen=True, eq=False):
 
 
 class DeadLetter(Event, frozen=True, eq=False):
-    """Nobody handles this message, for the reason that `why` gives."""
+    """Nobody handles this message, for the reason that `why` gives; `sender` is an actor's address, if known."""
 
     message: Any
     why: str
+    sender: str = ""
 
 
 class ChildRestarted(Event, frozen=True, eq=False):
@@ -77,6 +78,26 @@ class ChildTerminated(Event, frozen=True, eq=False):
     reason: ExitReason
     restarts: int = 0
     allowed: int = 0
+
+
+class ChildStopped(Event, frozen=True, eq=False):
+    """A child has ended because it was told to, or a transient one because its work is done.
+
+    `by` is the address of the actor that has called for it: the child itself, its supervisor, or who has asked its
+    supervisor; "" if that was no actor. `because` says why in words.
+    """
+
+    life: int
+    reason: ExitReason
+    by: str
+    because: str
+
+
+class EndedByLink(Event, frozen=True, eq=False):
+    """An actor ends because one that it is linked to, `peer`, has ended abnormally."""
+
+    peer: str
+    reason: ExitReason
 
 
 class ChildStartFailed(Event, frozen=True, eq=False):
@@ -462,11 +483,16 @@ class EventHub:
     def __init__(self, changed: Callable[[bool], None] = lambda anybody: None) -> None:
         self._changed = changed  # told whether there is anybody at all
         self.has_listeners = False  # else events are not even made
+        self.hears_letters = False  # the same of dead letters
         self._streams: list[EventStream] = []
         self._sinks: list[Callable[[Event], None]] = []
+        self._recorder: Callable[[Event], None] | None = None
+        self._resting: set[bool] = set()  # of what the recorder has had enough for now: True: dead letters
 
     def emit(self, event: Event) -> None:
         """Give the event to every listener and sink."""
+        if self._recorder is not None:
+            self._recorder(event)
         for stream in self._streams:
             stream.put(event)
         for sink in self._sinks:
@@ -475,6 +501,21 @@ class EventHub:
     def add_sink(self, sink: Callable[[Event], None]) -> None:
         """Call `sink` with every event, at once."""
         self._sinks.append(sink)
+        self._count()
+
+    def record(self, recorder: Callable[[Event], None]) -> None:
+        """Call `recorder` with every event. Unlike a sink it may rest while there are too many."""
+        self._recorder = recorder
+        self._count()
+
+    def rest(self, *, letters: bool) -> None:
+        """The recorder has had enough dead letters, or enough of all others: make none for it alone until `wake`."""
+        self._resting.add(letters)
+        self._count()
+
+    def wake(self) -> None:
+        """The recorder takes all events again."""
+        self._resting.clear()
         self._count()
 
     def listen(self, most: int = 10_000) -> EventStream:
@@ -491,7 +532,9 @@ class EventHub:
         self._count()
 
     def _count(self) -> None:
-        self.has_listeners = bool(self._streams or self._sinks)
+        anybody = bool(self._streams or self._sinks)
+        self.has_listeners = anybody or (self._recorder is not None and False not in self._resting)
+        self.hears_letters = anybody or (self._recorder is not None and True not in self._resting)
         self._changed(self.has_listeners)
 
     def close(self) -> None:
