@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import msgspec
 
 from ...actors.control.orders import Status
 from ...actors.errors import portable
-from ...actors.kernel.envelope import item_name
+from ...actors.kernel.envelope import Ask, item_name
 from ...supervision.intensity import recent_restarts
 from ...supervision.supervisor import Supervisor
 from .lives import PastLife
@@ -25,6 +27,8 @@ STORE_KINDS = ("JournalBlocked", "JournalFull", "JournalGoesOn", "JournalStopped
 """Events that say how the store is."""
 GAVE_UP_KINDS = ("SupervisorGaveUp", "AutoShutdown")
 """Events of supervisors that end with all below them."""
+MOST_LOOKED_AT = 50_000
+"""Actors and messages in mailboxes that are looked at for asks of one actor."""
 MOST = 200
 """Events of the address that are looked at, the newest."""
 
@@ -140,9 +144,25 @@ def put_aside(one: QuarantinedMessage, *, payloads: bool = False) -> PutAside:
 def outstanding(node: Node, address: str) -> list[Outstanding]:
     """The asks of an actor that have no answer yet, the oldest first."""
     now = node.loop.time()
-    asks = [ask for ask in node.deadlines.waiting() if ask.sender is not None and ask.sender.path == address]
-    found = [Outstanding(ask.to.path, item_name(ask), max(0.0, now - (ask.deadline - ask.timeout))) for ask in asks]
+    asks = {id(ask): (ask.to.path, ask) for ask in node.deadlines.waiting()}
+    asks.update((id(ask), (path, ask)) for path, ask in _in_mailboxes(node))
+    found = [
+        Outstanding(to, item_name(ask), max(0.0, now - (ask.deadline - ask.timeout)))
+        for to, ask in asks.values()
+        if ask.sender is not None and ask.sender.path == address
+    ]
     return sorted(found, key=lambda one: -one.seconds)
+
+
+def _in_mailboxes(node: Node) -> Iterator[tuple[str, Ask]]:
+    """The asks that actors of this process have in hand or in their mailboxes, also those that came from processes."""
+    left, cells = MOST_LOOKED_AT, [] if node.root is None else [node.root]
+    while cells and left > 0:
+        cell = cells.pop()
+        cells.extend((cell.children or {}).values())
+        items = [cell.item, *itertools.islice(cell.queue or (), left)]
+        left -= len(items)
+        yield from ((cell.path, item) for item in items if isinstance(item, Ask) and not item.is_done)
 
 
 def _allowance(cell: Cell) -> Allowance | None:

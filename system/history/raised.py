@@ -19,8 +19,9 @@ MOST_CAUSES = 3
 """Errors of a chain that are kept, the last one raised last."""
 LONGEST = 4_000
 """Characters that are kept of a traceback; of a longer one its end."""
-OURS = str(Path(__file__).parents[2])
-"""The folder of this package: where a user's error was raised is not there."""
+ROOMS = ("actors", "adapters.py", "checkpoint", "console", "diagnosis", "ftm", "supervision", "system", "testing")
+OURS = tuple(str(Path(__file__).parents[2] / room) for room in ROOMS)
+"""Where this package is: where a user's error was raised is not there."""
 FRAME = re.compile(r'^  File "(?P<file>[^"\n]{1,1000})", line (?P<line>\d{1,9}), in (?P<name>[^\n]{1,200})$', re.M)
 
 

@@ -71,6 +71,10 @@ class HistoryWriter:
     def add(self, event: PastEvent) -> None:
         """Have an event written soon."""
         self._unwritten.append(event)
+        self._wake()
+
+    def _wake(self) -> None:
+        """In nobody's name: whoever told the event may be an actor in its turn."""
         if self._timer is None and not self._is_closed:
             loop = self._node.loop
             delay = max(0.0, self._due - loop.time())
@@ -87,7 +91,8 @@ class HistoryWriter:
                     shelf.put(wanted)
         except HoldfastError as error:
             self._due = self._node.loop.time() + RETRY
-            self._unwritten.extendleft(reversed(events[-MOST_UNWRITTEN:]))
+            self._unwritten.extend(events)
+            self._wake()
             if not self._has_failed:
                 self._has_failed = True
                 self._node.emit(HistoryNotKept(f"/{self._node.name}", str(error)))
