@@ -22,7 +22,7 @@ from ..actors.process.wire.frame_buffer import LENGTH
 from ..actors.streams import Listener
 from ..actors.values import encode_value
 from ..system.history.authors import ACTING, OPERATOR
-from ..system.history.page import HistoryPage
+from ..system.history.pages import HistoryPage
 from ..system.script import check_folders
 from ..system.system import ActorSystem
 from .trust import Needed, trusted_imports

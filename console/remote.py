@@ -26,7 +26,7 @@ from ..ftm.group.protected import ProtectionStatus
 from ..supervision.spec import NAMELESS, ChildSpec, Isolation, Strategy, child
 from ..system.history.evidence import PutAside
 from ..system.history.lives import PastLife
-from ..system.history.page import MOST_ON_PAGE, HistoryPage, question
+from ..system.history.pages import MOST_ON_PAGE, HistoryPage, question
 from ..system.transaction.operation import Step
 from .wire import (
     RESPONSE,

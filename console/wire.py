@@ -21,7 +21,7 @@ from ..actors.process.wire.frame_buffer import LENGTH
 from ..actors.process.wire.start_codec import pack_data, pack_recipe, unpack_data, unpack_recipe
 from ..actors.values import decode_value, encode_value
 from ..supervision.spec import ChildSpec
-from ..system.history.page import HistoryQuestion
+from ..system.history.pages import HistoryQuestion
 
 CREDENTIALS = struct.Struct("3i")
 

@@ -5,7 +5,7 @@ from ..actors.control.orders import Status
 from ..actors.control.tracing import Statistics
 from .history.evidence import PutAside
 from .history.lives import PastLife
-from .history.page import HistoryPage
+from .history.pages import HistoryPage
 from .history.past_event import PastEvent
 from .portal import ThreadPortal
 from .transaction.change import Change

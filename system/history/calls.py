@@ -12,7 +12,7 @@ from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
 from ...actors.seconds import check_seconds
 from .evidence import PutAside, collect, literal, put_aside
 from .lives import PastLife
-from .page import MOST_ON_PAGE, HistoryPage, HistoryQuestion, answer, question
+from .pages import MOST_ON_PAGE, HistoryPage, HistoryQuestion, answer, question
 from .recorder import HistoryRecorder
 from .why import why
 

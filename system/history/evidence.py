@@ -14,7 +14,7 @@ from ...actors.kernel.envelope import Ask, item_name
 from ...supervision.intensity import recent_restarts
 from ...supervision.supervisor import Supervisor
 from .lives import PastLife
-from .page import answer, question
+from .pages import answer, question
 from .past_event import PastEvent, message_type, shortened
 
 if TYPE_CHECKING:

@@ -54,7 +54,7 @@ class PastLife(msgspec.Struct):
 
     @property
     def is_over(self) -> bool:
-        """Whether it has ended, or did not begin."""
+        """Say whether the life has ended, or did not even begin."""
         return self.ended is not None
 
 

@@ -14,7 +14,7 @@ import holdfast as hf
 from holdfast.console.endpoint import control_endpoint
 from holdfast.console.remote import RemoteSystem
 from holdfast.console.wire import AskHistory
-from holdfast.system.history.page import HistoryQuestion
+from holdfast.system.history.pages import HistoryQuestion
 from tests.history.players import Do, Worker, failed, until
 
 T = TypeVar("T")

@@ -8,7 +8,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.system.history.lives import LivesByAddress
-from holdfast.system.history.page import question
+from holdfast.system.history.pages import question
 from holdfast.system.history.past_event import PastEvent
 from holdfast.system.history.paths import matcher
 from tests.history.players import Do, Worker, failed, until
