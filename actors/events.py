@@ -7,7 +7,7 @@ import functools
 import typing
 from collections import deque
 from collections.abc import AsyncIterator, Callable
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -422,6 +422,10 @@ TRACED = (MessageIn, TurnBegan, TurnEnded, MessageOut)
 """What is told to those who trace the actor, and to nobody else."""
 
 
+Restful = Literal["letters", "starts", "others"]
+"""Dead letters, the first lives at addresses, and all other events: what a recorder may rest from."""
+
+
 class EventStream:
     """One listener's view: an async iterator over events, with a bound on how far it may fall behind.
 
@@ -483,11 +487,12 @@ class EventHub:
     def __init__(self, changed: Callable[[bool], None] = lambda anybody: None) -> None:
         self._changed = changed  # told whether there is anybody at all
         self.has_listeners = False  # else events are not even made
-        self.hears_letters = False  # the same of dead letters
+        self.hears_letters = False  # the same of dead letters,
+        self.hears_starts = False  # and of the first lives at addresses
         self._streams: list[EventStream] = []
         self._sinks: list[Callable[[Event], None]] = []
         self._recorder: Callable[[Event], None] | None = None
-        self._resting: set[bool] = set()  # of what the recorder has had enough for now: True: dead letters
+        self._resting: set[Restful] = set()  # of what the recorder has had enough for now
 
     def emit(self, event: Event) -> None:
         """Give the event to every listener and sink."""
@@ -508,9 +513,9 @@ class EventHub:
         self._recorder = recorder
         self._count()
 
-    def rest(self, *, letters: bool) -> None:
-        """The recorder has had enough dead letters, or enough of all others: make none for it alone until `wake`."""
-        self._resting.add(letters)
+    def rest(self, of: Restful) -> None:
+        """The recorder has had enough of these events: make none for it alone until `wake`."""
+        self._resting.add(of)
         self._count()
 
     def wake(self) -> None:
@@ -533,8 +538,10 @@ class EventHub:
 
     def _count(self) -> None:
         anybody = bool(self._streams or self._sinks)
-        self.has_listeners = anybody or (self._recorder is not None and False not in self._resting)
-        self.hears_letters = anybody or (self._recorder is not None and True not in self._resting)
+        records = self._recorder is not None
+        self.has_listeners = anybody or (records and "others" not in self._resting)
+        self.hears_letters = anybody or (records and "letters" not in self._resting)
+        self.hears_starts = anybody or (records and not self._resting & {"starts", "others"})
         self._changed(self.has_listeners)
 
     def close(self) -> None:

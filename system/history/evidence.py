@@ -10,7 +10,9 @@ import msgspec
 
 from ...actors.control.orders import Status
 from ...actors.errors import portable
-from ...actors.kernel.envelope import Ask, item_name
+from ...actors.kernel.cell import GONE
+from ...actors.kernel.envelope import Ask, message_in
+from ...actors.process.process_host import Outlet
 from ...supervision.intensity import recent_restarts
 from ...supervision.supervisor import Supervisor
 from .lives import PastLife
@@ -77,6 +79,7 @@ class Evidence(msgspec.Struct, frozen=True):
     Attributes:
         address: whom it is about.
         now: Unix time.
+        is_there: whether the address has an actor now, or will have one again.
         lives: the newest lives, oldest first.
         events: the newest events about the address, oldest first.
         above: the newest events of supervisors above it that gave up.
@@ -91,6 +94,7 @@ class Evidence(msgspec.Struct, frozen=True):
 
     address: str
     now: float
+    is_there: bool = False
     lives: list[PastLife] = []
     events: list[PastEvent] = []
     above: list[PastEvent] = []
@@ -121,6 +125,7 @@ def collect(
     return Evidence(
         address,
         node.clock.wall(),
+        cell is not None and cell.state is not GONE,
         recorder.lives.at(address),
         answer(recorder, question(literal(address), limit=MOST)).events,
         sorted(ancestors, key=lambda event: event.number),
@@ -147,7 +152,7 @@ def outstanding(node: Node, address: str) -> list[Outstanding]:
     asks = {id(ask): (ask.to.path, ask) for ask in node.deadlines.waiting()}
     asks.update((id(ask), (path, ask)) for path, ask in _in_mailboxes(node))
     found = [
-        Outstanding(to, item_name(ask), max(0.0, now - (ask.deadline - ask.timeout)))
+        Outstanding(to, message_type(message_in(ask)), max(0.0, now - (ask.deadline - ask.timeout)))
         for to, ask in asks.values()
         if ask.sender is not None and ask.sender.path == address
     ]
@@ -155,12 +160,14 @@ def outstanding(node: Node, address: str) -> list[Outstanding]:
 
 
 def _in_mailboxes(node: Node) -> Iterator[tuple[str, Ask]]:
-    """The asks that actors of this process have in hand or in their mailboxes, also those that came from processes."""
+    """The asks that actors have in hand or in their mailboxes, also those that go from one process to another."""
     left, cells = MOST_LOOKED_AT, [] if node.root is None else [node.root]
     while cells and left > 0:
         cell = cells.pop()
         cells.extend((cell.children or {}).values())
-        items = [cell.item, *itertools.islice(cell.queue or (), left)]
+        outlet = cell.more.outlet if cell.more is not None else None
+        sent = [item for _, item in outlet.flight] if isinstance(outlet, Outlet) else []
+        items = [cell.item, *itertools.islice(itertools.chain(sent, cell.queue or ()), left)]
         left -= len(items)
         yield from ((cell.path, item) for item in items if isinstance(item, Ask) and not item.is_done)
 

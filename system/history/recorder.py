@@ -23,6 +23,7 @@ from ...actors.events import (
     ProcessDied,
     ProcessStarted,
     Recovered,
+    Restful,
     TurnSlow,
 )
 from .authors import author
@@ -126,23 +127,24 @@ class HistoryRecorder:
 
     def _admits(self, event: Event, kind: type[Event]) -> bool:
         now = self._node.loop.time()
+        of: Restful = "others"
         if kind is DeadLetter:
             is_admitted = self._letter_quota.take(now)
+            of = "letters"
         elif kind is ActorStarted and isinstance(event, ActorStarted) and event.life == 1:
             is_admitted = self._quota.take(now, least=BURST * FIRST_LIVES)
-            if not is_admitted:  # Many are started: that is no storm.
-                return False
+            of = "starts"
         else:
             is_admitted = self._quota.take(now)
         if not is_admitted:
-            self._rest(is_letter=kind is DeadLetter, now=now)
+            self._rest(of, now)
         return is_admitted
 
-    def _rest(self, *, is_letter: bool, now: float) -> None:
+    def _rest(self, of: Restful, now: float) -> None:
         """Have no more of these events made, as long as nobody else wants them."""
-        if self._storm_since is None:
+        if self._storm_since is None and of != "starts":
             self._storm_since = now
-        self._node.events.rest(letters=is_letter)
+        self._node.events.rest(of)
         if self._storm_timer is None:
             self._storm_timer = self._later(PACE, self._look)
 

@@ -37,6 +37,8 @@ def _well(evidence: Evidence) -> str:
     status = evidence.status
     if status is None and not evidence.lives:
         return f"Nobody lives at {evidence.address}, and the history knows of no life there."
+    if not evidence.is_there:
+        return f"Nobody lives at {evidence.address} any more, and how its last life ended is not known."
     if status is None:
         return f"{evidence.address} does not say how it is, and the history knows of nothing that is wrong."
     return f"{evidence.address} is {status.state}, in life {status.life}, and nothing is wrong as far as is known."
@@ -283,7 +285,7 @@ def _replicas(evidence: Evidence) -> list[str]:
     said: list[str] = []
     if over is not None:
         replica, cause = over.fields.get("replica"), over.fields.get("why")
-        said.append(f"Replica {replica} leads since {_since(evidence, over.at)} (failover): {cause}.")
+        said.append(f"Replica {replica} took over {_since(evidence, over.at)}: {cause}.")
     if lost is not None and (back is None or back.number < lost.number):
         replica, cause = lost.fields.get("replica"), lost.fields.get("why")
         said.append(f"Replica {replica} was lost {_since(evidence, lost.at)} and is not back: {cause}.")
@@ -301,12 +303,12 @@ def _store(evidence: Evidence) -> list[str]:
             case "JournalGoesOn":
                 said.pop("JournalBlocked", None)
             case "JournalBlocked":
-                said[event.kind] = f"The store takes nothing since {_since(evidence, event.at)}: {reason}."
+                said[event.kind] = f"The store stopped taking anything {_since(evidence, event.at)}: {reason}."
             case "JournalStopped":
                 said[event.kind] = f"The store failed {_since(evidence, event.at)}, and nothing is accepted: {reason}."
             case "JournalFull" if event.address == evidence.address:
                 said[event.kind] = (
-                    f"Its journal is full since {_since(evidence, event.at)}, and it accepts nothing: "
+                    f"Its journal became full {_since(evidence, event.at)}, and it accepts nothing: "
                     f"{event.fields.get('way_out')}."
                 )
             case _:

@@ -306,3 +306,22 @@ async def test_a_store_that_is_full_hurts_nobody_and_is_told_of_once(monkeypatch
             await until(lambda: "HistoryNotKept" in {one.kind for one in writer.stored(store)})
         assert [one.number for one in writer.stored(store)] == [one.number for one in kept.after(0)]
         kept.close()
+
+
+async def test_ends_that_never_come_are_forgotten() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        kept = system._history
+        assert kept is not None
+        for number in range(3_000):
+            kept.expect(f"/app/{number}", "the program", "")
+        assert len(kept._expected) == recorder.MOST_EXPECTED
+
+
+async def test_an_address_with_the_signs_of_patterns_is_just_itself() -> None:
+    async with hf.ActorSystem("app", log=False, intensity=10) as system:
+        star, other = (await system.start(hf.child(name, hf.start(Worker))) for name in ("w*", "w[1]"))
+        await failed(star, "crash")
+        await failed(other, "crash")
+        assert {one.address for one in system.history(star).events} == {"/app/w*"}
+        assert {one.address for one in system.history(other).events} == {"/app/w[1]"}
+        assert "/app/w* ended" in " ".join(await system.why(star))

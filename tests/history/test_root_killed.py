@@ -6,6 +6,9 @@ import sys
 from pathlib import Path
 
 import holdfast as hf
+from holdfast.system.history.past_event import PastEvent
+from holdfast.system.history.shelf import EventShelf
+from holdfast.system.history.writer import EVENTS, stored
 from tests.history.conftest import ROOT
 from tests.history.players import Do, Worker
 
@@ -49,3 +52,21 @@ async def test_the_next_root_knows_what_was_before_the_kill(tmp_path: Path) -> N
         [*_, started] = system.history(kinds=["SystemStarted"]).events
         assert started.fields["why"] == "the process of the root ended"
         assert system.lives("/app/worker")[-1].reason_kind in ("Shutdown", "SystemStopped")
+
+
+def test_an_event_that_was_written_twice_is_there_once() -> None:
+    """A store that has failed in the middle of a write is given the same events again."""
+    notes: dict[str, bytes] = {}
+    shelf = EventShelf(EVENTS, {}, lambda name, value: notes.update({name: value or b""}), 50_000)
+    events = [PastEvent(number, 1.0, "HookFailed", "/app", {}) for number in (1, 2, 3)]
+    shelf.put(events[:2])
+    shelf.put(events)
+
+    class Store:
+        def note(self, key: str, value: bytes | None) -> None:
+            raise AssertionError("nothing is written")
+
+        def notes(self, prefix: str) -> dict[str, bytes]:
+            return {key: value for key, value in notes.items() if key.startswith(prefix)}
+
+    assert [one.number for one in stored(Store())] == [1, 2, 3]

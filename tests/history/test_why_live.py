@@ -4,6 +4,7 @@ import asyncio
 import os
 import signal
 from collections.abc import AsyncIterator
+from typing import Any
 
 import pytest
 
@@ -172,6 +173,24 @@ async def test_a_turn_that_waits(system: hf.ActorSystem) -> None:
         await asked
 
 
+@pytest.mark.parametrize("places", [("task", "process"), ("process", "task"), ("process", "process")], ids="-".join)
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["none", "hybrid"])
+async def test_a_turn_that_waits_wherever_both_live(
+    system: hf.ActorSystem, places: tuple[Any, Any], recovery: hf.Method | None
+) -> None:
+    one, other = places
+    spec = hf.child("caller", hf.start(Caller), isolation=one, recovery=recovery, shutdown="brutal_kill")
+    caller = await system.start(spec)
+    ref = await system.start(worker(isolation=other, recovery=recovery, shutdown="brutal_kill"))
+    asked = caller.ask(Pass(ref, "wait"), 60.0)
+    await asyncio.sleep(1.2)
+    text = await said(system, caller)
+    assert "it waits for /app/worker to answer tests.history.players.Do, asked " in text
+    await system.stop(caller)
+    with pytest.raises(hf.HoldfastError):
+        await asked
+
+
 async def test_suspended_and_full(system: hf.ActorSystem) -> None:
     ref = await system.start(worker())
     await system.suspend(ref)
@@ -205,5 +224,5 @@ async def test_replicas(system: hf.ActorSystem) -> None:
     os.kill(system.pid_of(ref), signal.SIGKILL)
     await ref.ask(Do("well"), 30.0)
     text = await said(system, ref)
-    assert "(failover): " in text
+    assert " took over " in text
     assert any(life.by == "failover" for life in system.lives(ref))
