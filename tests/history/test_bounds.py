@@ -11,7 +11,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.events import ActorCrashed, ActorStarted, ChildStopped, DeadLetter, LogLine
-from holdfast.actors.exit_reasons import SHUTDOWN, crash
+from holdfast.actors.exit_reasons import SHUTDOWN, Crash, crash
 from holdfast.checkpoint.store_opening import open_journal
 from holdfast.system.history import quota, recorder, writer
 from holdfast.system.history.lives import LivesByAddress
@@ -72,13 +72,17 @@ def test_a_traceback_has_a_bounded_length_and_says_where() -> None:
         else:
             raise ValueError("x" * 1_000_000)
 
-    try:
+    def outer() -> None:
         try:
             deep(500)
         except ValueError as error:
             raise RuntimeError("outer") from error
-    except RuntimeError as error:
-        text = traceback_text(crash(error))  # type: ignore[arg-type]  # it is a Crash
+
+    with pytest.raises(RuntimeError) as raised:
+        outer()
+    reason = crash(raised.value)
+    assert isinstance(reason, Crash)
+    text = traceback_text(reason)
     assert len(text) <= 4_000
     assert text.endswith("RuntimeError: outer")
     assert "ValueError: xxx" in text
@@ -319,7 +323,7 @@ async def test_ends_that_never_come_are_forgotten() -> None:
 
 async def test_an_address_with_the_signs_of_patterns_is_just_itself() -> None:
     async with hf.ActorSystem("app", log=False, intensity=10) as system:
-        star, other = (await system.start(hf.child(name, hf.start(Worker))) for name in ("w*", "w[1]"))
+        star, other = [await system.start(hf.child(name, hf.start(Worker))) for name in ("w*", "w[1]")]
         await failed(star, "crash")
         await failed(other, "crash")
         assert {one.address for one in system.history(star).events} == {"/app/w*"}

@@ -22,16 +22,13 @@ def told(kind: str, address: str = AT, at: float = 990.0, number: int = 1, **fie
 
 
 def status(state: str = "running", **more: Any) -> hf.system.Status:
-    known = {
-        "parent": "/app/shop",
-        "life": 2,
-        "queued": 0,
-        "turn": None,
-        "turn_seconds": 0.0,
-        "links": 0,
-        "monitors": 0,
-    }
-    return hf.system.Status(AT, "shop.Till", state, **{**known, "pid": 7, **more})
+    known: dict[str, Any] = {"parent": "/app/shop", "life": 2, "queued": 0, "turn": None, "turn_seconds": 0.0, "pid": 7}
+    return hf.system.Status(AT, "shop.Till", state, links=0, monitors=0, **{**known, **more})
+
+
+def evidence(known: dict[str, Any]) -> Evidence:
+    rest = {name: value for name, value in known.items() if name != "now"}
+    return Evidence(AT, known.get("now", NOW), **rest)
 
 
 CRASHES = [
@@ -143,8 +140,8 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     "replay diverges": (
         {"events": [told("RecoveryFailed", reason=f"replay of {AT} diverged at turn 1: the reply differs")]},
         (
-            f"{AT} cannot be recovered, for its turns do not go as they went before: replay of {AT} diverged at turn 1: "
-            "the reply differs."
+            f"{AT} cannot be recovered, for its turns do not go as they went before: replay of {AT} diverged at "
+            "turn 1: the reply differs."
         ),
     ),
     "recovery fails": (
@@ -223,16 +220,16 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_each_cause_has_its_sentence(name: str) -> None:
-    evidence, sentence = CASES[name]
-    said = why(Evidence(AT, **{"now": NOW, **evidence}))
+    known, sentence = CASES[name]
+    said = why(evidence(known))
     assert len(said) == 1
     assert said[0] == sentence or (sentence.endswith("1970-01-01") and said[0].startswith(sentence))
 
 
 def test_each_rule_is_met() -> None:
     met: set[str] = set()
-    for evidence, _ in CASES.values():
-        met |= {name for name, rule in RULES.items() if rule(Evidence(AT, **{"now": NOW, **evidence}))}
+    for known, _ in CASES.values():
+        met |= {name for name, rule in RULES.items() if rule(evidence(known))}
     assert met == set(RULES)
 
 
