@@ -11,7 +11,6 @@ from ...actors.errors import portable
 from ...actors.events import (
     TRACED,
     ActorCrashed,
-    DeadLetter,
     Event,
     HookFailed,
     LogLine,
@@ -138,8 +137,3 @@ def _put_message(fields: dict[str, Plain], value: Any, *, payloads: bool) -> Non
     if payloads:
         message = message_of(value)
         fields["payload"] = shortened(portable(str(value if message is None else message)))
-
-
-def is_letter(kind: str) -> bool:
-    """Whether an event of this kind is about a message that nobody has handled: those have a ring of their own."""
-    return kind == DeadLetter.__name__

@@ -2,13 +2,6 @@
 
 from __future__ import annotations
 
-BURST = 1_000
-"""Events that are recorded at once."""
-PER_SECOND = 200.0
-"""Events that are recorded each second for as long as a storm lasts."""
-FIRST_LIVES = 0.5
-"""The part of the quota that is left to other events when many actors are started."""
-
 
 class EventQuota:
     """A bucket of tokens: it is full at first, and again after a quiet while.

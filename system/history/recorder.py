@@ -7,30 +7,11 @@ from collections.abc import Callable
 from heapq import merge
 from typing import TYPE_CHECKING
 
-from ...actors.events import (
-    ActorCrashed,
-    ActorStarted,
-    ChildRestarted,
-    ChildStartFailed,
-    ChildStopped,
-    ChildTerminated,
-    DeadLetter,
-    EndedByLink,
-    Event,
-    HeldMessages,
-    LoopLagged,
-    Moved,
-    ProcessDied,
-    ProcessStarted,
-    Recovered,
-    Restful,
-    TurnSlow,
-)
+from ...actors.events import ActorStarted, ChildStopped, ChildTerminated, Event, Restful
 from .authors import author
 from .lives import LivesByAddress
-from .past_event import UNKEPT, PastEvent, Plain, is_letter, plain_fields
-from .quota import BURST, FIRST_LIVES, PER_SECOND, EventQuota
-from .ring import EventRing
+from .past_event import UNKEPT, PastEvent, Plain, plain_fields
+from .tracks import BOUNDS, EventTrack, TrackName, track_of
 from .writer import PACE, HistoryWriter, NoteStore, stored
 
 if TYPE_CHECKING:
@@ -39,36 +20,13 @@ if TYPE_CHECKING:
 
     from ...actors.kernel.node import Node
 
-MOST_EVENTS, MOST_BYTES = 5_000, 4 * 1024 * 1024
-"""Events that are kept in memory, and the bytes that they may take, about."""
-MOST_LETTERS, MOST_LETTER_BYTES = 1_000, 1024 * 1024
-"""The same of dead letters, which leave the others alone."""
-LETTER_BURST, LETTERS_PER_SECOND = 500, 50.0
-"""Dead letters that are recorded at once, and each second for as long as they go on."""
 MOST_EXPECTED = 1_000
 """Ends that somebody has called for and that have not come yet."""
-
-IN_STORMS: frozenset[type[Event]] = frozenset(
-    {
-        ActorCrashed,
-        ActorStarted,
-        ChildRestarted,
-        ChildStartFailed,
-        ChildStopped,
-        ChildTerminated,
-        DeadLetter,
-        EndedByLink,
-        HeldMessages,
-        LoopLagged,
-        Moved,
-        ProcessDied,
-        ProcessStarted,
-        Recovered,
-        TurnSlow,
-    }
-)
-"""Events that come by the thousand when many actors start or fail; all others are rare, and none is left out."""
+FIRST_LIVES = 0.5
+"""The part of a quota that is left to other events when many actors are started."""
 ENDS = frozenset({ChildStopped, ChildTerminated})
+RESTFUL: dict[TrackName, Restful] = {"others": "others", "letters": "letters"}
+"""What need not be made while a track has had enough; rare events are told in any case."""
 
 
 class HistoryRecorder:
@@ -87,11 +45,7 @@ class HistoryRecorder:
     def __init__(self, node: Node, store: NoteStore | None, *, log_payloads: bool) -> None:
         self._node, self.keeps_payloads = node, log_payloads
         self.lives = LivesByAddress()
-        self._events = EventRing(MOST_EVENTS, MOST_BYTES)
-        self._letters = EventRing(MOST_LETTERS, MOST_LETTER_BYTES)
-        now = node.loop.time()
-        self._quota = EventQuota(BURST, PER_SECOND, now)
-        self._letter_quota = EventQuota(LETTER_BURST, LETTERS_PER_SECOND, now)
+        self._tracks = {name: EventTrack(bounds, node.loop.time()) for name, bounds in BOUNDS.items()}
         self._storm_since: float | None = None
         self._storm_timer: asyncio.TimerHandle | None = None
         self._expected: dict[str, tuple[str, str]] = {}
@@ -116,7 +70,7 @@ class HistoryRecorder:
     def __call__(self, event: Event) -> None:
         """Record an event, unless it is of no interest later, or there are too many."""
         kind = type(event)
-        if kind in UNKEPT or (kind in IN_STORMS and not self._admits(event, kind)):
+        if kind in UNKEPT or not self._admits(event, kind):
             return
         fields = plain_fields(event, payloads=self.keeps_payloads)
         if kind in ENDS and event.address in self._expected:
@@ -126,25 +80,19 @@ class HistoryRecorder:
         self._add(kind.__name__, event.address, fields)
 
     def _admits(self, event: Event, kind: type[Event]) -> bool:
-        now = self._node.loop.time()
-        of: Restful = "others"
-        if kind is DeadLetter:
-            is_admitted = self._letter_quota.take(now)
-            of = "letters"
-        elif kind is ActorStarted and isinstance(event, ActorStarted) and event.life == 1:
-            is_admitted = self._quota.take(now, least=BURST * FIRST_LIVES)
-            of = "starts"
-        else:
-            is_admitted = self._quota.take(now)
+        now, name = self._node.loop.time(), track_of(kind.__name__)
+        is_first = isinstance(event, ActorStarted) and event.life == 1
+        is_admitted = self._tracks[name].admits(now, leaving=FIRST_LIVES if is_first else 0.0)
         if not is_admitted:
-            self._rest(of, now)
+            self._rest("starts" if is_first else RESTFUL.get(name), now)
         return is_admitted
 
-    def _rest(self, of: Restful, now: float) -> None:
+    def _rest(self, of: Restful | None, now: float) -> None:
         """Have no more of these events made, as long as nobody else wants them."""
         if self._storm_since is None and of != "starts":
             self._storm_since = now
-        self._node.events.rest(of)
+        if of is not None:
+            self._node.events.rest(of)
         if self._storm_timer is None:
             self._storm_timer = self._later(PACE, self._look)
 
@@ -153,7 +101,7 @@ class HistoryRecorder:
         self._storm_timer = None
         self._node.events.wake()
         now = self._node.loop.time()
-        if not (self._quota.has(now, BURST / 4) and self._letter_quota.has(now, LETTER_BURST / 4)):
+        if not all(track.is_quiet(now) for track in self._tracks.values()):
             self._storm_timer = self._later(PACE, self._look)
         elif self._storm_since is not None:
             seconds, self._storm_since = now - self._storm_since, None
@@ -183,7 +131,7 @@ class HistoryRecorder:
 
     def _keep(self, event: PastEvent) -> None:
         self._last = max(self._last, event.number)
-        (self._letters if is_letter(event.kind) else self._events).add(event)
+        self._tracks[track_of(event.kind)].ring.add(event)
         self.lives.apply(event)
 
     def _later(self, seconds: float, call: Callable[[], None]) -> asyncio.TimerHandle:
@@ -199,7 +147,8 @@ class HistoryRecorder:
 
     def after(self, number: int) -> Iterator[PastEvent]:
         """The events with larger numbers that are kept, oldest first."""
-        return merge(self._events.after(number), self._letters.after(number), key=lambda event: event.number)
+        found = (track.ring.after(number) for track in self._tracks.values())
+        return merge(*found, key=lambda event: event.number)
 
     @property
     def is_in_storm(self) -> bool:
@@ -209,12 +158,12 @@ class HistoryRecorder:
     @property
     def oldest(self) -> int:
         """The smallest number of an event that is kept; 0 if there is none."""
-        return min((ring.oldest for ring in (self._events, self._letters) if ring.oldest), default=0)
+        return min((track.ring.oldest for track in self._tracks.values() if track.ring.oldest), default=0)
 
     @property
     def dropped(self) -> int:
         """Events that have given way to newer ones."""
-        return self._events.dropped + self._letters.dropped
+        return sum(track.ring.dropped for track in self._tracks.values())
 
     def changed(self) -> asyncio.Future[None]:
         """A future that ends with the next event."""

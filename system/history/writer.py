@@ -8,24 +8,21 @@ from typing import TYPE_CHECKING, Protocol
 
 from ...actors.errors import HoldfastError
 from ...actors.events import Event
-from .past_event import PastEvent, is_letter
+from .past_event import PastEvent
 from .shelf import EventShelf, events_in
+from .tracks import BOUNDS, TrackName, track_of
 
 if TYPE_CHECKING:
     import asyncio
 
     from ...actors.kernel.node import Node
 
-STORED_BYTES, STORED_LETTER_BYTES = 512 * 1024, 128 * 1024
-"""Bytes that the store keeps of events, and of dead letters."""
 PACE = 0.25
 """Seconds between two writes while events come."""
 RETRY = 30.0
 """Seconds until a store is tried again that has refused."""
 MOST_UNWRITTEN = 2_000
 """Events that wait for the store; the oldest are not written if there are more."""
-EVENTS, LETTERS = "history events ", "history letters "
-"""How the names of the notes begin."""
 
 
 class HistoryNotKept(Event, frozen=True, eq=False):
@@ -46,9 +43,14 @@ class NoteStore(Protocol):
         ...
 
 
+def prefix(track: TrackName) -> str:
+    """How the names of the notes of a track begin."""
+    return f"history {track} "
+
+
 def stored(store: NoteStore) -> list[PastEvent]:
     """What a store has of earlier roots, oldest first, each event once."""
-    found = [*events_in(store.notes(EVENTS)), *events_in(store.notes(LETTERS))]
+    found = [event for name in BOUNDS for event in events_in(store.notes(prefix(name)))]
     by_number = {event.number: event for event in found}
     return [by_number[number] for number in sorted(by_number)]
 
@@ -61,8 +63,10 @@ class HistoryWriter:
 
     def __init__(self, node: Node, store: NoteStore) -> None:
         self._node = node
-        self._shelf = EventShelf(EVENTS, store.notes(EVENTS), store.note, STORED_BYTES)
-        self._letters = EventShelf(LETTERS, store.notes(LETTERS), store.note, STORED_LETTER_BYTES)
+        self._shelves = {
+            name: EventShelf(prefix(name), store.notes(prefix(name)), store.note, bounds.stored_bytes)
+            for name, bounds in BOUNDS.items()
+        }
         self._unwritten: deque[PastEvent] = deque(maxlen=MOST_UNWRITTEN)
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0  # the next write is not before
@@ -85,8 +89,8 @@ class HistoryWriter:
         events = list(self._unwritten)
         self._unwritten.clear()
         try:
-            for shelf, is_for_letters in ((self._shelf, False), (self._letters, True)):
-                wanted = [event for event in events if is_letter(event.kind) is is_for_letters]
+            for name, shelf in self._shelves.items():
+                wanted = [event for event in events if track_of(event.kind) == name]
                 if wanted:
                     shelf.put(wanted)
         except HoldfastError as error:

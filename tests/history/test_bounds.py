@@ -13,13 +13,13 @@ import holdfast as hf
 from holdfast.actors.events import ActorCrashed, ActorStarted, ChildStopped, DeadLetter, LogLine
 from holdfast.actors.exit_reasons import SHUTDOWN, Crash, crash
 from holdfast.checkpoint.store_opening import open_journal
-from holdfast.system.history import quota, recorder, writer
+from holdfast.system.history import quota, recorder, tracks, writer
 from holdfast.system.history.lives import LivesByAddress
 from holdfast.system.history.past_event import LONGEST, PastEvent, plain_fields
 from holdfast.system.history.raised import raised_at, traceback_text
 from holdfast.system.history.ring import EventRing
 from holdfast.system.history.shelf import EventShelf, events_in
-from holdfast.system.history.writer import EVENTS, STORED_BYTES
+from holdfast.system.history.writer import prefix
 from tests.history.players import Do, Worker, failed, until
 
 
@@ -180,9 +180,14 @@ def test_a_damaged_note_is_passed_over() -> None:
 # -- storms -----------------------------------------------------------------------------------------------------------
 
 
+def others_are(monkeypatch: pytest.MonkeyPatch, **bounds: Any) -> None:
+    """Have less room for events that are neither rare nor dead letters."""
+    changed = {**tracks.BOUNDS, "others": tracks.BOUNDS["others"]._replace(**bounds)}
+    monkeypatch.setattr(recorder, "BOUNDS", changed)
+
+
 async def test_a_storm_is_recorded_in_part_and_no_more_events_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder, "BURST", 50)
-    monkeypatch.setattr(recorder, "PER_SECOND", 20.0)
+    others_are(monkeypatch, burst=50, per_second=20.0)
     async with hf.ActorSystem("app", log=False, intensity=100_000, period=0.001) as system:
         worker = await system.start(hf.child("worker", hf.start(Worker)))
         for _ in range(200):
@@ -201,7 +206,7 @@ async def test_a_storm_is_recorded_in_part_and_no_more_events_are_made(monkeypat
 
 
 async def test_who_listens_gets_all_events_of_a_storm(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder, "BURST", 10)
+    others_are(monkeypatch, burst=10, per_second=20.0)
     async with hf.ActorSystem("app", log=False, intensity=100_000, period=0.001) as system:
         with system.events() as events:
             worker = await system.start(hf.child("worker", hf.start(Worker)))
@@ -212,7 +217,7 @@ async def test_who_listens_gets_all_events_of_a_storm(monkeypatch: pytest.Monkey
 
 
 async def test_what_is_rare_is_recorded_in_the_middle_of_a_storm(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder, "BURST", 10)
+    others_are(monkeypatch, burst=10, per_second=0.001)
     async with hf.ActorSystem("app", log=False, intensity=100_000, period=0.001) as system:
         worker = await system.start(hf.child("worker", hf.start(Worker)))
         await system.start(hf.supervisor("weak", intensity=0, children=[hf.child("one", hf.start(Worker))]))
@@ -232,7 +237,7 @@ async def test_dead_letters_leave_the_others_alone() -> None:
             worker.tell(Do("well"))
         assert system.dead_letters == 3_000
         letters = system.history(kinds=["DeadLetter"]).events
-        assert recorder.LETTER_BURST <= len(letters) < 600
+        assert tracks.BOUNDS["letters"].burst <= len(letters) < 600
         assert not system._node.events.hears_letters
         assert [one.kind for one in system.history(worker.path).events][:2] == ["ActorStarted", "ActorCrashed"]
 
@@ -242,6 +247,19 @@ def test_the_start_of_a_crowd_leaves_room_for_what_follows() -> None:
     taken = sum(bucket.take(0.0, least=50.0) for _ in range(1_000))
     assert taken == 51
     assert sum(bucket.take(0.0) for _ in range(1_000)) == 49
+
+
+async def test_a_storm_does_not_drive_out_what_is_rare(monkeypatch: pytest.MonkeyPatch) -> None:
+    others_are(monkeypatch, most=20)
+    async with hf.ActorSystem("app", log=False, intensity=100_000, period=0.001) as system:
+        worker = await system.start(hf.child("worker", hf.start(Worker)))
+        system._node.emit(hf.events.MessageQuarantined("/app/worker", "tests:Do", 3))
+        for _ in range(50):
+            await failed(worker, "crash")
+        events = system.history(worker).events
+        assert [one.kind for one in events].count("MessageQuarantined") == 1
+        assert len(events) <= 21
+        assert system.history().dropped > 100
 
 
 async def test_lines_and_snapshots_are_not_kept() -> None:
@@ -264,8 +282,8 @@ async def test_the_store_has_a_bounded_part_of_it(tmp_path: Path) -> None:
                     await asyncio.sleep(0.3)
     engine = open_journal(store, takeover=False)
     try:
-        notes = engine.notes(EVENTS)
-        assert sum(map(len, notes.values())) <= STORED_BYTES + 64 * 1024
+        notes = engine.notes(prefix("others"))
+        assert sum(map(len, notes.values())) <= tracks.BOUNDS["others"].stored_bytes + 64 * 1024
         kept = [one.number for one in events_in(notes)]
         assert kept == list(range(kept[0], kept[-1] + 1))
     finally:

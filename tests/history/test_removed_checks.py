@@ -16,23 +16,30 @@ OUTSIDE = "tests/history/test_from_outside.py"
 
 CHECKS = {
     "in a storm a part is recorded": Check(
-        "system/history/recorder.py",
-        "            is_admitted = self._quota.take(now)\n        if not",
-        "            is_admitted = True\n        if not",
+        "system/history/tracks.py",
+        "        return self._quota.take(now, least=max(1.0, leaving * self._burst))\n",
+        "        return True\n",
         BOUNDS,
         "test_a_storm_is_recorded_in_part_and_no_more_events_are_made",
     ),
-    "what is rare has no quota": Check(
-        "system/history/recorder.py",
-        "(kind in IN_STORMS and not self._admits(event, kind))",
-        "(not self._admits(event, kind))",
+    "what is rare has a quota of its own": Check(
+        "system/history/tracks.py",
+        '    if kind in RARE:\n        return "rare"\n',
+        "",
         BOUNDS,
         "test_what_is_rare_is_recorded_in_the_middle_of_a_storm",
     ),
-    "dead letters have a ring of their own": Check(
+    "what is rare has a ring of its own": Check(
         "system/history/recorder.py",
-        "            is_admitted = self._letter_quota.take(now)\n",
-        "            is_admitted = True\n",
+        "        self._tracks[track_of(event.kind)].ring.add(event)\n",
+        '        self._tracks["others"].ring.add(event)\n',
+        BOUNDS,
+        "test_a_storm_does_not_drive_out_what_is_rare",
+    ),
+    "dead letters have a quota of their own": Check(
+        "system/history/tracks.py",
+        '    return "letters" if kind in LETTERS else "others"\n',
+        '    return "others"\n',
         BOUNDS,
         "test_dead_letters_leave_the_others_alone",
     ),

@@ -8,7 +8,7 @@ from pathlib import Path
 import holdfast as hf
 from holdfast.system.history.past_event import PastEvent
 from holdfast.system.history.shelf import EventShelf
-from holdfast.system.history.writer import EVENTS, stored
+from holdfast.system.history.writer import prefix, stored
 from tests.history.conftest import ROOT
 from tests.history.players import Do, Worker
 
@@ -57,7 +57,7 @@ async def test_the_next_root_knows_what_was_before_the_kill(tmp_path: Path) -> N
 def test_an_event_that_was_written_twice_is_there_once() -> None:
     """A store that has failed in the middle of a write is given the same events again."""
     notes: dict[str, bytes] = {}
-    shelf = EventShelf(EVENTS, {}, lambda name, value: notes.update({name: value or b""}), 50_000)
+    shelf = EventShelf(prefix("others"), {}, lambda name, value: notes.update({name: value or b""}), 50_000)
     events = [PastEvent(number, 1.0, "HookFailed", "/app", {}) for number in (1, 2, 3)]
     shelf.put(events[:2])
     shelf.put(events)
