@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from ...actors.control.orders import Status
-from ...actors.errors import portable
 from ...actors.kernel.cell import GONE
 from ...actors.kernel.envelope import Ask, message_in
 from ...actors.process.process_host import Outlet
@@ -17,7 +16,7 @@ from ...supervision.intensity import recent_restarts
 from ...supervision.supervisor import Supervisor
 from .lives import PastLife
 from .pages import answer, question
-from .past_event import PastEvent, message_type, shortened
+from .past_event import PastEvent, content, message_type, shortened
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
@@ -142,7 +141,7 @@ def collect(
 def put_aside(one: QuarantinedMessage, *, payloads: bool = False) -> PutAside:
     """A message in quarantine as plain data; what is in it only with `payloads`."""
     name = one.kind if one.message is None else message_type(one.message)
-    payload = shortened(portable(str(one.message))) if payloads and one.message is not None else ""
+    payload = shortened(content(one.message)) if payloads and one.message is not None else ""
     return PutAside(one.address, name, one.attempts, one.since, one.sender or "", one.id, payload)
 
 

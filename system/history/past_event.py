@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import msgspec
 
-from ...actors.errors import portable
+from ...actors.errors import portable, type_name
 from ...actors.events import (
     TRACED,
     ActorCrashed,
@@ -72,11 +72,13 @@ class PastEvent(msgspec.Struct, frozen=True):
 
 
 def shortened(text: str, most: int = LONGEST) -> str:
-    """A text of at most about `most` characters: its beginning and its end.
+    """A text of at most about `most` characters, its beginning and its end, that any store and any border takes.
 
-    >>> shortened("a" * 5 + "b" * 5, 4)
-    'aa [6 characters left out] bb'
+    >>> shortened("a" * 5 + "b" * 5, 4), shortened("half a pair: \\ud800")
+    ('aa [6 characters left out] bb', 'half a pair: ?')
     """
+    if not text.isascii():
+        text = portable(text)
     if len(text) <= most:
         return text
     half = most // 2
@@ -102,15 +104,15 @@ def plain_fields(event: Event, *, payloads: bool = False) -> dict[str, Plain]:
             fields[name] = shortened(str(value))
             fields[f"{name}_kind"] = kind.__name__
             if isinstance(value, Crash) and isinstance(event, TELL_WHERE):
-                fields["traceback"] = traceback_text(value)
-        elif isinstance(value, (Message, Item, MessageText)):
+                fields["traceback"] = shortened(traceback_text(value), 2 * LONGEST)
+        elif isinstance(value, (Message, Item, MessageText, Parcel)):
             _put_message(fields, value, payloads=payloads)
         elif isinstance(value, (tuple, list)):
             fields[name] = [shortened(str(one), 200) for one in value[:MOST_ITEMS]]
         elif isinstance(value, dict):
             fields[name] = {str(key): round(float(one), 6) for key, one in list(value.items())[:MOST_ITEMS]}
         else:
-            fields[name] = shortened(portable(str(value)))
+            fields[name] = shortened(content(value))
     return fields
 
 
@@ -122,6 +124,14 @@ def _names(kind: type[Event]) -> tuple[str, ...]:
 def _dotted(name: str) -> str:
     """The type of a message as people write it; homes know it by its wire name, `module:Class`."""
     return name.replace(":", ".", 1)
+
+
+def content(value: object) -> str:
+    """A value as text; a user's `__str__` may itself raise, and whoever tells an event must not be hurt by that."""
+    try:
+        return str(value)
+    except Exception as error:
+        return f"<its text cannot be shown: {type_name(type(error))}>"
 
 
 def message_type(value: object) -> str:
@@ -136,4 +146,4 @@ def _put_message(fields: dict[str, Plain], value: Any, *, payloads: bool) -> Non
         fields["sender"] = value.sender.path
     if payloads:
         message = message_of(value)
-        fields["payload"] = shortened(portable(str(value if message is None else message)))
+        fields["payload"] = shortened(content(value if message is None else message))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ...actors.events import ActorStarted, ChildStopped, ChildTerminated, Event, Restful
 from .authors import author
 from .lives import LivesByAddress
-from .past_event import UNKEPT, PastEvent, Plain, plain_fields
+from .past_event import UNKEPT, PastEvent, Plain, plain_fields, shortened
 from .tracks import BOUNDS, EventTrack, TrackName, track_of
 from .writer import PACE, HistoryWriter, NoteStore, stored
 
@@ -119,7 +119,7 @@ class HistoryRecorder:
         self._add(kind, f"/{self._node.name}", fields)
 
     def _add(self, kind: str, address: str, fields: dict[str, Plain]) -> None:
-        event = PastEvent(self._last + 1, self._node.clock.wall(), kind, address, fields)
+        event = PastEvent(self._last + 1, self._node.clock.wall(), kind, shortened(address), fields)
         self._keep(event)
         if self._writer is not None:
             self._writer.add(event)

@@ -12,6 +12,7 @@ import pytest
 import holdfast as hf
 from holdfast.actors.events import ActorCrashed, ActorStarted, ChildStopped, DeadLetter, LogLine
 from holdfast.actors.exit_reasons import SHUTDOWN, Crash, crash
+from holdfast.actors.kernel.codec import Parcel
 from holdfast.checkpoint.store_opening import open_journal
 from holdfast.system.history import quota, recorder, tracks, writer
 from holdfast.system.history.lives import LivesByAddress
@@ -44,6 +45,31 @@ def test_of_a_message_its_type_is_kept_and_its_content_only_if_wanted() -> None:
     payload = plain_fields(letter, payloads=True)["payload"]
     assert isinstance(payload, str)
     assert len(payload) < LONGEST + 100
+
+
+class Broken(hf.Message):
+    data: str = ""
+
+    def __str__(self) -> str:
+        raise ValueError("no text")
+
+
+def test_what_cannot_be_shown_or_written_hurts_nobody() -> None:
+    payload = plain_fields(DeadLetter("/app/one", Broken(), "nobody"), payloads=True)["payload"]
+    assert payload == "<its text cannot be shown: ValueError>"
+    try:
+        raise KeyError("half a pair: \ud800")
+    except KeyError as error:
+        fields = plain_fields(ActorCrashed("/app/one", 1, crash(error), DeadLetter))
+    odd = PastEvent(1, 1.0, "HookFailed", "/app", {**fields, **plain_fields(LogLine("/", "\ud800", "\udfff"))})
+    notes: dict[str, bytes] = {}
+    EventShelf("h ", {}, lambda name, value: notes.update({name: value or b""}), 50_000).put([odd])
+    assert events_in(notes) == [odd]
+
+
+def test_of_a_message_whose_class_is_not_known_the_type_is_kept() -> None:
+    letter = DeadLetter("/app/one", Parcel("shop:Pay", b"secret"), "nobody")
+    assert plain_fields(letter)["message"] == "shop.Pay"
 
 
 def test_an_error_leaves_no_frame_in_memory() -> None:
