@@ -34,7 +34,7 @@ MIB = 1024 * 1024
 BOUNDS: Mapping[TrackName, TrackBounds] = MappingProxyType(
     {
         "rare": TrackBounds(2_000, 2 * MIB, 256 * 1024, 1_000, 100.0),
-        "others": TrackBounds(5_000, 4 * MIB, 512 * 1024, 1_000, 200.0),
+        "others": TrackBounds(5_000, 4 * MIB, 512 * 1024, 1_000, 100.0),
         "letters": TrackBounds(1_000, MIB, 128 * 1024, 500, 50.0),
     }
 )
