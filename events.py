@@ -6,9 +6,11 @@ from .actors.events import (
     AutoShutdown,
     ChildRestarted,
     ChildStartFailed,
+    ChildStopped,
     ChildTerminated,
     DeadLetter,
     EffectRepeated,
+    EndedByLink,
     Event,
     EventStream,
     HeldMessages,
@@ -78,6 +80,7 @@ from .ftm.events import (
     TurnHung,
     WrongSuspicion,
 )
+from .system.history.writer import HistoryNotKept
 from .system.mechanism_notes import AdaptationUndone
 from .system.specification import SpecificationNotKept, SpecificationSuperseded
 from .system.transaction.events import (
@@ -95,15 +98,18 @@ __all__ = [
     "BackgroundWorkLost",
     "ChildRestarted",
     "ChildStartFailed",
+    "ChildStopped",
     "ChildTerminated",
     "DeadLetter",
     "Diverged",
     "EffectRepeated",
+    "EndedByLink",
     "Event",
     "EventStream",
     "FailedOver",
     "FrameRefused",
     "HeldMessages",
+    "HistoryNotKept",
     "HookFailed",
     "JournalBlocked",
     "JournalFull",

@@ -7,7 +7,7 @@ import functools
 import typing
 from collections import deque
 from collections.abc import AsyncIterator, Callable
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
@@ -54,10 +54,11 @@ class LifeAbandoned(Event, frozen=True, eq=False):
 
 
 class DeadLetter(Event, frozen=True, eq=False):
-    """Nobody handles this message, for the reason that `why` gives."""
+    """Nobody handles this message, for the reason that `why` gives; `sender` is an actor's address, if known."""
 
     message: Any
     why: str
+    sender: str = ""
 
 
 class ChildRestarted(Event, frozen=True, eq=False):
@@ -80,6 +81,26 @@ class ChildTerminated(Event, frozen=True, eq=False):
     reason: ExitReason
     restarts: int = 0
     allowed: int = 0
+
+
+class ChildStopped(Event, frozen=True, eq=False):
+    """A child has ended because it was told to, or a transient one because its work is done.
+
+    `by` is the address of the actor that has called for it: the child itself, its supervisor, or who has asked its
+    supervisor; "" if that was no actor. `because` says why in words.
+    """
+
+    life: int
+    reason: ExitReason
+    by: str
+    because: str
+
+
+class EndedByLink(Event, frozen=True, eq=False):
+    """An actor ends because one that it is linked to, `peer`, has ended abnormally."""
+
+    peer: str
+    reason: ExitReason
 
 
 class ChildStartFailed(Event, frozen=True, eq=False):
@@ -408,6 +429,10 @@ TRACED = (MessageIn, TurnBegan, TurnEnded, MessageOut)
 """What is told to those who trace the actor, and to nobody else."""
 
 
+Restful = Literal["letters", "starts", "others"]
+"""Dead letters, the first lives at addresses, and all other events: what a recorder may rest from."""
+
+
 class EventStream:
     """One listener's view: an async iterator over events, with a bound on how far it may fall behind.
 
@@ -488,11 +513,17 @@ class EventHub:
     def __init__(self, changed: Callable[[bool], None] = lambda anybody: None) -> None:
         self._changed = changed  # told whether there is anybody at all
         self.has_listeners = False  # else events are not even made
+        self.hears_letters = False  # the same of dead letters,
+        self.hears_starts = False  # and of the first lives at addresses
         self._streams: list[EventStream] = []
         self._sinks: list[Callable[[Event], None]] = []
+        self._recorder: Callable[[Event], None] | None = None
+        self._resting: set[Restful] = set()  # of what the recorder has had enough for now
 
     def emit(self, event: Event) -> None:
         """Give the event to every listener and sink."""
+        if self._recorder is not None:
+            self._recorder(event)
         for stream in self._streams:
             stream.put(event)
         for sink in self._sinks:
@@ -501,6 +532,21 @@ class EventHub:
     def add_sink(self, sink: Callable[[Event], None]) -> None:
         """Call `sink` with every event, at once."""
         self._sinks.append(sink)
+        self._count()
+
+    def record(self, recorder: Callable[[Event], None]) -> None:
+        """Call `recorder` with every event. Unlike a sink it may rest while there are too many."""
+        self._recorder = recorder
+        self._count()
+
+    def rest(self, of: Restful) -> None:
+        """The recorder has had enough of these events: make none for it alone until `wake`."""
+        self._resting.add(of)
+        self._count()
+
+    def wake(self) -> None:
+        """The recorder takes all events again."""
+        self._resting.clear()
         self._count()
 
     def listen(self, most: int = 10_000) -> EventStream:
@@ -517,7 +563,11 @@ class EventHub:
         self._count()
 
     def _count(self) -> None:
-        self.has_listeners = bool(self._streams or self._sinks)
+        anybody = bool(self._streams or self._sinks)
+        records = self._recorder is not None
+        self.has_listeners = anybody or (records and "others" not in self._resting)
+        self.hears_letters = anybody or (records and "letters" not in self._resting)
+        self.hears_starts = anybody or (records and not self._resting & {"starts", "others"})
         self._changed(self.has_listeners)
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from .. import HoldfastError, run
-from . import operate, upgrade_commands
+from . import history_commands, operate, upgrade_commands
 from .store_commands import store
 
 commands = typer.Typer(
@@ -74,6 +74,11 @@ def demo(
 commands.command()(operate.apply)
 commands.command()(operate.tree)
 commands.command()(operate.status)
+commands.command()(history_commands.why)
+commands.command()(history_commands.history)
+commands.command()(history_commands.events)
+commands.command("dead-letters")(history_commands.dead_letters)
+commands.command()(history_commands.quarantine)
 commands.command("check-upgrade")(upgrade_commands.check)
 commands.command("replay")(upgrade_commands.replay)
 commands.add_typer(store)

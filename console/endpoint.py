@@ -21,12 +21,18 @@ from ..actors.ordered import Ordered
 from ..actors.process.wire.frame_buffer import LENGTH
 from ..actors.streams import Listener
 from ..actors.values import encode_value
+from ..system.history.authors import ACTING, OPERATOR
+from ..system.history.pages import HistoryPage
 from ..system.script import check_folders
 from ..system.system import ActorSystem
 from .trust import Needed, trusted_imports
 from .wire import (
     REQUEST,
     AnyRequest,
+    AskHistory,
+    AskLives,
+    AskQuarantined,
+    AskWhy,
     BadRequest,
     ControlActor,
     ControlResponse,
@@ -292,6 +298,7 @@ class Endpoint:
 
     async def _respond(self, request: AnyRequest) -> ControlResponse:
         try:
+            ACTING.set(OPERATOR)  # In the context of the task of this request.
             async with asyncio.timeout(LONGEST):
                 value = await self._do(request)
             return ControlResponse(encode_value(value))
@@ -309,6 +316,25 @@ class Endpoint:
                 return await self._control(request)
             case Transact():
                 return await self._transact(request)
+            case AskHistory():
+                return msgspec.to_builtins(await self._history(request))
+            case AskLives():
+                return msgspec.to_builtins(system.lives(request.path))
+            case AskWhy():
+                return await system.why(request.path, timeout=min(request.timeout, LONGEST))
+            case AskQuarantined():
+                return msgspec.to_builtins(system.put_aside(request.path))
+
+    async def _history(self, request: AskHistory) -> HistoryPage:
+        """A page; its question comes from elsewhere, and is checked as everybody's is."""
+        asked = request.question
+        page = self._system.history(
+            asked.path, kinds=asked.kinds, since=asked.since, until=asked.until, after=asked.after, limit=asked.limit
+        )
+        if page.events or not request.wait:
+            return page
+        after, wait = page.next, min(request.wait, LONGEST)
+        return await self._system.follow_history(asked.path, kinds=asked.kinds, after=after, timeout=wait)
 
     async def _control(self, request: ControlActor) -> Any:
         system, timeout = self._system, min(request.timeout, LONGEST)

@@ -8,10 +8,12 @@ import os
 import socket
 import threading
 import uuid
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
+
+import msgspec
 
 from ..actors.control.orders import Change as StateChange
 from ..actors.control.orders import Status
@@ -22,10 +24,17 @@ from ..actors.process.wire.frame_buffer import LENGTH
 from ..actors.seconds import check_seconds
 from ..ftm.group.protected import ProtectionStatus
 from ..supervision.spec import NAMELESS, ChildSpec, Isolation, Strategy, child
+from ..system.history.evidence import PutAside
+from ..system.history.lives import PastLife
+from ..system.history.pages import MOST_ON_PAGE, HistoryPage, question
 from ..system.transaction.operation import Step
 from .wire import (
     RESPONSE,
     AnyRequest,
+    AskHistory,
+    AskLives,
+    AskQuarantined,
+    AskWhy,
     ControlActor,
     Transact,
     Tree,
@@ -196,6 +205,44 @@ class RemoteSystem:
         args = [] if on is None else [int(on)]
         counts: Statistics | None = await self._control("statistics", ref, timeout, *args, changes=on is not None)
         return counts
+
+    # -- its past -----------------------------------------------------------------------------------------------------
+
+    def history(
+        self,
+        target: RemoteTarget = "**",
+        *,
+        kinds: Sequence[str] = (),
+        since: float = 0.0,
+        until: float = float("inf"),
+        after: int | None = None,
+        limit: int = MOST_ON_PAGE,
+    ) -> HistoryPage:
+        """Past events, oldest first; see `ActorSystem.history`."""
+        asked = question(text_of(target), kinds=kinds, since=since, until=until, after=after, limit=limit)
+        return msgspec.convert(self._client.call(AskHistory(asked), 10.0), HistoryPage)
+
+    async def follow_history(
+        self, target: RemoteTarget = "**", *, after: int, kinds: Sequence[str] = (), timeout: float = 30.0
+    ) -> HistoryPage:
+        """Past events behind `after`, as soon as there is one; see `ActorSystem.follow_history`."""
+        check_seconds("follow_history", "timeout", timeout)
+        asked = question(text_of(target), kinds=kinds, after=after)
+        return msgspec.convert(await self.call(AskHistory(asked, timeout), timeout), HistoryPage)
+
+    def lives(self, target: RemoteTarget) -> list[PastLife]:
+        """The newest lives at an address, oldest first."""
+        return msgspec.convert(self._client.call(AskLives(text_of(target)), 10.0), list[PastLife])
+
+    async def why(self, target: RemoteTarget, *, timeout: float = 5.0) -> list[str]:
+        """Why an actor restarts, has ended, or does not get on, in sentences."""
+        check_seconds("why", "timeout", timeout)
+        return msgspec.convert(await self.call(AskWhy(text_of(target), timeout), timeout), list[str])
+
+    def put_aside(self, target: RemoteTarget | None = None) -> list[PutAside]:
+        """The messages in quarantine, of one actor or of all, oldest first."""
+        path = None if target is None else text_of(target)
+        return msgspec.convert(self._client.call(AskQuarantined(path), 10.0), list[PutAside])
 
     # -- orders to one actor ------------------------------------------------------------------------------------------
 

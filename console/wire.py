@@ -21,6 +21,7 @@ from ..actors.process.wire.frame_buffer import LENGTH
 from ..actors.process.wire.start_codec import pack_data, pack_recipe, unpack_data, unpack_recipe
 from ..actors.values import decode_value, encode_value
 from ..supervision.spec import ChildSpec
+from ..system.history.pages import HistoryQuestion
 
 CREDENTIALS = struct.Struct("3i")
 
@@ -189,7 +190,33 @@ class Transact(ControlRequest, tag="transaction", frozen=True):
     script: tuple[str, str] | None = None
 
 
-AnyRequest = Tree | Whereis | ControlActor | Transact
+class AskHistory(ControlRequest, tag="history", frozen=True):
+    """Past events, as `ActorSystem.history` takes the question; with `wait`, until there is one, or for so long."""
+
+    question: HistoryQuestion
+    wait: float = 0.0
+
+
+class AskLives(ControlRequest, tag="lives", frozen=True):
+    """The newest lives at an address."""
+
+    path: str
+
+
+class AskWhy(ControlRequest, tag="why", frozen=True):
+    """Why an actor is as it is, in sentences."""
+
+    path: str
+    timeout: float
+
+
+class AskQuarantined(ControlRequest, tag="quarantined", frozen=True):
+    """The messages in quarantine, of one address or of all."""
+
+    path: str | None
+
+
+AnyRequest = Tree | Whereis | ControlActor | Transact | AskHistory | AskLives | AskWhy | AskQuarantined
 REQUEST: msgspec.msgpack.Decoder[AnyRequest] = msgspec.msgpack.Decoder(AnyRequest)
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from ..actors.errors import NoSuchActor, StartFailed, type_name
+from ..actors.events import ChildStopped
 from ..actors.exit_reasons import ExitReason
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.envelope import Item
@@ -90,6 +91,13 @@ def new_cell(own: Cell, one: Child) -> Cell:
         assert target is not None
         node.bind(cell, port, target, is_claimed=is_claimed)
     return cell
+
+
+def tell_stopped(cell: Cell, by: str, because: str) -> None:
+    """Tell that a life has ended because it was called for; see `ChildStopped`."""
+    node = cell.node
+    if node.events.has_listeners:
+        node.emit(ChildStopped(cell.path, cell.life, cell.extra().reason, by, because))
 
 
 class StartRow:

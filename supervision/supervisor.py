@@ -47,6 +47,7 @@ from .children import (
     begin_start,
     complete,
     new_cell,
+    tell_stopped,
 )
 from .decisions import affected, decide, is_reported
 from .errands import Errand, answered
@@ -378,7 +379,10 @@ class Supervisor(Inquiries):
         """Tell that a child has ended without having been told to."""
         one.ignored_life = life
         node = self.ctx._cell.node
-        if node.events.has_listeners and is_reported(one.spec.restart, reason):
+        if not is_reported(one.spec.restart, reason):
+            if one.spec.restart == "transient" and one.cell is not None:
+                tell_stopped(one.cell, one.cell.path, "its work is done")
+        elif node.events.has_listeners:
             allowed, period = self._flags.intensity, self._flags.period
             restarts = len(recent_restarts(self._restarts, node.loop.time(), period))
             node.emit(ChildTerminated(self._path_of(one), reason, restarts, allowed))
@@ -509,10 +513,11 @@ class Supervisor(Inquiries):
         """Stop the others newest first, then start all of them in order; siblings wait for one that takes its time."""
         running = [one for one in group if one is not failed and one.state != STOPPED]
         row = StartRow(group, RESTARTING)
+        because = f"{self._path_of(failed)} has ended, and they are restarted together ({self._flags.strategy})"
         for one in reversed(running):
             if one.row is not row:
                 continue
-            await self._stop(one, row=row)
+            await self._stop(one, row=row, because=because)
             if one.row is row and one.spec.restart == "temporary":
                 self._give_up_address(one, SHUTDOWN)
         while (other := row.next()) is not None:
@@ -541,11 +546,19 @@ class Supervisor(Inquiries):
 
     # -- stopping ---------------------------------------------------------------------------------------------------
 
-    async def _stop(self, one: Child, reason: ExitReason = SHUTDOWN, *, row: StartRow | None = None) -> None:
+    async def _stop(
+        self,
+        one: Child,
+        reason: ExitReason = SHUTDOWN,
+        *,
+        row: StartRow | None = None,
+        by: str | None = None,
+        because: str = "its supervisor has stopped it",
+    ) -> None:
         """Stop a child as its spec says, and wait for its end; its address and queue stay.
 
         `row` is that with which it will be started again; without one, whoever waits for its start hears that it was
-        stopped.
+        stopped. `by` and `because` are told with its end: who has called for it (None: we), and why.
         """
         cell = one.cell
         one.retry += 1
@@ -559,6 +572,7 @@ class Supervisor(Inquiries):
         if cell.state is not DOWN:
             one.state = STOPPING
             await one.spec.stop(cell, reason)
+            tell_stopped(cell, self.ctx.path if by is None else by, because)
         elif starting is not None:
             cell.kill()
         if one.row is row:
@@ -577,7 +591,10 @@ class Supervisor(Inquiries):
             if one is not None:
                 self._has_ended(one)
             if child.parent is self.ctx._cell:  # Else it was given to another supervisor while we stopped others.
+                is_living = child.state not in (DOWN, GONE)
                 await child.node.stop_child(child)
+                if is_living:
+                    tell_stopped(child, self.ctx.path, "its supervisor has ended")
 
     def _is_parked(self, name: str) -> bool:
         """Whether this child was stopped by order, and not started since; also if it is forgotten by now."""
@@ -601,6 +618,11 @@ class Supervisor(Inquiries):
             self._report_end(one, cell.life, cell.extra().reason)
 
     # -- administration ---------------------------------------------------------------------------------------------
+
+    def _asker(self) -> str:
+        """The address of the actor whose request we handle in this turn; "" if no actor has asked."""
+        item = self.ctx._item
+        return item.sender.path if isinstance(item, Item) and item.sender is not None else ""
 
     @on(StartChild)
     def _start_child(self, message: StartChild) -> ReplyHandle[Any]:
@@ -684,6 +706,7 @@ class Supervisor(Inquiries):
         return self._answered(self._remove(message))
 
     async def _remove(self, message: RemoveChild) -> None:
+        by = self._asker()
         if message.candidate:
             one = self._candidate(message.id, message.candidate)
             if one is None:
@@ -695,7 +718,7 @@ class Supervisor(Inquiries):
             self._parked.add(message.id)
         self._forget(one)  # From here on nobody starts it again, with others or by itself.
         reason = SHUTDOWN if message.reason is None else unpack_exit(message.reason)
-        await self._stop(one, reason)
+        await self._stop(one, reason, by=by, because="it was removed by order")
         if self._has_lost(one):
             raise NoSuchChild(message.id)
         self._note_end(one, reason)
@@ -710,11 +733,11 @@ class Supervisor(Inquiries):
         return self._answered(self._terminate(message))
 
     async def _terminate(self, message: TerminateChild) -> None:
-        one = self._child(message.id)
+        by, one = self._asker(), self._child(message.id)
         reason = SHUTDOWN if message.reason is None else unpack_exit(message.reason)
         if message.parks:
             self._parked.add(one.spec.id)
-        await self._stop(one, reason)
+        await self._stop(one, reason, by=by, because="it was stopped by order")
         if self._has_lost(one):
             raise NoSuchChild(message.id)
         if one.row is None:  # Else it is started again with others meanwhile.
@@ -726,13 +749,13 @@ class Supervisor(Inquiries):
         return self._answered(self._begin_again(message))
 
     async def _begin_again(self, message: RestartChild) -> Any:
-        one = self._child(message.id)
+        by, one = self._asker(), self._child(message.id)
         if message.unless_parked and message.id in self._parked:
             raise ChildParked(message.id)
         self._parked.discard(message.id)
         if message.running and one.state == UP:
             row = StartRow((one,), RESTARTING)
-            await self._stop(one, row=row)
+            await self._stop(one, row=row, by=by, because="it was restarted by order")
             if one.row is not row:  # Whoever has it now says what becomes of it.
                 raise StartFailed(self._path_of(one), "it was stopped, or started by somebody else, meanwhile")
             one.state = STOPPED

@@ -3,14 +3,22 @@
 from ..actors.control.live_state import Opaque
 from ..actors.control.orders import Status
 from ..actors.control.tracing import Statistics
+from .history.evidence import PutAside
+from .history.lives import PastLife
+from .history.pages import HistoryPage
+from .history.past_event import PastEvent
 from .portal import ThreadPortal
 from .transaction.change import Change
 from .transaction.operation import Operation, Step
 
 __all__ = [
     "Change",
+    "HistoryPage",
     "Opaque",
     "Operation",
+    "PastEvent",
+    "PastLife",
+    "PutAside",
     "Statistics",
     "Status",
     "Step",

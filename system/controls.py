@@ -39,6 +39,7 @@ from ..checkpoint.places.far_parent import SlotPlace
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Isolation
 from ..supervision.supervisor import Supervisor
+from .history.recorder import HistoryRecorder, expect_end
 from .live_moves import Moves, check_isolation
 from .transaction.errors import TransactionFailed
 from .transaction.mechanisms import Isolate
@@ -60,6 +61,7 @@ class Controls:
     """
 
     _moves: Moves
+    _history: HistoryRecorder | None
 
     @property
     def _node(self) -> Node:
@@ -267,6 +269,7 @@ class Controls:
         check_seconds(ref.path, "timeout", timeout)
         cell = self._living(ref)
         gone = cell.ended()
+        expect_end(self._history, cell.path, "it was terminated")
         cell.request_stop(reason)
         done, _ = await asyncio.wait((gone,), timeout=timeout)
         if not done:

@@ -71,6 +71,7 @@ from ..ftm.events import (
     ReplicaLost,
     TurnHung,
 )
+from .history.writer import HistoryNotKept
 from .mechanism_notes import AdaptationUndone
 from .specification import SpecificationNotKept
 from .transaction.events import ScriptLoaded, TransactionCommitted, TransactionRolledBack
@@ -217,6 +218,7 @@ WRITTEN: dict[type, tuple[int, str]] = {
     JournalGoesOn: (logging.INFO, "journal goes on"),
     JournalStopped: (logging.CRITICAL, "journal stopped"),
     StoreRefused: (logging.ERROR, "store refused"),
+    HistoryNotKept: (logging.WARNING, "history not kept"),
     LogLine: (logging.INFO, "output"),
     Moved: (logging.INFO, "actor moved"),
     ScriptLoaded: (logging.INFO, "code loaded"),

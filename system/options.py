@@ -32,6 +32,7 @@ class SystemOptions:
     preload: tuple[str, ...]
     log: bool
     log_payloads: bool
+    history: bool
     seed: int | None
     takeover: bool
     watch_lag: float | None

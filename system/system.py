@@ -39,11 +39,14 @@ from ..checkpoint.recovery_settings import RecoveryHooks
 from ..checkpoint.store_key import StoreKey
 from ..checkpoint.store_opening import check_system, open_journal
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
+from ..supervision.children import tell_stopped
 from ..supervision.patience import end_within
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor, kill_starting
 from .controls import Controls
+from .history.calls import Remembering
+from .history.recorder import HistoryRecorder, expect_end
 from .live_moves import Moves
 from .logs import LogSink
 from .mechanism_notes import MechanismNotes, check_no_part
@@ -69,7 +72,7 @@ LONG = 365 * 86_400.0
 """Seconds `start` and `stop` wait: no limit of their own, the child specs say how long a start or an end may take."""
 
 
-class ActorSystem(Recorded, Controls):
+class ActorSystem(Recorded, Controls, Remembering):
     """A tree of actors: an async context manager that lives in whatever loop it is entered in.
 
     Args:
@@ -86,6 +89,7 @@ class ActorSystem(Recorded, Controls):
         log: write crashes, dead letters, output of processes and the like to structlog or standard logging, whichever
             the program has set up (docs/operating.md).
         log_payloads: write what was in the message that an actor has crashed in; else only its type is written.
+        history: keep what has happened, in memory and in the store, for `history`, `lives` and `why` (docs/history.md).
         seed: for `ctx.random` of actors without a journal; random if left out.
         watch_lag: tell (LoopLagged) when this process's event loop comes later than this many seconds.
         watch_turns: tell (TurnSlow) of turns in this process that occupy the loop for longer than this many seconds.
@@ -110,6 +114,7 @@ class ActorSystem(Recorded, Controls):
         preload: Sequence[str] = (),
         log: bool = True,
         log_payloads: bool = False,
+        history: bool = True,
         seed: int | None = None,
         takeover: bool = False,
         watch_lag: float | None = None,
@@ -126,6 +131,7 @@ class ActorSystem(Recorded, Controls):
             preload=tuple(preload),
             log=log,
             log_payloads=log_payloads,
+            history=history,
             seed=seed,
             takeover=takeover,
             watch_lag=watch_lag,
@@ -134,6 +140,7 @@ class ActorSystem(Recorded, Controls):
             recovery=recovery,
         )
         self._sink: LogSink | None = None
+        self._history: HistoryRecorder | None = None
         self._running: Node | None = None
         self._root: Cell | None = None
         self._body: asyncio.Task[Any] | None = None
@@ -164,6 +171,9 @@ class ActorSystem(Recorded, Controls):
             with contextlib.suppress(HoldfastError):  # What it says now is only what follows from that.
                 engine.close()
             raise
+        if options.history:
+            store = self._homes if self._homes.journal.durable else None
+            self._history = HistoryRecorder(node, store, log_payloads=options.log_payloads)
         RecoveryTree(node, self._homes).begin_with_first_home()
         self._workers = self._make_pool(node)
         if file is not None:
@@ -242,6 +252,8 @@ class ActorSystem(Recorded, Controls):
         await self._workers.close()
         await node.close()
         await self._homes.settled()
+        if self._history is not None:
+            self._history.close()
         try:
             self._homes.close()
         finally:
@@ -394,6 +406,7 @@ class ActorSystem(Recorded, Controls):
         """
         cell = ref._cell.living
         check_no_part(cell)
+        expect_end(self._history, cell.path, "it was stopped")
         caller = current.get(None)
         if caller is None or not is_below(caller._cell, cell):
             await self._stop(cell, reason, deadline if drain else None)
@@ -419,6 +432,7 @@ class ActorSystem(Recorded, Controls):
                 pass
         elif not cell.is_dead:
             await lifecycle.stop_in_time(cell, reason)
+            tell_stopped(cell, "", "it was stopped")
 
     @overload
     def ref(self, path: str) -> ActorRef[Any]: ...

@@ -379,16 +379,17 @@ class Cell(_Hot):
         """What an asker gets whose message was never run."""
         return ActorStopped(self.path, reason)
 
-    def undelivered(self, message: Message[Any], reason: str) -> None:
+    def undelivered(self, message: Message[Any], reason: str, sender: Cell | None = None) -> None:
         """A message that will not be handled: offered to `on_undelivered`, else a dead letter."""
         last = self.more.last if self.more is not None else None
         if last is None:
-            self.node.dead_letter(self, message, reason)
+            self.node.dead_letter(self, message, reason, sender)
             return
         try:
             last.on_undelivered(message)
         except BaseException as error:
-            self.node.dead_letter(self, message, f"{reason}; on_undelivered raised {type_name(type(error))}: {error}")
+            why = f"{reason}; on_undelivered raised {type_name(type(error))}: {error}"
+            self.node.dead_letter(self, message, why, sender)
 
     def __repr__(self) -> str:
         return f"<Cell {self.path} {self.state} life {self.life}>"

@@ -42,9 +42,13 @@ class Deadlines:
         if queue.timer is None:
             queue.arm()
 
+    def waiting(self) -> list[Ask]:
+        """The asks that have no outcome yet; looks at all that were made within their time-outs."""
+        return [ask for queue in self._queues.values() for ask in queue.asks if not ask.future.done()]
+
     def close(self) -> list[Ask]:
         """Forget all timers. Returns the asks that have no outcome yet."""
-        left = [ask for queue in self._queues.values() for ask in queue.asks if not ask.future.done()]
+        left = self.waiting()
         for queue in self._queues.values():
             if queue.timer is not None:
                 queue.timer.cancel()

@@ -149,7 +149,9 @@ def chain_of(item: Any) -> Chain:
 def unhandled(actor: Any, message: Any) -> object:
     """Stands in the table for types without a handler."""
     ctx: ActorContext = actor.ctx
-    ctx._cell.node.dead_letter(ctx._cell, message, f"{type(actor).__name__} has no handler for it")
+    cell = ctx._cell
+    sender = cell.item.sender if isinstance(cell.item, Item) else None
+    cell.node.dead_letter(cell, message, f"{type(actor).__name__} has no handler for it", sender)
     return None
 
 
@@ -167,7 +169,7 @@ class Envelope(Item, msgspec.Struct, eq=False):
         return actor._table[type(message)](actor, message)
 
     def undelivered(self, cell: Cell, reason: str) -> None:
-        cell.undelivered(self.message, reason)
+        cell.undelivered(self.message, reason, self.sender)
 
 
 Coroutine_ = types.CoroutineType

@@ -161,7 +161,7 @@ def begin(
     build(cell, start, context_type)
     cell.state = RUNNING
     node = cell.node
-    if node.events.has_listeners:
+    if node.events.hears_starts if cell.life == 1 else node.events.has_listeners:
         node.emit(ActorStarted(cell.path, cell.life))
     for topic in start.kind._topics:
         node.topics.subscribe(topic, cell)

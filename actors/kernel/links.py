@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from ..events import EndedByLink
 from ..exit_reasons import NOPROC, NORMAL, ExitReason
 from .envelope import LEAVE, Item
 
@@ -245,6 +246,8 @@ class Exit(Item):
             return None
         from . import lifecycle
 
+        if cell.node.events.has_listeners:
+            cell.node.emit(EndedByLink(cell.path, item.name, item.reason))
         lifecycle.finish(cell, item.reason, is_orderly=False)
         return LEAVE
 

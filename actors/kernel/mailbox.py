@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import MailboxFull
 from ..overflow import Overflow, check, decide
-from .envelope import LEAVE, Ask, Envelope, Item
+from .envelope import LEAVE, Ask, Envelope, Item, message_in
 
 if TYPE_CHECKING:
     from .cell import Cell
@@ -55,7 +55,8 @@ def admit_closing(cell: Cell, item: Any) -> None:
     if isinstance(item, Ask):
         item.fail(cell.stopped_error("it is stopping"))
     else:
-        cell.node.dead_letter(cell, item.message if isinstance(item, Envelope) else item, "the actor is stopping")
+        sender = item.sender if isinstance(item, Envelope) else None
+        cell.node.dead_letter(cell, message_in(item), "the actor is stopping", sender)
 
 
 def admit_gone(cell: Cell, item: Any) -> None:
@@ -215,7 +216,8 @@ class Bound:
         message = item.message if isinstance(item, (Envelope, Ask)) else item
         if isinstance(item, Ask):
             item.fail(MailboxFull(cell.path, self.capacity))
-        cell.node.dead_letter(cell, message, f"mailbox full ({self.capacity}, {self.overflow})")
+        sender = item.sender if isinstance(item, (Envelope, Ask)) else None
+        cell.node.dead_letter(cell, message, f"mailbox full ({self.capacity}, {self.overflow})", sender)
 
     def _lose_queued(self, cell: Cell, keep: int) -> None:
         """Drop queued messages, oldest first, until `keep` are left."""

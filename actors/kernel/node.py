@@ -32,6 +32,7 @@ from .blocking_handlers import HandlerThreads
 from .cell import DOWN, GONE, RUNNING, Cell, Host
 from .codec import Codec
 from .deadlines import Deadlines
+from .envelope import Item
 from .lifecycle import LOCAL
 from .loop import RunLoop
 from .mailbox import Bound, Bounded, admit_bounded, admit_gone
@@ -222,11 +223,12 @@ class Node(RunLoop):
         """Put an event on the stream."""
         self.events.emit(event)
 
-    def dead_letter(self, cell: Cell, message: object, why: str) -> None:
+    def dead_letter(self, cell: Cell, message: object, why: str, sender: Cell | None = None) -> None:
         """A message that nobody handles: counted, and told to who looks, opened if it came packed."""
         self.numbers.dead_letters += 1
-        if self.events.has_listeners:
-            self.events.emit(DeadLetter(cell.path, self.codec.opened(cell, message), why))
+        if self.events.hears_letters:
+            known = "" if sender is None else sender.path
+            self.events.emit(DeadLetter(cell.path, self.codec.opened(cell, message), why, known))
 
     def not_taken(self, cell: Cell, message: object, error: HoldfastError) -> None:
         """A subscriber could not take what was published.
@@ -238,8 +240,9 @@ class Node(RunLoop):
 
     def refused(self, cell: Cell, item: Any, no: Refusal) -> None:
         """A tell was answered with a Refusal: there is nobody to hand it to."""
-        if self.events.has_listeners:
-            self.events.emit(DeadLetter(cell.path, item, f"refused: {no}"))
+        if self.events.hears_letters:
+            known = item.sender.path if isinstance(item, Item) and item.sender is not None else ""
+            self.events.emit(DeadLetter(cell.path, item, f"refused: {no}", known))
 
     # -- the tree ---------------------------------------------------------------------------------------------------
 

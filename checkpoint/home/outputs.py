@@ -168,7 +168,7 @@ class Outputs:
                     source = switch.record(MESSAGE, out.name, out.body, cell.path, batch)
                     batch.after.append(lambda: switch.admitted(source))
             except MailboxFull as error:  # Its turn has gone on: there is nobody to raise this to.
-                home.node.dead_letter(target, Parcel(out.name, out.body), str(error))
+                home.node.dead_letter(target, Parcel(out.name, out.body), str(error), cell)
             return
         if self._keeps(target, out, batch, origin, cell.path):
             return
@@ -177,7 +177,7 @@ class Outputs:
             try:
                 target.admit(target, Envelope(home.node.codec.message_in(target, out.name, out.body), cell))
             except HoldfastError as error:
-                home.node.dead_letter(target, Parcel(out.name, out.body), str(error))
+                home.node.dead_letter(target, Parcel(out.name, out.body), str(error), cell)
 
         batch.after.append(send)
 

@@ -10,6 +10,7 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.ref import ActorRef
 from ...supervision.admin import ChildBusy, NoSuchChild, NotSupported, RestartChild, TerminateChild
 from ...supervision.supervisor import Supervisor
+from ..history.recorder import expect_end
 from .arrangement import child_of
 from .draft import START_TIMEOUT, Draft, DraftPlace, Target, check_awake, is_elsewhere
 from .operation import Operation, wrong
@@ -72,6 +73,7 @@ class StopChild(OnChild):
     async def finish(self, system: ActorSystem) -> None:
         place = self._place
         assert place.parent is not None
+        expect_end(system._history, self.target, "it was stopped")
         await stop_child(place.parent.living(system._node), self._name)
 
 

@@ -11,6 +11,7 @@ from ...actors.errors import HoldfastError, error_text, type_name
 from ...actors.kernel.ref import current
 from ...actors.seconds import check_seconds
 from ...supervision.arbiter import on_errand
+from ..history.authors import ACTING, author
 from .arrangement import Arrangement
 from .change import Change
 from .draft import Draft, difference
@@ -217,6 +218,7 @@ class Transaction:
         system, shared = self._system, self._shared
         # In nobody's name: it has to go on when the life is over from whose turn it was begun.
         context = system._node.base_context.copy()
+        context.run(ACTING.set, f"a transaction of {author()}")
         work = system._node.loop.create_task(self._finish_all(), name="end of a transaction", context=context)
         shared.behind.add(work)
         work.add_done_callback(shared.behind.discard)

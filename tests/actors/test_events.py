@@ -10,6 +10,7 @@ from holdfast.actors.events import (
     ActorCrashed,
     ActorStarted,
     ChildRestarted,
+    ChildStopped,
     ChildTerminated,
     DeadLetter,
     event_data,
@@ -46,6 +47,7 @@ async def test_a_life_as_events(system: hf.ActorSystem) -> None:
         (ChildTerminated, "/t/one"),
         (ChildRestarted, "/t/one"),
         (ActorStarted, "/t/one"),
+        (ChildStopped, "/t/one"),
         (DeadLetter, "/t/one"),
     ]
     assert [event.life for event in events if isinstance(event, ActorStarted)] == [1, 2]
@@ -111,7 +113,12 @@ async def test_a_listener_that_falls_behind_loses_the_oldest_and_is_told_how_man
         assert [event.address for event in stream.take()] == ["/t/c", "/t/d"]
 
 
-async def test_with_nobody_looking_no_event_is_made(system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_with_nobody_looking_no_event_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with hf.ActorSystem("t", log=False, history=False) as system:
+        await no_event_is_made(system, monkeypatch)
+
+
+async def no_event_is_made(system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch) -> None:
     emitted: list[Any] = []
     hub = system._node.events
     monkeypatch.setattr(hub, "emit", emitted.append)

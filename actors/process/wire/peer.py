@@ -219,8 +219,8 @@ class Peer:
             message = self._message_in(cell, frame)
         except HoldfastError as error:
             name = self.connection.names.from_wire(frame.name) if type(frame.name) is int else str(frame.name)
-            self._sender(frame.sender)
-            self.node.dead_letter(cell, Parcel(name, bytes(frame.body)), str(error))
+            sender = self._sender(frame.sender)
+            self.node.dead_letter(cell, Parcel(name, bytes(frame.body)), str(error), sender)
             if page is not None:
                 page[1] = frame.number
             return
@@ -231,7 +231,7 @@ class Peer:
             try:
                 cell.admit(cell, message if sender is None else Envelope(message, sender))
             except HoldfastError as error:
-                self.node.dead_letter(cell, message, str(error))
+                self.node.dead_letter(cell, message, str(error), sender)
 
     def on_offer(self, cells: Iterable[Cell], frame: frames.Offer | frames.Publish, topic: str | None = None) -> None:
         """Take in a message whose sender waits until every one of `cells` has accepted it, or left the topic."""

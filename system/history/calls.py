@@ -1,0 +1,154 @@
+"""A system's methods for its history: past events and lives, and what follows from them in words."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from ...actors.control.orders import Status
+from ...actors.errors import HoldfastError, SpecError
+from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
+from ...actors.seconds import check_seconds
+from .evidence import PutAside, collect, literal, put_aside
+from .lives import PastLife
+from .pages import MOST_ON_PAGE, HistoryPage, HistoryQuestion, answer, question
+from .recorder import HistoryRecorder
+from .why import why
+
+if TYPE_CHECKING:
+    from ...actors.kernel.node import Node
+    from ...checkpoint.home.quarantine import QuarantinedMessage
+
+SEVERAL = 20
+"""Messages in a mailbox from which on it is looked at twice."""
+BETWEEN = 0.2
+"""Seconds between the two looks."""
+
+
+class Remembering:
+    """What a system knows of its past."""
+
+    _history: HistoryRecorder | None
+
+    @property
+    def _node(self) -> Node:
+        """The node that hosts this process's actors."""
+        raise NotImplementedError
+
+    async def get_status(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Status:
+        """How an actor is."""
+        raise NotImplementedError
+
+    def quarantined(self, actor: ActorRef[Any] | str | None = None) -> list[QuarantinedMessage]:
+        """Messages that are put aside."""
+        raise NotImplementedError
+
+    def history(
+        self,
+        target: ActorRef[Any] | str = "**",
+        *,
+        kinds: Sequence[str] = (),
+        since: float = 0.0,
+        until: float = float("inf"),
+        after: int | None = None,
+        limit: int = MOST_ON_PAGE,
+    ) -> HistoryPage:
+        """Past events, oldest first: the newest `limit` of those that are meant, or the first `limit` behind `after`.
+
+        Args:
+            target: an actor, an address, or a pattern: `/app/*/till` means one name by the star, `/app/shop/**` the
+                shop and all below it.
+            kinds: the classes of events by name, such as `["ActorCrashed", "DeadLetter"]`; empty: all.
+            since, until: Unix times.
+            after: the number of an event, from `page.next`: to go on where a page ended.
+            limit: events at most, from 1 to 1000.
+
+        Raises:
+            SpecError: it cannot be asked so, or the system was made with `history=False`.
+        """
+        asked = question(_pattern(target), kinds=kinds, since=since, until=until, after=after, limit=limit)
+        return answer(self._recorder, asked)
+
+    async def follow_history(
+        self, target: ActorRef[Any] | str = "**", *, after: int, kinds: Sequence[str] = (), timeout: float = 30.0
+    ) -> HistoryPage:
+        """Past events behind `after`, as soon as there is one; an empty page if none came within `timeout` seconds.
+
+        Raises:
+            SpecError: as `history`.
+        """
+        check_seconds("follow_history", "timeout", timeout)
+        return await self._follow(question(_pattern(target), kinds=kinds, after=after), timeout)
+
+    async def _follow(self, asked: HistoryQuestion, timeout: float) -> HistoryPage:
+        recorder = self._recorder
+        try:
+            async with asyncio.timeout(timeout):
+                while not (page := answer(recorder, asked)).events:
+                    await recorder.changed()
+        except TimeoutError:
+            page = answer(recorder, asked)
+        return page
+
+    def lives(self, target: ActorRef[Any] | str) -> list[PastLife]:
+        """The newest lives at an address, oldest first: how each began and ended, by whom, and why; 16 at most.
+
+        Raises:
+            SpecError: the system was made with `history=False`.
+        """
+        return self._recorder.lives.at(_path(target))
+
+    async def why(self, target: ActorRef[Any] | str, *, timeout: float = DEFAULT_TIMEOUT) -> list[str]:
+        """Say in a few sentences why an actor restarts, has ended, or does not get on.
+
+        Args:
+            target: an actor, or an address, whether or not anybody lives there.
+            timeout: seconds that the actor's process may take to say how it is; the rest is known without it.
+
+        Raises:
+            SpecError: the system was made with `history=False`.
+        """
+        check_seconds("why", "timeout", timeout)
+        path, node, recorder = _path(target), self._node, self._recorder
+        status, before = await self._look(path, timeout)
+        return why(collect(node, recorder, path, status, before, self.quarantined(path)))
+
+    def put_aside(self, target: ActorRef[Any] | str | None = None) -> list[PutAside]:
+        """The messages in quarantine as plain data, oldest first; what is in them only with `log_payloads`.
+
+        `quarantined` returns the messages themselves, to be tried again or dropped.
+        """
+        payloads = self._history is not None and self._history.keeps_payloads
+        return [put_aside(one, payloads=payloads) for one in self.quarantined(target)]
+
+    async def _look(self, path: str, timeout: float) -> tuple[Status | None, int | None]:
+        """The status of an actor, and how many messages waited a moment before, if there are several."""
+        cell = self._node.find(path)
+        if cell is None:
+            return None, None
+        try:
+            status = await self.get_status(ActorRef(cell), timeout=timeout)
+            if status.queued < SEVERAL:
+                return status, None
+            await asyncio.sleep(BETWEEN)
+            return await self.get_status(ActorRef(cell), timeout=timeout), status.queued
+        except HoldfastError:
+            return None, None  # It has ended meanwhile, or does not answer: the rest is known all the same.
+
+    @property
+    def _recorder(self) -> HistoryRecorder:
+        if self._history is None:
+            raise SpecError("history", "the system keeps none: it was made with history=False, or is not running")
+        return self._history
+
+
+def _path(target: ActorRef[Any] | str) -> str:
+    path = target.path if isinstance(target, ActorRef) else target
+    if not isinstance(path, str):
+        raise SpecError("history", f"takes an actor or an address, not {target!r}")
+    return path
+
+
+def _pattern(target: ActorRef[Any] | str) -> str:
+    return literal(target.path) if isinstance(target, ActorRef) else target

@@ -1,0 +1,261 @@
+"""Past lives: what each address went through, folded from past events; a pure function of them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from typing import TypeAlias
+
+import msgspec
+
+from .past_event import PastEvent
+
+MOST_LIVES = 16
+"""Lives that are kept of one address, the newest."""
+MOST_ADDRESSES = 10_000
+"""Addresses whose lives are kept; beyond, whoever had nothing happen for longest is forgotten."""
+
+
+class PastLife(msgspec.Struct):
+    """A life at an address, from its start to its end, as far as the history has seen it.
+
+    Attributes:
+        number: counts from 1 at each address, and from 1 again in the next root.
+        started: Unix time; None if the start failed, or was not seen.
+        ended: Unix time; None while the life goes on.
+        reason: why it ended, in words; "" while it goes on.
+        reason_kind: the class of the exit reason, such as "Crash" or "Signal"; "StartFailed" if it did not even begin.
+        traceback: that of the error that has ended it, if one has.
+        handling: the type of the message, or the hook, whose turn has ended it.
+        by: who has ended it: the address of an actor, "the program", "an operator", "a transaction", "failover";
+            "" if it ended by itself.
+        because: why that one did, in words.
+        restarts: restarts within the supervisor's period when this life was to be followed by another, that one
+            included; None if none was.
+        allowed: how many restarts the supervisor allows within its period.
+        pid: the OS process that it had for itself; 0 if it had none.
+        phases: seconds that each phase of its recovery took (detect, isolate, restart, restore, replay, release).
+        replayed: turns that were handled again before it was there.
+    """
+
+    number: int
+    started: float | None = None
+    ended: float | None = None
+    reason: str = ""
+    reason_kind: str = ""
+    traceback: str = ""
+    handling: str = ""
+    by: str = ""
+    because: str = ""
+    restarts: int | None = None
+    allowed: int | None = None
+    pid: int = 0
+    phases: dict[str, float] = {}
+    replayed: int = 0
+
+    @property
+    def is_over(self) -> bool:
+        """Say whether the life has ended, or did not even begin."""
+        return self.ended is not None
+
+
+Lives: TypeAlias = "deque[PastLife]"
+
+
+class LivesByAddress:
+    """The newest lives of each address, oldest first.
+
+    Args:
+        most: lives that are kept of one address.
+        most_addresses: addresses of which any are kept.
+    """
+
+    def __init__(self, most: int = MOST_LIVES, most_addresses: int = MOST_ADDRESSES) -> None:
+        self._most, self._most_addresses = most, most_addresses
+        self._known: OrderedDict[str, Lives] = OrderedDict()
+
+    def at(self, address: str) -> list[PastLife]:
+        """The lives of an address, oldest first; copies."""
+        return [msgspec.structs.replace(life) for life in self._known.get(address, ())]
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+    def apply(self, event: PastEvent) -> None:
+        """Learn what an event says of the lives at its address."""
+        learn = LEARN.get(event.kind)
+        if learn is None:
+            return
+        if event.kind in ROOT:
+            for known in self._known.values():
+                _root_ended(known, event)
+            return
+        lives = self._known.get(event.address)
+        if lives is None:
+            lives = self._known[event.address] = deque(maxlen=self._most)
+            if len(self._known) > self._most_addresses:
+                self._known.popitem(last=False)
+        else:
+            self._known.move_to_end(event.address)
+        learn(lives, event)
+
+
+def _now(lives: Lives) -> PastLife:
+    """The life that goes on; if none is known to, one that has begun unseen."""
+    if not lives or lives[-1].is_over:
+        lives.append(PastLife(lives[-1].number + 1 if lives else 1))
+    return lives[-1]
+
+
+def _last(lives: Lives) -> PastLife:
+    """The newest life, over or not."""
+    return lives[-1] if lives else _now(lives)
+
+
+def _text(event: PastEvent, name: str) -> str:
+    value = event.fields.get(name)
+    return value if isinstance(value, str) else ""
+
+
+def _number(event: PastEvent, name: str) -> int | None:
+    value = event.fields.get(name)
+    return value if isinstance(value, int) else None
+
+
+def _end(life: PastLife, event: PastEvent) -> None:
+    """The life is over; the first that is told of its end says the most."""
+    if life.ended is None:
+        life.ended = event.at
+    if not life.reason:
+        life.reason, life.reason_kind = _text(event, "reason"), _text(event, "reason_kind")
+        life.traceback = _text(event, "traceback")
+
+
+def _started(lives: Lives, event: PastEvent) -> None:
+    number = _number(event, "life") or 1
+    if lives and not lives[-1].is_over:
+        life = lives[-1]
+        if life.started is None:
+            life.number, life.started = number, event.at
+            return
+        if life.number == number:
+            return  # A replica of the same life.
+        life.ended, life.reason = event.at, life.reason or "its end was not recorded"
+    lives.append(PastLife(number, event.at))
+
+
+def _process_started(lives: Lives, event: PastEvent) -> None:
+    """The process is told of before the life that begins in it."""
+    life = _now(lives)
+    life.pid = _number(event, "pid") or 0
+
+
+def _crashed(lives: Lives, event: PastEvent) -> None:
+    life = _now(lives)
+    number = _number(event, "life")
+    if life.started is None and number:
+        life.number = number
+    life.handling = _text(event, "message") or life.handling
+    _end(life, event)
+
+
+def _process_died(lives: Lives, event: PastEvent) -> None:
+    life = _last(lives)
+    if life.pid in (0, _number(event, "pid")):
+        life.pid = _number(event, "pid") or 0
+        _end(life, event)
+
+
+def _terminated(lives: Lives, event: PastEvent) -> None:
+    life = _last(lives)
+    _end(life, event)
+    life.allowed = _number(event, "allowed")
+    _blame(life, event)
+
+
+def _blame(life: PastLife, event: PastEvent) -> None:
+    if not life.by:
+        life.by, life.because = _text(event, "by"), _text(event, "because")
+
+
+def _stopped(lives: Lives, event: PastEvent) -> None:
+    life = _last(lives)
+    number = _number(event, "life")
+    if life.is_over and number is not None and number > life.number:
+        lives.append(life := PastLife(number))
+    _end(life, event)
+    _blame(life, event)
+
+
+def _linked_end(lives: Lives, event: PastEvent) -> None:
+    life = _now(lives)
+    life.by, life.because = _text(event, "peer"), "it is linked to it"
+    _end(life, event)
+
+
+def _restarted(lives: Lives, event: PastEvent) -> None:
+    life = _last(lives)
+    _end(life, event)
+    life.restarts, life.allowed = _number(event, "attempt"), _number(event, "allowed")
+
+
+def _not_started(lives: Lives, event: PastEvent) -> None:
+    life = _last(lives)
+    if (life.started is not None and life.is_over) or not lives:
+        life = _now(lives)
+    if life.started is None or not life.is_over:
+        life.ended = event.at
+        life.reason, life.reason_kind = _text(event, "reason"), "StartFailed"
+
+
+def _recovered(lives: Lives, event: PastEvent) -> None:
+    life = _last(lives)
+    phases = event.fields.get("phases")
+    life.phases = phases if isinstance(phases, dict) else {}
+    life.replayed = _number(event, "replayed") or 0
+
+
+def _failed_over(lives: Lives, event: PastEvent) -> None:
+    life = _now(lives)
+    life.ended, life.reason, life.reason_kind = event.at, _text(event, "why"), "FailedOver"
+    life.by, life.because = "failover", f"{_text(event, 'replica')} leads now"
+    lives.append(PastLife(life.number, event.at))
+
+
+def _quarantined(lives: Lives, event: PastEvent) -> None:
+    """The processes that have died in a row had this message in hand."""
+    left = _number(event, "deliveries") or 1
+    for life in reversed(lives):
+        if left and life.reason_kind in DEATHS:
+            life.handling = life.handling or _text(event, "message")
+            left -= 1
+
+
+def _root_ended(lives: Lives, event: PastEvent) -> None:
+    """Whoever lived has ended with the process of the root."""
+    if lives and not lives[-1].is_over:
+        life = lives[-1]
+        life.ended, life.reason = event.at, _text(event, "why") or "the system stopped"
+        life.reason_kind = "SystemStopped" if event.kind == "SystemStopped" else "RootKilled"
+        life.by = "the program"
+
+
+ROOT = ("SystemStarted", "SystemStopped")
+DEATHS = frozenset({"Signal", "Exited", "OutOfMemory", "Hung"})
+"""Exit reasons of a process that says nothing itself of what it had in hand."""
+LEARN = {
+    "ActorStarted": _started,
+    "ActorCrashed": _crashed,
+    "ProcessStarted": _process_started,
+    "ProcessDied": _process_died,
+    "ChildTerminated": _terminated,
+    "ChildStopped": _stopped,
+    "EndedByLink": _linked_end,
+    "ChildRestarted": _restarted,
+    "ChildStartFailed": _not_started,
+    "Recovered": _recovered,
+    "FailedOver": _failed_over,
+    "MessageQuarantined": _quarantined,
+    "SystemStarted": _root_ended,
+    "SystemStopped": _root_ended,
+}
+"""What each kind of event says of the lives at its address."""

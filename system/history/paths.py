@@ -1,0 +1,60 @@
+"""Patterns of paths: which addresses a question is about."""
+
+from __future__ import annotations
+
+import fnmatch
+import re
+from collections.abc import Callable
+
+from ...actors.errors import SpecError
+
+LONGEST = 1_000
+"""Characters of a pattern."""
+
+
+def matcher(pattern: str) -> Callable[[str], bool]:
+    """A test for the addresses that a pattern means.
+
+    In a name, `*` stands for any characters and `?` for one. `**` as a name stands for any number of names, none
+    included: `/app/shop/**` is the shop with all below it.
+
+    Raises:
+        SpecError: it is no text, or too long.
+
+    >>> shop = matcher("/app/shop/**")
+    >>> shop("/app/shop"), shop("/app/shop/till/1"), shop("/app/shopping")
+    (True, True, False)
+    >>> matcher("/app/*/worker-?")("/app/north/worker-1"), matcher("/app/*")("/app/north/worker-1")
+    (True, False)
+    """
+    if not isinstance(pattern, str) or len(pattern) > LONGEST:
+        raise SpecError("history", f"a path is text of at most {LONGEST} characters, not {str(pattern)[:50]!r}")
+    if not any(sign in pattern for sign in "*?["):
+        return pattern.__eq__
+    names = [re.compile(fnmatch.translate(name)) if name != "**" else None for name in pattern.split("/")]
+
+    def matches(path: str) -> bool:
+        reached = _past_any({0}, names)
+        for name in path.split("/"):
+            stepped = {at if names[at] is None else at + 1 for at in reached if _takes(names, at, name)}
+            reached = _past_any(stepped, names)
+        return len(names) in reached
+
+    return matches
+
+
+def _takes(names: list[re.Pattern[str] | None], at: int, name: str) -> bool:
+    if at == len(names):
+        return False
+    pattern = names[at]
+    return pattern is None or pattern.match(name) is not None
+
+
+def _past_any(reached: set[int], names: list[re.Pattern[str] | None]) -> set[int]:
+    """Where one may be as well: behind a `**` that stands for nothing more."""
+    found = set(reached)
+    for at in sorted(reached):
+        while at < len(names) and names[at] is None:
+            at += 1
+            found.add(at)
+    return found

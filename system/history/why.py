@@ -1,0 +1,362 @@
+"""Why an actor is as it is, in a few plain sentences: pure functions of the evidence, one for each cause."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+from .evidence import Evidence, PutAside
+from .lives import PastLife
+from .past_event import PastEvent
+from .raised import raised_at
+
+LATELY = 60.0
+"""Seconds within which ends belong to one crash loop, if the supervisor's period is not known to be longer."""
+LONG_TURN = 1.0
+"""Seconds from which on a turn is worth a sentence."""
+MANY = 100
+"""Messages in a mailbox that are worth a sentence."""
+MOST_TEXT = 300
+"""Characters of an error that a sentence quotes."""
+
+Rule = Callable[[Evidence], list[str]]
+
+
+def why(evidence: Evidence) -> list[str]:
+    """Say in sentences why the actor restarts, has ended, or does not get on: what weighs most comes first.
+
+    >>> why(Evidence("/app/till", 0.0))
+    ['Nobody lives at /app/till, and the history knows of no life there.']
+    """
+    said = [sentence for rule in RULES.values() for sentence in rule(evidence)]
+    return said or [_well(evidence)]
+
+
+def _well(evidence: Evidence) -> str:
+    status = evidence.status
+    if status is None and not evidence.lives:
+        return f"Nobody lives at {evidence.address}, and the history knows of no life there."
+    if not evidence.is_there:
+        return f"Nobody lives at {evidence.address} any more, and how its last life ended is not known."
+    if status is None:
+        return f"{evidence.address} does not say how it is, and the history knows of nothing that is wrong."
+    return f"{evidence.address} is {status.state}, in life {status.life}, and nothing is wrong as far as is known."
+
+
+# -- ends -------------------------------------------------------------------------------------------------------------
+
+
+def _ends(evidence: Evidence) -> list[PastLife]:
+    """The lives that ended by a fault, oldest first; only those behind the last good start of the root."""
+    return [life for life in evidence.lives if life.is_over and _is_fault(life)]
+
+
+def _is_fault(life: PastLife) -> bool:
+    return life.reason_kind not in CLEAN and not life.by
+
+
+CLEAN = frozenset({"", "Normal", "Shutdown", "SystemStopped", "RootKilled", "FailedOver"})
+
+
+def _crash_loop(evidence: Evidence) -> list[str]:
+    """Restarted again and again, or once, because of its own faults."""
+    ends = _ends(evidence)
+    if not ends or (evidence.lives[-1] is not ends[-1] and _last_ended(evidence) is not ends[-1]):
+        return []
+    last = ends[-1]
+    allowance = evidence.allowance
+    span = max(LATELY, allowance.period if allowance is not None else 0.0)
+    loop = [life for life in ends if (last.ended or 0.0) - (life.ended or 0.0) <= span]
+    if last.reason_kind == "StartFailed":
+        return [_start_fails(evidence, loop)]
+    if len(loop) == 1:
+        return [_one_end(evidence, last)]
+    said = f"{evidence.address} {_restarted(loop)} {_within(evidence, loop)}"
+    said += _common("handling", [life.handling for life in loop])
+    said += f"; {_fault(last)}" + ("" if len({life.reason for life in loop}) == 1 else " (the last time)")
+    limit = _limit(evidence, last)
+    return [f"{said}; {limit}." if limit else f"{said}."]
+
+
+def _within(evidence: Evidence, loop: list[PastLife]) -> str:
+    first, last = loop[0].ended or evidence.now, loop[-1].ended or evidence.now
+    if evidence.now - last < LATELY:
+        return f"in the last {max(1, math.ceil(evidence.now - first))} s"
+    return f"within {max(1, math.ceil(last - first))} s, the last time {_since(evidence, last)}"
+
+
+def _last_ended(evidence: Evidence) -> PastLife | None:
+    return next((life for life in reversed(evidence.lives) if life.is_over), None)
+
+
+def _restarted(loop: list[PastLife]) -> str:
+    ends, restarts = len(loop), sum(life.restarts is not None for life in loop)
+    if restarts == ends:
+        return f"restarted {restarts} times"
+    return f"ended {ends} times and was restarted {restarts} times" if restarts else f"ended {ends} times"
+
+
+def _common(what: str, values: list[str]) -> str:
+    known = {value for value in values if value}
+    if len(known) != 1 or not all(values):
+        return f"; {what} {', '.join(sorted(known))}" if known else ""
+    return f"; each time {what} {known.pop()}"
+
+
+def _one_end(evidence: Evidence, life: PastLife) -> str:
+    handling = f" handling {life.handling}" if life.handling else ""
+    then = ", and was restarted" if life.restarts is not None else ""
+    said = f"{evidence.address} ended {_ago(evidence, life)}{handling}{then}: {_fault(life)}"
+    limit = _limit(evidence, life)
+    return f"{said}; {limit}." if limit else f"{said}."
+
+
+def _fault(life: PastLife) -> str:
+    """What has ended a life, in words."""
+    reason = life.reason[:MOST_TEXT]
+    match life.reason_kind:
+        case "Crash":
+            place = raised_at(life.traceback)
+            return f"{reason} at {place}" if place else reason
+        case "Signal":
+            who = (
+                ", which nobody can catch: the kernel, an administrator or a program sent it"
+                if reason == "SIGKILL"
+                else ""
+            )
+            return f"its process was ended by {reason}{who}"
+        case "OutOfMemory":
+            return f"its process was {reason}" if life.pid else reason
+        case "Hung":
+            return f"its process {reason}: a loop without await, a blocking call or a lock"
+        case "Killed":
+            return "it was killed, by `ref.kill()` or by a time limit"
+        case "TrustBreach":
+            return f"its process was ended for a {reason}"
+        case _:
+            return reason or "nobody knows why"
+
+
+def _limit(evidence: Evidence, life: PastLife) -> str:
+    """What the supervisor will do at the next end."""
+    allowance = evidence.allowance
+    if allowance is None:
+        return "" if life.allowed is None else f"its supervisor allows {life.allowed} restarts"
+    left = allowance.intensity - allowance.restarts
+    said = f"its supervisor allows {allowance.intensity} in {allowance.period:g} s"
+    return f"{said} and gives up at the next" if left <= 0 else f"{said}, of which it has counted {allowance.restarts}"
+
+
+def _start_fails(evidence: Evidence, loop: list[PastLife]) -> str:
+    last = loop[-1]
+    failures = [life for life in loop if life.reason_kind == "StartFailed"]
+    times = "" if len(failures) == 1 else f" {len(failures)} times, the last time"
+    return f"{evidence.address} could not be started{times} {_ago(evidence, last)}: {last.reason[:MOST_TEXT]}."
+
+
+# -- ends that others have called for ---------------------------------------------------------------------------------
+
+
+def _ended_by_others(evidence: Evidence) -> list[str]:
+    """Stopped by its supervisor, a sibling's end, an operator, the program, a transaction, or a link."""
+    life = _last_ended(evidence)
+    if life is None or not life.by or life.reason_kind in ("FailedOver", "RootKilled", "SystemStopped"):
+        return []
+    if life.by == evidence.address:
+        return [f"{evidence.address} ended by itself {_ago(evidence, life)}: {life.because}."]
+    because = f": {life.because}" if life.because else ""
+    fault = "" if life.reason_kind in CLEAN else f" ({_fault(life)})"
+    return [f"{evidence.address} was ended by {life.by} {_ago(evidence, life)}{because}{fault}."]
+
+
+def _given_up_above(evidence: Evidence) -> list[str]:
+    """A supervisor above it has given up, or has ended because its significant children had."""
+    said: list[str] = []
+    for event in evidence.above[-3:]:
+        child, reason = event.fields.get("child"), event.fields.get("reason")
+        if event.kind == "SupervisorGaveUp":
+            said.append(
+                f"{event.address} gave up {_since(evidence, event.at)}, and all below it ended: "
+                f"{event.address}/{child} had failed too often, the last time with {str(reason)[:MOST_TEXT]}."
+            )
+        else:
+            said.append(
+                f"{event.address} ended {_since(evidence, event.at)}: its significant child {child} did ({reason})."
+            )
+    return said
+
+
+def _gave_up(evidence: Evidence) -> list[str]:
+    """It is a supervisor, and has given up itself."""
+    event = _newest(evidence, "SupervisorGaveUp")
+    if event is None:
+        return []
+    child, reason = event.fields.get("child"), str(event.fields.get("reason"))[:MOST_TEXT]
+    return [
+        f"{evidence.address} gave up {_since(evidence, event.at)}: its child {child} had failed too often ({reason})."
+    ]
+
+
+def _root_ended(evidence: Evidence) -> list[str]:
+    life = _last_ended(evidence)
+    if life is None or life.reason_kind != "RootKilled":
+        return []
+    return [f"{evidence.address} ended {_ago(evidence, life)} because {life.reason}; what it had in hand was cut off."]
+
+
+# -- recovery ---------------------------------------------------------------------------------------------------------
+
+
+def _quarantine(evidence: Evidence) -> list[str]:
+    """Messages that are put aside because they have ended the process again and again."""
+    if evidence.quarantined:
+        return [_is_put_aside(evidence, one) for one in evidence.quarantined[-3:]]
+    event = _newest(evidence, "MessageQuarantined")
+    if event is None:
+        return []
+    put = f"The message {event.fields.get('message')} was put into quarantine {_since(evidence, event.at)}"
+    return [f"{put}, after {event.fields.get('deliveries')} deaths of the process, and is not there any more."]
+
+
+def _is_put_aside(evidence: Evidence, one: PutAside) -> str:
+    put = f"The message {one.message} was put into quarantine {_since(evidence, one.since)}"
+    deaths = f"it had ended the process {one.attempts} times in a row"
+    return f"{put}: {deaths}. The actor goes on without it; retry or drop it once the cause is mended."
+
+
+def _recovery_fails(evidence: Evidence) -> list[str]:
+    """It cannot be brought back: its replay leads elsewhere, or what is recorded cannot be used."""
+    event = _newest(evidence, "RecoveryFailed")
+    back = _newest(evidence, "Recovered")
+    if event is None or (back is not None and back.number > event.number):
+        return []
+    reason = str(event.fields.get("reason", ""))[: 2 * MOST_TEXT]
+    if "diverged" in reason:
+        return [f"{evidence.address} cannot be recovered, for its turns do not go as they went before: {reason}."]
+    return [f"{evidence.address} could not be recovered {_since(evidence, event.at)}: {reason}."]
+
+
+# -- how it is now ----------------------------------------------------------------------------------------------------
+
+
+def _suspended(evidence: Evidence) -> list[str]:
+    status = evidence.status
+    if status is None or status.state != "suspended":
+        return []
+    return [f"{evidence.address} is suspended: it handles nothing, and {status.queued} messages wait, until `resume`."]
+
+
+def _restarting(evidence: Evidence) -> list[str]:
+    status = evidence.status
+    if status is None or status.state != "restarting":
+        return []
+    return [f"{evidence.address} has no life at the moment: it waits for its next start, or is being recovered."]
+
+
+def _waits(evidence: Evidence) -> list[str]:
+    """Its turn waits for an answer, or for something else."""
+    status = evidence.status
+    if status is None or status.turn is None or status.turn_seconds < LONG_TURN:
+        return []
+    said = f"{evidence.address} has been in the turn of {status.turn} for {_seconds(status.turn_seconds)}"
+    if not evidence.asks:
+        return [f"{said}; it waits for something that is no ask of this process."]
+    first = evidence.asks[0]
+    more = f", and {len(evidence.asks) - 1} more asks" if len(evidence.asks) > 1 else ""
+    return [f"{said}: it waits for {first.to} to answer {first.message}, asked {_seconds(first.seconds)} ago{more}."]
+
+
+def _mailbox(evidence: Evidence) -> list[str]:
+    status = evidence.status
+    if status is None or status.queued < MANY or status.state == "suspended":
+        return []
+    before = evidence.queued_before
+    if before is None or before == status.queued:
+        return [f"{status.queued} messages wait in its mailbox."]
+    way = "and they become more" if status.queued > before else "and they become fewer"
+    return [f"{status.queued} messages wait in its mailbox, {way}."]
+
+
+def _replicas(evidence: Evidence) -> list[str]:
+    """What has happened to its replicas, unless all of them are back since."""
+    lost, over = _newest(evidence, "ReplicaLost"), _newest(evidence, "FailedOver")
+    gone, back = _newest(evidence, "ProtectionLost"), _newest(evidence, "ReplicaJoined")
+    said: list[str] = []
+    if over is not None:
+        replica, cause = over.fields.get("replica"), over.fields.get("why")
+        said.append(f"Replica {replica} took over {_since(evidence, over.at)}: {cause}.")
+    if lost is not None and (back is None or back.number < lost.number):
+        replica, cause = lost.fields.get("replica"), lost.fields.get("why")
+        said.append(f"Replica {replica} was lost {_since(evidence, lost.at)} and is not back: {cause}.")
+    if gone is not None and (back is None or back.number < gone.number):
+        said.append("It is not protected at the moment: no replica may die.")
+    return said
+
+
+def _store(evidence: Evidence) -> list[str]:
+    """The store fails, or is full."""
+    said: dict[str, str] = {}
+    for event in evidence.store:
+        reason = str(event.fields.get("reason", ""))[:MOST_TEXT]
+        match event.kind:
+            case "JournalGoesOn":
+                said.pop("JournalBlocked", None)
+            case "JournalBlocked":
+                said[event.kind] = f"The store stopped taking anything {_since(evidence, event.at)}: {reason}."
+            case "JournalStopped":
+                said[event.kind] = f"The store failed {_since(evidence, event.at)}, and nothing is accepted: {reason}."
+            case "JournalFull" if event.address == evidence.address:
+                said[event.kind] = (
+                    f"Its journal became full {_since(evidence, event.at)}, and it accepts nothing: "
+                    f"{event.fields.get('way_out')}."
+                )
+            case _:
+                pass
+    return list(said.values())
+
+
+def _gap(evidence: Evidence) -> list[str]:
+    return ["Events are left out at the moment, because there are too many."] if evidence.suspects_gap else []
+
+
+RULES: dict[str, Rule] = {
+    "a supervisor above has given up": _given_up_above,
+    "it has given up": _gave_up,
+    "its own faults": _crash_loop,
+    "ended by others": _ended_by_others,
+    "the root was killed": _root_ended,
+    "quarantine": _quarantine,
+    "recovery fails": _recovery_fails,
+    "suspended": _suspended,
+    "restarting": _restarting,
+    "its turn waits": _waits,
+    "mailbox": _mailbox,
+    "replicas": _replicas,
+    "store": _store,
+    "events left out": _gap,
+}
+"""The causes, in the order in which they are told."""
+
+
+# -- words ------------------------------------------------------------------------------------------------------------
+
+
+def _newest(evidence: Evidence, kind: str) -> PastEvent | None:
+    return next((event for event in reversed(evidence.events) if event.kind == kind), None)
+
+
+def _ago(evidence: Evidence, life: PastLife) -> str:
+    return _since(evidence, life.ended or evidence.now)
+
+
+def _since(evidence: Evidence, at: float) -> str:
+    """A moment as people say it: how long ago, or the time of day if that is long."""
+    seconds = evidence.now - at
+    if seconds < 120.0:
+        return f"{_seconds(max(0.0, seconds))} ago"
+    return f"at {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(at))}"
+
+
+def _seconds(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.1f} s"

@@ -1,0 +1,228 @@
+"""What `why` says of real systems, whose actors fail for each cause in turn."""
+
+import asyncio
+import os
+import signal
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.actors.kernel import links
+from tests.history.players import Caller, Do, Fickle, Pass, Stubborn, Worker, failed, until
+
+
+@pytest.fixture
+async def system() -> AsyncIterator[hf.ActorSystem]:
+    """A system that bears many restarts."""
+    async with hf.ActorSystem("app", log=False, intensity=100) as running:
+        yield running
+
+
+def worker(name: str = "worker", **options: object) -> hf.ChildSpec[Worker]:
+    return hf.child(name, hf.start(Worker), **options)  # type: ignore[arg-type]
+
+
+async def said(system: hf.ActorSystem, target: hf.ActorRef[hf.Actor] | str) -> str:
+    return " ".join(await system.why(target))
+
+
+async def test_nobody_and_nothing(system: hf.ActorSystem) -> None:
+    assert await said(system, "/app/nobody") == "Nobody lives at /app/nobody, and the history knows of no life there."
+    ref = await system.start(worker())
+    assert await said(system, ref) == "/app/worker is running, in life 1, and nothing is wrong as far as is known."
+
+
+async def test_a_crash_loop() -> None:
+    async with hf.ActorSystem("app", log=False, intensity=3, period=60.0) as system:
+        ref = await system.start(worker())
+        for _ in range(3):
+            await failed(ref, "crash")
+        await ref.ask(Do("well"))
+        text = await said(system, ref)
+    assert text.startswith("/app/worker restarted 3 times in the last ")
+    assert "each time handling tests.history.players.Do; ZeroDivisionError: nothing to divide at players.py:" in text
+    assert text.endswith("its supervisor allows 3 in 60 s and gives up at the next.")
+
+
+@pytest.mark.parametrize(
+    ("what", "reason"),
+    [
+        ("kill", "its process was ended by SIGKILL, which nobody can catch"),
+        ("exit", "process exited with code 3"),
+        ("eat", "out of memory: all gone"),
+    ],
+)
+async def test_a_process_that_ends(system: hf.ActorSystem, what: str, reason: str) -> None:
+    ref = await system.start(worker(isolation="process"))
+    await failed(ref, what)
+    await ref.ask(Do("well"), 30.0)
+    text = await said(system, ref)
+    assert text.startswith("/app/worker ended ")
+    assert reason in text
+    assert "and was restarted" in text
+
+
+async def test_a_process_that_hangs(system: hf.ActorSystem) -> None:
+    ref = await system.start(worker(isolation="process", limits=hf.Limits(hung_after=1.0)))
+    await failed(ref, "hang")
+    await ref.ask(Do("well"), 30.0)
+    assert "s: a loop without await, a blocking call or a lock" in await said(system, ref)
+
+
+async def test_a_poison_message(system: hf.ActorSystem) -> None:
+    ref = await system.start(worker(isolation="process", recovery=hf.hybrid(max_deliveries=2)))
+    await failed(ref, "kill")
+    await ref.ask(Do("well"), 30.0)
+    text = await said(system, ref)
+    assert "each time handling tests.history.players.Do" in text
+    assert "The message tests.history.players.Do was put into quarantine" in text
+    assert "it had ended the process 2 times in a row" in text
+    system.drop(system.quarantined(ref)[0])
+    assert "after 2 deaths of the process, and is not there any more" in await said(system, ref)
+
+
+async def test_a_start_that_fails(system: hf.ActorSystem) -> None:
+    with pytest.raises(hf.StartFailed):
+        await system.start(hf.child("stubborn", hf.start(Stubborn)))
+    text = await said(system, "/app/stubborn")
+    assert text.startswith("/app/stubborn could not be started ")
+    assert "FileNotFoundError: no file of settings" in text
+
+
+async def test_a_restart_that_fails(system: hf.ActorSystem) -> None:
+    Fickle.started = 0
+    backoff = hf.Backoff(initial=30.0, maximum=30.0)
+    ref = await system.start(hf.child("fickle", hf.start(Fickle), restart="permanent", backoff=backoff))
+    ref.tell(Do("crash"))
+    await until(lambda: bool(system.lives(ref)) and system.lives(ref)[-1].is_over)
+    assert "/app/fickle has no life at the moment" in await said(system, ref)
+
+
+async def test_a_replay_that_leads_elsewhere() -> None:
+    async with hf.ActorSystem("app", log=False, intensity=1) as system:
+        inner = hf.supervisor("inner", intensity=0, children=[worker(isolation="process", recovery=hf.hybrid())])
+        await system.start(inner)
+        ref = system.ref("/app/inner/worker", Worker)
+        await ref.ask(Do("clock"))
+        await failed(ref, "kill")
+        await until(lambda: any(life.is_over for life in system.lives("/app/inner")))
+        text = await said(system, "/app/inner/worker")
+    assert "/app/inner gave up" in text or "cannot be recovered" in text
+
+
+async def test_who_has_stopped_it(system: hf.ActorSystem) -> None:
+    first, second = await system.start(worker("first")), await system.start(worker("second"))
+    await system.stop(first)
+    assert "/app/first was ended by the program" in await said(system, "/app/first")
+    async with system.transaction() as change:
+        change.remove(second)
+    assert "/app/second was ended by a transaction of the program" in await said(system, "/app/second")
+    third = system.spawn(hf.start(Worker), "third")
+    await system.stop(third)
+    assert "/app/third was ended by the program" in await said(system, "/app/third")
+    fourth = await system.start(worker("fourth", restart="transient"))
+    await fourth.ask(Do("stop"))
+    await until(lambda: system.lives("/app/fourth")[-1].is_over)
+    assert "/app/fourth ended by itself" in await said(system, "/app/fourth")
+
+
+async def test_a_sibling_s_restart(system: hf.ActorSystem) -> None:
+    await system.start(hf.supervisor("family", strategy="one_for_all", children=[worker("one"), worker("two")]))
+    one, two = system.ref("/app/family/one", Worker), system.ref("/app/family/two", Worker)
+    await failed(two, "crash")
+    await one.ask(Do("well"))
+    text = await said(system, one)
+    assert "/app/family/one was ended by /app/family" in text
+    assert "/app/family/two has ended, and they are restarted together (one_for_all)" in text
+
+
+async def test_a_supervisor_that_gives_up(system: hf.ActorSystem) -> None:
+    await system.start(hf.supervisor("family", intensity=0, children=[worker("one"), worker("two")]))
+    await failed(system.ref("/app/family/two", Worker), "crash")
+    await until(lambda: len(system.lives("/app/family")) > 1)
+    assert "/app/family gave up" in await said(system, "/app/family/one")
+    text = await said(system, "/app/family")
+    assert "its child two had failed too often (ZeroDivisionError: nothing to divide)" in text
+
+
+async def test_a_link(system: hf.ActorSystem) -> None:
+    one = await system.start(worker("one"))
+    two = await system.start(worker("two"))
+    links.link(one._cell, two._cell)
+    await failed(one, "crash")
+    await two.ask(Do("well"))
+    text = await said(system, two)
+    assert "/app/two was ended by /app/one" in text
+    assert "it is linked to it" in text
+
+
+async def test_a_turn_that_waits(system: hf.ActorSystem) -> None:
+    caller = await system.start(hf.child("caller", hf.start(Caller)))
+    ref = await system.start(worker(shutdown="brutal_kill"))
+    asked = caller.ask(Pass(ref, "wait"), 60.0)
+    await until(lambda: bool(system._node.deadlines.waiting()))
+    await asyncio.sleep(1.1)
+    text = await said(system, caller)
+    assert "/app/caller has been in the turn of tests.history.players.Pass for 1." in text
+    assert "it waits for /app/worker to answer tests.history.players.Do, asked 1." in text
+    assert "it waits for something that is no ask" in await said(system, ref)
+    ref.kill()
+    with pytest.raises(hf.HoldfastError):
+        await asked
+
+
+@pytest.mark.parametrize("places", [("task", "process"), ("process", "task"), ("process", "process")], ids="-".join)
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["none", "hybrid"])
+async def test_a_turn_that_waits_wherever_both_live(
+    system: hf.ActorSystem, places: tuple[Any, Any], recovery: hf.Method | None
+) -> None:
+    one, other = places
+    spec = hf.child("caller", hf.start(Caller), isolation=one, recovery=recovery, shutdown="brutal_kill")
+    caller = await system.start(spec)
+    ref = await system.start(worker(isolation=other, recovery=recovery, shutdown="brutal_kill"))
+    asked = caller.ask(Pass(ref, "wait"), 60.0)
+    await asyncio.sleep(1.2)
+    text = await said(system, caller)
+    assert "it waits for /app/worker to answer tests.history.players.Do, asked " in text
+    await system.stop(caller)
+    with pytest.raises(hf.HoldfastError):
+        await asked
+
+
+async def test_suspended_and_full(system: hf.ActorSystem) -> None:
+    ref = await system.start(worker())
+    await system.suspend(ref)
+    for _ in range(150):
+        ref.tell(Do("well"))
+    assert "/app/worker is suspended: it handles nothing, and 150 messages wait" in await said(system, ref)
+    await system.resume(ref)
+
+
+async def test_a_mailbox_that_grows(system: hf.ActorSystem) -> None:
+    ref = await system.start(worker(shutdown="brutal_kill"))
+    ref.tell(Do("wait"))
+    for _ in range(150):
+        ref.tell(Do("well"))
+
+    async def feed() -> None:
+        while True:
+            ref.tell(Do("well"))
+            await asyncio.sleep(0.01)
+
+    feeding = asyncio.create_task(feed())
+    assert "messages wait in its mailbox, and they become more" in await said(system, ref)
+    feeding.cancel()
+
+
+async def test_replicas(system: hf.ActorSystem) -> None:
+    spec = worker(mechanism=hf.ftm.PBR())
+    ref = await system.start(spec)
+    await ref.ask(Do("well"))
+    await until(lambda: "ReplicaJoined" in {event.kind for event in system.history(ref).events}, 30.0)
+    os.kill(system.pid_of(ref), signal.SIGKILL)
+    await ref.ask(Do("well"), 30.0)
+    text = await said(system, ref)
+    assert " took over " in text
+    assert any(life.by == "failover" for life in system.lives(ref))
