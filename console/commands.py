@@ -10,14 +10,14 @@ import typer
 from rich.console import Console
 
 from .. import HoldfastError, run
-from . import operate, upgrade_commands
+from . import upgrade_commands
+from .operate import changing, declaring, following, looking
 from .store_commands import store
 
 commands = typer.Typer(
     name="holdfast",
     help="Actors in supervision trees, with crash recovery that loses nothing.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
@@ -71,9 +71,24 @@ def demo(
         raise typer.Exit(DIFFERS)
 
 
-commands.command()(operate.apply)
-commands.command()(operate.tree)
-commands.command()(operate.status)
+for command in (
+    looking.ls,
+    looking.tree,
+    looking.inspect,
+    following.trace,
+    changing.suspend,
+    changing.resume,
+    changing.restart,
+    changing.stop,
+    changing.start,
+    changing.remove,
+    changing.bind,
+    changing.unbind,
+    changing.protect,
+    changing.checkpoint,
+    declaring.apply,
+):
+    commands.command()(command)
 commands.command("check-upgrade")(upgrade_commands.check)
 commands.command("replay")(upgrade_commands.replay)
 commands.add_typer(store)
