@@ -86,6 +86,7 @@ for command in (
     changing.unbind,
     changing.protect,
     changing.checkpoint,
+    declaring.plan,
     declaring.apply,
 ):
     commands.command()(command)

@@ -31,6 +31,7 @@ from .wire import (
     AnyRequest,
     ControlActor,
     CountTurns,
+    Declare,
     Follow,
     Inspect,
     NextEvents,
@@ -56,7 +57,7 @@ GRACE = 35.0
 
 SHORT_GRACE = 5.0
 """The same of one that changes nothing."""
-CHANGES = (ControlActor, RestartActor, Transact)
+CHANGES = (ControlActor, Declare, RestartActor, Transact)
 
 
 class NotReached(
@@ -310,6 +311,12 @@ class RemoteSystem:
         change._take(answer)
         if self._told is not None:
             self._told(change)
+
+    async def declare(self, text: str, name: str, *, dry_run: bool = False, timeout: float = 60.0) -> RemoteChange:
+        """Have the tree be as a file says, by one transaction; `name` is what the file is called in errors."""
+        change = RemoteChange()
+        change._take(await self.call(Declare(text, name, dry_run, timeout), timeout))
+        return change
 
     async def call(self, request: AnyRequest, timeout: float) -> Any:
         """Ask in a thread; if the wait is cancelled the connection ends, and what was asked for is undone."""

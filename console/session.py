@@ -13,6 +13,8 @@ import msgspec
 from ..actors.errors import HoldfastError, SpecError, type_name
 from ..actors.events import Event, EventStream, MessageIn, MessageOut, TurnBegan, TurnEnded
 from ..actors.kernel.actor import Actor
+from ..system.transaction.change import Change
+from .declare.tree_plan import declare
 from .inspection import inspected
 from .overview import look_at
 from .restarting import restart_actor
@@ -23,6 +25,7 @@ from .wire import (
     BadRequest,
     ControlActor,
     CountTurns,
+    Declare,
     Follow,
     Inspect,
     NextEvents,
@@ -90,6 +93,10 @@ class Session:
                 return await self._next_events(request)
             case CountTurns():
                 return await self._count(request.paths)
+            case Declare():
+                timeout = min(request.timeout, LONGEST)
+                change = await declare(system, request.text, request.name, dry_run=request.dry_run, timeout=timeout)
+                return {"steps": [], "difference": []} if change is None else as_told(change)
             case _:
                 assert_never(request)
 
@@ -115,8 +122,7 @@ class Session:
                 if at < 0:
                     raise BadRequest(f"{verb} lacks {', '.join(named[at:])}")
                 getattr(change, verb)(*args[:at], **dict(zip(named, args[at:], strict=True)))
-        steps = [(step.number, step.verb, step.target, step.text) for step in change.steps]
-        return {"steps": steps, "difference": list(change.difference)}
+        return as_told(change)
 
     # -- following ----------------------------------------------------------------------------------------------------
 
@@ -170,6 +176,12 @@ class Session:
         except HoldfastError:  # It has gone, or does not come to it: no number is shown.
             return None
         return None if known is None else known.turns
+
+
+def as_told(change: Change) -> dict[str, Any]:
+    """The steps of a transaction, and how the tree changes, as plain data."""
+    steps = [(step.number, step.verb, step.target, step.text) for step in change.steps]
+    return {"steps": steps, "difference": list(change.difference)}
 
 
 def event_words(event: Event) -> dict[str, Any]:

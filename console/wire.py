@@ -233,6 +233,15 @@ class Transact(ControlRequest, tag="transaction", frozen=True):
     script: tuple[str, str] | None = None
 
 
+class Declare(ControlRequest, tag="declare", frozen=True):
+    """Have the tree be as a file says; `name` is what it is called in errors."""
+
+    text: str
+    name: str
+    dry_run: bool
+    timeout: float
+
+
 AnyRequest = (
     About
     | Overview
@@ -241,6 +250,7 @@ AnyRequest = (
     | Follow
     | NextEvents
     | CountTurns
+    | Declare
     | Tree
     | Whereis
     | ControlActor

@@ -149,8 +149,7 @@ def _end(
     with reached(verb, system, socket) as remote:
         all_rows = remote.look().rows
         rows = _tops(select(all_rows, paths))
-        lost = _lost_states(rows, all_rows) + _lost_messages(rows, all_rows)
-        confirm(verb, [] if dry_run else lost, yes=yes)
+        confirm(verb, [] if dry_run else lost_by(rows, all_rows), yes=yes)
         _transact(
             remote,
             lambda change: _each(change.stop if verb == "stop" else change.remove, rows),
@@ -320,6 +319,11 @@ def _ending(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[ActorRow]:
     """The actors that end: these, and all below them."""
     paths = {row.path for row in rows}
     return [row for row in all_rows if row.path in paths or any(above in paths for above in _above(row.path))]
+
+
+def lost_by(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[str]:
+    """What is lost when these end for good, in words."""
+    return _lost_states(rows, all_rows) + _lost_messages(rows, all_rows)
 
 
 def _lost_states(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[str]:

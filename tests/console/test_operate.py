@@ -5,7 +5,8 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import AsyncIterator
+import tempfile
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,12 @@ DONE, FAILED, UNUSABLE = 0, 1, 2
 
 
 @pytest.fixture(autouse=True)
-def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder for sockets that no other test has."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def own_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder for sockets that no other test has; its path is short, as that of a socket must be."""
     monkeypatch.delenv("HOLDFAST_SYSTEM", raising=False)
-    return tmp_path
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", folder)
+        yield Path(folder)
 
 
 @pytest.fixture
@@ -252,5 +254,6 @@ async def test_trace_follows_one_actor_and_gives_back_what_it_has_switched_on(na
     told = [json.loads(line) for line in output.splitlines()]
     assert (status, sorted(line["what"] for line in told)) == (DONE, ["MessageIn", "TurnBegan", "TurnEnded"])
     more = one._cell.more
-    while more is not None and more.tap is not None and more.tap.is_on:
-        await asyncio.sleep(0)
+    async with asyncio.timeout(20):
+        while more is not None and more.tap is not None and more.tap.is_on:
+            await asyncio.sleep(0.01)
