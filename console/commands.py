@@ -74,6 +74,7 @@ def demo(
 for command in (
     looking.ls,
     looking.tree,
+    looking.top,
     looking.inspect,
     following.trace,
     changing.suspend,

@@ -15,7 +15,7 @@ from ..overview import ActorRow, Look
 from ..remote import RemoteSystem
 from ..runtime_folder import found_sockets, sweep
 from .patterns import select
-from .reaching import Json, Paths, Socket, System, complete_path, reached, show_json, told
+from .reaching import FAILED, Json, Paths, Socket, System, complete_path, ended, reached, show_json, told
 
 COLOURS = {"running": "green", "suspended": "yellow", "restarting": "magenta", "starting": "magenta", "stopped": "red"}
 MEASURED = 0.2
@@ -145,6 +145,29 @@ def row_line(row: ActorRow, *, is_top: bool) -> str:
 
 def _short(kind: str) -> str:
     return kind.rpartition(".")[2]
+
+
+def top(
+    patterns: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[PATTERN]...", help="Only these.", autocompletion=complete_path),
+    ] = None,
+    system: System = None,
+    socket: Socket = None,
+    seconds: Annotated[float, typer.Option(min=0.2, max=60.0, help="Between two looks.")] = 1.0,
+) -> None:
+    """Show a running system on one page, again and again: states, mailboxes, turns, memory, processor.
+
+    Keys: s suspends, r resumes, R restarts, i or Enter shows all of an actor, o changes the order, / takes a pattern.
+
+    Exit status 0: left by q. 1: the system has gone. 2: no system answers.
+    """
+    from .top import Top  # only now: Textual takes a while to import
+
+    with reached("top", system, socket) as remote:
+        why = Top(remote, seconds=seconds, patterns=tuple(patterns or ())).run()
+    if why:
+        raise ended("top", why, FAILED)
 
 
 def inspect(
