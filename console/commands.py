@@ -12,6 +12,7 @@ from rich.console import Console
 from .. import HoldfastError, run
 from . import upgrade_commands
 from .operate import changing, declaring, following, looking
+from .service import doctor, project, running
 from .store_commands import store
 
 commands = typer.Typer(
@@ -89,6 +90,9 @@ for command in (
     changing.checkpoint,
     declaring.plan,
     declaring.apply,
+    running.run,
+    project.new,
+    doctor.doctor,
 ):
     commands.command()(command)
 commands.command("check-upgrade")(upgrade_commands.check)

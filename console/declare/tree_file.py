@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import tomllib
 from collections.abc import Callable
 from typing import Any, Final, cast
@@ -17,8 +16,9 @@ from ...actors.values.classes import find_class
 from ...checkpoint.recovery_file import METHODS, find_line
 from ...ftm.model.mechanism import find
 from ...supervision.dynamic import dynamic
-from ...supervision.spec import ChildSpec, child
+from ...supervision.spec import ChildSpec, Flags, child
 from ...supervision.tree import supervisor
+from .wanted import WantedActor
 
 FLAGS: Final = ("strategy", "intensity", "period", "auto_shutdown", "max_children", "journal")
 SUPERVISOR: Final = ("supervisor", *FLAGS[1:], "restart", "shutdown", "isolation", "limits", "significant")
@@ -41,34 +41,6 @@ ACTOR: Final = (
     "names",
 )
 STRATEGIES: Final = ("one_for_one", "one_for_all", "rest_for_one")
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class WantedActor:
-    """One table of a file, read."""
-
-    path: str
-    spec: ChildSpec | None
-    """What its supervisor is to have; None for one that is kept as it is, and for the root."""
-    given: dict[str, Any]
-    names: tuple[str, ...] = ()
-    bindings: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
-    is_running: bool = True
-
-    @property
-    def is_kept(self) -> bool:
-        """Whether it stays as it is, with all below it."""
-        return self.given.get("keep") is True
-
-    @property
-    def above(self) -> str:
-        """The address of its supervisor."""
-        return self.path.rpartition("/")[0]
-
-    @property
-    def id(self) -> str:
-        """The last part of its address."""
-        return self.path.rpartition("/")[2]
 
 
 class TreeFile:
@@ -97,16 +69,21 @@ class TreeFile:
 
     def error(self, path: str, problem: str, key: str | None = None) -> SpecError:
         """An error at a table, or at a key in it."""
-        line = find_line(self._text, path, key)
+        line = find_line(self._text, path, key) or self._line_of(path)
         where = f"{self._name}{f', line {line}' if line else ''}, {path}{f', {key}' if key else ''}"
         return SpecError(where, problem)
+
+    def _line_of(self, key: str) -> int:
+        """Where a key stands that is in no table; 0 if it is written in some other way."""
+        lines = self._text.splitlines()
+        return next((at for at, line in enumerate(lines, 1) if line.partition("=")[0].strip(" \"'") == key), 0)
 
     def _check(self) -> None:
         for path, one in self.actors.items():
             if path != self.below and not path.startswith(f"{self.below}/"):
                 raise self.error(path, f"it is not below {self.below}, which this file is about")
             above = self.actors.get(one.above)
-            if above is not None and (above.is_kept or (above.spec is not None and not above.spec.is_supervisor)):
+            if above is not None and (above.keeps_below or (above.spec is not None and not above.spec.is_supervisor)):
                 raise self.error(path, f"{above.path} is no supervisor here, and has nobody below it")
             if above is None and path != self.below and one.above != self.below:
                 raise self.error(path, f"its supervisor {one.above} has no table in this file")
@@ -117,13 +94,13 @@ class TreeFile:
 
     def _is_kept(self, path: str) -> bool:
         """Whether somebody above is kept as it is, and may have this one below it."""
-        return any(one.is_kept and path.startswith(f"{one.path}/") for one in self.actors.values())
+        return any(one.keeps_below and path.startswith(f"{one.path}/") for one in self.actors.values())
 
     # -- one table ----------------------------------------------------------------------------------------------------
 
     def _read(self, path: str, given: dict[str, Any]) -> WantedActor:
         if given.get("keep") is True and len(given) == 1:
-            return WantedActor(path, None, given)
+            return WantedActor(path, None, keeps_below=True)
         if "keep" in given:
             raise self.error(path, "keep = true stands alone: the actor stays as it is", "keep")
         is_root = path.count("/") == 1
@@ -135,7 +112,7 @@ class TreeFile:
             if key not in known:
                 raise self.error(path, f"there is no key {key!r} here; there are {', '.join(known)}", key)
         if is_root:
-            return WantedActor(path, None, given)
+            return WantedActor(path, None, flags=self._flags(path, given))
         try:
             spec = self._supervisor(path, given) if is_supervisor else self._actor(path, given)
         except (HoldfastError, TypeError, ValueError, DamagedValue) as error:
@@ -143,8 +120,16 @@ class TreeFile:
             if isinstance(error, SpecError) and error.where.startswith(self._name):
                 raise
             raise self.error(path, problem, next((key for key in given if key in problem), None)) from error
-        names = self._texts(path, "names", given.get("names", []))
-        return WantedActor(path, spec, given, tuple(names), dict(spec.bindings), given.get("running", True) is True)
+        flags = spec.start.args[0] if is_supervisor else None
+        return WantedActor(path, spec, flags=flags, names=tuple(self._texts(path, "names", given.get("names", []))))
+
+    def _flags(self, path: str, given: dict[str, Any]) -> Flags:
+        """The flags of the root: what is not said is as `ActorSystem` has it."""
+        strategy = given["supervisor"]
+        try:
+            return Flags(strategy, given.get("intensity", 3), given.get("period", 5.0))
+        except SpecError as error:
+            raise self.error(path, error.problem, next((key for key in given if key in error.problem), None)) from error
 
     def _supervisor(self, path: str, given: dict[str, Any]) -> ChildSpec:
         options = {key: value for key, value in given.items() if key != "supervisor"}

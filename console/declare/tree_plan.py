@@ -24,7 +24,8 @@ from ...system.transaction.running import StartAgain, StopChild
 from ...system.transaction.structure import AddChild, RemoveActor, Reorder, SetFlags
 from ...system.transaction.wiring import Bind, RegisterName, Unbind, UnregisterName
 from ..trust import Needed, trusted_imports
-from .tree_file import TreeFile, WantedActor
+from .tree_file import TreeFile
+from .wanted import WantedActor, WantedTree
 
 if TYPE_CHECKING:
     from ...system.system import ActorSystem
@@ -53,6 +54,17 @@ async def declare(
     """
     with trusted_imports(system._node, Needed(None, [])):
         wanted = TreeFile(text, name)
+    return await change_to(system, wanted, dry_run=dry_run, timeout=timeout)
+
+
+async def change_to(
+    system: ActorSystem, wanted: WantedTree, *, dry_run: bool = False, timeout: float = 60.0
+) -> Change | None:
+    """Have the tree of a running system be as it is wanted, by one transaction; None: it is so already.
+
+    Raises:
+        SpecError: it cannot be so while all runs. TransactionRefused, TransactionFailed: as any transaction.
+    """
     steps = await TreePlan(system, wanted, timeout).steps()
     if not steps:
         return None
@@ -67,10 +79,25 @@ def keep_state(state: Any, old: object) -> Any:
     return state
 
 
-class TreePlan:
-    """Compares what runs with a file."""
+def classes_of(system: ActorSystem) -> list[tuple[str, type[Actor]]]:
+    """The classes of all actors that are no supervisors, and no parts of the runtime, by address."""
+    found: list[tuple[str, type[Actor]]] = []
+    waiting = [Draft(system._node, Arrangement(), 1.0).root]
+    while waiting:
+        place = waiting.pop()
+        if place.kind is RecoverySupervisor:
+            continue
+        if place.kind is not None and not place.is_supervisor and not place.is_stopped:
+            found.append((place.path, place.kind))
+        if not place.is_protected:
+            waiting.extend(place.children.values())
+    return found
 
-    def __init__(self, system: ActorSystem, wanted: TreeFile, timeout: float) -> None:
+
+class TreePlan:
+    """Compares what runs with what is wanted."""
+
+    def __init__(self, system: ActorSystem, wanted: WantedTree, timeout: float) -> None:
         self._system, self._wanted = system, wanted
         self._draft = Draft(system._node, Arrangement(), timeout)
         self._there: dict[str, DraftPlace] = {}  # who is at each address of the file already, or comes there
@@ -111,7 +138,9 @@ class TreePlan:
                 continue
             if place.is_supervisor and not place.is_stopped:
                 await self._draft.supervisor(place.path)
+            wanted = self._wanted.actors.get(place.path)
             free = place.is_dynamic or place.is_uniform or place.is_partitioned
+            free = free or (wanted is not None and wanted.keeps_below)
             for child in place.children.values():
                 is_named = child.path in self._wanted.actors
                 if child.kind is RecoverySupervisor or child.know_spec() is None or (free and not is_named):
@@ -120,7 +149,7 @@ class TreePlan:
                 waiting.append(child)
 
     def _is_kept(self, path: str) -> bool:
-        return any(one.is_kept and path.startswith(f"{one.path}/") for one in self._wanted.actors.values())
+        return any(one.keeps_below and path.startswith(f"{one.path}/") for one in self._wanted.actors.values())
 
     def _new(self) -> list[WantedActor]:
         return [one for one in self._wanted.actors.values() if one.spec is not None and one.path not in self._there]
@@ -149,9 +178,8 @@ class TreePlan:
     def _freed_names(self) -> Iterator[Operation]:
         for path, place in self._there.items():
             wanted = self._wanted.actors[path]
-            for name in place.names if wanted.spec is not None and not place.is_stopped else ():
-                if name not in wanted.names:
-                    yield UnregisterName(name)
+            if wanted.names is not None and not place.is_stopped:
+                yield from (UnregisterName(name) for name in place.names if name not in wanted.names)
 
     def _moves(self) -> Iterator[Operation]:
         fresh = {one.path for one in self._new()}
@@ -172,11 +200,8 @@ class TreePlan:
     def _spec_of(self, one: WantedActor, fresh: dict[str, WantedActor]) -> ChildSpec:
         """The spec of one that is new, with all that is new below it."""
         assert one.spec is not None
-        spec = dataclasses.replace(
-            one.spec,
-            bindings=self._bound_early(one, fresh),
-            register=one.names[0] if one.names else None,
-        )
+        register = one.spec.register if one.names is None else next(iter(one.names), None)
+        spec = dataclasses.replace(one.spec, bindings=self._bound_early(one, fresh), register=register)
         below = [inner for inner in fresh.values() if inner.above == one.path]
         if not spec.is_supervisor or not below or len(spec.start.args) != 2:
             return spec
@@ -209,23 +234,16 @@ class TreePlan:
             yield Protect(path, spec.mechanism)
 
     def _changed_flags(self, wanted: WantedActor, place: DraftPlace) -> Iterator[Operation]:
-        flags, given, path = place.flags, wanted.given, wanted.path
-        if flags is None or "supervisor" not in given:
+        now, flags, path = place.flags, wanted.flags, wanted.path
+        if flags is None or now is None:
             return
-        target = wanted.spec.start.args[0] if wanted.spec is not None and not place.is_dynamic else flags
         for name in FIXED_FLAGS:
-            if name in given and given[name] != getattr(flags, name):
-                raise self._wanted.error(path, f"it is {getattr(flags, name)!r} now, and {ANEW}", name)
-        strategy = given["supervisor"] if given["supervisor"] != "dynamic" else flags.strategy
-        if place.is_dynamic != (given["supervisor"] == "dynamic"):
-            raise self._wanted.error(path, f"what kind of supervisor it is {ANEW}", "supervisor")
-        if strategy != flags.strategy:
-            yield SetFlags(path, strategy=strategy)
-        default = target if wanted.spec is not None else flags
-        intensity = given.get("intensity", default.intensity)
-        period = float(given.get("period", default.period))
-        if (intensity, period) != (flags.intensity, flags.period):
-            yield SetFlags(path, intensity=intensity, period=period)
+            if getattr(flags, name) != getattr(now, name):
+                raise self._wanted.error(path, f"it is {getattr(now, name)!r} now, and {ANEW}", name)
+        if flags.strategy != now.strategy:
+            yield SetFlags(path, strategy=flags.strategy)
+        if (flags.intensity, flags.period) != (now.intensity, now.period):
+            yield SetFlags(path, intensity=flags.intensity, period=flags.period)
 
     def _changed_code(self, path: str, spec: ChildSpec, now: ChildSpec, place: DraftPlace) -> Iterator[Operation]:
         if place.kind is not spec.start.kind:
@@ -256,8 +274,12 @@ class TreePlan:
                 if bound.get(port) != to:
                     yield Bind(path, port, to)
             for port in bound.keys() - one.bindings.keys():
-                yield Unbind(path, port)
-            for name in one.names if place is not None else one.names[1:]:
+                if one.names is not None or (
+                    place is not None and place.spec is not None and port in place.spec.bindings
+                ):
+                    yield Unbind(path, port)  # A program binds by calls, too; a file says all of it.
+            names = one.names or ()
+            for name in names if place is not None else names[1:]:
                 if place is None or name not in place.names:
                     yield RegisterName(name, path)
 
