@@ -21,7 +21,7 @@ from ..actors.values import encode_value
 from ..system.system import ActorSystem
 from .claims import EndpointInUse, absolute, claimed, listen, remove
 from .runtime_folder import socket_path
-from .session import LONGEST, Session
+from .session import LONGEST, ClientSession
 from .wire import (
     REQUEST,
     AnyRequest,
@@ -123,7 +123,7 @@ class Endpoint:
         task = asyncio.current_task()
         assert task is not None
         self._clients.add(task)
-        session = Session(self._system, self._since)
+        session = ClientSession(self._system, self._since)
         try:
             check_user(peer_uid(writer.get_extra_info("socket")), self._uid)
             self._make_place()
@@ -167,7 +167,7 @@ class Endpoint:
             self._idle.pop(task, None)
 
     async def _answer(
-        self, session: Session, body: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+        self, session: ClientSession, body: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> bool:
         """Carry out one request. If the client goes meanwhile it is cancelled, and with it undone: False."""
         request = REQUEST.decode(body)
@@ -187,7 +187,7 @@ class Endpoint:
             await write(writer, work.result())
         return is_over
 
-    async def _respond(self, session: Session, request: AnyRequest) -> ControlResponse:
+    async def _respond(self, session: ClientSession, request: AnyRequest) -> ControlResponse:
         try:
             async with asyncio.timeout(LONGEST):
                 value = await session.answer(request)

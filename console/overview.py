@@ -71,7 +71,7 @@ class ProcessUse(msgspec.Struct, frozen=True, array_like=True):
     cpu_seconds: float
 
 
-class Look(msgspec.Struct, frozen=True):
+class SystemLook(msgspec.Struct, frozen=True):
     """All rows of a system, parents before children, at one time."""
 
     system: str
@@ -82,7 +82,7 @@ class Look(msgspec.Struct, frozen=True):
     processes: list[ProcessUse]
 
 
-LOOK: msgspec.msgpack.Decoder[Look] = msgspec.msgpack.Decoder(Look)
+LOOK: msgspec.msgpack.Decoder[SystemLook] = msgspec.msgpack.Decoder(SystemLook)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class Found:
     pid: int
 
 
-async def look_at(system: ActorSystem, *, parts: bool) -> Look:
+async def look_at(system: ActorSystem, *, parts: bool) -> SystemLook:
     """Every actor of a system, in one pass; those in other processes are asked all at once.
 
     Args:
@@ -119,7 +119,7 @@ async def look_at(system: ActorSystem, *, parts: bool) -> Look:
             rows[place] = as_told(rows[place], status)
     pids = sorted({row.pid for row in rows if row.pid} | {os.getpid()})
     uses = [use for pid in pids if (use := process_use(pid)) is not None]
-    return Look(system.name, os.getpid(), time.monotonic(), rows, uses)
+    return SystemLook(system.name, os.getpid(), time.monotonic(), rows, uses)
 
 
 def walk(top: Found, *, parts: bool) -> Iterator[Found]:

@@ -24,16 +24,16 @@ from ..actors.values import decode_value, describe_value
 from ..ftm.group.protected import ProtectionStatus
 from ..supervision.spec import NAMELESS, ChildSpec, Isolation, Strategy, child
 from ..system.transaction.operation import Step
-from .overview import LOOK, Look
+from .overview import LOOK, SystemLook
 from .wire import (
     RESPONSE,
     About,
     AnyRequest,
     ControlActor,
     CountTurns,
-    Declare,
-    Follow,
-    Inspect,
+    DeclareTree,
+    FollowActor,
+    InspectActor,
     NextEvents,
     Overview,
     RestartActor,
@@ -57,7 +57,7 @@ GRACE = 35.0
 
 SHORT_GRACE = 5.0
 """The same of one that changes nothing."""
-CHANGES = (ControlActor, Declare, RestartActor, Transact)
+CHANGES = (ControlActor, DeclareTree, RestartActor, Transact)
 
 
 class NotReached(
@@ -186,14 +186,14 @@ class RemoteSystem:
         found: dict[str, Any] = self._client.call(About(), ABOUT_TIMEOUT)
         return found
 
-    def look(self, *, parts: bool = False) -> Look:
+    def look(self, *, parts: bool = False) -> SystemLook:
         """How all actors are; with `parts` those of the runtime itself too."""
-        found: Look = LOOK.decode(self._client.call(Overview(parts), 10.0))
+        found: SystemLook = LOOK.decode(self._client.call(Overview(parts), 10.0))
         return found
 
     def inspect(self, ref: RemoteTarget, *, timeout: float = 5.0) -> dict[str, Any]:
         """All that can be said of one actor, as plain data."""
-        found: dict[str, Any] = self._client.call(Inspect(text_of(ref), timeout), timeout)
+        found: dict[str, Any] = self._client.call(InspectActor(text_of(ref), timeout), timeout)
         return found
 
     def state(self, ref: RemoteTarget, *, timeout: float = 5.0) -> Any:
@@ -206,7 +206,7 @@ class RemoteSystem:
 
     def follow(self, ref: RemoteTarget) -> None:
         """Follow what an actor does, for as long as this connection lasts: `next_events` tells."""
-        self._client.call(Follow(text_of(ref)), 10.0)
+        self._client.call(FollowActor(text_of(ref)), 10.0)
 
     def next_events(self, seconds: float) -> dict[str, Any]:
         """What the actor that is followed has done since the last time, waiting at most so long for something."""
@@ -315,7 +315,7 @@ class RemoteSystem:
     async def declare(self, text: str, name: str, *, dry_run: bool = False, timeout: float = 60.0) -> RemoteChange:
         """Have the tree be as a file says, by one transaction; `name` is what the file is called in errors."""
         change = RemoteChange()
-        change._take(await self.call(Declare(text, name, dry_run, timeout), timeout))
+        change._take(await self.call(DeclareTree(text, name, dry_run, timeout), timeout))
         return change
 
     async def call(self, request: AnyRequest, timeout: float) -> Any:

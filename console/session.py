@@ -25,9 +25,9 @@ from .wire import (
     BadRequest,
     ControlActor,
     CountTurns,
-    Declare,
-    Follow,
-    Inspect,
+    DeclareTree,
+    FollowActor,
+    InspectActor,
     NextEvents,
     Overview,
     RestartActor,
@@ -53,7 +53,7 @@ NAMED = {"update": ("mechanism", "role")}
 """What comes last is named."""
 
 
-class Session:
+class ClientSession:
     """Answers the requests of one client. `close` gives back what it has switched on."""
 
     def __init__(self, system: ActorSystem, since: float) -> None:
@@ -79,7 +79,7 @@ class Session:
                 return system.whereis(request.name).path
             case Overview():
                 return msgspec.msgpack.encode(await look_at(system, parts=request.parts))
-            case Inspect():
+            case InspectActor():
                 return await inspected(system, request.path, min(request.timeout, LONGEST))
             case RestartActor():
                 return await restart_actor(system, request.path, min(request.timeout, LONGEST))
@@ -87,13 +87,13 @@ class Session:
                 return await self._control(request)
             case Transact():
                 return await self._transact(request)
-            case Follow():
+            case FollowActor():
                 return await self._follow(request.path)
             case NextEvents():
                 return await self._next_events(request)
             case CountTurns():
                 return await self._count(request.paths)
-            case Declare():
+            case DeclareTree():
                 timeout = min(request.timeout, LONGEST)
                 change = await declare(system, request.text, request.name, dry_run=request.dry_run, timeout=timeout)
                 return {"steps": [], "difference": []} if change is None else as_told(change)

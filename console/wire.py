@@ -161,7 +161,7 @@ class Overview(ControlRequest, tag="overview", frozen=True):
     parts: bool = False
 
 
-class Inspect(ControlRequest, tag="inspect", frozen=True):
+class InspectActor(ControlRequest, tag="inspect", frozen=True):
     """All that can be said of one actor."""
 
     path: str
@@ -175,7 +175,7 @@ class RestartActor(ControlRequest, tag="restart", frozen=True):
     timeout: float = 5.0
 
 
-class Follow(ControlRequest, tag="follow", frozen=True):
+class FollowActor(ControlRequest, tag="follow", frozen=True):
     """Follow the messages of one actor, for as long as this connection lasts."""
 
     path: str
@@ -233,7 +233,7 @@ class Transact(ControlRequest, tag="transaction", frozen=True):
     script: tuple[str, str] | None = None
 
 
-class Declare(ControlRequest, tag="declare", frozen=True):
+class DeclareTree(ControlRequest, tag="declare", frozen=True):
     """Have the tree be as a file says; `name` is what it is called in errors."""
 
     text: str
@@ -245,12 +245,12 @@ class Declare(ControlRequest, tag="declare", frozen=True):
 AnyRequest = (
     About
     | Overview
-    | Inspect
+    | InspectActor
     | RestartActor
-    | Follow
+    | FollowActor
     | NextEvents
     | CountTurns
-    | Declare
+    | DeclareTree
     | Tree
     | Whereis
     | ControlActor

@@ -11,7 +11,7 @@ import msgspec
 import typer
 
 from ...actors.errors import HoldfastError
-from ..overview import ActorRow, Look
+from ..overview import ActorRow, SystemLook
 from ..remote import RemoteSystem
 from ..runtime_folder import found_sockets, sweep
 from .patterns import select
@@ -91,7 +91,7 @@ def tree(
         typer.echo("\n".join(tree_lines(with_ancestors(look.rows, rows))))
 
 
-def as_plain_look(look: Look, rows: list[ActorRow]) -> dict[str, Any]:
+def as_plain_look(look: SystemLook, rows: list[ActorRow]) -> dict[str, Any]:
     """A look as the JSON output has it."""
     return {
         "system": look.system,

@@ -14,7 +14,7 @@ from textual.screen import ModalScreen
 from textual.widgets import Footer, Input, Static
 
 from ...actors.errors import HoldfastError
-from ..overview import ActorRow, Look
+from ..overview import ActorRow, SystemLook
 from ..remote import NotReached, RemoteSystem
 from .changing import lost_by
 from .looking import COLOURS, inspection_lines
@@ -85,7 +85,7 @@ class Top(App[str]):
     def __init__(self, remote: RemoteSystem, *, seconds: float = 1.0, patterns: tuple[str, ...] = ()) -> None:
         super().__init__()
         self._remote, self._seconds, self._patterns = remote, seconds, patterns
-        self._look: Look | None = None
+        self._look: SystemLook | None = None
         self._turns: dict[str, int] = {}
         self._rates: dict[str, float] = {}
         self._sort = SORTS[0]
@@ -128,20 +128,19 @@ class Top(App[str]):
             self._is_asking = False
         self._show(look, rows, turns)
 
-    def _chosen(self, look: Look) -> list[ActorRow]:
+    def _chosen(self, look: SystemLook) -> list[ActorRow]:
         rows = look.rows
         if self._patterns:
             with contextlib.suppress(HoldfastError):
                 rows = select(rows, self._patterns)
-        keys = {
-            "queued": lambda row: -row.queued,
-            "restarts": lambda row: -row.restarts,
-            "turns/s": lambda row: -self._rates.get(row.path, 0.0),
-        }
-        key = keys.get(self._sort)
-        return (rows if key is None else sorted(rows, key=key))[:MOST_ROWS]
+        return sorted(rows, key=self._place_of)[:MOST_ROWS] if self._sort != "tree" else rows[:MOST_ROWS]
 
-    def _show(self, look: Look, rows: list[ActorRow], turns: dict[str, int]) -> None:
+    def _place_of(self, row: ActorRow) -> float:
+        """What the rows are ordered by: the most comes first."""
+        found = {"queued": row.queued, "restarts": row.restarts, "turns/s": self._rates.get(row.path, 0.0)}
+        return -found[self._sort]
+
+    def _show(self, look: SystemLook, rows: list[ActorRow], turns: dict[str, int]) -> None:
         before, self._look = self._look, look
         seconds = look.seconds - before.seconds if before is not None else 0.0
         self._rates = {
@@ -159,7 +158,7 @@ class Top(App[str]):
         self.query_one("#head", Static).update(f"{head}; {sum(self._rates.values()):.0f} turns/s; by {self._sort}")
 
     @staticmethod
-    def _processes(look: Look, before: Look | None, seconds: float) -> dict[int, tuple[str, str]]:
+    def _processes(look: SystemLook, before: SystemLook | None, seconds: float) -> dict[int, tuple[str, str]]:
         """Of each process its memory, and the share of one processor that it has used since the last time."""
         used = {use.pid: use.cpu_seconds for use in before.processes} if before is not None else {}
         return {

@@ -34,7 +34,7 @@ UNSYNCHRONISED: Final = 5
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Finding:
+class MachineFinding:
     """One thing that was looked at."""
 
     about: str
@@ -43,22 +43,22 @@ class Finding:
     advice: str = ""
 
 
-def ok(about: str, found: str) -> Finding:
+def ok(about: str, found: str) -> MachineFinding:
     """All is as it should be."""
-    return Finding(about, "ok", found)
+    return MachineFinding(about, "ok", found)
 
 
-def warn(about: str, found: str, advice: str) -> Finding:
+def warn(about: str, found: str, advice: str) -> MachineFinding:
     """It works, but not under all circumstances."""
-    return Finding(about, "warning", found, advice)
+    return MachineFinding(about, "warning", found, advice)
 
 
-def fail(about: str, found: str, advice: str) -> Finding:
+def fail(about: str, found: str, advice: str) -> MachineFinding:
     """It does not work so."""
-    return Finding(about, "failed", found, advice)
+    return MachineFinding(about, "failed", found, advice)
 
 
-def python() -> Iterator[Finding]:
+def python() -> Iterator[MachineFinding]:
     """The interpreter, the event loop, and the operating system."""
     yield ok("python", f"{platform.python_version()} at {sys.executable}")
     if importlib.util.find_spec("uvloop") is not None:
@@ -71,7 +71,7 @@ def python() -> Iterator[Finding]:
         yield warn("system", sys.platform, "actors in processes need Linux; elsewhere there are tasks only")
 
 
-def limits() -> Iterator[Finding]:
+def limits() -> Iterator[MachineFinding]:
     """What the kernel lets this user have."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY or soft >= LEAST_FILES:
@@ -85,7 +85,7 @@ def limits() -> Iterator[Finding]:
         yield warn("processes", str(most), "ulimit -u 4096: each process actor is a process, each replica too")
 
 
-def memory() -> Iterator[Finding]:
+def memory() -> Iterator[MachineFinding]:
     """Shared memory, the memory of the machine, and the limits of a container."""
     if sys.platform == "linux":
         try:
@@ -113,7 +113,7 @@ def cgroup_number(name: str) -> int | None:
     return int(text) if text.isdecimal() else None
 
 
-def clock() -> Iterator[Finding]:
+def clock() -> Iterator[MachineFinding]:
     """Whether the clock of the machine is kept right: timers that wait for days go by it."""
     state = clock_state()
     if state is None:
@@ -134,7 +134,7 @@ def clock_state() -> int | None:
     return None if state < 0 else state
 
 
-def folder() -> Iterator[Finding]:
+def folder() -> Iterator[MachineFinding]:
     """Where systems are found by name."""
     try:
         where = runtime_folder()
@@ -144,7 +144,7 @@ def folder() -> Iterator[Finding]:
         yield fail("runtime folder", str(error), "systems are not found by name; set XDG_RUNTIME_DIR, or use --socket")
 
 
-def store(path: Path) -> Iterator[Finding]:
+def store(path: Path) -> Iterator[MachineFinding]:
     """A store: where it is, what room it has, and whether all of it is good."""
     about = f"store {path}"
     if not path.exists():
@@ -179,7 +179,7 @@ def file_system(path: Path) -> str:
     return max(mounts, key=lambda one: len(one.mountpoint)).fstype if mounts else ""
 
 
-LOOKS: Final[tuple[Callable[[], Iterator[Finding]], ...]] = (python, limits, memory, clock, folder)
+LOOKS: Final[tuple[Callable[[], Iterator[MachineFinding]], ...]] = (python, limits, memory, clock, folder)
 COLOURS: Final = {"ok": "green", "warning": "yellow", "failed": "red"}
 
 

@@ -28,6 +28,12 @@ class Take(hf.Message[int]):
     count: int
 
 
+class Sell(hf.Message[str]):
+    """Sell so many to a customer; the answer is for the customer."""
+
+    count: int
+
+
 class SoldOut(hf.Refusal, text="there are only {left} left"):
     """There are not so many."""
 
@@ -37,7 +43,7 @@ ACTORS: Final = '''"""The actors of $name."""
 
 import holdfast as hf
 
-from .messages import Put, SoldOut, Take
+from .messages import Put, Sell, SoldOut, Take
 
 
 class Stock(hf.Actor):
@@ -57,53 +63,72 @@ class Stock(hf.Actor):
             raise SoldOut(self.count)
         self.count -= message.count
         return self.count
+
+
+class Clerk(hf.Actor):
+    """Sells what is in the stock to which it is bound."""
+
+    stock: hf.Binding[Stock]
+
+    @hf.on(Sell)
+    async def sell(self, message: Sell) -> str:
+        return f"{await self.stock.ask(Take(message.count))} are left"
 '''
-TREE: Final = '''"""What runs: `holdfast run $name.tree:tree`."""
+TREE: Final = '''"""What runs: `holdfast run $name.tree:tree --name $name`."""
 
 import holdfast as hf
 
-from .actors import Stock
+from .actors import Clerk, Stock
 
 
-def tree() -> hf.ChildSpec:
-    """The supervision tree."""
+def tree() -> list[hf.ChildSpec]:
+    """The children of the root."""
     articles = [hf.child(article, hf.start(Stock, 10), recovery=hf.hybrid()) for article in ("apples", "pears")]
-    return hf.supervisor("stock", intensity=5, period=10.0, children=articles)
+    return [
+        hf.supervisor("stock", intensity=5, period=10.0, children=articles),
+        hf.child("clerk", hf.start(Clerk), bindings={"stock": "/$name/stock/apples"}),
+    ]
 '''
-TEST: Final = '''"""The stock is kept over a crash of its actor."""
+TEST: Final = '''"""The stock is kept, also over an end of its actor."""
 
 import asyncio
+from collections.abc import Awaitable, Callable
 
 import holdfast as hf
 import pytest
-from $name.actors import Stock
-from $name.messages import Put, SoldOut, Take
+from $name.actors import Clerk, Stock
+from $name.messages import Put, Sell, SoldOut, Take
 from $name.tree import tree
 
 
-def test_what_is_put_can_be_taken() -> None:
-    async def scenario() -> None:
-        async with hf.ActorSystem("app", log=False) as system:
-            await system.start(tree())
-            apples = system.ref("/app/stock/apples", Stock)
-            assert await apples.ask(Put(5)) == 15
-            assert await apples.ask(Take(3)) == 12
-            with pytest.raises(SoldOut):
-                await apples.ask(Take(100))
+def in_system(scenario: Callable[[hf.ActorSystem], Awaitable[None]]) -> None:
+    async def main() -> None:
+        async with hf.ActorSystem("$name", log=False) as system:
+            for spec in tree():
+                await system.start(spec)
+            await scenario(system)
 
-    asyncio.run(scenario())
+    asyncio.run(main())
+
+
+def test_what_is_put_can_be_sold() -> None:
+    async def scenario(system: hf.ActorSystem) -> None:
+        assert await system.ref("/$name/stock/apples", Stock).ask(Put(5)) == 15
+        assert await system.ref("/$name/clerk", Clerk).ask(Sell(3)) == "12 are left"
+        with pytest.raises(SoldOut):
+            await system.ref("/$name/stock/apples", Stock).ask(Take(100))
+
+    in_system(scenario)
 
 
 def test_the_stock_survives_the_end_of_its_actor() -> None:
-    async def scenario() -> None:
-        async with hf.ActorSystem("app", log=False) as system:
-            await system.start(tree())
-            pears = system.ref("/app/stock/pears", Stock)
-            assert await pears.ask(Put(5)) == 15
-            await system.terminate(pears)
-            assert await pears.ask(Take(0)) == 15
+    async def scenario(system: hf.ActorSystem) -> None:
+        pears = system.ref("/$name/stock/pears", Stock)
+        assert await pears.ask(Put(5)) == 15
+        await system.terminate(pears)
+        assert await pears.ask(Take(0)) == 15
 
-    asyncio.run(scenario())
+    in_system(scenario)
 '''
 PYPROJECT: Final = """[build-system]
 requires = ["setuptools>=77"]
@@ -157,9 +182,9 @@ README: Final = """# $name
 
 ```sh
 pip install -e . pytest
-python -m pytest                 # its tests
-holdfast run $name.tree:tree     # in one terminal
-holdfast tree                    # in another one
+python -m pytest                                # its tests
+holdfast run $name.tree:tree --name $name       # in one terminal
+holdfast tree                                   # in another one
 holdfast top
 ```
 
@@ -210,4 +235,4 @@ def new(
         raise ended("new", f"{where}: {error.strerror or error}", UNUSABLE) from error
     for file in files:
         typer.echo(str(file))
-    typer.echo(f"cd {where} && python -m pytest && holdfast run {name}.tree:tree")
+    typer.echo(f"cd {where} && python -m pytest && holdfast run {name}.tree:tree --name {name}")

@@ -33,7 +33,7 @@ RELOAD_TIMEOUT = 60.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Program:
+class ServedProgram:
     """What is run: a file, or what a module names."""
 
     target: str
@@ -69,20 +69,20 @@ class Program:
             return _words(await change_to(system, WantedSpecs(system.name, top, self.target), timeout=RELOAD_TIMEOUT))
 
 
-def load_program(target: str) -> Program:
+def load_program(target: str) -> ServedProgram:
     """Find what is to be run. Raises SpecError: there is no such thing."""
     if target.endswith(".toml"):
         _text(target)
-        return Program(target)
+        return ServedProgram(target)
     if target.partition(":")[0].endswith(".py"):
         raise SpecError(target, "name a module, such as shop.tree:tree: actors in processes are imported by its name")
     found = load_named(target)
     if not inspect.iscoroutinefunction(found):
         specs_in(target, found)
-        return Program(target)
+        return ServedProgram(target)
     if len(inspect.signature(found).parameters) != 1:
         raise SpecError(target, "an async main takes the running system: async def main(system)")
-    return Program(target, found)
+    return ServedProgram(target, found)
 
 
 def _text(file: str) -> str:
@@ -110,7 +110,7 @@ async def _replace_codes(system: ActorSystem, names: set[str]) -> list[str]:
     return _words(change)
 
 
-async def serve(program: Program, make: Callable[[], ActorSystem], notifier: Notifier) -> None:
+async def serve(program: ServedProgram, make: Callable[[], ActorSystem], notifier: Notifier) -> None:
     """Run the program until it is told to stop, or its main has returned."""
     system = make()
     async with system, control_endpoint(system) as socket:
@@ -142,7 +142,9 @@ def tell(text: str) -> None:
     typer.echo(f"holdfast run: {text}", err=True)
 
 
-async def _reload(program: Program, system: ActorSystem, modules: ProjectModules | None, notifier: Notifier) -> None:
+async def _reload(
+    program: ServedProgram, system: ActorSystem, modules: ProjectModules | None, notifier: Notifier
+) -> None:
     """Reload, and say what has become of it: whoever has sent the signal reads it in the log."""
     notifier.reloading()
     try:

@@ -23,7 +23,7 @@ from holdfast.console import endpoint as endpoint_module
 from holdfast.console.claims import EndpointInUse, claimed
 from holdfast.console.endpoint import Endpoint, control_endpoint
 from holdfast.console.remote import Client, NotReached, RemoteRef, RemoteSystem
-from holdfast.console.session import Session
+from holdfast.console.session import ClientSession
 from holdfast.console.wire import (
     RESPONSE,
     BadRequest,
@@ -255,12 +255,12 @@ async def test_clients_at_work_are_not_sent_away(
     monkeypatch.setattr(endpoint_module, "MOST_CLIENTS", 1)
     at_work, finish = asyncio.Event(), asyncio.Event()
 
-    async def wait(session: Session, request: Any) -> Any:
+    async def wait(session: ClientSession, request: Any) -> Any:
         at_work.set()
         await finish.wait()
         return system.tree()
 
-    monkeypatch.setattr(Session, "answer", wait)
+    monkeypatch.setattr(ClientSession, "answer", wait)
     reader, writer = await asyncio.open_unix_connection(path)
     writer.write(frame(Tree()))
     await at_work.wait()

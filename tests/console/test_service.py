@@ -7,7 +7,7 @@ import signal
 import socket
 import sys
 import tempfile
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncGenerator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -105,7 +105,7 @@ class Service:
 
 
 @asynccontextmanager
-async def running(*arguments: object) -> AsyncIterator[Service]:
+async def running(*arguments: object) -> AsyncGenerator[Service]:
     """The program, up, under a service manager."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager, tempfile.TemporaryDirectory(dir="/tmp") as folder:
         manager.bind(f"{folder}/notify")

@@ -1,7 +1,7 @@
 """`holdfast top`, by Textual's pilot, against a real system behind its real endpoint."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from tests.system.trees import Add, ref
 
 
 @asynccontextmanager
-async def shown(path: Path) -> AsyncIterator[Pilot[str]]:
+async def shown(path: Path) -> AsyncGenerator[Pilot[str]]:
     """The page, filled."""
     with await asyncio.to_thread(RemoteSystem, path) as remote:
         app = Top(remote, seconds=0.2)
