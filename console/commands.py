@@ -10,14 +10,15 @@ import typer
 from rich.console import Console
 
 from .. import HoldfastError, run
-from . import history_commands, operate, upgrade_commands
+from . import upgrade_commands
+from .operate import changing, declaring, following, looking, remembering
+from .service import doctor, project, running
 from .store_commands import store
 
 commands = typer.Typer(
     name="holdfast",
     help="Actors in supervision trees, with crash recovery that loses nothing.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
@@ -71,14 +72,34 @@ def demo(
         raise typer.Exit(DIFFERS)
 
 
-commands.command()(operate.apply)
-commands.command()(operate.tree)
-commands.command()(operate.status)
-commands.command()(history_commands.why)
-commands.command()(history_commands.history)
-commands.command()(history_commands.events)
-commands.command("dead-letters")(history_commands.dead_letters)
-commands.command()(history_commands.quarantine)
+for command in (
+    looking.ls,
+    looking.tree,
+    looking.top,
+    looking.inspect,
+    following.trace,
+    changing.suspend,
+    changing.resume,
+    changing.restart,
+    changing.stop,
+    changing.start,
+    changing.remove,
+    changing.bind,
+    changing.unbind,
+    changing.protect,
+    changing.checkpoint,
+    remembering.why,
+    remembering.history,
+    remembering.events,
+    remembering.dead_letters,
+    remembering.quarantine,
+    declaring.plan,
+    declaring.apply,
+    running.run,
+    project.new,
+    doctor.doctor,
+):
+    commands.command()(command)
 commands.command("check-upgrade")(upgrade_commands.check)
 commands.command("replay")(upgrade_commands.replay)
 commands.add_typer(store)

@@ -4,47 +4,35 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
-import fcntl
 import os
 import socket
-import stat
-from collections.abc import AsyncGenerator, Generator
+import time
+from collections.abc import AsyncGenerator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from ..actors.errors import HoldfastError
-from ..actors.kernel.actor import Actor
 from ..actors.ordered import Ordered
 from ..actors.process.wire.frame_buffer import LENGTH
 from ..actors.streams import Listener
 from ..actors.values import encode_value
 from ..system.history.authors import ACTING, OPERATOR
-from ..system.history.pages import HistoryPage
-from ..system.script import check_folders
 from ..system.system import ActorSystem
-from .trust import Needed, trusted_imports
+from .claims import EndpointInUse, absolute, claimed, listen, remove
+from .runtime_folder import socket_path
+from .session import LONGEST, ClientSession
 from .wire import (
     REQUEST,
     AnyRequest,
-    AskHistory,
-    AskLives,
-    AskQuarantined,
-    AskWhy,
     BadRequest,
-    ControlActor,
     ControlResponse,
     NotServed,
-    Transact,
-    Tree,
-    Whereis,
     body_size,
     check_user,
     failure,
     frame,
-    open_arg,
     peer_uid,
 )
 
@@ -56,25 +44,16 @@ PATIENCE = 10.0
 """Seconds that a frame may take once it has begun, either way."""
 LINGER = 1.0
 """Seconds that a client gets to take the reason why its connection ends."""
-LONGEST = 3600.0
-"""Seconds that one request may take."""
-_TREE = {"add", "remove", "move", "reorder", "strategy", "intensity", "isolation", "stop", "start"}
-_LIVING = {"bind", "unbind", "register", "unregister", "suspend", "resume", "replace_state", "replace_code"}
-OPERATIONS = frozenset(_TREE | _LIVING | {"protect", "update"})
-NAMED = {"update": ("mechanism", "role")}
-"""What comes last is named."""
-
-
-class EndpointInUse(HoldfastError, text="control endpoint {path}: {why}"):
-    """A live process listens at this socket, it is no socket, or the system cannot watch one more."""
-
-    path: str
-    why: str
 
 
 @contextlib.asynccontextmanager
-async def control_endpoint(system: ActorSystem, path: str | os.PathLike[str]) -> AsyncGenerator[Path, None]:
-    """Serve the control endpoint of a running system at `path`, for this user only, until the block ends.
+async def control_endpoint(
+    system: ActorSystem, path: str | os.PathLike[str] | None = None
+) -> AsyncGenerator[Path, None]:
+    """Serve the control endpoint of a running system, for this user only, until the block ends.
+
+    Without a path the system is found by its name: its socket is in `$XDG_RUNTIME_DIR/holdfast`, else in a private
+    folder of this user below that for temporary files.
 
     The folder must be one that nobody else can write to (or keep everybody's files apart, as /tmp does). A socket that
     a dead process has left is replaced.
@@ -83,7 +62,7 @@ async def control_endpoint(system: ActorSystem, path: str | os.PathLike[str]) ->
         EndpointInUse: a live process has it, there is something else, or the system cannot watch one more descriptor.
         UntrustedFile: others may write the folder.
     """
-    where = absolute(path)
+    where = socket_path(system.name) if path is None else absolute(path)
     with claimed(where):
         sock, inode = listen(where)
         endpoint = Endpoint(system, os.geteuid())
@@ -99,104 +78,11 @@ async def control_endpoint(system: ActorSystem, path: str | os.PathLike[str]) ->
             remove(where, inode)
 
 
-@contextlib.contextmanager
-def claimed(path: Path) -> Generator[None, None, None]:
-    """Have the path for oneself: of several processes that find the socket of a dead one, one replaces it.
-
-    The claim is a lock on a file beside the socket, which the kernel takes back when its holder dies, however.
-
-    Raises:
-        EndpointInUse: a live process has it. UntrustedFile: others may write the folder.
-    """
-    beside = path.with_name(f"{path.name}.lock")
-    try:
-        check_folders(path.parent, {os.geteuid()}, may_share=True)
-        file = _locked(beside, str(path))
-    except OSError as error:
-        raise EndpointInUse(str(path), error.strerror or str(error)) from error
-    try:
-        yield
-    finally:
-        remove(beside, os.fstat(file).st_ino)
-        os.close(file)
-
-
-def _locked(beside: Path, path: str) -> int:
-    while True:
-        file = os.open(beside, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            ours, there = os.fstat(file), os.stat(beside, follow_symlinks=False)
-        except BlockingIOError:
-            os.close(file)
-            raise EndpointInUse(path, "a live process listens there") from None
-        except FileNotFoundError:  # Its last holder has just ended in good order.
-            os.close(file)
-            continue
-        except BaseException:
-            os.close(file)
-            raise
-        if (ours.st_dev, ours.st_ino) == (there.st_dev, there.st_ino):
-            if not stat.S_ISREG(ours.st_mode) or ours.st_uid != os.geteuid() or ours.st_nlink != 1 or ours.st_size:
-                os.close(file)
-                raise EndpointInUse(path, f"{beside} is no lock of ours: an empty file of this user, with one name")
-            return file
-        os.close(file)
-
-
-def absolute(path: str | os.PathLike[str]) -> Path:
-    """The path from the root on: the folder in which we are may change."""
-    return Path(path).absolute()
-
-
-def remove(path: Path, inode: int) -> None:
-    """Remove what we have made, unless something else is there by now."""
-    try:
-        if os.lstat(path).st_ino == inode:
-            os.unlink(path)
-    except FileNotFoundError:
-        pass
-
-
-def listen(path: Path) -> tuple[socket.socket, int]:
-    """A listening socket at `path` that never had wider rights than 0600, and its inode."""
-    clear(path)
-    sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
-    try:
-        os.fchmod(sock.fileno(), 0o600)  # The file gets these rights, less the umask: there is no moment with more.
-        before = os.umask(0o177)
-        try:
-            sock.bind(str(path))
-        finally:
-            os.umask(before)
-        sock.listen(MOST_CLIENTS)
-        return sock, os.lstat(path).st_ino
-    except OSError as error:
-        sock.close()
-        raise EndpointInUse(str(path), error.strerror or str(error)) from error
-
-
-def clear(path: Path) -> None:
-    """Remove the socket that a dead process has left. Raises EndpointInUse if it is not that."""
-    try:
-        found = os.lstat(path)
-    except FileNotFoundError:
-        return
-    if not stat.S_ISSOCK(found.st_mode) or found.st_uid != os.geteuid():
-        raise EndpointInUse(str(path), "there is something else at this path")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.settimeout(PATIENCE)
-        code = probe.connect_ex(str(path))
-    if code != errno.ECONNREFUSED:
-        raise EndpointInUse(str(path), "a live process listens there")
-    remove(path, found.st_ino)
-
-
 class Endpoint:
     """Serves many clients side by side; what one of them does wrong ends its own connection only."""
 
     def __init__(self, system: ActorSystem, uid: int) -> None:
-        self._system, self._uid = system, uid
+        self._system, self._uid, self._since = system, uid, time.time()
         self._loop = asyncio.get_running_loop()
         self._clients: set[asyncio.Task[Any]] = set()
         self._listener: Listener | None = None
@@ -238,10 +124,13 @@ class Endpoint:
         task = asyncio.current_task()
         assert task is not None
         self._clients.add(task)
+        session = ClientSession(self._system, self._since)
         try:
             check_user(peer_uid(writer.get_extra_info("socket")), self._uid)
             self._make_place()
-            while (body := await self._next(task, reader)) is not None and await self._answer(body, reader, writer):
+            while (body := await self._next(task, reader)) is not None and await self._answer(
+                session, body, reader, writer
+            ):
                 pass
         except (HoldfastError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             no = error if isinstance(error, HoldfastError) else BadRequest(str(error))
@@ -254,6 +143,7 @@ class Endpoint:
         finally:
             self._clients.discard(task)
             writer.close()
+            await session.close()
 
     def _make_place(self) -> None:
         """One more client: if there are too many, whoever has asked for nothing for the longest time has to go.
@@ -277,10 +167,12 @@ class Endpoint:
         finally:
             self._idle.pop(task, None)
 
-    async def _answer(self, body: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
+    async def _answer(
+        self, session: ClientSession, body: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> bool:
         """Carry out one request. If the client goes meanwhile it is cancelled, and with it undone: False."""
         request = REQUEST.decode(body)
-        work = asyncio.create_task(self._respond(request))
+        work = asyncio.create_task(self._respond(session, request))
         more = asyncio.create_task(reader.read(1))
         try:
             await asyncio.wait((work, more), return_when=asyncio.FIRST_COMPLETED)
@@ -296,70 +188,14 @@ class Endpoint:
             await write(writer, work.result())
         return is_over
 
-    async def _respond(self, request: AnyRequest) -> ControlResponse:
+    async def _respond(self, session: ClientSession, request: AnyRequest) -> ControlResponse:
         try:
             ACTING.set(OPERATOR)  # In the context of the task of this request.
             async with asyncio.timeout(LONGEST):
-                value = await self._do(request)
+                value = await session.answer(request)
             return ControlResponse(encode_value(value))
         except Exception as error:  # It is the client's to know; a bug in a user's code must not end the endpoint.
             return failure(error)
-
-    async def _do(self, request: AnyRequest) -> Any:
-        system = self._system
-        match request:
-            case Tree():
-                return system.tree()
-            case Whereis():
-                return system.whereis(request.name).path
-            case ControlActor():
-                return await self._control(request)
-            case Transact():
-                return await self._transact(request)
-            case AskHistory():
-                return msgspec.to_builtins(await self._history(request))
-            case AskLives():
-                return msgspec.to_builtins(system.lives(request.path))
-            case AskWhy():
-                return await system.why(request.path, timeout=min(request.timeout, LONGEST))
-            case AskQuarantined():
-                return msgspec.to_builtins(system.put_aside(request.path))
-
-    async def _history(self, request: AskHistory) -> HistoryPage:
-        """A page; its question comes from elsewhere, and is checked as everybody's is."""
-        asked = request.question
-        page = self._system.history(
-            asked.path, kinds=asked.kinds, since=asked.since, until=asked.until, after=asked.after, limit=asked.limit
-        )
-        if page.events or not request.wait:
-            return page
-        after, wait = page.next, min(request.wait, LONGEST)
-        return await self._system.follow_history(asked.path, kinds=asked.kinds, after=after, timeout=wait)
-
-    async def _control(self, request: ControlActor) -> Any:
-        system, timeout = self._system, min(request.timeout, LONGEST)
-        ref = system.ref(request.path, Actor)
-        with trusted_imports(system._node, Needed(request.script, request.args)):
-            args = [open_arg(arg) for arg in request.args]
-        value = await getattr(system, request.verb)(ref, *args, timeout=timeout)
-        return str(value) if request.verb == "terminate" else value
-
-    async def _transact(self, request: Transact) -> Any:
-        timeout = min(request.timeout, LONGEST)
-        everything = [arg for _, args in request.operations for arg in args]
-        with trusted_imports(self._system._node, Needed(request.script, everything)):
-            operations = [(verb, [open_arg(arg) for arg in args]) for verb, args in request.operations]
-        async with self._system.transaction(dry_run=request.dry_run, timeout=timeout) as change:
-            for verb, args in operations:
-                if verb not in OPERATIONS:
-                    raise BadRequest(f"there is no operation {verb!r}")
-                named = NAMED.get(verb, ())
-                at = len(args) - len(named)
-                if at < 0:
-                    raise BadRequest(f"{verb} lacks {', '.join(named[at:])}")
-                getattr(change, verb)(*args[:at], **dict(zip(named, args[at:], strict=True)))
-        steps = [(step.number, step.verb, step.target, step.text) for step in change.steps]
-        return {"steps": steps, "difference": list(change.difference)}
 
 
 async def read(reader: asyncio.StreamReader) -> bytes | None:

@@ -22,20 +22,30 @@ from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.actor import Actor, Start
 from ..actors.process.wire.frame_buffer import LENGTH
 from ..actors.seconds import check_seconds
+from ..actors.values import decode_value, describe_value
 from ..ftm.group.protected import ProtectionStatus
 from ..supervision.spec import NAMELESS, ChildSpec, Isolation, Strategy, child
 from ..system.history.evidence import PutAside
 from ..system.history.lives import PastLife
 from ..system.history.pages import MOST_ON_PAGE, HistoryPage, question
 from ..system.transaction.operation import Step
+from .overview import LOOK, SystemLook
 from .wire import (
     RESPONSE,
+    About,
     AnyRequest,
     AskHistory,
     AskLives,
     AskQuarantined,
     AskWhy,
     ControlActor,
+    CountTurns,
+    DeclareTree,
+    FollowActor,
+    InspectActor,
+    NextEvents,
+    Overview,
+    RestartActor,
     Transact,
     Tree,
     Whereis,
@@ -48,8 +58,15 @@ from .wire import (
     peer_uid,
 )
 
+ABOUT_TIMEOUT = 5.0
+"""Seconds that a system has to say which it is."""
 GRACE = 35.0
 """Seconds beyond its own time limit that a request is waited for: it may have to be undone."""
+
+
+SHORT_GRACE = 5.0
+"""The same of one that changes nothing."""
+CHANGES = (ControlActor, DeclareTree, RestartActor, Transact)
 
 
 class NotReached(
@@ -104,20 +121,20 @@ class Client:
             self._sock.close()
             raise
 
-    def call(self, request: AnyRequest, timeout: float) -> Any:
-        """Ask, and wait at most `timeout` seconds (and some for an undo) for the answer.
+    def call(self, request: AnyRequest, timeout: float, read: Callable[[bytes], Any] = decode_value) -> Any:
+        """Ask, and wait at most `timeout` seconds (and some for an undo) for the answer, which `read` makes of bytes.
 
         Raises:
             HoldfastError: what the system answers. NotReached: it does not.
         """
         with self._lock:
             try:
-                self._sock.settimeout(timeout + GRACE)
+                self._sock.settimeout(timeout + (GRACE if isinstance(request, CHANGES) else SHORT_GRACE))
                 self._sock.sendall(frame(request))
                 body = self._read(body_size(self._read(LENGTH.size)))
             except OSError as error:
                 raise NotReached(self.path, error.strerror or str(error)) from error
-        return outcome(RESPONSE.decode(body))
+        return outcome(RESPONSE.decode(body), read)
 
     def _read(self, size: int) -> bytes:
         data = bytearray()
@@ -172,6 +189,43 @@ class RemoteSystem:
         self._client.close()
 
     # -- looking at it ------------------------------------------------------------------------------------------------
+
+    def about(self) -> dict[str, Any]:
+        """Which system it is: name, pid, since when it is served (seconds of the clock), and how many actors it has."""
+        found: dict[str, Any] = self._client.call(About(), ABOUT_TIMEOUT)
+        return found
+
+    def look(self, *, parts: bool = False) -> SystemLook:
+        """How all actors are; with `parts` those of the runtime itself too."""
+        found: SystemLook = LOOK.decode(self._client.call(Overview(parts), 10.0))
+        return found
+
+    def inspect(self, ref: RemoteTarget, *, timeout: float = 5.0) -> dict[str, Any]:
+        """All that can be said of one actor, as plain data."""
+        found: dict[str, Any] = self._client.call(InspectActor(text_of(ref), timeout), timeout)
+        return found
+
+    def state(self, ref: RemoteTarget, *, timeout: float = 5.0) -> Any:
+        """An actor's state as plain data: no class of it is imported here."""
+        from ..checkpoint.store_tools.plain_export import as_plain  # only now: it takes a while to import
+
+        return as_plain(
+            self._client.call(ControlActor("get_state", text_of(ref), [], timeout), timeout, describe_value)
+        )
+
+    def follow(self, ref: RemoteTarget) -> None:
+        """Follow what an actor does, for as long as this connection lasts: `next_events` tells."""
+        self._client.call(FollowActor(text_of(ref)), 10.0)
+
+    def next_events(self, seconds: float) -> dict[str, Any]:
+        """What the actor that is followed has done since the last time, waiting at most so long for something."""
+        found: dict[str, Any] = self._client.call(NextEvents(seconds), seconds + 10.0)
+        return found
+
+    def count_turns(self, paths: list[str]) -> dict[str, int]:
+        """Count the turns of just these actors, for as long as this connection lasts; how many there were so far."""
+        found: dict[str, int] = self._client.call(CountTurns(paths), 10.0)
+        return found
 
     def tree(self) -> list[str]:
         """The addresses that live now, parents before children."""
@@ -269,6 +323,15 @@ class RemoteSystem:
         """Have a suspended actor go on as another class."""
         await self._control("replace_code", ref, timeout, new, change, changes=True)
 
+    async def checkpoint(self, ref: RemoteTarget, *, timeout: float = 5.0) -> None:
+        """Have a recorded actor's state saved."""
+        await self._control("checkpoint", ref, timeout, changes=True)
+
+    async def restart(self, ref: RemoteTarget, *, timeout: float = 5.0) -> str:
+        """End a life in good order, so that the supervisor begins the next one. Returns how it ended, in words."""
+        ended: str = await self.call(RestartActor(text_of(ref), timeout), timeout)
+        return ended
+
     async def terminate(self, ref: RemoteTarget, *, timeout: float = 5.0) -> str:
         """End a life in good order; its supervisor then does as its spec says. Returns its exit reason in words."""
         reason: str = await self._control("terminate", ref, timeout, changes=True)
@@ -295,6 +358,12 @@ class RemoteSystem:
         change._take(answer)
         if self._told is not None:
             self._told(change)
+
+    async def declare(self, text: str, name: str, *, dry_run: bool = False, timeout: float = 60.0) -> RemoteChange:
+        """Have the tree be as a file says, by one transaction; `name` is what the file is called in errors."""
+        change = RemoteChange()
+        change._take(await self.call(DeclareTree(text, name, dry_run, timeout), timeout))
+        return change
 
     async def call(self, request: AnyRequest, timeout: float) -> Any:
         """Ask in a thread; if the wait is cancelled the connection ends, and what was asked for is undone."""

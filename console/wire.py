@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import socket
 import struct
+from collections.abc import Callable
 from types import NoneType
 from typing import Any, Literal
 
@@ -151,6 +152,48 @@ class ControlRequest(msgspec.Struct, tag_field="ask", forbid_unknown_fields=True
     """Base of all requests to a running system."""
 
 
+class About(ControlRequest, tag="about", frozen=True):
+    """Which system this is: its name, its process, since when it is served, and how many actors it has."""
+
+
+class Overview(ControlRequest, tag="overview", frozen=True):
+    """How all actors are; with `parts` those of the runtime itself too."""
+
+    parts: bool = False
+
+
+class InspectActor(ControlRequest, tag="inspect", frozen=True):
+    """All that can be said of one actor."""
+
+    path: str
+    timeout: float = 5.0
+
+
+class RestartActor(ControlRequest, tag="restart", frozen=True):
+    """End a life in good order, so that its supervisor begins the next one."""
+
+    path: str
+    timeout: float = 5.0
+
+
+class FollowActor(ControlRequest, tag="follow", frozen=True):
+    """Follow the messages of one actor, for as long as this connection lasts."""
+
+    path: str
+
+
+class NextEvents(ControlRequest, tag="next", frozen=True):
+    """What the actor that is followed has done since the last time; at most so many seconds are waited for it."""
+
+    seconds: float
+
+
+class CountTurns(ControlRequest, tag="count", frozen=True):
+    """Count the turns of just these actors, for as long as this connection lasts, and say how many there were."""
+
+    paths: list[str]
+
+
 class Tree(ControlRequest, tag="tree", frozen=True):
     """All addresses that live now."""
 
@@ -171,6 +214,7 @@ class ControlActor(ControlRequest, tag="control", frozen=True):
         "get_status",
         "protection",
         "statistics",
+        "checkpoint",
         "terminate",
         "replace_state",
         "replace_code",
@@ -216,7 +260,33 @@ class AskQuarantined(ControlRequest, tag="quarantined", frozen=True):
     path: str | None
 
 
-AnyRequest = Tree | Whereis | ControlActor | Transact | AskHistory | AskLives | AskWhy | AskQuarantined
+class DeclareTree(ControlRequest, tag="declare", frozen=True):
+    """Have the tree be as a file says; `name` is what it is called in errors."""
+
+    text: str
+    name: str
+    dry_run: bool
+    timeout: float
+
+
+AnyRequest = (
+    About
+    | Overview
+    | InspectActor
+    | RestartActor
+    | FollowActor
+    | NextEvents
+    | CountTurns
+    | DeclareTree
+    | AskHistory
+    | AskLives
+    | AskWhy
+    | AskQuarantined
+    | Tree
+    | Whereis
+    | ControlActor
+    | Transact
+)
 REQUEST: msgspec.msgpack.Decoder[AnyRequest] = msgspec.msgpack.Decoder(AnyRequest)
 
 
@@ -259,14 +329,14 @@ def failure(error: BaseException) -> ControlResponse:
     return ControlResponse(error=type_name(type(error)), args=args, text=error_text(error))
 
 
-def outcome(response: ControlResponse) -> Any:
-    """The value in a response.
+def outcome(response: ControlResponse, read: Callable[[bytes], Any] = decode_value) -> Any:
+    """The value in a response, as `read` makes it of its bytes.
 
     Raises:
         HoldfastError: the error in it, as its class if that is known here.
     """
     if not response.error:
-        return decode_value(response.value)
+        return read(response.value)
     error: HoldfastError | None = None
     if response.args:
         try:

@@ -50,6 +50,15 @@ def replace_mechanism(cell: Cell, spec: ChildSpec) -> None:
     )  # fmt: skip
 
 
+def replace_options(cell: Cell, options: dict[str, Any]) -> None:
+    """A child's spec has these options from now on, also under supervisors that are started anew."""
+
+    def change(known: ChildSpec) -> ChildSpec:
+        return dataclasses.replace(known, **options)
+
+    _change(cell, change(cell.spec) if isinstance(cell.spec, ChildSpec) else cell.spec, change)
+
+
 def rebind(cell: Cell, port: str, target: str | None) -> None:
     """The next lives at `cell` have a port bound to this address, also those under supervisors that are started anew.
 

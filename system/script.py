@@ -128,25 +128,28 @@ def guarded_imports(tell: Callable[[str, str], None], beside: tuple[str, ...] = 
     """While the block runs, modules are imported only from files of this user, or root's, that nobody else may write.
 
     Args:
-        tell: is told path and sha256 of each.
+        tell: is told path and sha256 of each, when the block is over.
         beside: folders that are not looked into, such as those of the interpreter itself.
 
     Raises (in the import):
         UntrustedFile: somebody else could have written it.
     """
-    guard = _Guard(tell, beside)
+    guard = _Guard(beside)
     sys.meta_path.insert(0, guard)
     try:
         yield
     finally:
         sys.meta_path.remove(guard)
+        for path, sha256 in guard.found:  # Not before: whoever is told may need a module that is half imported.
+            tell(path, sha256)
 
 
 class _Guard:
     """Stands before all other finders, and looks at what they find."""
 
-    def __init__(self, tell: Callable[[str, str], None], beside: tuple[str, ...]) -> None:
-        self._tell, self._beside = tell, beside
+    def __init__(self, beside: tuple[str, ...]) -> None:
+        self._beside = beside
+        self.found: list[tuple[str, str]] = []  # path and sha256 of each module
 
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: types.ModuleType | None = None
@@ -167,7 +170,7 @@ class _Guard:
         try:
             check_owner(str(full), os.stat(full), {owner, 0})
             check_folders(full.parent, {owner, 0})
-            self._tell(str(full), hashlib.sha256(full.read_bytes()).hexdigest())
+            self.found.append((str(full), hashlib.sha256(full.read_bytes()).hexdigest()))
         except OSError as error:
             raise UntrustedFile(origin, error.strerror or str(error)) from error
 

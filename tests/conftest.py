@@ -180,6 +180,7 @@ def temporary_folder(no_orphan_left: None, tmp_path_factory: pytest.TempPathFact
     folder = tmp_path_factory.mktemp("temporary")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TMPDIR", str(folder))
+        patch.setenv("XDG_RUNTIME_DIR", str(folder))  # where systems are found by name
         patch.setattr(tempfile, "tempdir", None)
         yield
     left = [one.name for one in folder.glob("holdfast-*") if f"-{os.getpid()}-" not in one.name]

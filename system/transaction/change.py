@@ -14,6 +14,7 @@ from .draft import Target
 from .mechanisms import Isolate, OnProtection, Protect, Update
 from .operation import Operation, Step, text_of
 from .reparenting import Reparent
+from .respecifying import Respecify
 from .running import StartAgain, StopChild
 from .structure import AddChild, RemoveActor, Reorder, SetFlags, named_spec
 from .wiring import Bind, RegisterName, Unbind, UnregisterName
@@ -76,6 +77,15 @@ class Change:
     def isolation(self, target: Target, isolation: Isolation) -> None:
         """Have an actor live in a process of its own, or as a task."""
         self.step(Isolate(target, isolation))
+
+    def respecify(self, target: Target, **options: Any) -> None:
+        """Have a child restarted and stopped by other options from now on.
+
+        Args:
+            target: the child.
+            options: restart, shutdown, backoff, significant, start_timeout, rules: as `child` takes them.
+        """
+        self.step(Respecify(target, options))
 
     # -- what connects actors -----------------------------------------------------------------------------------------
 

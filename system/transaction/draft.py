@@ -16,6 +16,7 @@ from ...actors.kernel.node import Node, cell_kind
 from ...actors.kernel.ref import ActorRef
 from ...actors.process.process_host import WorkerPlace
 from ...actors.process.wire.peer import OutsidePlace
+from ...checkpoint.method import Method
 from ...supervision.children import STOPPED, Child
 from ...supervision.dynamic import DynamicSupervisor
 from ...supervision.respec import recipe_spec
@@ -266,8 +267,9 @@ class DraftPlace:
             said += [self.spec.restart, self.spec.isolation]
             if not self.spec.autostart:
                 said.append("stopped")
-            if self.spec.recovery is not None:
-                said.append(type(self.spec.recovery).__name__.lower())
+            recovery = self.spec.recovery
+            if recovery is not None:
+                said.append(recovery.name if isinstance(recovery, Method) else type(recovery).__name__.lower())
             if self.spec.mechanism is not None:
                 said.append(f"protected by {rules().names_of(self.spec.mechanism)}")
         if self.flags is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.errors import ActorStopped, NameTaken, NoSuchActor, type_name
@@ -81,6 +82,9 @@ class Unbind(Operation):
         if owner.cell is not None and not owner.cell.host.place.is_here:
             raise wrong(owner.path, "it lives in another process, which keeps a binding: bind it to somebody else")
         del owner.bindings[self._port]
+        if owner.spec is not None and not owner.is_planned:  # It may be started before its target from now on.
+            left = {port: path for port, path in owner.spec.bindings.items() if port != self._port}
+            owner.spec = dataclasses.replace(owner.spec, bindings=left)
 
     def ready(self, system: ActorSystem) -> str:
         assert self._owner is not None

@@ -38,6 +38,15 @@ def load_specs(target: str) -> Named:
     Raises:
         SpecError: it cannot be imported, or is none of these.
     """
+    return specs_in(target, load_named(target))
+
+
+def load_named(target: str) -> Any:
+    """What a target names, 'module:name' or 'program.py:name', whatever it is.
+
+    Raises:
+        SpecError: it cannot be imported, or is not there.
+    """
     module, _, name = target.rpartition(":")
     if not module or not name:
         raise SpecError(target, "name the specs as 'module:name' or 'program.py:name', such as 'shop.main:tree'")
@@ -54,6 +63,11 @@ def load_specs(target: str) -> Named:
         found = getattr(found, part, None)
     if found is None:
         raise SpecError(target, f"{module} has no {name}")
+    return found
+
+
+def specs_in(target: str, found: Any) -> Named:
+    """The specs in what a target names, which is called if it is a function. Raises SpecError."""
     specs: Named = {}
     try:
         _collect(target, found() if callable(found) else found, specs)

@@ -1,6 +1,5 @@
 """`holdfast apply`: a script of its user, and of nobody else, changes a running system, as it would in process."""
 
-import asyncio
 import hashlib
 import os
 import sys
@@ -11,6 +10,7 @@ import pytest
 import holdfast as hf
 from holdfast.system import script as script_module
 from holdfast.system.script import UntrustedFile, read_source
+from tests.console.commands import holdfast
 from tests.system.trees import Add, picture, ref
 
 DONE, FAILED, UNUSABLE = 0, 1, 2
@@ -58,18 +58,6 @@ def written(path: Path, text: str) -> Path:
     path.write_text(text)
     path.chmod(0o600)
     return path
-
-
-async def holdfast(*arguments: object) -> tuple[int, str, str]:
-    """The command in a process of its own: exit status, output, errors."""
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "holdfast.console.cli", *map(str, arguments)),
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-    )
-    async with asyncio.timeout(60):
-        output, errors = await process.communicate()
-    return process.returncode or 0, output.decode(), errors.decode()
 
 
 async def test_a_script_may_use_the_modules_beside_it(
@@ -224,16 +212,6 @@ async def test_a_module_that_others_may_write_is_not_imported(
 
 
 async def test_nobody_answers(grow: Path, tmp_path: Path) -> None:
-    for command in (("apply", grow), ("tree",), ("status", "/app")):
+    for command in (("apply", grow), ("tree",), ("inspect", "/app")):
         status, _, errors = await holdfast(*command, "--socket", tmp_path / "gone.sock")
         assert (status, "no system answers at" in errors) == (UNUSABLE, True)
-
-
-async def test_tree_and_status_tell_of_the_running_system(system: hf.ActorSystem, path: Path) -> None:
-    status, output, _ = await holdfast("tree", "--socket", path)
-    assert (status, output.split()) == (DONE, system.tree())
-    status, output, _ = await holdfast("status", "/app/left/a", "--socket", path)
-    assert status == DONE
-    assert "kind: tests.system.trees.Counter\nstate: running\nparent: /app/left\n" in output
-    status, _, errors = await holdfast("status", "/app/nowhere", "--socket", path)
-    assert (status, errors) == (FAILED, "holdfast status: there is no actor at /app/nowhere\n")

@@ -18,9 +18,12 @@ import holdfast as hf
 from holdfast.actors.kernel.codec import MAX_BYTES
 from holdfast.actors.process.wire.frame_buffer import LENGTH
 from holdfast.actors.values import encode_value
+from holdfast.console import claims
 from holdfast.console import endpoint as endpoint_module
-from holdfast.console.endpoint import Endpoint, EndpointInUse, claimed, control_endpoint
+from holdfast.console.claims import EndpointInUse, claimed
+from holdfast.console.endpoint import Endpoint, control_endpoint
 from holdfast.console.remote import Client, NotReached, RemoteRef, RemoteSystem
+from holdfast.console.session import ClientSession
 from holdfast.console.wire import (
     RESPONSE,
     BadRequest,
@@ -89,7 +92,7 @@ async def test_it_has_no_wider_rights_at_the_moment_of_its_birth(
     monkeypatch.setattr(socket, "socket", Looking)
     before = os.umask(0o022)
     try:
-        sock, _ = endpoint_module.listen(tmp_path / "app.sock")
+        sock, _ = claims.listen(tmp_path / "app.sock")
     finally:
         os.umask(before)
     sock.close()
@@ -252,12 +255,12 @@ async def test_clients_at_work_are_not_sent_away(
     monkeypatch.setattr(endpoint_module, "MOST_CLIENTS", 1)
     at_work, finish = asyncio.Event(), asyncio.Event()
 
-    async def wait(endpoint: Endpoint, request: Any) -> Any:
+    async def wait(session: ClientSession, request: Any) -> Any:
         at_work.set()
         await finish.wait()
         return system.tree()
 
-    monkeypatch.setattr(Endpoint, "_do", wait)
+    monkeypatch.setattr(ClientSession, "answer", wait)
     reader, writer = await asyncio.open_unix_connection(path)
     writer.write(frame(Tree()))
     await at_work.wait()

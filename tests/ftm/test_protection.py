@@ -85,7 +85,7 @@ async def test_the_command_line_shows_it(system: hf.ActorSystem, tmp_path: Path)
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=PBR()))
     await two_again(ref)
     async with control_endpoint(system, tmp_path / "app.sock") as socket:
-        command = ["status", ref.path, "--socket", str(socket)]
+        command = ["inspect", ref.path, "--socket", str(socket)]
         shown = await asyncio.to_thread(lambda: CliRunner().invoke(commands, command))
     assert "protection: pbr, whole since" in shown.output, shown.output
     assert "epoch 1 (r1 leads, r2 follows)" in shown.output

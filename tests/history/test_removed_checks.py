@@ -170,7 +170,7 @@ CHECKS = {
         "test_who_has_stopped_it",
     ),
     "a terminal obeys no event": Check(
-        "console/history_commands.py",
+        "console/operate/remembering.py",
         "        typer.echo(line.translate(UNPRINTED))\n",
         "        typer.echo(line)\n",
         OUTSIDE,

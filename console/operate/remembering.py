@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Iterable
-from pathlib import Path
-from typing import Annotated, TypeVar
+from collections.abc import Iterable
+from typing import Annotated
 
 import msgspec
 import typer
 
-from ..actors.errors import HoldfastError
-from ..system import PastEvent, PastLife
-from .operate import FAILED, UNUSABLE
-from .remote import NotReached, RemoteSystem
-from .wire import WrongUser
-
-T = TypeVar("T")
+from ...system import PastEvent, PastLife
+from .reaching import Json, OnePath, Socket, System, reached, show_json
 
 ONE_LOOK = 30.0
 """Seconds that one request of `--follow` waits for the next event."""
@@ -26,73 +20,76 @@ HIDDEN = frozenset({"traceback", "reason_kind"})
 UNPRINTED = dict.fromkeys((*range(32), *range(127, 160)), "?")
 """Characters that make a terminal do something."""
 
-Socket = Annotated[Path, typer.Option("--socket", help="The control endpoint of the running system.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
-Address = Annotated[str, typer.Argument(help="An address, such as /app/bank/alice.")]
 Pattern = Annotated[str, typer.Argument(help="An address, or a pattern such as '/app/bank/**'.")]
 Limit = Annotated[int, typer.Option("--limit", min=1, max=1000, help="How many, the newest.")]
 
 
-def why(path: Address, socket: Socket, json: Json = False) -> None:
+def why(path: OnePath, system: System = None, socket: Socket = None, as_json: Json = False) -> None:
     """Say in a few sentences why an actor restarts, has ended, or does not get on."""
-    sentences = _asked("why", socket, lambda system: asyncio.run(system.why(path)))
-    if json:
-        _print_json({"address": path, "why": sentences})
+    with reached("why", system, socket) as remote:
+        sentences = asyncio.run(remote.why(path))
+    if as_json:
+        show_json({"address": path, "why": sentences})
     else:
         _print_lines(sentences)
 
 
-def history(path: Address, socket: Socket, json: Json = False) -> None:
+def history(path: OnePath, system: System = None, socket: Socket = None, as_json: Json = False) -> None:
     """List the last lives of an actor: when each began and ended, why, and by whom."""
-    lives = _asked("history", socket, lambda system: system.lives(path))
-    if json:
-        _print_json({"address": path, "lives": lives})
+    with reached("history", system, socket) as remote:
+        lives = remote.lives(path)
+    if as_json:
+        show_json({"address": path, "lives": msgspec.to_builtins(lives)})
     else:
         _print_lines(map(life_line, lives) if lives else [f"the history knows of no life at {path}"])
 
 
 def events(
-    socket: Socket,
     path: Pattern = "**",
+    system: System = None,
+    socket: Socket = None,
     kinds: Annotated[list[str] | None, typer.Option("--kind", help="Only this kind of event; may be repeated.")] = None,
     seconds: Annotated[
         float | None, typer.Option("--last", min=0.0, help="Only what was told in so many last seconds.")
     ] = None,
     limit: Limit = 50,
     follow: Annotated[bool, typer.Option("--follow", help="Go on with events as they come, until Ctrl+C.")] = False,
-    json: Json = False,
+    as_json: Json = False,
 ) -> None:
     """Print past events, oldest first; with --json one object on each line."""
-
-    def ask(system: RemoteSystem) -> None:
-        since = 0.0 if seconds is None else time.time() - seconds
-        page = system.history(path, kinds=kinds or (), since=since, limit=limit)
-        _print_events(page.events, json=json)
-        while follow:
-            page = asyncio.run(system.follow_history(path, kinds=kinds or (), after=page.next, timeout=ONE_LOOK))
-            _print_events(page.events, json=json)
-
     try:
-        _asked("events", socket, ask)
+        with reached("events", system, socket) as remote:
+            since = 0.0 if seconds is None else time.time() - seconds
+            page = remote.history(path, kinds=kinds or (), since=since, limit=limit)
+            _print_events(page.events, as_json=as_json)
+            while follow:
+                asked = remote.follow_history(path, kinds=kinds or (), after=page.next, timeout=ONE_LOOK)
+                page = asyncio.run(asked)
+                _print_events(page.events, as_json=as_json)
     except KeyboardInterrupt:
         return  # This is how one ends it.
 
 
-def dead_letters(socket: Socket, path: Pattern = "**", limit: Limit = 50, json: Json = False) -> None:
+def dead_letters(
+    path: Pattern = "**", system: System = None, socket: Socket = None, limit: Limit = 50, as_json: Json = False
+) -> None:
     """Print the messages that nobody handled, or that were refused: type, sender, and why."""
-    page = _asked("dead-letters", socket, lambda system: system.history(path, kinds=["DeadLetter"], limit=limit))
-    _print_events(page.events, json=json)
+    with reached("dead-letters", system, socket) as remote:
+        page = remote.history(path, kinds=["DeadLetter"], limit=limit)
+    _print_events(page.events, as_json=as_json)
 
 
 def quarantine(
-    socket: Socket,
     path: Annotated[str | None, typer.Argument(help="An address; without one, of all.")] = None,
-    json: Json = False,
+    system: System = None,
+    socket: Socket = None,
+    as_json: Json = False,
 ) -> None:
     """List the messages that were put aside because they have ended their actor's process again and again."""
-    messages = _asked("quarantine", socket, lambda system: system.put_aside(path))
-    if json:
-        _print_json({"quarantine": messages})
+    with reached("quarantine", system, socket) as remote:
+        messages = remote.put_aside(path)
+    if as_json:
+        show_json({"quarantine": msgspec.to_builtins(messages)})
         return
     for one in messages:
         sender = f" from {one.sender}" if one.sender else ""
@@ -100,35 +97,15 @@ def quarantine(
         _print_lines([f"{moment(one.since)} {one.address} {one.message}{sender}, {one.attempts} deaths{payload}"])
 
 
-def _asked(command: str, socket: Path, ask: Callable[[RemoteSystem], T]) -> T:
-    """What the running system answers. Exit status 1: it refuses; 2: it cannot be reached."""
-    try:
-        with RemoteSystem(socket) as system:
-            return ask(system)
-    except (NotReached, WrongUser) as error:
-        raise _failed(command, error, UNUSABLE) from error
-    except HoldfastError as error:
-        raise _failed(command, error, FAILED) from error
-
-
-def _failed(command: str, error: Exception, code: int) -> typer.Exit:
-    typer.echo(f"holdfast {command}: {error}", err=True)
-    return typer.Exit(code)
-
-
-def _print_json(value: object) -> None:
-    typer.echo(msgspec.json.encode(value).decode())
-
-
 def _print_lines(lines: Iterable[str]) -> None:
     for line in lines:
         typer.echo(line.translate(UNPRINTED))
 
 
-def _print_events(found: Iterable[PastEvent], *, json: bool) -> None:
+def _print_events(found: Iterable[PastEvent], *, as_json: bool) -> None:
     for event in found:
-        if json:
-            _print_json(event)
+        if as_json:
+            typer.echo(msgspec.json.encode(event).decode())
         else:
             _print_lines([event_line(event)])
 

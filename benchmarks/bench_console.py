@@ -1,0 +1,104 @@
+"""How long does an operator wait for a running system: for one actor while it is saturated, and for a tree of 10,000?
+
+Baseline: the same with the system idle, and for the tree none. The client is a process of its own.
+Command: python benchmarks/bench_console.py [--quick]
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from bench_lag import RELAYS, TOKEN, TOKENS, Join, Relay
+from harness import Run, main
+
+import holdfast as hf
+from holdfast.console.endpoint import control_endpoint
+from holdfast.console.remote import RemoteSystem
+
+ACTORS = 10_000
+
+
+class Idle(hf.Actor):
+    """Is there."""
+
+
+def client(socket: str, requests: int) -> None:
+    """The other process: prints the 99th percentile of a request about one actor, and the best of three whole trees."""
+    with RemoteSystem(socket) as remote:
+        taken: list[float] = []
+        for _ in range(requests):
+            began = time.perf_counter()
+            remote.inspect("/bench")
+            taken.append(time.perf_counter() - began)
+        trees: list[float] = []
+        for _ in range(3):
+            began = time.perf_counter()
+            remote.look()
+            trees.append(time.perf_counter() - began)
+    print(json.dumps({"p99": sorted(taken)[int(requests * 0.99)] * 1e3, "tree": min(trees)}))
+
+
+async def asked(socket: Path, requests: int) -> dict[str, float]:
+    """What the client has measured."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, __file__, "client", str(socket), str(requests), stdout=subprocess.PIPE
+    )
+    output, _ = await process.communicate()
+    found: dict[str, float] = json.loads(output)
+    return found
+
+
+@asynccontextmanager
+async def served() -> AsyncGenerator[tuple[hf.ActorSystem, Path]]:
+    """A system with its endpoint."""
+    with tempfile.TemporaryDirectory() as folder:
+        async with hf.ActorSystem("bench", log=False) as system, control_endpoint(system, f"{folder}/s") as socket:
+            yield system, socket
+
+
+async def saturated(run: Run) -> None:
+    requests = 200 if run.quick else 1000
+
+    async def busy() -> float:
+        async with served() as (system, socket):
+            refs: list[Any] = [system.spawn(hf.start(Relay)) for _ in range(RELAYS)]
+            for ref, neighbour in zip(refs, refs[1:] + refs[:1], strict=True):
+                ref.tell(Join(neighbour))
+            for number in range(TOKENS):
+                refs[number % RELAYS].tell(TOKEN)
+            return (await asked(socket, requests))["p99"]
+
+    async def idle() -> float:
+        async with served() as (_, socket):
+            return (await asked(socket, requests))["p99"]
+
+    await run.added("p99 added to a request by a saturated system", busy, idle, unit="ms", target=20.0)
+
+
+async def tree(run: Run) -> None:
+    async def whole() -> float:
+        async with served() as (system, socket):
+            children = [hf.child(f"n{number}", hf.start(Idle)) for number in range(ACTORS)]
+            await system.start(hf.supervisor("many", children=children))
+            return (await asked(socket, 1))["tree"]
+
+    async def none() -> float:
+        return 0.0
+
+    await run.added(f"a tree of {ACTORS:,} actors with their statuses", whole, none, unit="s", target=1.0)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["client"]:
+        client(sys.argv[2], int(sys.argv[3]))
+    else:
+        main([saturated, tree])

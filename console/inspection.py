@@ -1,0 +1,90 @@
+"""One actor of a running system, in full: what `holdfast inspect` shows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from ..actors.errors import NoSuchActor
+from ..actors.kernel.cell import Cell
+from ..supervision.intensity import recent_restarts
+from ..supervision.spec import ChildSpec
+from ..supervision.supervisor import Supervisor
+from .overview import Found, as_told, children_of, is_far, process_use, row_of
+
+if TYPE_CHECKING:
+    from ..system.system import ActorSystem
+
+
+async def inspected(system: ActorSystem, path: str, timeout: float) -> dict[str, Any]:
+    """All that can be said of one actor, as plain data; of a child that is stopped only what its spec says.
+
+    Raises:
+        NoSuchActor: nobody is known at the address. HoldfastError: it does not answer in time.
+    """
+    one = find(system, path)
+    cell = one.cell
+    if cell is None or cell.is_dead:
+        return {"actor": msgspec.structs.asdict(row_of(one)), "spec": _spec_words(one.child and one.child.spec)}
+    status = await system.get_status(cell.ref, timeout=timeout)
+    row = as_told(row_of(one), status) if is_far(cell) else row_of(one)
+    more = cell.more
+    ties = more.ties if more is not None and more.has_more else None
+    protection = await system.protection(cell.ref)
+    use = process_use(row.pid) if row.pid else None
+    return {
+        "actor": msgspec.structs.asdict(row),
+        "life": status.life,
+        "bindings": dict(status.bindings),
+        "links": sorted(ties.links.values()) if ties is not None else [],
+        "monitors": sorted({each.watcher.path for each in ties.monitors if each.active}) if ties is not None else [],
+        "spec": _spec_words(cell.spec),
+        "supervises": _supervises(cell),
+        "protection": msgspec.to_builtins(protection) if protection.is_protected else None,
+        "process": None if use is None else msgspec.structs.asdict(use),
+    }
+
+
+def find(system: ActorSystem, path: str) -> Found:
+    """An address as a pass through the whole tree finds it, also one that is stopped. Raises NoSuchActor."""
+    try:
+        cell = system.ref(path)._cell.living
+    except NoSuchActor:
+        above, _, name = path.rpartition("/")
+        known = children_of(system.ref(above)._cell.actor) if above else []
+        child = next((one for one in known if one.spec.id == name), None)
+        if child is None:
+            raise
+        return Found(path, child.cell, child, 0)
+    parent = cell.parent
+    known = children_of(parent.actor) if parent is not None else []
+    child = next((one for one in known if one.cell is cell), None)
+    try:
+        return Found(cell.path, cell, child, system.pid_of(cell.ref))
+    except NoSuchActor:  # It is between two lives.
+        return Found(cell.path, cell, child, 0)
+
+
+def _spec_words(spec: object) -> dict[str, Any]:
+    """What a child spec says, as text."""
+    if not isinstance(spec, ChildSpec):
+        return {}
+    said = {name: getattr(spec, name) for name in ("restart", "shutdown", "isolation", "start_timeout")}
+    given = {name: getattr(spec, name) for name in ("recovery", "mailbox", "backoff", "limits", "mechanism")}
+    return said | {name: str(value) for name, value in given.items() if value is not None}
+
+
+def _supervises(cell: Cell) -> dict[str, Any] | None:
+    """A supervisor's flags, how many restarts it has used up, and how many children there are."""
+    actor = cell.actor
+    if not isinstance(actor, Supervisor) or "_children" not in actor.__dict__:
+        return None
+    flags, now = actor._flags, cell.node.loop.time()
+    return {
+        "strategy": flags.strategy,
+        "intensity": flags.intensity,
+        "period": flags.period,
+        "restarts": len(recent_restarts(actor._restarts, now, flags.period)),
+        "children": len(actor._children),
+    }

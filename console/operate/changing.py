@@ -1,0 +1,345 @@
+"""The commands that change a running system: each is one transaction, or one call that there is."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ...actors.errors import HoldfastError
+from ..overview import ActorRow
+from ..remote import RemoteChange, RemoteSystem
+from .patterns import select
+from .reaching import (
+    FAILED,
+    DryRun,
+    Json,
+    OnePath,
+    Paths,
+    Socket,
+    System,
+    Timeout,
+    Yes,
+    complete_path,
+    confirm,
+    ended,
+    meant_rows,
+    reached,
+    show_json,
+)
+
+MOST_NAMED = 5
+"""Actors that are named before something is lost; the others are counted."""
+
+
+def suspend(
+    paths: Paths,
+    system: System = None,
+    socket: Socket = None,
+    dry_run: DryRun = False,
+    timeout: Timeout = 10.0,
+    as_json: Json = False,
+) -> None:
+    """Have actors handle no message until they are resumed; messages wait. All of them, or none: one transaction.
+
+    Exit status 0: done. 1: refused, nothing was done. 2: no system answers.
+    """
+    with reached("suspend", system, socket) as remote:
+        rows = meant_rows(remote, paths)
+        _transact(remote, lambda change: _each(change.suspend, rows), dry_run, timeout, as_json)
+
+
+def resume(
+    paths: Paths,
+    system: System = None,
+    socket: Socket = None,
+    dry_run: DryRun = False,
+    timeout: Timeout = 10.0,
+    as_json: Json = False,
+) -> None:
+    """Have suspended actors handle messages again. All of them, or none: one transaction.
+
+    Exit status 0: done. 1: refused, nothing was done. 2: no system answers.
+    """
+    with reached("resume", system, socket) as remote:
+        rows = meant_rows(remote, paths)
+        _transact(remote, lambda change: _each(change.resume, rows), dry_run, timeout, as_json)
+
+
+def restart(
+    paths: Paths,
+    system: System = None,
+    socket: Socket = None,
+    yes: Yes = False,
+    timeout: Timeout = 10.0,
+    as_json: Json = False,
+) -> None:
+    """End the lives of actors in good order, one after another; their supervisors begin the next ones.
+
+    Messages wait for the next life. The state of an actor without recovery is lost, and asked about. A restart counts
+    for the supervisor as any other does: one that would make it give up is refused.
+
+    Exit status 0: all of them are up again. 1: one is not, and those behind it were left alone. 2: no system answers.
+    """
+    with reached("restart", system, socket) as remote:
+        all_rows = remote.look().rows
+        rows = select(all_rows, paths)
+        confirm("restart", _lost_states(rows, all_rows), yes=yes)
+        done = [asyncio.run(remote.restart(row.path, timeout=timeout)) for row in _announced(rows, as_json)]
+    if as_json:
+        show_json({"restarted": done})
+
+
+def _announced(rows: list[ActorRow], as_json: bool) -> Any:
+    """The rows, each named when it is done."""
+    for row in rows:
+        yield row
+        if not as_json:
+            typer.echo(f"restarted {row.path}")
+
+
+def stop(
+    paths: Paths,
+    system: System = None,
+    socket: Socket = None,
+    yes: Yes = False,
+    dry_run: DryRun = False,
+    timeout: Timeout = 10.0,
+    as_json: Json = False,
+) -> None:
+    """Stop children and keep their specs: `start` brings them back. All of them, or none: one transaction.
+
+    Waiting messages are handed back to whoever sent them; what was recorded stays.
+
+    Exit status 0: done. 1: refused, nothing was done. 2: no system answers.
+    """
+    _end("stop", paths, system, socket, yes, dry_run, timeout, as_json)
+
+
+def remove(
+    paths: Paths,
+    system: System = None,
+    socket: Socket = None,
+    yes: Yes = False,
+    dry_run: DryRun = False,
+    timeout: Timeout = 10.0,
+    as_json: Json = False,
+) -> None:
+    """Stop actors for good, also those of dynamic supervisors: their specs go. One transaction.
+
+    Exit status 0: done. 1: refused, nothing was done. 2: no system answers.
+    """
+    _end("remove", paths, system, socket, yes, dry_run, timeout, as_json)
+
+
+def _end(
+    verb: str,
+    paths: list[str],
+    system: str | None,
+    socket: Path | None,
+    yes: bool,
+    dry_run: bool,
+    timeout: float,
+    as_json: bool,
+) -> None:
+    with reached(verb, system, socket) as remote:
+        all_rows = remote.look().rows
+        rows = _tops(select(all_rows, paths))
+        confirm(verb, [] if dry_run else lost_by(rows, all_rows), yes=yes)
+        _transact(
+            remote,
+            lambda change: _each(change.stop if verb == "stop" else change.remove, rows),
+            dry_run,
+            timeout,
+            as_json,
+        )
+
+
+def start(
+    paths: Paths,
+    system: System = None,
+    socket: Socket = None,
+    dry_run: DryRun = False,
+    timeout: Timeout = 60.0,
+    as_json: Json = False,
+) -> None:
+    """Start children again that were stopped. All of them, or none: one transaction.
+
+    Exit status 0: they are up. 1: refused, nothing was done. 2: no system answers.
+    """
+    with reached("start", system, socket) as remote:
+        rows = meant_rows(remote, paths)
+
+        def collect(change: RemoteChange) -> None:
+            for row in rows:
+                above, _, name = row.path.rpartition("/")
+                change.start(above, name)
+
+        _transact(remote, collect, dry_run, timeout, as_json)
+
+
+def bind(
+    owner: OnePath,
+    port: Annotated[str, typer.Argument(metavar="PORT", help="The name of the binding in the owner's class.")],
+    target: OnePath,
+    system: System = None,
+    socket: Socket = None,
+    dry_run: DryRun = False,
+    timeout: Timeout = 10.0,
+    as_json: Json = False,
+) -> None:
+    """Have a binding of an actor lead to another actor, from its next turn on and after restarts.
+
+    Exit status 0: done. 1: refused, nothing was done. 2: no system answers.
+    """
+    with reached("bind", system, socket) as remote:
+        (one,), (other,) = (meant_rows(remote, [path]) for path in (owner, target))
+        _transact(remote, lambda change: change.bind(one.path, port, other.path), dry_run, timeout, as_json)
+
+
+def unbind(
+    owner: OnePath,
+    port: Annotated[str, typer.Argument(metavar="PORT", help="The name of the binding in the owner's class.")],
+    system: System = None,
+    socket: Socket = None,
+    dry_run: DryRun = False,
+    timeout: Timeout = 10.0,
+    as_json: Json = False,
+) -> None:
+    """Have a binding of an actor lead to nobody.
+
+    Exit status 0: done. 1: refused, nothing was done. 2: no system answers.
+    """
+    with reached("unbind", system, socket) as remote:
+        (one,) = meant_rows(remote, [owner])
+        _transact(remote, lambda change: change.unbind(one.path, port), dry_run, timeout, as_json)
+
+
+def protect(
+    path: Annotated[
+        str, typer.Argument(metavar="PATH", help="Actors, as in all commands.", autocompletion=complete_path)
+    ],
+    mechanisms: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[MECHANISM]...", help="Outermost first: pbr, lfr, tr, or a file that defines one."),
+    ] = None,
+    off: Annotated[bool, typer.Option("--off", help="Have them protected by nothing.")] = False,
+    system: System = None,
+    socket: Socket = None,
+    dry_run: DryRun = False,
+    timeout: Timeout = 60.0,
+    as_json: Json = False,
+) -> None:
+    """Have actors protected by just these mechanisms, whatever they have now; their lives go on. One transaction.
+
+    New mechanisms are on probation for some seconds: `holdfast inspect` tells when they are settled.
+
+    Exit status 0: done. 1: refused, nothing was done. 2: no system answers, or neither mechanisms nor --off are given.
+    """
+    if bool(mechanisms) == off:
+        raise typer.BadParameter("give mechanisms, such as pbr, or --off")
+    with reached("protect", system, socket) as remote:
+        rows = meant_rows(remote, [path])
+        stack = tuple(mechanisms) if mechanisms else None
+        _transact(remote, lambda change: _each(lambda one: change.protect(one, stack), rows), dry_run, timeout, as_json)
+
+
+def checkpoint(
+    paths: Paths, system: System = None, socket: Socket = None, timeout: Timeout = 10.0, as_json: Json = False
+) -> None:
+    """Have the states of recorded actors saved, and wait until they are.
+
+    Exit status 0: done. 1: one has no snapshots, or could not be saved in time. 2: no system answers.
+    """
+    with reached("checkpoint", system, socket) as remote:
+        rows = meant_rows(remote, paths)
+        failed: list[str] = []
+        for row in rows:
+            try:
+                asyncio.run(remote.checkpoint(row.path, timeout=timeout))
+            except HoldfastError as error:
+                failed.append(str(error))
+    if as_json:
+        show_json({"saved": len(rows) - len(failed), "failed": failed})
+    else:
+        typer.echo(f"{len(rows) - len(failed)} of {len(rows)} saved")
+    if failed:
+        raise ended("checkpoint", "; ".join(failed), FAILED)
+
+
+# -- how --------------------------------------------------------------------------------------------------------------
+
+
+def _each(do: Callable[[str], Any], rows: Sequence[ActorRow]) -> None:
+    for row in rows:
+        do(row.path)
+
+
+def _transact(
+    remote: RemoteSystem, collect: Callable[[RemoteChange], Any], dry_run: bool, timeout: float, as_json: bool
+) -> None:
+    """Carry out what is collected as one transaction, and show it."""
+
+    async def main() -> RemoteChange:
+        async with remote.transaction(dry_run=dry_run, timeout=timeout) as change:
+            collect(change)
+        return change
+
+    show_change(asyncio.run(main()), dry_run=dry_run, as_json=as_json)
+
+
+def show_change(change: RemoteChange, *, dry_run: bool, as_json: bool) -> None:
+    """The steps of a transaction, and how the tree has changed."""
+    if as_json:
+        steps = [dataclasses.asdict(step) for step in change.steps]
+        show_json({"dry_run": dry_run, "steps": steps, "difference": list(change.difference)})
+        return
+    typer.echo(change.describe())
+    typer.echo("nothing was done: this was a dry run" if dry_run else "done")
+
+
+def _tops(rows: list[ActorRow]) -> list[ActorRow]:
+    """Those that are below no other one of them: the others end with those."""
+    paths = {row.path for row in rows}
+    return [row for row in rows if not any(above in paths for above in _above(row.path))]
+
+
+def _above(path: str) -> list[str]:
+    found: list[str] = []
+    while path := path.rpartition("/")[0]:
+        found.append(path)
+    return found
+
+
+def _ending(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[ActorRow]:
+    """The actors that end: these, and all below them."""
+    paths = {row.path for row in rows}
+    return [row for row in all_rows if row.path in paths or any(above in paths for above in _above(row.path))]
+
+
+def lost_by(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[str]:
+    """What is lost when these end for good, in words."""
+    return _lost_states(rows, all_rows) + _lost_messages(rows, all_rows)
+
+
+def _lost_states(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[str]:
+    """Whose state is lost when they end, in words."""
+    lost = [
+        row.path
+        for row in _ending(rows, all_rows)
+        if not (row.is_supervisor or row.recovery) and row.state != "stopped"
+    ]
+    if not lost:
+        return []
+    more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
+    return [f"without recovery, the state is lost of {', '.join(lost[:MOST_NAMED])}{more}"]
+
+
+def _lost_messages(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[str]:
+    """How many waiting messages are handed back when they end, in words."""
+    count = sum(row.queued for row in _ending(rows, all_rows))
+    return [f"{count} waiting messages are handed back"] if count else []

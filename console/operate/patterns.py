@@ -1,0 +1,135 @@
+"""Patterns of addresses with conditions, such as `/app/**[restarts>3, state=running]`."""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+import operator
+import re
+from collections.abc import Callable, Iterable
+from typing import Any, Final
+
+from ...actors.errors import HoldfastError, NoSuchActor
+from ..overview import ActorRow
+
+COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {
+    ">=": operator.ge,
+    "<=": operator.le,
+    "!=": operator.ne,
+    ">": operator.gt,
+    "<": operator.lt,
+    "=": operator.eq,
+}
+FORM: Final = re.compile(r"(?P<glob>[^\[\]]+)(?:\[(?P<conditions>[^\[\]]*)\])?")
+CONDITION: Final = re.compile(r"\s*(?P<field>\w+)\s*(?P<verb>>=|<=|!=|=|>|<)\s*(?P<value>.*?)\s*")
+FIELDS: Final = tuple(name for name in ActorRow.__struct_fields__ if name not in ("path", "is_supervisor"))
+NUMBERS: Final = ("pid", "restarts", "queued", "turn_seconds")
+
+
+class BadPattern(HoldfastError, text="pattern {pattern!r}: {problem}"):
+    """What was given is no address, no name and no pattern."""
+
+    pattern: str
+    problem: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Condition:
+    """One comparison of a field of an actor."""
+
+    field: str
+    verb: str
+    value: str
+
+    def holds(self, row: ActorRow) -> bool:
+        """Whether it is true of an actor. Texts may have `*`; a class may be given by its last part."""
+        told = dict(zip(row.__struct_fields__, _values(row), strict=True))[self.field]
+        if self.field in NUMBERS:
+            return COMPARE[self.verb](float(told), float(self.value))
+        texts = told if isinstance(told, tuple) else (told, told.rpartition(".")[2])
+        is_like = any(fnmatch.fnmatchcase(text, self.value) for text in texts or ("",))
+        return is_like == (self.verb == "=")
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Pattern:
+    """An address, a name, or a pattern with conditions.
+
+    `*` stands for a part of an address, or a piece of one, and `**` for any number of whole parts.
+    """
+
+    text: str
+    glob: re.Pattern[str]
+    conditions: tuple[Condition, ...]
+    is_one: bool
+    """Whether it is one address or name, which has to be there."""
+
+    def matches(self, row: ActorRow) -> bool:
+        """Whether an actor is meant."""
+        named = self.is_one and self.text in row.names
+        return (named or self.glob.fullmatch(row.path) is not None) and all(one.holds(row) for one in self.conditions)
+
+
+def read_pattern(text: str) -> Pattern:
+    """Make a pattern of what a user has typed. Raises BadPattern."""
+    form = FORM.fullmatch(text)
+    if form is None:
+        raise BadPattern(text, "write an address, with conditions behind it in brackets: '/app/**[restarts>3]'")
+    glob, given = form["glob"].strip(), form["conditions"]
+    conditions = () if given is None else tuple(_condition(text, one) for one in given.split(","))
+    is_one = given is None and "*" not in glob and "?" not in glob
+    if not glob.startswith("/") and not is_one:
+        raise BadPattern(text, "an address begins with '/', as /app/bank does")
+    return Pattern(text, _regex(glob.rstrip("/") or "/"), conditions, is_one)
+
+
+def _condition(pattern: str, text: str) -> Condition:
+    found = CONDITION.fullmatch(text)
+    if found is None:
+        raise BadPattern(pattern, f"{text.strip()!r} is no condition such as restarts>3 or state=suspended")
+    one = Condition(found["field"], found["verb"], found["value"])
+    if one.field not in FIELDS:
+        raise BadPattern(pattern, f"there is no field {one.field!r}; there are {', '.join(FIELDS)}")
+    if one.field in NUMBERS:
+        try:
+            float(one.value)
+        except ValueError:
+            raise BadPattern(pattern, f"{one.field} is compared with a number, not {one.value!r}") from None
+    elif one.verb not in ("=", "!="):
+        raise BadPattern(pattern, f"{one.field} is text: compare it by = or !=")
+    return one
+
+
+def _regex(glob: str) -> re.Pattern[str]:
+    """What a path is matched with.
+
+    >>> [bool(_regex("/app/**").fullmatch(path)) for path in ("/app", "/app/a", "/app/a/b")]
+    [False, True, True]
+    >>> [bool(_regex("/app/**/x*").fullmatch(path)) for path in ("/app/x", "/app/a/x1", "/app/a")]
+    [True, True, False]
+    """
+    parts = glob.split("/")
+    made = ""
+    for number, part in enumerate(parts):
+        if part == "**":
+            made += "(?:/[^/]+)+" if number == len(parts) - 1 else "(?:/[^/]+)*"
+        elif part or number:
+            made += "/" + re.escape(part).replace(r"\*", "[^/]*").replace(r"\?", "[^/]")
+    return re.compile(made)
+
+
+def _values(row: ActorRow) -> tuple[Any, ...]:
+    return tuple(getattr(row, name) for name in row.__struct_fields__)
+
+
+def select(rows: Iterable[ActorRow], texts: Iterable[str]) -> list[ActorRow]:
+    """Those that are meant, each once, in the order of the rows.
+
+    Raises:
+        BadPattern: a text is no pattern. NoSuchActor: an address or name is nobody's, or a pattern fits nobody.
+    """
+    known, wanted = list(rows), [read_pattern(text) for text in texts]
+    for pattern in wanted:
+        if not any(pattern.matches(row) for row in known):
+            raise NoSuchActor(pattern.text)
+    return [row for row in known if any(pattern.matches(row) for pattern in wanted)]

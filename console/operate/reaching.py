@@ -1,0 +1,143 @@
+"""Which running system a command is for, and how a command ends that cannot do what it is asked."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+from collections.abc import Generator
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from ...actors.errors import HoldfastError
+from ...system.script import UntrustedFile
+from ..overview import ActorRow
+from ..remote import NotReached, RemoteSystem
+from ..runtime_folder import found_sockets, sweep
+from ..wire import WrongUser
+from .patterns import select
+
+FAILED: Final = 1
+UNUSABLE: Final = 2
+
+
+class NoSystem(HoldfastError, text="{problem}"):
+    """There is no running system that is meant, or there are several."""
+
+    problem: str
+
+
+def complete_system(incomplete: str) -> list[str]:
+    """The names of running systems, for the shell."""
+    try:
+        return sorted({one.system for one in found_sockets() if one.system.startswith(incomplete)})
+    except HoldfastError:  # The folder is not to be trusted: a command says so, a shell that waits for words does not.
+        return []
+
+
+def complete_path(ctx: typer.Context, incomplete: str) -> list[str]:
+    """The addresses in the system that is meant, for the shell."""
+    try:
+        with RemoteSystem(chosen(ctx.params.get("system"), ctx.params.get("socket"))) as remote:
+            return [path for path in remote.tree() if path.startswith(incomplete)]
+    except HoldfastError:  # A shell that waits for words has no use for a sentence.
+        return []
+
+
+System = Annotated[
+    str | None,
+    typer.Option(
+        "--system",
+        "-s",
+        envvar="HOLDFAST_SYSTEM",
+        metavar="NAME",
+        help="The running system, by its name or its pid; the only one there is if left out.",
+        autocompletion=complete_system,
+    ),
+]
+Socket = Annotated[
+    Path | None, typer.Option("--socket", metavar="FILE", help="The control endpoint of the running system, by path.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before something is lost.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]
+Timeout = Annotated[float, typer.Option(min=0.1, max=3600.0, help="Seconds that it may take.")]
+Paths = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="PATH...",
+        help="Addresses, names, or patterns such as '/app/**[restarts>3]'.",
+        autocompletion=complete_path,
+    ),
+]
+OnePath = Annotated[str, typer.Argument(metavar="PATH", help="An address or a name.", autocompletion=complete_path)]
+
+
+def chosen(system: str | None, socket: Path | None) -> Path:
+    """The socket of the system that is meant.
+
+    Raises:
+        NoSystem: there is none, or there are several. UntrustedFile: others may enter the folder of sockets.
+    """
+    if socket is not None:
+        return socket
+    sweep()
+    live = found_sockets()
+    meant = [one for one in live if system in (None, "", one.system, str(one.pid))]
+    if len(meant) == 1:
+        return meant[0].path
+    there = ", ".join(f"{one.system} (pid {one.pid})" for one in meant or live)
+    if meant:
+        hint = "--system PID" if len({one.system for one in meant}) == 1 else "--system NAME"
+        raise NoSystem(f"several systems run: {there}; say which one is meant, with {hint}")
+    wanted = f"no system {system!r} runs" if system else "no system of yours runs with a control endpoint"
+    hint = f"there are {there}" if there else "a program opens one by control_endpoint(system)"
+    raise NoSystem(f"{wanted}; {hint}")
+
+
+@contextlib.contextmanager
+def told(command: str) -> Generator[None, None, None]:
+    """Say what went wrong in a sentence, and end with 2 if the system or a file cannot be had, else with 1."""
+    try:
+        yield
+    except (NotReached, NoSystem, WrongUser, UntrustedFile) as error:
+        raise ended(command, error, UNUSABLE) from error
+    except HoldfastError as error:
+        raise ended(command, error, FAILED) from error
+
+
+def ended(command: str, error: Exception | str, code: int) -> typer.Exit:
+    """The end of a command that has failed, told on standard error."""
+    typer.echo(f"holdfast {command}: {error}", err=True)
+    return typer.Exit(code)
+
+
+@contextlib.contextmanager
+def reached(command: str, system: str | None, socket: Path | None) -> Generator[RemoteSystem, None, None]:
+    """The running system that is meant; whatever goes wrong ends the command with a sentence."""
+    with told(command), RemoteSystem(chosen(system, socket)) as remote:
+        yield remote
+
+
+def meant_rows(remote: RemoteSystem, paths: list[str]) -> list[ActorRow]:
+    """The actors that the patterns mean. Raises BadPattern, NoSuchActor."""
+    return select(remote.look().rows, paths)
+
+
+def show_json(value: Any) -> None:
+    """Print plain data as JSON, one document."""
+    typer.echo(json.dumps(value, ensure_ascii=False, indent=2 if sys.stdout.isatty() else None))
+
+
+def confirm(command: str, lost: list[str], *, yes: bool) -> None:
+    """Ask before something is lost; nobody is asked if nothing is, or with `--yes`. Raises typer.Exit: no."""
+    if yes or not lost:
+        return
+    for line in lost:
+        typer.echo(line, err=True)
+    if not sys.stdin.isatty():
+        raise ended(command, "this needs a yes: say --yes", FAILED)
+    if not typer.confirm("Go on?", err=True):
+        raise ended(command, "nothing was done", FAILED)

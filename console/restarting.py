@@ -1,0 +1,58 @@
+"""A restart by order: a life ends in good order, and the supervisor begins the next one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..actors.control.orders import Ready
+from ..actors.control.orders_lane import order
+from ..actors.errors import SpecError
+from ..actors.exit_reasons import SHUTDOWN, Crash, ExitReason
+from ..actors.kernel.cell import Cell
+from ..supervision.intensity import recent_restarts
+from ..supervision.spec import ChildSpec
+from ..supervision.supervisor import Supervisor
+
+if TYPE_CHECKING:
+    from ..system.system import ActorSystem
+
+ASKED = Crash("holdfast.Restart", "an operator has asked for it")
+"""The reason of a life that would not be followed by another one if it ended as when it is stopped."""
+
+
+async def restart_actor(system: ActorSystem, path: str, timeout: float) -> str:
+    """End a life in good order, and wait until the next one is up; returns how it ended, in words.
+
+    What waits at the address waits for the next life.
+
+    Raises:
+        SpecError: nobody would start it again, or its supervisor would give up over it.
+        HoldfastError: it has not ended, or is not up again, within `timeout` seconds.
+    """
+    ref = system.ref(path)
+    cell = ref._cell.living
+    if cell.parent is None:
+        raise SpecError(path, "the root is not restarted: end the program, and start it again")
+    if cell.spec is None and cell.parent.actor is not None:
+        raise SpecError(path, "no supervisor looks after it, so that it would not come back")
+    reason: ExitReason = SHUTDOWN
+    if isinstance(cell.spec, ChildSpec):
+        reason = SHUTDOWN if cell.spec.restarts(SHUTDOWN) else ASKED
+        if not cell.spec.restarts(reason):
+            raise SpecError(path, f"its spec ({cell.spec.restart}) does not let it come back: stop it, and start it")
+    check_allowed(cell.parent, path)
+    ended = await system.terminate(ref, reason, timeout=timeout)
+    await order(ref._cell.living, Ready(), timeout)
+    return str(ended)
+
+
+def check_allowed(above: Cell, path: str) -> None:
+    """Whether a supervisor has a restart left. Raises SpecError: it would give up, and end all below it."""
+    actor = above.actor
+    if not isinstance(actor, Supervisor) or "_flags" not in actor.__dict__:
+        return  # It lives in another process, and only it knows.
+    flags = actor._flags
+    recent = recent_restarts(actor._restarts, above.node.loop.time(), flags.period)
+    if len(recent) >= flags.intensity:
+        used = f"{len(recent)} of {flags.intensity} restarts within {flags.period:g} s are used up"
+        raise SpecError(path, f"{above.path} would give up over its restart ({used}): wait, or allow more of them")

@@ -1,0 +1,90 @@
+"""Every command that docs/command-line.md shows does what it says there."""
+
+import asyncio
+import doctest
+import re
+import shlex
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from holdfast.console.commands import commands
+from holdfast.console.service.project import write_project
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "command-line.md").read_text("utf-8")
+CONSOLE = re.compile(r"^```console\n(?P<body>.*?)^```$", re.M | re.S)
+SECTIONS = {
+    title: CONSOLE.findall(body)
+    for title, body in re.findall(r"^### ([^\n]+)\n(.*?)(?=^##|\Z)", PAGE, re.M | re.S)
+    if CONSOLE.search(body)
+}
+TREE = re.search(r"^```toml\n(.*?)^```$", PAGE, re.M | re.S)
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The program of the page, in its folder."""
+    folder = tmp_path / "shop"
+    write_project("shop", folder)
+    assert TREE is not None
+    (folder / "shop.toml").write_text(TREE[1])
+    (folder / "shop.toml").chmod(0o600)
+    monkeypatch.chdir(folder)
+    monkeypatch.delenv("HOLDFAST_SYSTEM", raising=False)
+    with tempfile.TemporaryDirectory(dir="/tmp") as runtime:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", runtime)
+        yield folder
+
+
+async def said(line: str) -> str:
+    """What a command prints, to both outputs, and its exit status if that is not 0."""
+    program, *arguments = shlex.split(line)
+    assert program == "holdfast"
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "holdfast.console.cli", *arguments),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+    )
+    async with asyncio.timeout(25):
+        output, _ = await process.communicate()
+    return output.decode() + (f"[exit {process.returncode}]\n" if process.returncode else "")
+
+
+def steps(body: str) -> Iterator[tuple[str, str]]:
+    """The commands of a block, each with what is shown of its output."""
+    for part in re.split(r"^\$ ", body, flags=re.M)[1:]:
+        line, _, shown = part.partition("\n")
+        yield line, shown
+
+
+@pytest.mark.parametrize("title", SECTIONS)
+async def test_the_page_is_true(project: Path, title: str) -> None:
+    service = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "holdfast.console.cli", "run", "shop.tree:tree", "--name", "shop"),
+        stderr=asyncio.subprocess.PIPE,
+    )
+    try:
+        assert service.stderr is not None
+        async with asyncio.timeout(25):
+            assert b"shop runs" in await service.stderr.readline()
+        for body in SECTIONS[title]:
+            for line, shown in steps(body):
+                output = await said(line)
+                is_shown = doctest.OutputChecker().check_output(
+                    shown, output, doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+                )
+                assert is_shown, f"$ {line}\n{output}"
+    finally:
+        service.terminate()
+        await service.communicate()
+
+
+def test_every_command_is_on_the_page() -> None:
+    names = {one.name or (one.callback.__name__ if one.callback else "") for one in commands.registered_commands}
+    titles = re.findall(r"^### ([^\n]+)$", PAGE, re.M)
+    shown = {name for title in titles for name in title.split(", ")}
+    assert names - shown == {"check-upgrade", "replay", "demo"}

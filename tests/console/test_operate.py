@@ -1,0 +1,259 @@
+"""The commands that look at a running system and change it, each in a process of its own, as an operator types them."""
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.console.endpoint import control_endpoint
+from holdfast.console.runtime_folder import runtime_folder
+from tests.console.commands import holdfast
+from tests.system.trees import Add, Counter, ref
+
+DONE, FAILED, UNUSABLE = 0, 1, 2
+
+
+@pytest.fixture(autouse=True)
+def own_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder for sockets that no other test has; its path is short, as that of a socket must be."""
+    monkeypatch.delenv("HOLDFAST_SYSTEM", raising=False)
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", folder)
+        yield Path(folder)
+
+
+@pytest.fixture
+async def named(system: hf.ActorSystem) -> AsyncIterator[hf.ActorSystem]:
+    """The system, found by its name."""
+    async with control_endpoint(system):
+        yield system
+
+
+async def as_json(*arguments: object) -> Any:
+    status, output, errors = await holdfast(*arguments, "--json")
+    assert (status, errors) == (DONE, "")
+    return json.loads(output)
+
+
+# -- by name ----------------------------------------------------------------------------------------------------------
+
+
+async def test_a_system_is_found_by_its_name_and_by_its_pid(named: hf.ActorSystem) -> None:
+    (one,) = await as_json("ls")
+    assert (one["name"], one["pid"], one["actors"]) == ("app", os.getpid(), len(named.tree()))
+    for more in ((), ("--system", "app"), ("--system", os.getpid())):
+        status, output, _ = await holdfast("tree", "--paths", *more)
+        assert (status, output.split()[0]) == (DONE, "/app")
+
+
+async def test_no_system_and_several_are_told_apart(named: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch) -> None:
+    status, _, errors = await holdfast("tree", "--system", "till")
+    assert status == UNUSABLE
+    assert errors == f"holdfast tree: no system 'till' runs; there are app (pid {os.getpid()})\n"
+    async with hf.ActorSystem("other", log=False) as other, control_endpoint(other):
+        status, _, errors = await holdfast("tree")
+        assert (status, "several systems run: app" in errors) == (UNUSABLE, True)
+        monkeypatch.setenv("HOLDFAST_SYSTEM", "other")
+        assert (await holdfast("tree", "--paths"))[:2] == (DONE, "/other\n")
+
+
+DIES = """
+import asyncio, os, sys
+import holdfast as hf
+from holdfast.console.endpoint import control_endpoint
+
+async def main():
+    async with hf.ActorSystem("till one", log=False) as system, control_endpoint(system) as path:
+        print(path, flush=True)
+        os._exit(9)
+
+asyncio.run(main())
+"""
+
+
+async def test_what_a_dead_system_has_left_is_removed(own_folder: Path) -> None:
+    died = subprocess.run([sys.executable, "-c", DIES], check=False, capture_output=True, text=True, timeout=60)
+    left = Path(died.stdout.strip())
+    assert left.parent == own_folder / "holdfast"
+    assert left.is_socket()
+    assert await as_json("ls") == []
+    assert list(left.parent.iterdir()) == []
+
+
+async def test_a_folder_that_others_may_enter_is_refused(own_folder: Path) -> None:
+    runtime_folder().chmod(0o755)
+    status, _, errors = await holdfast("ls")
+    assert (status, "others may enter it (mode 0755); chmod 700" in errors) == (UNUSABLE, True)
+
+
+def test_a_link_in_the_place_of_the_folder_is_refused(own_folder: Path) -> None:
+    (own_folder / "elsewhere").mkdir(mode=0o700)
+    (own_folder / "holdfast").symlink_to(own_folder / "elsewhere")
+    with pytest.raises(hf.errors.UntrustedFile, match="it is no folder"):
+        runtime_folder()
+
+
+# -- looking ----------------------------------------------------------------------------------------------------------
+
+
+async def test_the_tree_shows_what_runs_and_what_is_stopped(named: hf.ActorSystem) -> None:
+    await named.suspend(ref(named, "/app/left/a"))
+    status, output, _ = await holdfast("tree")
+    assert status == DONE
+    lines = output.splitlines()
+    assert lines[0] == f"/app  Supervisor  running, task {os.getpid()}"
+    assert "├── left  Supervisor  running" in lines
+    assert "│   ├── a  Counter  suspended, named first" in lines
+    assert "│   ├── e  Counter  stopped" in lines
+
+
+async def test_a_pattern_with_conditions_selects(named: hf.ActorSystem) -> None:
+    await named.suspend(ref(named, "/app/left/a"))
+    told = await as_json("tree", "/app/**[state=suspended]", "/app/right/e")
+    assert [one["path"] for one in told["actors"]] == ["/app/left/a", "/app/right/e"]
+    status, _, errors = await holdfast("tree", "/app/**[restarts>3]")
+    assert (status, errors) == (FAILED, "holdfast tree: there is no actor at /app/**[restarts>3]\n")
+    status, _, errors = await holdfast("tree", "/app/**[colour=red]")
+    assert (status, "there is no field 'colour'; there are kind, state" in errors) == (FAILED, True)
+
+
+async def test_inspect_tells_all_of_an_actor(named: hf.ActorSystem) -> None:
+    status, output, _ = await holdfast("inspect", "first", "/app/right/client", "/app/right", "--state")
+    assert status == DONE
+    for line in (
+        "address: /app/left/a",
+        "kind: tests.system.trees.Counter",
+        "state: running",
+        f"place: task, pid {os.getpid()}",
+        "state count: 0",
+        "binding peer: /app/left/a",
+        "supervises: 3 children, one_for_all, 0 of 5 restarts within 5 s used up",
+    ):
+        assert line in output.splitlines()
+    status, _, errors = await holdfast("inspect", "/app/nowhere")
+    assert (status, errors) == (FAILED, "holdfast inspect: there is no actor at /app/nowhere\n")
+
+
+async def test_actors_in_processes_say_themselves_how_they_are(named: hf.ActorSystem) -> None:
+    far = hf.supervisor("far", isolation="process", children=[hf.child("one", hf.start(Counter))])
+    await named.start(far)
+    alone = await named.start(hf.child("alone", hf.start(Counter), isolation="process", recovery=hf.hybrid()))
+    await named.suspend(alone)
+    await named.suspend(ref(named, "/app/far/one"))
+    told = {one["path"]: one for one in (await as_json("tree"))["actors"]}
+    assert told["/app/alone"]["pid"] == named.pid_of(alone) != os.getpid()
+    assert [told[path]["state"] for path in ("/app/alone", "/app/far/one")] == ["suspended", "suspended"]
+    assert (told["/app/alone"]["place"], told["/app/alone"]["recovery"]) == ("process", "hybrid")
+    assert told["/app/far/one"]["pid"] == told["/app/far"]["pid"] != os.getpid()
+    assert not any(path.startswith("/app/recovery") for path in told)
+
+
+# -- changing ---------------------------------------------------------------------------------------------------------
+
+
+async def test_suspend_and_resume_by_pattern_are_one_transaction(named: hf.ActorSystem) -> None:
+    with named.events() as stream:
+        status, output, _ = await holdfast("suspend", "/app/left/*")
+        begun = [one for one in stream.take() if isinstance(one, hf.events.TransactionBegan)]
+    assert (status, len(begun), len(begun[0].steps)) == (DONE, 1, 3)
+    assert output.endswith("3. suspend /app/left/c\ndone\n")
+    assert (await named.get_status(ref(named, "/app/left/b"))).state == "suspended"
+    assert (await holdfast("resume", "/app/**[state=suspended]"))[0] == DONE
+    assert (await named.get_status(ref(named, "/app/left/b"))).state == "running"
+
+
+async def test_a_restart_asks_before_state_is_lost(named: hf.ActorSystem) -> None:
+    assert await ref(named, "/app/left/a").ask(Add(5)) == 5
+    status, _, errors = await holdfast("restart", "/app/left/a")
+    assert status == FAILED
+    assert errors.splitlines() == [
+        "without recovery, the state is lost of /app/left/a",
+        "holdfast restart: this needs a yes: say --yes",
+    ]
+    assert await ref(named, "/app/left/a").ask(Add(1)) == 6
+    assert (await holdfast("restart", "/app/left/a", "--yes"))[:2] == (DONE, "restarted /app/left/a\n")
+    assert await ref(named, "/app/left/a").ask(Add(1)) == 1
+
+
+async def test_a_restart_keeps_what_is_recorded_and_what_waits(named: hf.ActorSystem) -> None:
+    kept = hf.child("kept", hf.start(Counter), recovery=hf.hybrid(), restart="transient")
+    one = await named.start(kept)
+    assert await one.ask(Add(5)) == 5
+    await named.suspend(one)
+    waiting = one.ask(Add(2))
+    assert (await holdfast("restart", "/app/kept"))[0] == DONE
+    assert await waiting == 7
+
+
+async def test_a_restart_that_would_end_the_supervisor_is_refused(named: hf.ActorSystem) -> None:
+    await named.start(hf.supervisor("strict", intensity=0, children=[hf.child("x", hf.start(Counter))]))
+    status, _, errors = await holdfast("restart", "/app/strict/x", "--yes")
+    assert status == FAILED
+    assert "/app/strict would give up over its restart (0 of 0 restarts within 5 s are used up)" in errors
+    assert (await named.get_status(ref(named, "/app/strict/x"))).life == 1
+
+
+async def test_a_restart_of_who_would_not_come_back_is_refused(named: hf.ActorSystem) -> None:
+    await named.start(hf.child("once", hf.start(Counter), restart="temporary"))
+    named.spawn(hf.start(Counter), "alone")
+    for path, why in (("/app/once", "stop it, and start it"), ("/app/alone", "no supervisor looks after it")):
+        status, _, errors = await holdfast("restart", path, "--yes")
+        assert (status, why in errors) == (FAILED, True)
+
+
+async def test_stop_start_and_remove(named: hf.ActorSystem) -> None:
+    status, output, _ = await holdfast("stop", "/app/left/b", "--dry-run")
+    assert (status, output.endswith("nothing was done: this was a dry run\n")) == (DONE, True)
+    assert (await holdfast("stop", "/app/left/b"))[0] == FAILED
+    assert (await holdfast("stop", "/app/left/b", "--yes"))[0] == DONE
+    assert "/app/left/b" not in named.tree()
+    assert (await holdfast("start", "/app/left/*[state=stopped]"))[0] == DONE
+    assert "/app/left/b" in named.tree()
+    assert (await holdfast("remove", "/app/pool/f", "--yes"))[0] == DONE
+    assert "/app/pool/f" not in named.tree()
+
+
+async def test_bind_and_unbind(named: hf.ActorSystem) -> None:
+    client = ref(named, "/app/right/client")
+    assert (await holdfast("bind", "/app/right/client", "peer", "second"))[0] == DONE
+    assert (await named.get_status(client)).bindings == {"peer": "/app/left/b"}
+    assert (await holdfast("unbind", "/app/right/client", "peer"))[0] == DONE
+    assert (await named.get_status(client)).bindings == {}
+    status, _, errors = await holdfast("bind", "/app/right/client", "till", "second")
+    assert (status, "has no binding 'till'" in errors) == (FAILED, True)
+
+
+async def test_protect_and_checkpoint(named: hf.ActorSystem) -> None:
+    await named.start(hf.child("kept", hf.start(Counter), recovery=hf.hybrid()))
+    assert (await holdfast("checkpoint", "/app/kept"))[:2] == (DONE, "1 of 1 saved\n")
+    status, _, errors = await holdfast("checkpoint", "/app/left/a")
+    assert (status, "keeps no snapshots" in errors) == (FAILED, True)
+    assert (await holdfast("protect", "/app/left/a", "pbr"))[0] == DONE
+    (told,) = await as_json("inspect", "/app/left/a")
+    assert (told["protection"]["stack"], told["actor"]["place"]) == (["pbr"], "replicas")
+    assert (await holdfast("protect", "/app/left/a", "--off"))[0] == DONE
+    assert (await named.protection(ref(named, "/app/left/a"))).stack == ()
+    assert (await holdfast("protect", "/app/left/a"))[0] == UNUSABLE
+
+
+async def test_trace_follows_one_actor_and_gives_back_what_it_has_switched_on(named: hf.ActorSystem) -> None:
+    one = ref(named, "/app/left/a")
+    work = asyncio.create_task(holdfast("trace", "/app/left/a", "--count", 3, "--json"))
+    while not work.done():
+        await one.ask(Add(1))
+        await asyncio.sleep(0)
+    status, output, _ = work.result()
+    told = [json.loads(line) for line in output.splitlines()]
+    assert (status, sorted(line["what"] for line in told)) == (DONE, ["MessageIn", "TurnBegan", "TurnEnded"])
+    more = one._cell.more
+    async with asyncio.timeout(20):
+        while more is not None and more.tap is not None and more.tap.is_on:
+            await asyncio.sleep(0.01)

@@ -1,0 +1,87 @@
+"""Each safety check of the console is there for a reason: take it out, and a test fails.
+
+`HOLDFAST_REMOVED=1 python -m pytest tests/console/test_removed_checks.py` does so, in a copy; otherwise it is only
+looked whether the checks and the tests are where this table says.
+"""
+
+from __future__ import annotations
+
+from tests.removing import Check, as_tests
+
+OPERATE = "tests/console/test_operate.py"
+DECLARE = "tests/console/test_declare.py"
+
+CHECKS = {
+    "nobody else may look into the folder of sockets": Check(
+        "console/runtime_folder.py",
+        "    if info.st_mode & (stat.S_IRWXG | stat.S_IRWXO):",
+        "    if False:",
+        OPERATE,
+        "test_a_folder_that_others_may_enter_is_refused",
+    ),
+    "the folder of sockets is no link": Check(
+        "console/runtime_folder.py",
+        "    if not stat.S_ISDIR(info.st_mode):",
+        "    if False:",
+        OPERATE,
+        "test_a_link_in_the_place_of_the_folder_is_refused",
+    ),
+    "a supervisor does not give up over a restart by order": Check(
+        "console/restarting.py",
+        "    check_allowed(cell.parent, path)\n",
+        "",
+        OPERATE,
+        "test_a_restart_that_would_end_the_supervisor_is_refused",
+    ),
+    "who would not come back is not restarted": Check(
+        "console/restarting.py",
+        "        if not cell.spec.restarts(reason):",
+        "        if False:",
+        OPERATE,
+        "test_a_restart_of_who_would_not_come_back_is_refused",
+    ),
+    "a client that goes follows nobody any more": Check(
+        "console/session.py",
+        "            self._followed.close()\n",
+        "            pass\n",
+        OPERATE,
+        "test_trace_follows_one_actor_and_gives_back_what_it_has_switched_on",
+    ),
+    "nothing is lost without a yes": Check(
+        "console/operate/reaching.py",
+        "    if yes or not lost:",
+        "    if True:",
+        OPERATE,
+        "test_a_restart_asks_before_state_is_lost or test_stop_start_and_remove",
+    ),
+    "modules of a tree are of nobody else": Check(
+        "console/declare/tree_plan.py",
+        "    with trusted_imports(system._node, Needed(None, [])):\n        wanted",
+        "    if True:\n        wanted",
+        DECLARE,
+        "test_a_module_that_others_may_write_is_not_imported_for_a_tree",
+    ),
+    "children of dynamic supervisors are not the file's": Check(
+        "console/declare/tree_plan.py",
+        " or (free and not is_named)",
+        "",
+        DECLARE,
+        "test_what_is_not_in_the_file_is_removed_and_children_of_dynamic_supervisors_stay",
+    ),
+    "only the arguments of the next lives change": Check(
+        "console/declare/tree_plan.py",
+        "ReplaceActorCode(path, spec.start, keep_state)",
+        "ReplaceActorCode(path, spec.start, lambda state, old: {})",
+        DECLARE,
+        "test_each_difference_is_one_step_and_state_is_kept",
+    ),
+    "who is unbound may be started before its target": Check(
+        "system/transaction/wiring.py",
+        "            owner.spec = dataclasses.replace(owner.spec, bindings=left)",
+        "            pass",
+        DECLARE,
+        "test_the_order_of_the_file_is_the_order_of_starts",
+    ),
+}
+
+test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
