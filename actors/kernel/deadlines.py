@@ -42,6 +42,11 @@ class Deadlines:
         if queue.timer is None:
             queue.arm()
 
+    @property
+    def outstanding(self) -> int:
+        """Asks without an outcome so far; each is looked at."""
+        return sum(not ask.future.done() for queue in self._queues.values() for ask in queue.asks)
+
     def close(self) -> list[Ask]:
         """Forget all timers. Returns the asks that have no outcome yet."""
         left = [ask for queue in self._queues.values() for ask in queue.asks if not ask.future.done()]

@@ -422,6 +422,7 @@ class OutsidePlace(Place):
     """Wherever the process at the other end has an actor."""
 
     is_here = False
+    kind = "elsewhere"
 
     def __init__(self, peer: Peer) -> None:
         self.peer = peer
