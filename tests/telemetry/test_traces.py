@@ -16,10 +16,11 @@ from opentelemetry.sdk.trace.sampling import ALWAYS_OFF
 from opentelemetry.trace import SpanKind, StatusCode, Tracer
 
 import holdfast as hf
+from holdfast.actors.control.trace_tail import tail_of
 from holdfast.actors.kernel.context import ActorContext
 from holdfast.actors.kernel.ref import ActorRef
 from tests.telemetry.scrapes import until
-from tests.telemetry.traced_shop import Clerk, Count, Fail, Held, Made, Note, Noted, Onto, Onward, Where
+from tests.telemetry.traced_shop import Clerk, Count, Fail, Held, Made, Note, Noted, Onto, Onward, Pass, Through, Where
 
 NEXT = {"next_one": "/app/bob"}
 
@@ -316,3 +317,62 @@ async def test_statistics_count_what_a_traced_turn_tells(traced: Traced) -> None
         counts = await system.statistics(alice)
         assert counts is not None
         assert (counts.messages_in, counts.messages_out, counts.turns) == (2, 2, 2)
+
+
+async def test_the_messages_of_the_runtime_begin_no_trace(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        system.trace_with(traced.tracer, one_in=1)
+        alice = await system.start(hf.child("alice", hf.start(Clerk), recovery=hf.hybrid()))
+        await system.get_state(alice)
+        assert traced.spans() == []
+        await alice.ask(Count())
+    assert [one.name for one in traced.spans()] == ["handle Count", "ask Count"]
+
+
+async def test_whoever_waits_for_a_turn_has_decided(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        bob = await system.start(hf.child("bob", hf.start(Clerk)))
+        alice = await system.start(hf.child("alice", hf.start(Through), bindings=NEXT))
+        await system.suspend(alice)
+        asker = await system.start(hf.child("asker", hf.start(Through), bindings={"next_one": "/app/alice"}))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        asked = asyncio.ensure_future(asker.ask(Pass()))
+        await bob.ask(Count())  # By now alice has been asked, in a turn that is in no trace.
+        system.trace_with(traced.tracer, one_in=1)
+        await system.resume(alice)
+        assert await asked == "none"
+    assert traced.spans() == []
+
+
+async def test_a_trace_is_begun_once(traced: Traced) -> None:
+    off = TracerProvider(sampler=ALWAYS_OFF).get_tracer("off")
+    async with hf.ActorSystem("app", log=False) as system:
+        alice = await system.start(hf.child("alice", hf.start(Clerk), isolation="process"))
+        dave = await system.start(hf.child("dave", hf.start(Through), bindings={"next_one": alice.path}))
+        system.trace_with(off, one_in=1)  # The turn of dave begins a trace, which is not sampled.
+        assert await dave.ask(Pass()) == "none"
+        chain = tail_of(dave._cell.item.chain)
+        assert chain == ""
+
+
+async def test_what_carries_no_trace(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        bob = await system.start(hf.child("bob", hf.start(Clerk)))
+        alice = await system.start(hf.child("alice", hf.start(Clerk), bindings=NEXT, recovery=hf.hybrid()))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        with traced.tracer.start_as_current_span("request"):
+            await bob.send(Note())
+            await system.publish("/notes", Note())
+            await alice.ask(Onto())  # It is recorded, and tells bob a note.
+        assert await bob.ask(Noted()) == ["none"] * 3
+
+
+async def test_a_process_without_a_provider_makes_no_spans(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.child("bob", hf.start(Clerk)))
+        alice = await system.start(hf.child("alice", hf.start(Clerk), bindings=NEXT, isolation="process"))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        with traced.tracer.start_as_current_span("request"):
+            await alice.ask(Onward())
+    assert parent_of(traced.one("handle Where")) == id_of(traced.one("ask Onward"))
+    assert [one.name for one in traced.spans()] == ["handle Where", "ask Onward", "request"]

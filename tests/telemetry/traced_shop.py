@@ -40,7 +40,7 @@ class Onward(hf.Message[str]):
     """Asks the next one where it is."""
 
 
-class Onto(hf.Message):
+class Onto(hf.Message[None]):
     """Tells the next one a note."""
 
 
@@ -61,6 +61,10 @@ def lines(spans: Iterable[ReadableSpan]) -> list[str]:
     return made
 
 
+class Pass(hf.Message[str]):
+    """Asks the next one onward, or where it is."""
+
+
 class Clerk(hf.Actor):
     next_one: "hf.Binding[Clerk]"
 
@@ -78,6 +82,7 @@ class Clerk(hf.Actor):
     async def where(self, message: Where) -> str:
         return here()
 
+    @hf.subscribe("/notes")
     @hf.on(Note)
     def note(self, message: Note) -> None:
         self.notes = [*self.notes, here()]
@@ -110,3 +115,17 @@ class Clerk(hf.Actor):
     @hf.on(Onto)
     def onto(self, message: Onto) -> None:
         self.next_one.tell(Note())
+
+    @hf.on(Pass)
+    def passed(self, message: Pass) -> str:
+        return here()
+
+
+class Through(hf.Actor):
+    """Hands on what it is asked."""
+
+    next_one: "hf.Binding[Clerk]"
+
+    @hf.on(Pass)
+    async def passed(self, message: Pass) -> str:
+        return await self.next_one.ask(Pass())
