@@ -376,3 +376,18 @@ async def test_a_process_without_a_provider_makes_no_spans(traced: Traced) -> No
             await alice.ask(Onward())
     assert parent_of(traced.one("handle Where")) == id_of(traced.one("ask Onward"))
     assert [one.name for one in traced.spans()] == ["handle Where", "ask Onward", "request"]
+
+
+async def test_an_endpoint_in_a_thread_continues_its_span(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        alice = await system.start(hf.child("alice", hf.start(Clerk)))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        portal = system.from_thread()
+
+        def endpoint() -> str:
+            with traced.tracer.start_as_current_span("request"):
+                return portal.ask(alice, Where(), timeout=5.0)
+
+        told = await asyncio.to_thread(endpoint)
+    assert told.split()[0] == f"{trace_of(traced.one('request')):032x}"
+    assert parent_of(traced.one("ask Where")) == id_of(traced.one("request"))
