@@ -549,6 +549,11 @@ class EventHub:
         self._resting.clear()
         self._count()
 
+    def remove_sink(self, sink: Callable[[Event], None]) -> None:
+        """Call it no more."""
+        self._sinks.remove(sink)
+        self._count()
+
     def listen(self, most: int = 10_000) -> EventStream:
         """A new stream; the oldest of more than `most` unread events are dropped and counted in `missed`."""
         stream = EventStream(self, most)

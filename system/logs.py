@@ -7,6 +7,7 @@ import logging
 import sys
 from typing import Any
 
+from ..actors.control.trace_tail import tail_of
 from ..actors.errors import portable
 from ..actors.events import (
     ActorCrashed,
@@ -259,6 +260,8 @@ def describe(event: Event, *, payloads: bool = False) -> Fields:
         value = getattr(event, name)
         if isinstance(value, (Message, Item, MessageText)):
             fields["message"] = item_name(value)
+            if isinstance(value, Item) and (trace := tail_of(value.chain)):
+                _, fields["trace_id"], fields["span_id"], *_ = (*trace.split("-"), "", "")
             if payloads:
                 message = message_of(value)
                 fields["payload"] = portable(str(value if message is None else message))

@@ -7,7 +7,7 @@ import contextlib
 import os
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
 
 from ..actors.control.drain import drain as drain_queue
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, TreeFailed
@@ -17,6 +17,7 @@ from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.address_host import AddressHost
 from ..actors.kernel.cell import GONE, Cell, Host
+from ..actors.kernel.deadlines import Deadlines
 from ..actors.kernel.lifecycle import LOCAL, NEAR
 from ..actors.kernel.mailbox import Bounded
 from ..actors.kernel.message import Message
@@ -57,6 +58,9 @@ from .recovery import RecoveryTree
 from .script import load_script
 from .specification import Specifications
 from .transaction.transaction import Transaction, Transactions
+
+if TYPE_CHECKING:
+    from opentelemetry.trace import Tracer
 
 A = TypeVar("A", bound=Actor)
 
@@ -249,6 +253,8 @@ class ActorSystem(Recorded, Controls, Remembering):
         while node.remains:
             await asyncio.wait(set(node.remains))
         self._watch.close()
+        if type(node.deadlines) is not Deadlines:
+            self.trace_with(None)
         await self._workers.close()
         await node.close()
         await self._homes.settled()
@@ -520,6 +526,26 @@ class ActorSystem(Recorded, Controls, Remembering):
     def events(self) -> EventStream:
         """Return a new stream of events from here on: `async for event in stream`; close it when done."""
         return self._node.events.listen()
+
+    def trace_with(self, tracer: Tracer | None, *, one_in: float = 100, baggage: bool = False) -> None:
+        """Make spans of OpenTelemetry from now on: of asks, tells and turns, of restarts and recoveries.
+
+        What is sent inside of a span that is sampled continues its trace, and the turns that follow from it are in it.
+        Of what is sent from outside of any, one message in so many begins a trace. It needs the extra `traces`.
+
+        Args:
+            tracer: makes the spans in this process; None ends it. (In actors' processes: the global tracer provider.)
+            one_in: so many messages from no trace begin one; `math.inf`: none does.
+            baggage: what is in the sender's baggage goes along with every message, sampled or not.
+
+        Raises:
+            SpecError: `one_in` is less than 1.
+        """
+        if not one_in >= 1:
+            raise SpecError("trace_with", f"one_in must be a number from 1 on, not {one_in!r}")
+        from .traced_events import trace_system  # Most systems are not traced, and need no OpenTelemetry.
+
+        trace_system(self._node, tracer, 1 / one_in, baggage=baggage)
 
     @property
     def dead_letters(self) -> int:

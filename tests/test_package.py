@@ -53,7 +53,10 @@ def test_pytest_holds_one_copy_of_the_package() -> None:
     assert [name for name in sys.modules if name.endswith("kernel.ref")] == ["holdfast.actors.kernel.ref"]
 
 
-@pytest.mark.parametrize("name", ["numpy", "holdfast.console", "holdfast.diagnosis", "holdfast.testing"])
+@pytest.mark.parametrize(
+    "name",
+    ["numpy", "holdfast.console", "holdfast.diagnosis", "holdfast.telemetry", "holdfast.testing", "opentelemetry"],
+)
 def test_importing_holdfast_leaves_alone(name: str) -> None:
     assert name not in modules_after_import()
 

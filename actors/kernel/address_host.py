@@ -71,6 +71,8 @@ class Place:
     """Whether that is this process."""
     owns_processes: bool = False
     """Whether each life has a process of its own, or several."""
+    kind: str = "task"
+    """Where that is, in a word, for whoever counts."""
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         """Begin a life. None: it is up already. Raises, or fails the future, with StartFailed."""

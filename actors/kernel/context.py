@@ -17,7 +17,7 @@ from ..exit_reasons import NORMAL, ExitReason
 from ..seconds import check_seconds
 from . import links, mailbox
 from .blocking_handlers import is_async
-from .envelope import NO_DEADLINE, Ask, Chain, Envelope, Item, ReplyHandle, chain_of, message_in
+from .envelope import NO_DEADLINE, Ask, Chain, Envelope, Item, ReplyHandle, chain_of, message_in, waiters
 from .links import Monitor
 from .message import Message, reply_type, require_message
 from .timers import Timer
@@ -142,7 +142,7 @@ class ActorContext:
         future: asyncio.Future[R] = node.loop.create_future()
         chain = self._chain()
         if waits_for(self, cell, chain):
-            future.set_exception(AskDeadlock(cell.path, tuple(path for path, _ in chain)))
+            future.set_exception(AskDeadlock(cell.path, waiters(chain)))
             return future
         ask = Ask(message, self._cell, chain, timeout, NO_DEADLINE, future, cell)
         node.deadlines.add(ask)

@@ -45,6 +45,8 @@ class Item:
     """The cell of the actor that has sent it, if one has."""
     chain: Chain = ()
     """The turns that wait for its turn."""
+    is_ask: bool = False
+    """Whether somebody waits for an answer to it."""
     stops: ExitReason | None = None
     """Why the life has to end in good order, if that is what it commands."""
 
@@ -59,6 +61,10 @@ class Item:
     def hook(self) -> str:
         """The actor's hook that it calls, if that is what it does."""
         return ""
+
+    def brings(self) -> str:
+        """The type of the message that it brings."""
+        return type_name(type(self.message))
 
     def stashed(self) -> None:
         """Its turn puts it aside: it will come again, out of its order."""
@@ -146,6 +152,11 @@ def chain_of(item: Any) -> Chain:
     return item.chain if isinstance(item, Item) else ()
 
 
+def waiters(chain: Chain) -> tuple[str, ...]:
+    """The addresses of the turns in a chain; what may stand behind them is none."""
+    return tuple(path for path, _ in chain if path.startswith("/"))
+
+
 def unhandled(actor: Any, message: Any) -> object:
     """Stands in the table for types without a handler."""
     ctx: ActorContext = actor.ctx
@@ -183,6 +194,7 @@ class Ask(Item, msgspec.Struct, eq=False):
     """A message that somebody waits for: exactly one outcome reaches `future`."""
 
     of_life = False
+    is_ask = True
 
     message: Any
     sender: Any  # the asking actor's Cell; None from outside

@@ -374,6 +374,7 @@ class WorkerPlace(Place):
     """A process of the actor's own; one such place per address."""
 
     is_here = False
+    kind = "process"
     owns_processes = True
 
     def __init__(self, home: WorkerHome, parent: Parent, workers: Workers, limits: Limits | None) -> None:

@@ -312,7 +312,7 @@ class Guest(Peer):
     def _tell(self, frame: frames.Tell) -> None:
         """The hot path in: a plain message to our own actor, of a type it has had before."""
         route = self.routes.get((frame.to, frame.name))
-        if route is not None and frame.sender is None:
+        if route is not None and frame.sender is None and not frame.chain:
             cell, decode, _ = route
             try:
                 message = decode(frame.body)

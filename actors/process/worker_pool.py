@@ -450,6 +450,11 @@ class Workers:
         """The process of an actor, if it has one now."""
         return self.by_cell.get(cell)
 
+    @property
+    def pids(self) -> dict[int, str]:
+        """The processes that live, with the address that each was given; "" for one in reserve."""
+        return {pid: worker.home for pid, worker in self._alive.items()}
+
     def want(self, module: str) -> None:
         """Have the fork server import a module before the next fork."""
         if module in self._preload or module == "__main__":

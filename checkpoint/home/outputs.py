@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ...actors.errors import AskDeadlock, HoldfastError, MailboxFull
 from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.codec import Parcel
-from ...actors.kernel.envelope import Envelope
+from ...actors.kernel.envelope import Envelope, waiters
 from ..durable_links import UNDONE_BY, connect
 from ..inputs import Batch
 from ..life.recorded_inbox import STARTED
@@ -296,7 +296,7 @@ class Outputs:
         if switch is None:
             batch.after.append(lambda: self._send_ask(target, ask))
         elif switch.waits(ask):
-            ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, tuple(p for p, _ in chain)))), batch)
+            ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, waiters(chain)))), batch)
         elif (bound := switch.intake.bound) is None or bound.makes_room(ask, out.name, out.body, home.path):
             asked = switch.record(MESSAGE, out.name, out.body, home.path, batch, origin_of(ask))
             asked.ask, asked.chain = ask, chain
@@ -308,7 +308,7 @@ class Outputs:
         try:
             ctx = target.ctx
             if ctx is not None and ctx._turn_in(ask.chain):
-                raise AskDeadlock(target.path, tuple(path for path, _ in ask.chain))
+                raise AskDeadlock(target.path, waiters(ask.chain))
             ask.message = home.node.codec.message_in(target, parcel.name, parcel.body)
             target.admit(target, ask)
         except HoldfastError as error:

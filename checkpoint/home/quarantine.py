@@ -116,6 +116,11 @@ class Quarantine:
             batch.add(PLACE, ("held", *msgspec.structs.astuple(one)), self._positions)
             batch.after.append(self._tidy)
 
+    @property
+    def count(self) -> int:
+        """How many messages it has."""
+        return len(self._held)
+
     def messages(self, address: str | None) -> list[QuarantinedMessage]:
         """What is in quarantine, oldest first: all of it, or what belongs to one address."""
         return [self._shown(one) for one in self._held.values() if address in (None, one.address)]

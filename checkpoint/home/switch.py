@@ -18,7 +18,7 @@ from ...actors.errors import AskDeadlock, HoldfastError, ReplayDiverged, StartIg
 from ...actors.events import RecoveryFailed
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
-from ...actors.kernel.envelope import Ask, Envelope, Item
+from ...actors.kernel.envelope import Ask, Chain, Envelope, Item, waiters
 from ...actors.kernel.message import message_name
 from ...actors.kernel.node import cell_kind
 from ..durable_links import DurableTies
@@ -139,13 +139,14 @@ class Switch:
         """Stands in `cell.admit`: number, journal, and feed unless the actor is being recovered."""
         self.node.check_thread(self.path)
         message, sender, ask = item, None, None
+        chain: Chain = ()
         if isinstance(item, Ask):
             message, sender, ask = item.message, item.sender, item
             if item.chain and self.waits(item):
-                item.fail(AskDeadlock(self.path, tuple(path for path, _ in item.chain)))
+                item.fail(AskDeadlock(self.path, waiters(item.chain)))
                 return
-        elif type(item) is Envelope:
-            message, sender = item.message, item.sender
+        elif isinstance(item, Envelope):
+            message, sender, chain = item.message, item.sender, item.chain
         if type(message) is Parcel:
             name, body = message.name, message.body
         else:
@@ -156,12 +157,14 @@ class Switch:
             return
         origin, bound = None if sender is None else sender.path, self.intake.bound
         if bound is None or bound.makes_room(ask, name, body, origin):
-            self.take(ask, name, body, origin)
+            self.take(ask, name, body, origin, chain)
 
-    def take(self, ask: Ask | None, name: str, body: bytes, sender: str | None) -> None:
+    def take(self, ask: Ask | None, name: str, body: bytes, sender: str | None, chain: Chain = ()) -> None:
         """Admit a message for which there is room."""
         if ask is None:
-            self.forward(self.record(MESSAGE, name, body, sender))
+            told = self.record(MESSAGE, name, body, sender)
+            told.chain = chain
+            self.forward(told)
             return
         origin = origin_of(ask) if isinstance(ask, SwitchAsk) else ""
         try:

@@ -27,16 +27,11 @@ INIT, STARTED, RECOVERED, STOP = "init", "start", "recovered", "stop"
 class Fed(Item):
     """An input in the mailbox of its life."""
 
-    __slots__ = ("feed", "is_stashed", "life", "message", "sender")
+    __slots__ = ("chain", "feed", "is_stashed", "life", "message", "sender")
 
     def __init__(self, life: Life, feed: Feed, message: Any, sender: Cell | None) -> None:
         self.life, self.feed, self.message, self.sender = life, feed, message, sender
-        self.is_stashed = False
-
-    @property
-    def chain(self) -> tuple[tuple[str, int], ...]:  # type: ignore[override]  # others have it as an attribute
-        """Who waits for this turn."""
-        return self.feed.chain
+        self.chain, self.is_stashed = feed.chain, False
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -63,6 +58,14 @@ class Fed(Item):
             return item.finish(result if life.page is None else life.drive(result))
         item.end_with(result)
         return None
+
+    @property
+    def is_ask(self) -> bool:  # type: ignore[override]  # as with the chain
+        """Whether somebody waits for an answer."""
+        return self.feed.is_ask
+
+    def brings(self) -> str:
+        return self.feed.name.replace(":", ".")
 
     def hook(self) -> str:
         return f"on_{self.feed.kind}" if self.feed.kind in ("start", "exit", "down") else self.feed.kind

@@ -13,6 +13,7 @@ import types
 from collections.abc import Callable, Coroutine, Generator
 from typing import Any, Final, NoReturn, Protocol, TypeVar
 
+from ...actors.control.trace_tail import follow
 from ...actors.effects import EffectCall
 from ...actors.errors import (
     ActorStopped,
@@ -228,6 +229,8 @@ class Life:
         else:
             sender = None if feed.sender is None else cell.node.cell_at(feed.sender)
             fed = Fed(self, feed, None, sender)
+        if feed.chain and feed.turn < 0:  # What is handled again is no new work.
+            follow(fed)
         if feed.kind == TICK and feed.origin in self.timers.cancelled and feed.turn < 0:
             return  # Its timer was cancelled while it was on its way; the home drops it too.
         if feed.id in self.restored.stash_ids and feed.turn < 0 and not self.is_live:
@@ -452,7 +455,7 @@ class Life:
         """Forget inputs that are queued, and are none any more."""
         queue = mailbox.queue_of(self.cell)
         for index, item in enumerate(queue):  # Not removed: the run loop has counted them.
-            if type(item) is Fed and is_over(item.feed):
+            if isinstance(item, Fed) and is_over(item.feed):
                 queue[index] = mailbox.NOTHING
 
     def release(self) -> None:

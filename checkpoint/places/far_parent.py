@@ -383,6 +383,7 @@ class SlotPlace(Place):
     """The process of the supervisor: each life has a word on its page."""
 
     is_here = False
+    kind = "subtree"
 
     def __init__(self, parent: FarParent, home: JournalHome) -> None:
         self._parent, self._home = parent, home

@@ -77,6 +77,7 @@ class GroupPlace(Place):
     """Replicas, each in a process of its own."""
 
     is_here = False
+    kind = "replicas"
     owns_processes = True
 
     def __init__(self, home: JournalHome, parent: Parent, mechanism: Any) -> None:

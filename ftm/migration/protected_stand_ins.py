@@ -51,6 +51,7 @@ class ChildAtRoot(ChildPlace):
     """The root: its lives are lived there, whoever restarts it is here."""
 
     is_here = False
+    kind = "replicas"
 
     def start(self, cell: Cell) -> asyncio.Future[None]:
         """Ask the root for replicas, or for a process."""

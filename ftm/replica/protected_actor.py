@@ -894,7 +894,7 @@ class Server(lifecycle.HerePlace):
         self.part.is_cut = True
         queue, left = mailbox.queue_of(life.cell), set[int]()
         for index, item in enumerate(queue):
-            if type(item) is Fed and item.life is life:
+            if isinstance(item, Fed) and item.life is life:
                 left.add(item.feed.id)
                 queue[index] = mailbox.NOTHING  # Not removed: the run loop has counted them.
         if left and life.feed is not None:

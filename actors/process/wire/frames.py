@@ -35,13 +35,17 @@ class Frame(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
 
 
 class Tell(Frame, tag=1):
-    """A message nobody waits for; `number` counts those to an actor with a process of its own (0: it has none)."""
+    """A message nobody waits for, so its `chain` has no turns, perhaps a trace.
+
+    `number` counts those to an actor with a process of its own (0: it has none).
+    """
 
     to: Name
     name: Name
     body: Raw
     number: int = 0
     sender: Name | None = None
+    chain: Chain = ()
 
 
 class Ask(Frame, tag=2):

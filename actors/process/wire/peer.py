@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
+from ...control.trace_tail import TracedEnvelope, follow
 from ...errors import AskDeadlock, BadMessage, BadReply, HoldfastError, type_name
 from ...exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...kernel import links
 from ...kernel.address_host import AddressHost, Home, Place
 from ...kernel.cell import Cell
 from ...kernel.codec import Codec, Parcel, Raw
-from ...kernel.envelope import Ask, Envelope, Item
+from ...kernel.envelope import Ask, Chain, Envelope, Item, waiters
 from ...kernel.lifecycle import NEAR
 from ...kernel.message import Message, message_name
 from . import frames
@@ -66,17 +67,19 @@ class Peer:
             BadMessage: it cannot be coded.
         """
         connection = self.connection
-        source, message = None, item
+        source: Cell | None = None
+        chain: Chain = ()
+        message = item
         if isinstance(item, Item):
             if isinstance(item, Ask):
                 self._send_ask(cell, path, item, number)
                 return
-            source, message = item.sender, item.message
+            source, chain, message = item.sender, item.chain, item.message
         # Names are numbered by first use: here in the order in which the other side reads them.
         to = connection.names.to_wire(path)
         name, body = self._payload(message)
         sender = None if source is None else connection.names.to_wire(source.path)
-        connection.send(frames.Tell(to, name, body, number, sender), path)
+        connection.send(frames.Tell(to, name, body, number, sender, chain), path)
 
     def _send_ask(self, cell: Cell, path: str, ask: Ask, number: int) -> None:
         connection = self.connection
@@ -226,10 +229,14 @@ class Peer:
             return
         sender = self._sender(frame.sender)
         if page is not None:
-            cell.admit(cell, Arrived(message, sender, frame.number, page))
+            arrived = Arrived(message, sender, frame.number, page, frame.chain)
+            if frame.chain:
+                follow(arrived)
+            cell.admit(cell, arrived)
         else:
+            item = message if sender is None else Envelope(message, sender)
             try:
-                cell.admit(cell, message if sender is None else Envelope(message, sender))
+                cell.admit(cell, TracedEnvelope(message, sender, frame.chain) if frame.chain else item)
             except HoldfastError as error:
                 self.node.dead_letter(cell, message, str(error), sender)
 
@@ -250,8 +257,10 @@ class Peer:
             finally:
                 if frame.sender is not None:
                     ask.sender = self._sender(frame.sender)
-            if ask.chain and (ctx := cell.ctx) is not None and ctx._turn_in(ask.chain):
-                raise AskDeadlock(cell.path, tuple(path for path, _ in ask.chain))
+            if ask.chain:
+                if (ctx := cell.ctx) is not None and ctx._turn_in(ask.chain):
+                    raise AskDeadlock(cell.path, waiters(ask.chain))
+                follow(ask)
             cell.admit(cell, ask)
         except HoldfastError as error:
             if page is not None:
@@ -292,6 +301,7 @@ class Arrived(Envelope, eq=False):
 
     number: int
     page: Any
+    chain: Chain = ()
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -431,6 +441,7 @@ class OutsidePlace(Place):
     """Wherever the process at the other end has an actor."""
 
     is_here = False
+    kind = "elsewhere"
 
     def __init__(self, peer: Peer) -> None:
         self.peer = peer

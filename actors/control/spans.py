@@ -1,0 +1,341 @@
+"""Spans of asks, tells and turns, in the traces of OpenTelemetry. Imported only when somebody wants them.
+
+Nothing is tested for while nobody does: asks get their deadlines from an object of another class, refs have other
+methods, and what stands in a mailbox has another `run`, for as long as a system is traced.
+"""
+
+from __future__ import annotations
+
+import contextvars
+import functools
+import random
+import types
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+from opentelemetry import context as otel
+from opentelemetry import trace
+from opentelemetry.baggage.propagation import W3CBaggagePropagator
+from opentelemetry.trace import (
+    NonRecordingSpan,
+    Span,
+    SpanContext,
+    SpanKind,
+    Status,
+    StatusCode,
+    TraceFlags,
+    Tracer,
+)
+
+from ..errors import type_name
+from ..kernel.deadlines import Deadlines
+from ..kernel.envelope import Ask, chain_of
+from ..kernel.message import Message
+from ..kernel.ref import ActorRef, current
+from .trace_tail import TracedEnvelope, follow, tail_of, with_tail
+from .tracing import TappedContext, tap_of
+
+if TYPE_CHECKING:
+    from contextvars import Token
+
+    from ..events import Event
+    from ..kernel.cell import Cell
+    from ..kernel.context import ActorContext
+    from ..kernel.node import Node
+
+Coroutine_ = types.CoroutineType
+NAME = "holdfast"
+"""Of the tracer that an actor process takes from its global tracer provider."""
+ADDRESS, BAGGAGE = "holdfast.address", "baggage"
+PACKAGE = f"{__name__.partition('.')[0]}."
+MOST_LAST = 1000
+"""Addresses of which it is known what was asked there last."""
+_BAGGAGE = W3CBaggagePropagator()
+_add, _random = Deadlines.add, random.random
+
+
+def _variable() -> Callable[[], otel.Context]:
+    """What gives the current context of OpenTelemetry: the context variable itself, if that can be found.
+
+    Every ask looks there, and the function for it takes four times as long.
+    """
+    mark = otel.Context()
+    token = otel.attach(mark)
+    try:
+        for variable, value in contextvars.copy_context().items():
+            if value is mark:
+                return functools.partial(variable.get, mark)
+    finally:
+        otel.detach(token)
+    return otel.get_current
+
+
+_here = _variable()
+
+
+class Spans:
+    """What a node needs to make spans.
+
+    Args:
+        node: whose actors are traced.
+        tracer: makes the spans.
+        share: of the messages that come from no trace, the part that begin one, from 0 to 1.
+        baggage: what is in the baggage of whoever sends goes along, also where nothing is traced.
+    """
+
+    def __init__(self, node: Node, tracer: Tracer, share: float, *, baggage: bool) -> None:
+        self.tracer, self.baggage = tracer, baggage
+        self.share = share
+        self._base = node.base_context.run(otel.get_current)  # of whoever entered the system: of no turn
+        self.sink: Callable[[Event], None] = lambda event: None  # who makes spans of events, if anybody does
+        self.last: dict[str, SpanContext] = {}  # by address: the last turn there that is in a trace
+
+    def around(self, ctx: ActorContext | None) -> otel.Context | None:
+        """In which context of OpenTelemetry a message is sent that belongs to a trace; None if it does to none.
+
+        Args:
+            ctx: of the actor that sends it; None if none does.
+        """
+        here = otel.get_current()
+        if here and (ctx is None or here is not self._base):
+            found = trace.get_current_span(here).get_span_context()
+            if found.is_valid or (self.baggage and _held(here)):
+                return here if _is_sampled(found) or (self.baggage and _held(here)) else None
+        if ctx is not None and chain_of(ctx._item):
+            return None  # Whoever waits for this turn has decided.
+        return otel.Context() if random.random() < self.share else None
+
+    def remember(self, address: str, span: Span) -> None:
+        """A turn there is in a trace: what happens to the actor next may have to do with it."""
+        self.last.pop(address, None)
+        self.last[address] = span.get_span_context()
+        if len(self.last) > MOST_LAST:
+            self.last.pop(next(iter(self.last)))
+
+    def begin(self, verb: str, kind: SpanKind, cell: Cell, message: str, parent: otel.Context) -> Span:
+        """A span about one message, of which the type is given, to one address."""
+        return self.tracer.start_span(f"{verb} {message.rpartition('.')[2]}", parent, kind, {ADDRESS: cell.path})
+
+    def tail(self, at: SpanContext, around: otel.Context) -> str:
+        """What goes along with a message whose parent is this span."""
+        written = f"00-{at.trace_id:032x}-{at.span_id:016x}-{at.trace_flags:02x}" if _is_sampled(at) else NO_TRACE
+        held = _held(around) if self.baggage else ""
+        return f"{written} {held}" if held else written
+
+    def ask(self, ask: Ask, around: otel.Context) -> None:
+        """An ask is about to be made: give it its trace, and perhaps a span up to its outcome."""
+        if type(ask) is not Ask:  # It is handed on for a recorded turn, and has the trace of that turn's asker.
+            return
+        if not around and _is_ours(ask.message):
+            return
+        if not around and _runs_here(ask.to):
+            tail = BEGIN
+        elif around and not _is_sampled(trace.get_current_span(around).get_span_context()):
+            tail = self.tail(SpanContext(0, 0, is_remote=False), around)
+        else:
+            span = self.begin("ask", SpanKind.CLIENT, ask.to, ask.brings(), around)
+            ask.future.add_done_callback(functools.partial(_outcome, span))
+            tail = self.tail(span.get_span_context(), around)
+        ask.chain = with_tail(ask.chain, tail)
+        follow(ask)
+
+    def tell(self, cell: Cell, message: Message[Any], ctx: ActorContext | None, around: otel.Context) -> None:
+        """Tell a message that belongs to a trace, or begins one."""
+        if ctx is not None:
+            ctx._alive()
+        if type(message) not in cell.table:
+            cell.require(message)
+        if around:
+            tail = self.tail(trace.get_current_span(around).get_span_context(), around)
+        elif _runs_here(cell):
+            tail = BEGIN
+        else:
+            span = self.begin("tell", SpanKind.PRODUCER, cell, type_name(type(message)), around)
+            span.end()
+            tail = self.tail(span.get_span_context(), around)
+        sender = None if ctx is None else ctx._cell
+        cell.admit(cell, TracedEnvelope(message, sender, ((tail, 0),)))
+        if ctx is not None and isinstance(ctx, TappedContext):
+            tap_of(ctx._cell).sent(cell.path, message)
+
+
+BEGIN, NO_TRACE = "+", "-"
+"""Stand for the trace of a message: its turn begins one; there is only baggage."""
+
+
+def _runs_here(cell: Cell) -> bool:
+    """Whether the very item that is sent is run here: then its turn can begin a trace, and needs no span before it."""
+    return cell.ctx is not None and not cell.ctx._may_rest
+
+
+def _is_ours(message: object) -> bool:
+    """Whether it is a message of the runtime's own: such a one begins no trace."""
+    return type(message).__module__.startswith(PACKAGE)
+
+
+def _is_sampled(at: SpanContext) -> bool:
+    return at.is_valid and at.trace_flags.sampled
+
+
+def _held(around: otel.Context) -> str:
+    """The baggage of a context, as it is written."""
+    carrier = dict[str, str]()
+    _BAGGAGE.inject(carrier, around)
+    return carrier.get(BAGGAGE, "")
+
+
+def context_of(tail: str) -> otel.Context:
+    """The context that a message was sent in, as far as it came along."""
+    found = otel.Context()
+    if tail == BEGIN:
+        return found
+    written, _, held = tail.partition(" ")
+    parts = written.split("-")
+    if len(parts) == 4:
+        try:
+            ids = (int(part, 16) for part in parts[1:])
+            at = SpanContext(next(ids), next(ids), is_remote=True, trace_flags=TraceFlags(next(ids)))
+        except ValueError:  # Another process may say anything.
+            return found
+        found = trace.set_span_in_context(NonRecordingSpan(at), found)
+    return _BAGGAGE.extract({BAGGAGE: held}, found) if held else found
+
+
+class TracedDeadlines(Deadlines):
+    """What every ask comes to, while the node is traced."""
+
+    spans: Spans
+
+    def add(self, ask: Ask) -> None:
+        """Set its deadline, and begin its span if it belongs to a trace."""
+        _add(self, ask)
+        spans, here = self.spans, _here()
+        if not here and ask.sender is None:  # From outside of any trace: the hot path.
+            if _random() >= spans.share:
+                return
+            spans.ask(ask, here)
+            return
+        around = spans.around(None if ask.sender is None else current.get(None))
+        if around is not None:
+            spans.ask(ask, around)
+
+
+class TracedSends:
+    """The methods that refs have while any node of this process is traced."""
+
+    nodes: ClassVar[int] = 0
+    tell_plainly: ClassVar[Callable[[ActorRef[Any], Message[Any]], None]] = ActorRef.tell
+
+    @classmethod
+    def put_in(cls) -> None:
+        """One more node is traced."""
+        cls.nodes += 1
+        cast("Any", ActorRef).tell = _tell
+
+    @classmethod
+    def take_out(cls) -> None:
+        """One less is."""
+        cls.nodes -= 1
+        if not cls.nodes:
+            cast("Any", ActorRef).tell = cls.tell_plainly
+
+
+def _tell(ref: ActorRef[Any], message: Message[Any]) -> None:
+    """What `ActorRef.tell` says."""
+    ctx, cell = current.get(None), ref._cell
+    spans = spans_of(cell.node)
+    around = None if spans is None or (ctx is not None and ctx._may_rest) else spans.around(ctx)
+    if spans is None or around is None or (not around and _is_ours(message)):
+        TracedSends.tell_plainly(ref, message)
+    else:
+        spans.tell(cell, message, ctx, around)
+
+
+def spans_of(node: Node) -> Spans | None:
+    """What makes the spans of a node; None if nobody traces it."""
+    deadlines = node.deadlines
+    return deadlines.spans if isinstance(deadlines, TracedDeadlines) else None
+
+
+def trace_node(node: Node, tracer: Tracer, share: float, *, baggage: bool) -> Spans:
+    """Trace a node from now on, by this tracer."""
+    deadlines: Any = node.deadlines
+    if not isinstance(deadlines, TracedDeadlines):
+        deadlines.__class__ = TracedDeadlines
+        TracedSends.put_in()
+    spans = deadlines.spans = Spans(node, tracer, share, baggage=baggage)
+    return spans
+
+
+def leave_node(node: Node) -> None:
+    """Trace it no more."""
+    if spans_of(node) is not None:
+        deadlines: Any = node.deadlines
+        del deadlines.spans
+        deadlines.__class__ = Deadlines
+        TracedSends.take_out()
+
+
+# -- a turn -----------------------------------------------------------------------------------------------------------
+
+
+def in_span(run: Callable[[Any, Any], object], actor: Any, item: Any) -> object:
+    """Run the turn of an item whose chain ends with a trace: it is a span, and so is current in the handler."""
+    cell: Cell = actor.ctx._cell
+    tail, node = tail_of(item.chain), cell.node
+    spans = spans_of(node)
+    if spans is None:
+        if node.ports.uplink is None:
+            return run(actor, item)  # It was traced when this was sent.
+        spans = trace_node(node, trace.get_tracer(NAME), 0.0, baggage=True)
+    around = context_of(tail)
+    span = None
+    if not tail.startswith(NO_TRACE):
+        kind = SpanKind.SERVER if item.is_ask else SpanKind.CONSUMER
+        span = spans.begin("handle", kind, cell, item.brings(), around)
+        spans.remember(cell.path, span)
+        around = trace.set_span_in_context(span, around)
+        if tail == BEGIN:
+            item.chain = item.chain[:-1]  # It has begun: what is asked in this turn must not begin another one.
+    token = otel.attach(around)
+    try:
+        result = run(actor, item)
+    except BaseException as error:
+        _over(span, token, error)
+        raise
+    if type(result) is Coroutine_:
+        return _followed(result, span, token)
+    _over(span, token, None)
+    return result
+
+
+async def _followed(turn: Any, span: Span | None, token: Token[otel.Context]) -> object:
+    try:
+        result = await turn
+    except BaseException as error:
+        _over(span, token, error)
+        raise
+    _over(span, token, None)
+    return result
+
+
+def _over(span: Span | None, token: Token[otel.Context], error: BaseException | None) -> None:
+    if not isinstance(error, GeneratorExit):  # Else the life is over, and its context with it.
+        otel.detach(token)
+    if span is None:
+        return
+    if error is not None:
+        if isinstance(error, Exception):
+            span.record_exception(error)
+        span.set_status(Status(StatusCode.ERROR, type(error).__name__))
+    span.end()
+
+
+def _outcome(span: Span, done: Any) -> None:
+    """The ask has its outcome, or nobody waits for it any more."""
+    if done.cancelled():
+        span.set_status(Status(StatusCode.ERROR, "cancelled"))
+    elif (error := done.exception()) is not None:
+        span.set_attribute("error.type", type_name(type(error)))
+        span.set_status(Status(StatusCode.ERROR, str(error)))
+    span.end()

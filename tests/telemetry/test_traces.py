@@ -1,0 +1,393 @@
+"""Traces over asks, tells, processes, recoveries and mechanisms; and that nobody pays while nobody traces."""
+
+import asyncio
+import math
+import os
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import pytest
+from opentelemetry import baggage
+from opentelemetry import context as otel
+from opentelemetry.sdk.trace import ReadableSpan, TracerProvider
+from opentelemetry.sdk.trace.export import SimpleSpanProcessor
+from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from opentelemetry.sdk.trace.sampling import ALWAYS_OFF
+from opentelemetry.trace import SpanKind, StatusCode, Tracer
+
+import holdfast as hf
+from holdfast.actors.control.trace_tail import tail_of
+from holdfast.actors.kernel.context import ActorContext
+from holdfast.actors.kernel.ref import ActorRef
+from tests.telemetry.scrapes import until
+from tests.telemetry.traced_shop import Clerk, Count, Fail, Held, Made, Note, Noted, Onto, Onward, Pass, Through, Where
+
+NEXT = {"next_one": "/app/bob"}
+
+
+class Traced(NamedTuple):
+    """A tracer, and what it has made."""
+
+    tracer: Tracer
+    exported: InMemorySpanExporter
+
+    def spans(self, name: str = "") -> list[ReadableSpan]:
+        return [one for one in self.exported.get_finished_spans() if one.name.startswith(name)]
+
+    def one(self, name: str) -> ReadableSpan:
+        (span,) = self.spans(name)
+        return span
+
+
+@pytest.fixture
+def traced() -> Iterator[Traced]:
+    provider, exported = TracerProvider(), InMemorySpanExporter()
+    provider.add_span_processor(SimpleSpanProcessor(exported))
+    yield Traced(provider.get_tracer("test"), exported)
+    provider.shutdown()
+
+
+def parent_of(span: ReadableSpan) -> int:
+    assert span.parent is not None
+    return span.parent.span_id
+
+
+def id_of(span: ReadableSpan) -> int:
+    assert span.context is not None
+    return span.context.span_id
+
+
+def trace_of(span: ReadableSpan) -> int:
+    assert span.context is not None
+    return span.context.trace_id
+
+
+async def test_an_ask_inside_of_a_span_continues_it(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.child("bob", hf.start(Clerk)))
+        alice = await system.start(hf.child("alice", hf.start(Clerk), bindings=NEXT))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        with traced.tracer.start_as_current_span("request"):
+            told = await alice.ask(Onward())
+    request, onward = traced.one("request"), traced.one("handle Onward")
+    ask_alice, ask_bob, where = traced.one("ask Onward"), traced.one("ask Where"), traced.one("handle Where")
+    assert parent_of(ask_alice) == id_of(request)
+    assert parent_of(onward) == id_of(ask_alice)
+    assert parent_of(ask_bob) == id_of(onward)
+    assert parent_of(where) == id_of(ask_bob)
+    assert told == f"{trace_of(request):032x} {id_of(where):016x}"
+    assert (ask_bob.kind, where.kind) == (SpanKind.CLIENT, SpanKind.SERVER)
+    assert dict(where.attributes or {}) == {"holdfast.address": "/app/bob"}
+
+
+async def test_a_tell_inside_of_a_span_continues_it(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        bob = await system.start(hf.child("bob", hf.start(Clerk)))
+        alice = await system.start(hf.child("alice", hf.start(Clerk), bindings=NEXT))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        with traced.tracer.start_as_current_span("request"):
+            alice.tell(Onto())
+        await alice.ask(Where())
+        noted = await bob.ask(Noted())
+    assert noted == [f"{trace_of(traced.one('request')):032x} {id_of(traced.one('handle Note')):016x}"]
+    assert parent_of(traced.one("handle Onto")) == id_of(traced.one("request"))
+    assert parent_of(traced.one("handle Note")) == id_of(traced.one("handle Onto"))
+    assert traced.one("handle Note").kind is SpanKind.CONSUMER
+
+
+async def test_what_is_in_no_trace_is_in_none(traced: Traced) -> None:
+    unsampled = TracerProvider(sampler=ALWAYS_OFF).get_tracer("off")
+    async with hf.ActorSystem("app", log=False) as system:
+        alice = await system.start(hf.child("alice", hf.start(Clerk)))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        assert await alice.ask(Where()) == "none"
+        with unsampled.start_as_current_span("request"):
+            assert await alice.ask(Where()) == "none"
+        with traced.tracer.start_as_current_span("request"):
+            assert await alice.ask(Where()) != "none"
+        assert await alice.ask(Where()) == "none"  # Nothing of the turn before is left.
+        alice.tell(Note())
+        assert await alice.ask(Noted()) == ["none"]
+
+
+async def test_one_message_in_so_many_begins_a_trace(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        bob = await system.start(hf.child("bob", hf.start(Clerk)))
+        alice = await system.start(hf.child("alice", hf.start(Clerk), bindings=NEXT))
+        system.trace_with(traced.tracer, one_in=1)
+        await alice.ask(Onward())
+        begun = traced.one("handle Onward")
+        assert begun.parent is None
+        assert trace_of(traced.one("handle Where")) == trace_of(begun)
+        traced.exported.clear()
+        alice.tell(Onto())
+        await alice.ask(Where())
+        await bob.ask(Where())
+        assert traced.one("handle Onto").parent is None
+        assert parent_of(traced.one("handle Note")) == id_of(traced.one("handle Onto"))
+        with pytest.raises(hf.errors.SpecError, match="one_in"):
+            system.trace_with(traced.tracer, one_in=0.5)
+
+
+async def test_who_enters_a_system_in_a_span_does_not_have_all_turns_in_it(traced: Traced) -> None:
+    with traced.tracer.start_as_current_span("lifespan"):
+        system = await hf.ActorSystem("app", log=False).__aenter__()
+    try:
+        bob = await system.start(hf.child("bob", hf.start(Clerk)))
+        alice = await system.start(hf.child("alice", hf.start(Clerk), bindings=NEXT))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        await alice.ask(Onward())
+        alice.tell(Onto())
+        await alice.ask(Where())
+        await bob.ask(Where())
+        assert [one.name for one in traced.spans()] == ["lifespan"]
+    finally:
+        await system.shutdown()
+
+
+async def test_failures_are_in_the_spans(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        alice = await system.start(hf.child("alice", hf.start(Clerk)))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        with traced.tracer.start_as_current_span("request"), pytest.raises(hf.errors.RemoteCrash):
+            await alice.ask(Fail())
+        await alice.ask(Where())
+        await asyncio.sleep(0)
+    failed, asked, again = traced.one("handle Fail"), traced.one("ask Fail"), traced.one("restart")
+    assert (failed.status.status_code, failed.events[0].name) == (StatusCode.ERROR, "exception")
+    assert asked.status.status_code is StatusCode.ERROR
+    assert again.parent is None
+    assert [link.context.span_id for link in again.links] == [id_of(failed)]
+    assert again.attributes is not None
+    assert again.attributes["holdfast.reason"] == "ValueError: failed"
+
+
+async def test_a_circle_is_told_without_the_trace(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        alice = await system.start(hf.child("alice", hf.start(Clerk)))
+        system.bind(alice, "next_one", alice)
+        system.trace_with(traced.tracer)
+        with traced.tracer.start_as_current_span("request"), pytest.raises(hf.errors.RemoteCrash) as crash:
+            await alice.ask(Onward())
+        assert "would wait for itself (/app/alice -> /app/alice)" in str(crash.value)
+
+
+PLACES: dict[str, dict[str, Any]] = {
+    "task": {},
+    "process": {"isolation": "process"},
+    "recorded": {"recovery": hf.hybrid()},
+    "recorded process": {"isolation": "process", "recovery": hf.hybrid()},
+    "protected": {"mechanism": hf.ftm.PBR()},
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+async def test_a_trace_crosses_every_border(traced: Traced, place: str) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        provides = place not in ("task", "recorded")
+        alice = await system.start(hf.child("alice", hf.start(Clerk, provides=provides), **PLACES[place]))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        with traced.tracer.start_as_current_span("request") as request:
+            told = await alice.ask(Where())
+            alice.tell(Note())
+        trace_id = f"{request.get_span_context().trace_id:032x}"
+        assert told.split()[0] == trace_id
+        (noted,) = await alice.ask(Noted())
+        assert noted.split()[0] == trace_id
+        if place in ("task", "recorded"):
+            where = traced.one("handle Where")
+            assert parent_of(where) == id_of(traced.one("ask Where"))
+        else:
+            made = await alice.ask(Made())
+            assert made[0] == f"handle Where {trace_id} {id_of(traced.one('ask Where')):016x}"
+            assert made[1].startswith(f"handle Note {trace_id} ")
+            assert len(made) == 2
+
+
+async def test_an_ask_of_a_process_is_in_the_trace_of_its_turn(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        bob = await system.start(hf.child("bob", hf.start(Clerk)))
+        alice = await system.start(
+            hf.child("alice", hf.start(Clerk, provides=True), isolation="process", bindings=NEXT)
+        )
+        system.trace_with(traced.tracer, one_in=math.inf)
+        with traced.tracer.start_as_current_span("request") as request:
+            told = await alice.ask(Onward())
+            alice.tell(Onto())
+        assert told.split()[0] == f"{request.get_span_context().trace_id:032x}"
+        made = await alice.ask(Made())
+        assert [" ".join(line.split()[:2]) for line in made] == ["ask Where", "handle Onward", "handle Onto"]
+        assert [one.split()[0] for one in await bob.ask(Noted())] == [told.split()[0]]
+        assert trace_of(traced.one("handle Where")) == request.get_span_context().trace_id
+
+
+async def test_a_replay_makes_no_spans_of_old_work(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        spec = hf.child("alice", hf.start(Clerk, provides=True), isolation="process", recovery=hf.replay_only())
+        alice = await system.start(spec)
+        system.trace_with(traced.tracer, one_in=math.inf)
+        with traced.tracer.start_as_current_span("request"):
+            for _ in range(3):
+                alice.tell(Count())
+            assert await alice.ask(Count()) == 4
+        with system.events() as events:
+            os.kill(system.pid_of(alice), 9)
+            assert await alice.ask(Count()) == 5
+            await until(events, hf.events.Recovered)
+        assert await alice.ask(Made()) == []  # The new process has handled all of it again.
+    recovery, replay = traced.one("recover"), traced.one("replay")
+    assert parent_of(replay) == id_of(recovery)
+    assert (recovery.attributes or {})["holdfast.replayed"] == 5
+    assert replay.start_time is not None
+    assert recovery.start_time is not None
+    assert recovery.start_time <= replay.start_time
+
+
+async def test_a_recovery_links_to_the_turn_that_failed(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        alice = await system.start(hf.child("alice", hf.start(Clerk), recovery=hf.hybrid()))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        with traced.tracer.start_as_current_span("request"), pytest.raises(hf.errors.RemoteCrash):
+            await alice.ask(Fail())
+        assert await alice.ask(Noted()) == []
+        await asyncio.sleep(0)
+    assert [link.context.span_id for link in traced.one("recover").links] == [id_of(traced.one("handle Fail"))]
+
+
+@pytest.mark.parametrize("place", ["task", "process", "recorded process"])
+async def test_baggage_crosses_on_request(traced: Traced, place: str) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        alice = await system.start(hf.child("alice", hf.start(Clerk), **PLACES[place]))
+        token = otel.attach(baggage.set_baggage("request", "r 7"))
+        try:
+            system.trace_with(traced.tracer, one_in=math.inf)
+            assert await alice.ask(Held()) == "None"
+            system.trace_with(traced.tracer, one_in=math.inf, baggage=True)
+            assert await alice.ask(Held()) == "r 7"
+            assert traced.spans() == []
+            with traced.tracer.start_as_current_span("request"):
+                assert await alice.ask(Held()) == "r 7"
+        finally:
+            otel.detach(token)
+        assert await alice.ask(Held()) == "None"
+
+
+def way_of(system: hf.ActorSystem, ref: ActorRef[Any]) -> list[Any]:
+    """Whatever a message passes: code, and who is called."""
+    cell = ref._cell
+    sends = (ActorRef.tell, ActorRef.ask, ActorRef.send, ActorContext._tell, ActorContext._ask)
+    return [*[one.__code__ for one in sends], cell.admit, cell.table, type(cell.ctx), type(system._node.deadlines)]
+
+
+async def test_nobody_pays_before_and_after(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        alice = await system.start(hf.child("alice", hf.start(Clerk)))
+        await alice.ask(Where())
+        before = way_of(system, alice)
+        system.trace_with(traced.tracer, one_in=1)
+        assert way_of(system, alice) != before
+        await alice.ask(Where())
+        system.trace_with(None)
+        assert way_of(system, alice) == before
+        made = len(traced.spans())
+        with traced.tracer.start_as_current_span("request"):
+            assert await alice.ask(Where()) == "none"
+        assert len(traced.spans()) == made + 1
+        system.trace_with(traced.tracer)
+    assert ActorRef.tell.__code__ is before[0]  # The end of a system ends its traces.
+
+
+async def test_a_system_beside_a_traced_one_is_not_traced(traced: Traced) -> None:
+    async with hf.ActorSystem("one", log=False) as one, hf.ActorSystem("two", log=False) as two:
+        alice = await two.start(hf.child("alice", hf.start(Clerk)))
+        one.trace_with(traced.tracer, one_in=1)
+        with traced.tracer.start_as_current_span("request"):
+            alice.tell(Note())
+            assert await alice.ask(Noted()) == ["none"]
+
+
+async def test_statistics_count_what_a_traced_turn_tells(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.child("bob", hf.start(Clerk)))
+        alice = await system.start(hf.child("alice", hf.start(Clerk), bindings=NEXT))
+        await system.statistics(alice, True)
+        system.trace_with(traced.tracer, one_in=1)
+        alice.tell(Onto())
+        await alice.ask(Onward())
+        counts = await system.statistics(alice)
+        assert counts is not None
+        assert (counts.messages_in, counts.messages_out, counts.turns) == (2, 2, 2)
+
+
+async def test_the_messages_of_the_runtime_begin_no_trace(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        system.trace_with(traced.tracer, one_in=1)
+        alice = await system.start(hf.child("alice", hf.start(Clerk), recovery=hf.hybrid()))
+        await system.get_state(alice)
+        assert traced.spans() == []
+        await alice.ask(Count())
+    assert [one.name for one in traced.spans()] == ["handle Count", "ask Count"]
+
+
+async def test_whoever_waits_for_a_turn_has_decided(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        bob = await system.start(hf.child("bob", hf.start(Clerk)))
+        alice = await system.start(hf.child("alice", hf.start(Through), bindings=NEXT))
+        await system.suspend(alice)
+        asker = await system.start(hf.child("asker", hf.start(Through), bindings={"next_one": "/app/alice"}))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        asked = asyncio.ensure_future(asker.ask(Pass()))
+        await bob.ask(Count())  # By now alice has been asked, in a turn that is in no trace.
+        system.trace_with(traced.tracer, one_in=1)
+        await system.resume(alice)
+        assert await asked == "none"
+    assert traced.spans() == []
+
+
+async def test_a_trace_is_begun_once(traced: Traced) -> None:
+    off = TracerProvider(sampler=ALWAYS_OFF).get_tracer("off")
+    async with hf.ActorSystem("app", log=False) as system:
+        alice = await system.start(hf.child("alice", hf.start(Clerk), isolation="process"))
+        dave = await system.start(hf.child("dave", hf.start(Through), bindings={"next_one": alice.path}))
+        system.trace_with(off, one_in=1)  # The turn of dave begins a trace, which is not sampled.
+        assert await dave.ask(Pass()) == "none"
+        chain = tail_of(dave._cell.item.chain)
+        assert chain == ""
+
+
+async def test_what_carries_no_trace(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        bob = await system.start(hf.child("bob", hf.start(Clerk)))
+        alice = await system.start(hf.child("alice", hf.start(Clerk), bindings=NEXT, recovery=hf.hybrid()))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        with traced.tracer.start_as_current_span("request"):
+            await bob.send(Note())
+            await system.publish("/notes", Note())
+            await alice.ask(Onto())  # It is recorded, and tells bob a note.
+        assert await bob.ask(Noted()) == ["none"] * 3
+
+
+async def test_a_process_without_a_provider_makes_no_spans(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.child("bob", hf.start(Clerk)))
+        alice = await system.start(hf.child("alice", hf.start(Clerk), bindings=NEXT, isolation="process"))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        with traced.tracer.start_as_current_span("request"):
+            await alice.ask(Onward())
+    assert parent_of(traced.one("handle Where")) == id_of(traced.one("ask Onward"))
+    assert [one.name for one in traced.spans()] == ["handle Where", "ask Onward", "request"]
+
+
+async def test_an_endpoint_in_a_thread_continues_its_span(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        alice = await system.start(hf.child("alice", hf.start(Clerk)))
+        system.trace_with(traced.tracer, one_in=math.inf)
+        portal = system.from_thread()
+
+        def endpoint() -> str:
+            with traced.tracer.start_as_current_span("request"):
+                return portal.ask(alice, Where(), timeout=5.0)
+
+        told = await asyncio.to_thread(endpoint)
+    assert told.split()[0] == f"{trace_of(traced.one('request')):032x}"
+    assert parent_of(traced.one("ask Where")) == id_of(traced.one("request"))

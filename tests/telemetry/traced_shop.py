@@ -1,0 +1,131 @@
+"""Actors that say which span they are in, and, in a process of their own, which spans were made there."""
+
+from collections.abc import Iterable
+
+from opentelemetry import baggage, trace
+from opentelemetry.sdk.trace import ReadableSpan, TracerProvider
+from opentelemetry.sdk.trace.export import SimpleSpanProcessor
+from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+
+import holdfast as hf
+
+
+class Where(hf.Message[str]):
+    """Answered with the trace id and the span id of the handler's span, or "none"."""
+
+
+class Note(hf.Message):
+    """Told: the actor keeps where it was handled."""
+
+
+class Noted(hf.Message[list[str]]): ...
+
+
+class Held(hf.Message[str]):
+    """Answered with what the baggage has for "request"."""
+
+
+class Made(hf.Message[list[str]]):
+    """Answered with the names and traces of the spans that were made in this process."""
+
+
+class Count(hf.Message[int]):
+    """Counted, and answered with how many there were."""
+
+
+class Fail(hf.Message[str]): ...
+
+
+class Onward(hf.Message[str]):
+    """Asks the next one where it is."""
+
+
+class Onto(hf.Message[None]):
+    """Tells the next one a note."""
+
+
+def here() -> str:
+    at = trace.get_current_span().get_span_context()
+    return f"{at.trace_id:032x} {at.span_id:016x}" if at.is_valid else "none"
+
+
+EXPORTED = InMemorySpanExporter()
+
+
+def lines(spans: Iterable[ReadableSpan]) -> list[str]:
+    """Name, trace and parent of spans."""
+    made = list[str]()
+    for one in spans:
+        assert one.context is not None
+        made.append(f"{one.name} {one.context.trace_id:032x} {one.parent.span_id if one.parent else 0:016x}")
+    return made
+
+
+class Pass(hf.Message[str]):
+    """Asks the next one onward, or where it is."""
+
+
+class Clerk(hf.Actor):
+    next_one: "hf.Binding[Clerk]"
+
+    def __init__(self, provides: bool = False) -> None:
+        self.notes: list[str] = []
+        self.count = 0
+        if provides and not isinstance(trace.get_tracer_provider(), TracerProvider):  # once in a process
+            provider = TracerProvider()
+            provider.add_span_processor(SimpleSpanProcessor(EXPORTED))
+            trace.set_tracer_provider(provider)
+
+    key_variables = ("notes", "count")
+
+    @hf.on(Where)
+    async def where(self, message: Where) -> str:
+        return here()
+
+    @hf.subscribe("/notes")
+    @hf.on(Note)
+    def note(self, message: Note) -> None:
+        self.notes = [*self.notes, here()]
+
+    @hf.on(Noted)
+    def noted(self, message: Noted) -> list[str]:
+        return self.notes
+
+    @hf.on(Held)
+    def held(self, message: Held) -> str:
+        return str(baggage.get_baggage("request"))
+
+    @hf.on(Made)
+    def made(self, message: Made) -> list[str]:
+        return lines(EXPORTED.get_finished_spans())
+
+    @hf.on(Count)
+    def counted(self, message: Count) -> int:
+        self.count += 1
+        return self.count
+
+    @hf.on(Fail)
+    def fail(self, message: Fail) -> str:
+        raise ValueError("failed")
+
+    @hf.on(Onward)
+    async def onward(self, message: Onward) -> str:
+        return await self.next_one.ask(Where())
+
+    @hf.on(Onto)
+    def onto(self, message: Onto) -> None:
+        self.next_one.tell(Note())
+
+    @hf.on(Pass)
+    def passed(self, message: Pass) -> str:
+        return here()
+
+
+class Through(hf.Actor):
+    """Hands on what it is asked."""
+
+    next_one: "hf.Binding[Clerk]"
+
+    @hf.on(Pass)
+    async def passed(self, message: Pass) -> str:
+        return await self.next_one.ask(Pass())
