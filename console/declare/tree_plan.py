@@ -74,7 +74,7 @@ async def change_to(
     return change
 
 
-def keep_state(state: Any, old: object) -> Any:
+def keep_state(state: Any) -> Any:
     """The state as it is: only the arguments of the next lives are others."""
     return state
 
