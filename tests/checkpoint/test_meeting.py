@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 from pathlib import Path
 from typing import Any, cast
 
@@ -282,8 +283,9 @@ async def test_each_attempt_counts_once_also_one_that_fails_inside_the_recovery(
     store: str | None, isolation: str, tmp_path: Path
 ) -> None:
     """The handler works once and fails under replay: each recovery fails, and nothing but the window ends that."""
+    again = dataclasses.replace(doing(isolation), backoff=hf.Backoff(initial=0.0, maximum=0.0))
     async with running(store) as system:
-        await system.start(tree(isolation, doing(isolation), intensity=3, period=60.0, restart="temporary"))
+        await system.start(tree(isolation, again, intensity=3, period=60.0, restart="temporary"))
         await at(system).ask(Do([f"replayed {tmp_path / 'marker'}"]), timeout=20.0)
         restarted: list[int] = []
         failed, gave_up = 0, False
