@@ -114,8 +114,18 @@ def test_the_version_is_that_of_the_distribution() -> None:
 
 def test_a_bare_install_has_all_public_names() -> None:
     modules = {
-        "clingo", "cryptography", "numpy", "pddl", "PIL", "pytest", "rich", "textual", "typer", "yaml", "zstandard",
-    }  # fmt: skip
+        "clingo",
+        "cryptography",
+        "numpy",
+        "pddl",
+        "PIL",
+        "pytest",
+        "rich",
+        "textual",
+        "typer",
+        "yaml",
+        "zstandard",
+    }
     program = f"import sys; sys.modules.update(dict.fromkeys({sorted(modules)})); from holdfast import *; Actor"
     done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Iterator
 from typing import TYPE_CHECKING, Any
 
+from ...actors.errors import SpecError, type_name
 from ...actors.kernel.actor import Actor, Start
 from ...checkpoint.method import Method
 from ...ftm.model.mechanism import compose
@@ -19,10 +20,10 @@ from ...system.transaction.living import ReplaceActorCode
 from ...system.transaction.mechanisms import Isolate, Protect
 from ...system.transaction.operation import Operation
 from ...system.transaction.reparenting import Reparent
-from ...system.transaction.respecifying import Respecify
-from ...system.transaction.running import StartAgain, StopChild
+from ...system.transaction.running import Respecify, StartAgain, StopChild
 from ...system.transaction.structure import AddChild, RemoveActor, Reorder, SetFlags
 from ...system.transaction.wiring import Bind, RegisterName, Unbind, UnregisterName
+from ..overview import is_far
 from ..trust import Needed, trusted_imports
 from .tree_file import TreeFile
 from .wanted import WantedActor, WantedTree
@@ -79,19 +80,34 @@ def keep_state(state: Any) -> Any:
     return state
 
 
-def classes_of(system: ActorSystem) -> list[tuple[str, type[Actor]]]:
-    """The classes of all actors that are no supervisors, and no parts of the runtime, by address."""
-    found: list[tuple[str, type[Actor]]] = []
+def actor_places(system: ActorSystem) -> Iterator[DraftPlace]:
+    """All actors that run, and are no supervisors and no parts of the runtime."""
     waiting = [Draft(system._node, Arrangement(), 1.0).root]
     while waiting:
         place = waiting.pop()
         if place.kind is RecoverySupervisor:
             continue
         if place.kind is not None and not place.is_supervisor and not place.is_stopped:
-            found.append((place.path, place.kind))
+            yield place
         if not place.is_protected:
             waiting.extend(place.children.values())
-    return found
+
+
+def other_code(place: DraftPlace, start: Start[Any], path: str) -> ReplaceActorCode:
+    """The step that has an actor go on as another class, or with other arguments.
+
+    Raises:
+        SpecError: the class is a reloaded one, and the actor's process has the old module.
+    """
+    old, new = place.kind, start.kind
+    if old is new:
+        return ReplaceActorCode(path, start, keep_state)
+    is_reloaded = old is not None and type_name(old) == type_name(new)
+    if is_reloaded and place.cell is not None and is_far(place.cell):
+        raise SpecError(
+            path, f"its process has the old module of {type_name(new)}: restart the program for its new code"
+        )
+    return ReplaceActorCode(path, start, None)
 
 
 class TreePlan:
@@ -218,8 +234,11 @@ class TreePlan:
             return
         if spec.is_supervisor != place.is_supervisor or (spec.is_supervisor and place.kind is not spec.start.kind):
             raise self._wanted.error(path, f"{place.kind and place.kind.__name__} runs there: its class {ANEW}")
-        if not spec.is_supervisor:
-            yield from self._changed_code(path, spec, now, place)
+        is_other = place.kind is not spec.start.kind
+        if not spec.is_supervisor and (
+            is_other or (spec.start.args, spec.start.kwargs) != (now.start.args, now.start.kwargs)
+        ):
+            yield other_code(place, spec.start, path)
         options = {name: getattr(spec, name) for name in CHANGEABLE if getattr(spec, name) != getattr(now, name)}
         if options:
             yield Respecify(path, options)
@@ -244,12 +263,6 @@ class TreePlan:
             yield SetFlags(path, strategy=flags.strategy)
         if (flags.intensity, flags.period) != (now.intensity, now.period):
             yield SetFlags(path, intensity=flags.intensity, period=flags.period)
-
-    def _changed_code(self, path: str, spec: ChildSpec, now: ChildSpec, place: DraftPlace) -> Iterator[Operation]:
-        if place.kind is not spec.start.kind:
-            yield ReplaceActorCode(path, spec.start, None)
-        elif (spec.start.args, spec.start.kwargs) != (now.start.args, now.start.kwargs):
-            yield ReplaceActorCode(path, spec.start, keep_state)
 
     def _started(self) -> Iterator[Operation]:
         for path, place in self._there.items():

@@ -15,13 +15,14 @@ from typing import Annotated, Any
 import typer
 
 from ...actors.errors import HoldfastError, SpecError
+from ...actors.kernel.actor import Start
 from ...checkpoint.method import Durability
 from ...system.run import run as run_loop
 from ...system.system import ActorSystem
 from ...system.transaction.change import Change
 from ...system.transaction.living import ReplaceActorCode
 from ...system.upgrade.new_program import load_named, specs_in
-from ..declare.tree_plan import change_to, classes_of, declare
+from ..declare.tree_plan import actor_places, change_to, declare, other_code
 from ..declare.wanted import WantedSpecs
 from ..endpoint import control_endpoint
 from ..operate.reaching import FAILED, UNUSABLE, ended
@@ -98,15 +99,21 @@ def _words(change: Change | None) -> list[str]:
 
 async def _replace_codes(system: ActorSystem, names: set[str]) -> list[str]:
     """Have all actors whose classes are in these modules go on as the new ones."""
-    found = [(path, kind) for path, kind in classes_of(system) if kind.__module__ in names]
-    if not found:
+    steps: list[ReplaceActorCode] = []
+    for place in actor_places(system):
+        kind = place.kind
+        if kind is None or kind.__module__ not in names:
+            continue
+        new = vars(sys.modules[kind.__module__]).get(kind.__qualname__)
+        if new is None:
+            raise SpecError(place.path, f"{kind.__module__} has no {kind.__qualname__} any more")
+        known = place.spec.start if place.spec is not None else Start(kind)
+        steps.append(other_code(place, Start(new, known.args, known.kwargs), place.path))
+    if not steps:
         return []
     async with system.transaction(timeout=RELOAD_TIMEOUT) as change:
-        for path, kind in found:
-            new = vars(sys.modules[kind.__module__]).get(kind.__qualname__)
-            if new is None:
-                raise SpecError(path, f"{kind.__module__} has no {kind.__qualname__} any more")
-            change.step(ReplaceActorCode(path, new, None))
+        for step in steps:
+            change.step(step)
     return _words(change)
 
 

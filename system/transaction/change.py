@@ -14,8 +14,7 @@ from .draft import Target
 from .mechanisms import Isolate, OnProtection, Protect, Update
 from .operation import Operation, Step, text_of
 from .reparenting import Reparent
-from .respecifying import Respecify
-from .running import StartAgain, StopChild
+from .running import Respecify, StartAgain, StopChild
 from .structure import AddChild, RemoveActor, Reorder, SetFlags, named_spec
 from .wiring import Bind, RegisterName, Unbind, UnregisterName
 

@@ -10,6 +10,8 @@ from tests.removing import Check, as_tests
 
 OPERATE = "tests/console/test_operate.py"
 DECLARE = "tests/console/test_declare.py"
+SERVICE = "tests/console/test_service.py"
+APPLY = "tests/console/test_apply.py"
 
 CHECKS = {
     "nobody else may look into the folder of sockets": Check(
@@ -70,8 +72,8 @@ CHECKS = {
     ),
     "only the arguments of the next lives change": Check(
         "console/declare/tree_plan.py",
-        "ReplaceActorCode(path, spec.start, keep_state)",
-        "ReplaceActorCode(path, spec.start, lambda state, old: {})",
+        "ReplaceActorCode(path, start, keep_state)",
+        "ReplaceActorCode(path, start, lambda state, old: {})",
         DECLARE,
         "test_each_difference_is_one_step_and_state_is_kept",
     ),
@@ -81,6 +83,42 @@ CHECKS = {
         "            pass",
         DECLARE,
         "test_the_order_of_the_file_is_the_order_of_starts",
+    ),
+    "new code that would not reach a process is refused": Check(
+        "console/declare/tree_plan.py",
+        "    if is_reloaded and place.cell is not None and is_far(place.cell):",
+        "    if False:",
+        SERVICE,
+        "test_code_that_would_not_reach_a_process_is_refused",
+    ),
+    "messages that may wait are of the classes that there are": Check(
+        "console/service/reloading.py",
+        "            if any(one.__module__ == name for one in messages):",
+        "            if False:",
+        SERVICE,
+        "test_a_reload_that_fails_changes_nothing and words",
+    ),
+    "modules are as before when a reload fails": Check(
+        "console/service/reloading.py",
+        "                vars(modules[name]).update(kept)\n",
+        "                vars(modules[name]).update(kept, hf=None, Clock=None)\n",
+        SERVICE,
+        "test_a_reload_that_fails_changes_nothing and clock",
+    ),
+    "a service manager that has no room is told again": Check(
+        "console/service/notify.py",
+        "                self._again = asyncio.get_running_loop().call_later(SEND_AGAIN, self._send)\n"
+        "                return\n",
+        "                pass\n",
+        SERVICE,
+        "test_a_manager_that_does_not_listen_holds_nothing_up",
+    ),
+    "imports for a request are told of": Check(
+        "system/script.py",
+        "            tell(path, sha256)\n",
+        "            pass\n",
+        APPLY,
+        "test_a_module_that_others_may_write_is_not_imported",
     ),
 }
 

@@ -180,6 +180,16 @@ async def test_a_reload_that_fails_changes_nothing(project: Path, file: str, tex
         assert (await service.state())["life"] == 1
 
 
+@pytest.mark.parametrize("target", ["tree:tree", "tree:main"])
+async def test_code_that_would_not_reach_a_process_is_refused(project: Path, target: str) -> None:
+    (project / "tree.py").write_text(TREE.replace("hf.hybrid()", 'hf.hybrid(), isolation="process"'))
+    async with running(target) as service:
+        await service.state()  # It is up, and its process has imported its module.
+        (project / "clock.py").write_text(ACTORS.replace('"first"', '"second"'))
+        assert "its process has the old module of clock.Clock" in await service.reload()
+        assert (await service.state())["release"] in ("", "first")
+
+
 async def test_a_tree_in_a_file_is_run_reloaded_and_kept_in_a_store(project: Path) -> None:
     options = ("tree.toml", "--store", f"sqlite:{project}/app.db")
     async with running(*options) as service:

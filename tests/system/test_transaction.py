@@ -489,3 +489,30 @@ async def test_what_cannot_be_undone_is_told(system: hf.ActorSystem) -> None:
             change.step(Stumble())
     assert failed.value.undone == ("stumble over a stone", "unregister first")
     assert "first" in system._node.names
+
+
+async def test_a_child_is_restarted_by_other_options_from_now_on(system: hf.ActorSystem) -> None:
+    one = ref(system, "/app/left/a")
+    async with system.transaction() as change:
+        change.respecify(one, restart="transient")
+    assert change.describe().startswith("1. set restart='transient' of /app/left/a\n- /app/left/a: Counter, permanent")
+    await system.terminate(one)
+    assert "/app/left/a" not in system.tree()
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        ({"mailbox": hf.bounded(3)}, "mailbox of a child that runs cannot be another"),
+        ({"restart": "often"}, "restart must be one of permanent, transient, temporary, not 'often'"),
+        ({"restart": "transient", "significant": True}, "significant, but auto_shutdown is 'never'"),
+    ],
+)
+async def test_options_that_a_child_cannot_have_are_refused(
+    system: hf.ActorSystem, options: dict[str, Any], problem: str
+) -> None:
+    before = picture(system)
+    with pytest.raises(hf.TransactionRefused, match=problem):
+        async with system.transaction() as change:
+            change.respecify("/app/left/a", **options)
+    assert picture(system) == before
