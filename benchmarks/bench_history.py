@@ -1,7 +1,7 @@
 """What does the history cost in a storm of restarts, and in the start of a crowd?
 
 Baseline: the same with `history=False`. Nobody looks at the events, and the log is off: nothing hides the cost. A storm
-lasts some seconds, as real ones do; of its first moments all events are recorded, later a few hundred each second.
+lasts some seconds, as real ones do; of its first moments all events are recorded, later a hundred each second.
 Times are those of the processor, so that others on the machine count less.
 Command: python benchmarks/bench_history.py [--quick]
 """
@@ -27,42 +27,36 @@ def _family(size: int, kind: type[hf.Actor]) -> hf.ChildSpec:
     return hf.supervisor("family", strategy="one_for_one", intensity=10**9, period=1e-6, children=children)
 
 
-async def _storm(seconds: float, *, history: bool, store: str | None = None) -> float:
+async def _storm(count: int, *, history: bool, store: str | None = None) -> float:
     """Microseconds of the processor for each crash and the start of the next life, while one follows the other."""
     async with hf.ActorSystem("bench", log=False, history=history, store=store) as system:
         await system.start(_family(1, Fragile))
         ref = system.ref("/bench/family/child0", Fragile)
-        count, began, spent = 0, time.perf_counter(), time.process_time()
-        while time.perf_counter() - began < seconds:
-            for _ in range(100):
-                ref.tell(BOOM)
-                await ref.ask(PING)
-            count += 100
-        return (time.process_time() - spent) / count * 1e6
-
-
-def _seconds(run: Run) -> float:
-    return 2.0 if run.quick else 10.0
+        began = time.process_time()
+        for _ in range(count):
+            ref.tell(BOOM)
+            await ref.ask(PING)
+        return (time.process_time() - began) / count * 1e6
 
 
 async def storm_in_memory(run: Run) -> None:
-    seconds = _seconds(run)
+    count = run.size(200_000)
 
     async def ours() -> float:
-        return await _storm(seconds, history=True)
+        return await _storm(count, history=True)
 
     async def limit() -> float:
-        return await _storm(seconds, history=False)
+        return await _storm(count, history=False)
 
-    await run.compare(f"a restart in a storm of {seconds:g} s", ours, limit, unit="us", target=0.98)
+    await run.compare(f"each of {count:,} restarts in a storm", ours, limit, unit="us", target=0.98)
 
 
 async def storm_with_store(run: Run) -> None:
-    seconds = _seconds(run)
+    count = run.size(200_000)
 
     async def measured(*, history: bool) -> float:
         with tempfile.TemporaryDirectory() as folder:
-            return await _storm(seconds, history=history, store=f"sqlite:{Path(folder) / 'bench.db'}")
+            return await _storm(count, history=history, store=f"sqlite:{Path(folder) / 'bench.db'}")
 
     async def ours() -> float:
         return await measured(history=True)
@@ -70,7 +64,7 @@ async def storm_with_store(run: Run) -> None:
     async def limit() -> float:
         return await measured(history=False)
 
-    await run.compare(f"a restart in a storm of {seconds:g} s, with a store", ours, limit, unit="us", target=0.98)
+    await run.compare(f"each of {count:,} restarts in a storm, with a store", ours, limit, unit="us", target=0.98)
 
 
 async def start_crowd(run: Run) -> None:

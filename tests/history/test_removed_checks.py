@@ -136,10 +136,24 @@ CHECKS = {
     ),
     "no frame stays in memory": Check(
         "system/history/past_event.py",
-        '                fields["traceback"] = traceback_text(value)\n',
-        '                fields["traceback"] = traceback_text(value)\n                fields["kept"] = value.error\n',
+        '            fields[f"{name}_kind"] = kind.__name__\n',
+        '            fields[f"{name}_kind"] = value\n',
         BOUNDS,
         "test_an_error_leaves_no_frame_in_memory",
+    ),
+    "a text that cannot be shown hurts nobody": Check(
+        "system/history/past_event.py",
+        "    try:\n        return str(value)\n    except Exception as error:\n",
+        "    return str(value)\n    try:\n        pass\n    except Exception as error:\n",
+        BOUNDS,
+        "test_what_cannot_be_shown_or_written_hurts_nobody",
+    ),
+    "half a pair of surrogates is written all the same": Check(
+        "system/history/past_event.py",
+        "    if not text.isascii():\n",
+        "    if False:\n",
+        BOUNDS,
+        "test_what_cannot_be_shown_or_written_hurts_nobody",
     ),
     "an address is no pattern": Check(
         "system/history/calls.py",
