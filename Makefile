@@ -38,7 +38,7 @@ campaign: $(VENV)/.dev
 	HOLDFAST_SYSCALLS=500 HOLDFAST_FUZZ=5000 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=900 \
 	    tests/faults tests/actors/process/hostile/test_fuzz.py
 	HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s tests/system/test_removed_checks.py \
-	    tests/actors/process/hostile/test_removed_claims.py
+	    tests/actors/process/hostile/test_removed_claims.py tests/telemetry/test_removed_checks.py
 	HOLDFAST_BUILDS=1 $(BIN)/python -m pytest -q -s tests/packaging
 	HOLDFAST_MUTANTS=100 $(BIN)/python -m pytest -q -s -o faulthandler_timeout=0 tests/test_mutants.py
 

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import os
 from collections.abc import Sequence
+from importlib.util import find_spec
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
 
@@ -539,10 +540,12 @@ class ActorSystem(Recorded, Controls, Remembering):
             baggage: what is in the sender's baggage goes along with every message, sampled or not.
 
         Raises:
-            SpecError: `one_in` is less than 1.
+            SpecError: `one_in` is less than 1, or the extra is not installed.
         """
         if not one_in >= 1:
             raise SpecError("trace_with", f"one_in must be a number from 1 on, not {one_in!r}")
+        if find_spec("opentelemetry") is None:
+            raise SpecError("trace_with", "needs the package opentelemetry-api: pip install 'holdfast[traces]'")
         from .traced_events import trace_system  # Most systems are not traced, and need no OpenTelemetry.
 
         trace_system(self._node, tracer, 1 / one_in, baggage=baggage)

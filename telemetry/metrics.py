@@ -10,8 +10,12 @@ import concurrent.futures
 import dataclasses
 import os
 from collections.abc import Awaitable, Callable, Iterable, MutableMapping
+from importlib.util import find_spec
 from time import perf_counter
 from typing import Any
+
+if find_spec("prometheus_client") is None:
+    raise ImportError("holdfast.telemetry.metrics needs the package prometheus_client: pip install 'holdfast[metrics]'")
 
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder

@@ -139,10 +139,18 @@ def test_an_import_brings_nothing_that_few_programs_use() -> None:
     assert (done.stdout, done.stderr) == ("[]\n", "")
 
 
-def test_what_needs_an_extra_says_which_one() -> None:
-    program = "import sys; sys.modules['cryptography'] = None; import holdfast.ftm.sec.authority"
+@pytest.mark.parametrize(
+    ("package", "extra", "use"),
+    [
+        ("cryptography", "sec", "import holdfast.ftm.sec.authority"),
+        ("prometheus_client", "metrics", "import holdfast.telemetry.metrics"),
+        ("opentelemetry", "traces", "import holdfast; holdfast.ActorSystem().trace_with(None)"),
+    ],
+)
+def test_what_needs_an_extra_says_which_one(package: str, extra: str, use: str) -> None:
+    program = f"import sys; sys.modules[{package!r}] = None; {use}"
     done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True, timeout=60)
-    assert "pip install 'holdfast[sec]'" in done.stderr
+    assert f"pip install 'holdfast[{extra}]'" in done.stderr
 
 
 def test_no_module_imports_pickle() -> None:

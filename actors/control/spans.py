@@ -11,7 +11,8 @@ import functools
 import random
 import types
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from contextvars import Token
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
 from opentelemetry import context as otel
 from opentelemetry import trace
@@ -36,8 +37,6 @@ from .trace_tail import TracedEnvelope, follow, tail_of, with_tail
 from .tracing import TappedContext, tap_of
 
 if TYPE_CHECKING:
-    from contextvars import Token
-
     from ..events import Event
     from ..kernel.cell import Cell
     from ..kernel.context import ActorContext
@@ -54,23 +53,28 @@ _BAGGAGE = W3CBaggagePropagator()
 _add, _random = Deadlines.add, random.random
 
 
-def _variable() -> Callable[[], otel.Context]:
-    """What gives the current context of OpenTelemetry: the context variable itself, if that can be found.
+class _Current(NamedTuple):
+    """How the current context of OpenTelemetry is read, set, and set back."""
 
-    Every ask looks there, and the function for it takes four times as long.
-    """
+    get: Callable[[], otel.Context]
+    attach: Callable[[otel.Context], Token[otel.Context]]
+    detach: Callable[[Token[otel.Context]], None]
+
+
+def _current() -> _Current:
+    """The context variable itself, if it can be found: every ask looks there, and the functions for it are slower."""
     mark = otel.Context()
     token = otel.attach(mark)
     try:
         for variable, value in contextvars.copy_context().items():
             if value is mark:
-                return functools.partial(variable.get, mark)
+                return _Current(functools.partial(variable.get, mark), variable.set, variable.reset)
     finally:
         otel.detach(token)
-    return otel.get_current
+    return _Current(otel.get_current, otel.attach, otel.detach)
 
 
-_here = _variable()
+_here, _attach, _detach = _current()
 
 
 class Spans:
@@ -107,18 +111,17 @@ class Spans:
 
     def remember(self, address: str, span: Span) -> None:
         """A turn there is in a trace: what happens to the actor next may have to do with it."""
-        self.last.pop(address, None)
         self.last[address] = span.get_span_context()
         if len(self.last) > MOST_LAST:
             self.last.pop(next(iter(self.last)))
 
     def begin(self, verb: str, kind: SpanKind, cell: Cell, message: str, parent: otel.Context) -> Span:
         """A span about one message, of which the type is given, to one address."""
-        return self.tracer.start_span(f"{verb} {message.rpartition('.')[2]}", parent, kind, {ADDRESS: cell.path})
+        return self.tracer.start_span(_title(verb, message), parent, kind, {ADDRESS: cell.path})
 
     def tail(self, at: SpanContext, around: otel.Context) -> str:
         """What goes along with a message whose parent is this span."""
-        written = f"00-{at.trace_id:032x}-{at.span_id:016x}-{at.trace_flags:02x}" if _is_sampled(at) else NO_TRACE
+        written = f"00-{at.trace_id:032x}-{at.span_id:016x}-01" if _is_sampled(at) else NO_TRACE
         held = _held(around) if self.baggage else ""
         return f"{written} {held}" if held else written
 
@@ -136,7 +139,7 @@ class Spans:
             span = self.begin("ask", SpanKind.CLIENT, ask.to, ask.brings(), around)
             ask.future.add_done_callback(functools.partial(_outcome, span))
             tail = self.tail(span.get_span_context(), around)
-        ask.chain = with_tail(ask.chain, tail)
+        ask.chain = with_tail(ask.chain, tail) if ask.chain else ((tail, 0),)
         follow(ask)
 
     def tell(self, cell: Cell, message: Message[Any], ctx: ActorContext | None, around: otel.Context) -> None:
@@ -161,6 +164,12 @@ class Spans:
 
 BEGIN, NO_TRACE = "+", "-"
 """Stand for the trace of a message: its turn begins one; there is only baggage."""
+
+
+@functools.lru_cache(4096)
+def _title(verb: str, message: str) -> str:
+    """The name of a span: what is done with a message, and the type of that without its module."""
+    return f"{verb} {message.rpartition('.')[2]}"
 
 
 def _runs_here(cell: Cell) -> bool:
@@ -295,9 +304,9 @@ def in_span(run: Callable[[Any, Any], object], actor: Any, item: Any) -> object:
         span = spans.begin("handle", kind, cell, item.brings(), around)
         spans.remember(cell.path, span)
         around = trace.set_span_in_context(span, around)
-        if tail == BEGIN:
-            item.chain = item.chain[:-1]  # It has begun: what is asked in this turn must not begin another one.
-    token = otel.attach(around)
+        if tail == BEGIN:  # It has begun: what comes of this turn, and whoever the ask is forwarded to, go on with it.
+            item.chain = (*item.chain[:-1], (spans.tail(span.get_span_context(), around), 0))
+    token = _attach(around)
     try:
         result = run(actor, item)
     except BaseException as error:
@@ -321,7 +330,7 @@ async def _followed(turn: Any, span: Span | None, token: Token[otel.Context]) ->
 
 def _over(span: Span | None, token: Token[otel.Context], error: BaseException | None) -> None:
     if not isinstance(error, GeneratorExit):  # Else the life is over, and its context with it.
-        otel.detach(token)
+        _detach(token)
     if span is None:
         return
     if error is not None:

@@ -1,6 +1,7 @@
 """Reads what a scrape says, as Prometheus would."""
 
 import asyncio
+from typing import TypeVar
 
 from prometheus_client import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
@@ -29,9 +30,13 @@ async def scraped(collector: Collector) -> Scrape:
     return Scrape((await asyncio.to_thread(generate_latest, collector)).decode())
 
 
-async def until(events: hf.events.EventStream, kind: type[hf.events.Event]) -> None:
-    """Wait for an event of this kind."""
+E = TypeVar("E", bound=hf.events.Event)
+
+
+async def until(events: hf.events.EventStream, kind: type[E]) -> E:
+    """The next event of this kind."""
     async with asyncio.timeout(20.0):
         async for event in events:
             if isinstance(event, kind):
-                return
+                return event
+    raise AssertionError("the system has ended")

@@ -20,7 +20,21 @@ from holdfast.actors.control.trace_tail import tail_of
 from holdfast.actors.kernel.context import ActorContext
 from holdfast.actors.kernel.ref import ActorRef
 from tests.telemetry.scrapes import until
-from tests.telemetry.traced_shop import Clerk, Count, Fail, Held, Made, Note, Noted, Onto, Onward, Pass, Through, Where
+from tests.telemetry.traced_shop import (
+    Clerk,
+    Count,
+    Fail,
+    Forwarder,
+    Held,
+    Made,
+    Note,
+    Noted,
+    Onto,
+    Onward,
+    Pass,
+    Through,
+    Where,
+)
 
 NEXT = {"next_one": "/app/bob"}
 
@@ -351,8 +365,17 @@ async def test_a_trace_is_begun_once(traced: Traced) -> None:
         dave = await system.start(hf.child("dave", hf.start(Through), bindings={"next_one": alice.path}))
         system.trace_with(off, one_in=1)  # The turn of dave begins a trace, which is not sampled.
         assert await dave.ask(Pass()) == "none"
-        chain = tail_of(dave._cell.item.chain)
-        assert chain == ""
+        assert tail_of(dave._cell.item.chain) == "-"
+
+
+async def test_a_forwarded_ask_goes_on_in_its_trace(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.child("bob", hf.start(Clerk)))
+        forwarder = await system.start(hf.child("forwarder", hf.start(Forwarder), bindings=NEXT))
+        system.trace_with(traced.tracer, one_in=1)
+        assert await forwarder.ask(Pass()) != "none"
+    first, second = traced.spans("handle Pass")
+    assert parent_of(second) == id_of(first)
 
 
 async def test_what_carries_no_trace(traced: Traced) -> None:

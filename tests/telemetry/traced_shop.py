@@ -129,3 +129,15 @@ class Through(hf.Actor):
     @hf.on(Pass)
     async def passed(self, message: Pass) -> str:
         return await self.next_one.ask(Pass())
+
+
+class Forwarder(hf.Actor):
+    """Leaves the answer to another one."""
+
+    next_one: "hf.Binding[Clerk]"
+
+    @hf.on(Pass)
+    def passed(self, message: Pass) -> hf.ReplyHandle[str]:
+        handle: hf.ReplyHandle[str] = self.ctx.reply_handle()
+        self.ctx.forward(self.next_one)
+        return handle
