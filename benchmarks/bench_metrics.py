@@ -16,7 +16,7 @@ from harness import Job, Run, ask_all, main
 from prometheus_client import generate_latest
 
 import holdfast as hf
-from holdfast.telemetry.metrics import Metrics
+from holdfast.console.telemetry.metrics import Metrics
 
 ACTORS = 10_000
 SCRAPES = 20

@@ -55,7 +55,7 @@ def test_pytest_holds_one_copy_of_the_package() -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["numpy", "holdfast.console", "holdfast.diagnosis", "holdfast.telemetry", "holdfast.testing", "opentelemetry"],
+    ["numpy", "holdfast.console", "holdfast.diagnosis", "holdfast.testing", "opentelemetry"],
 )
 def test_importing_holdfast_leaves_alone(name: str) -> None:
     assert name not in modules_after_import()
@@ -143,7 +143,7 @@ def test_an_import_brings_nothing_that_few_programs_use() -> None:
     ("package", "extra", "use"),
     [
         ("cryptography", "sec", "import holdfast.ftm.sec.authority"),
-        ("prometheus_client", "metrics", "import holdfast.telemetry.metrics"),
+        ("prometheus_client", "metrics", "import holdfast.console.telemetry.metrics"),
         ("opentelemetry", "traces", "import holdfast; holdfast.ActorSystem().trace_with(None)"),
     ],
 )

@@ -84,7 +84,8 @@ async def test_the_page_is_true(project: Path, title: str) -> None:
 
 
 def test_every_command_is_on_the_page() -> None:
-    names = {one.name or (one.callback.__name__ if one.callback else "") for one in commands.registered_commands}
+    named = {one.name or (one.callback.__name__ if one.callback else "") for one in commands.registered_commands}
+    names = {name.replace("_", "-") for name in named}
     titles = re.findall(r"^### ([^\n]+)$", PAGE, re.M)
     shown = {name for title in titles for name in title.split(", ")}
     assert names - shown == {"check-upgrade", "replay", "demo"}

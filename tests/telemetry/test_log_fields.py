@@ -10,7 +10,7 @@ import structlog
 from opentelemetry.sdk.trace import TracerProvider
 
 import holdfast as hf
-from holdfast.telemetry.log_fields import FIELDS, TurnFilter, add_turn, turn_fields
+from holdfast.console.telemetry.log_fields import FIELDS, TurnFilter, add_turn, turn_fields
 
 LOG = logging.getLogger("tests.telemetry.clerk")
 

@@ -14,10 +14,10 @@ from holdfast.actors.kernel import mailbox
 from holdfast.actors.kernel.context import ActorContext
 from holdfast.actors.kernel.loop import run_turns
 from holdfast.actors.kernel.ref import ActorRef
-from holdfast.telemetry import survey
-from holdfast.telemetry.families import FAMILIES
-from holdfast.telemetry.metrics import Metrics
-from holdfast.telemetry.series import Labels, Spread
+from holdfast.console.telemetry import survey
+from holdfast.console.telemetry.families import FAMILIES
+from holdfast.console.telemetry.metrics import Metrics
+from holdfast.console.telemetry.series import Labels, Spread
 from tests.telemetry.scrapes import Scrape, scraped, until
 from tests.telemetry.shop import Account, Add, Boom, Deny
 

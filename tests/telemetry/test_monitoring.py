@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 import holdfast as hf
-from holdfast.telemetry.metrics import Metrics
+from holdfast.console.telemetry.metrics import Metrics
 from tests.telemetry.scrapes import Scrape, scraped, until
 from tests.telemetry.shop import Account, Add, Boom, Deny
 

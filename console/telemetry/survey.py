@@ -13,11 +13,11 @@ from collections.abc import Awaitable, Callable, Sequence
 from time import perf_counter
 from typing import NamedTuple
 
-from ..actors.errors import type_name
-from ..actors.kernel.cell import GONE, Cell
-from ..actors.kernel.node import cell_kind
-from ..checkpoint.home.homes import Homes
-from ..ftm.group.protected import protection_of
+from ...actors.errors import type_name
+from ...actors.kernel.cell import GONE, Cell
+from ...actors.kernel.node import cell_kind
+from ...checkpoint.home.homes import Homes
+from ...ftm.group.protected import protection_of
 from .series import Labels
 
 SLICE = 0.001

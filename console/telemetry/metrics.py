@@ -15,20 +15,22 @@ from time import perf_counter
 from typing import Any
 
 if find_spec("prometheus_client") is None:
-    raise ImportError("holdfast.telemetry.metrics needs the package prometheus_client: pip install 'holdfast[metrics]'")
+    raise ImportError(
+        "holdfast.console.telemetry.metrics needs the package prometheus_client: pip install 'holdfast[metrics]'"
+    )
 
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
-from ..actors.control.tracing import Statistics, tap_of
-from ..actors.errors import HoldfastError
-from ..actors.kernel.cell import Cell
-from ..actors.kernel.ref import ActorRef
-from ..checkpoint.store_tools.store_counts import files_of
-from ..system.controls import has_process
-from ..system.system import ActorSystem
+from ...actors.control.tracing import Statistics, tap_of
+from ...actors.errors import HoldfastError
+from ...actors.kernel.cell import Cell
+from ...actors.kernel.ref import ActorRef
+from ...checkpoint.store_tools.store_counts import files_of
+from ...system.controls import has_process
+from ...system.system import ActorSystem
 from .families import Filled
 from .series import Labels, Spread
 from .store_times import time_store
@@ -169,7 +171,7 @@ class Metrics(Collector):
     # -- filling in -------------------------------------------------------------------------------------------------
 
     def _filled(self, look: _Look | None) -> Filled:
-        from .. import __version__  # it is the package's own, and the package imports nothing of this room
+        from ... import __version__  # it is the package's own, and the package imports nothing of this room
 
         out = Filled()
         out.put("holdfast_info", 1, __version__, self._system.name)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from .. import events
-from ..actors.events import (
+from ... import events
+from ...actors.events import (
     TRACED,
     ActorCrashed,
     ChildRestarted,
@@ -18,9 +18,9 @@ from ..actors.events import (
     SnapshotTaken,
     TurnSlow,
 )
-from ..actors.exit_reasons import Crash
-from ..ftm.bricks.sealed_frames import FrameRefused
-from ..ftm.events import FailedOver
+from ...actors.exit_reasons import Crash
+from ...ftm.bricks.sealed_frames import FrameRefused
+from ...ftm.events import FailedOver
 from .series import Labels, Spread, Tallies
 
 QUICK = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)

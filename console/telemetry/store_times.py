@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from time import perf_counter
 from typing import Protocol
 
-from ..checkpoint.engine_calls import Called
-from ..checkpoint.journal import Entry, Saved, StoreEngine
+from ...checkpoint.engine_calls import Called
+from ...checkpoint.journal import Entry, Saved, StoreEngine
 
 
 class TimesStore(Protocol):

@@ -10,10 +10,10 @@ import sys
 from collections.abc import MutableMapping
 from typing import Any, Final
 
-from ..actors.errors import HoldfastError
-from ..actors.kernel.context import begun_in
-from ..actors.kernel.envelope import Item, item_name
-from ..actors.kernel.ref import current
+from ...actors.errors import HoldfastError
+from ...actors.kernel.context import begun_in
+from ...actors.kernel.envelope import Item, item_name
+from ...actors.kernel.ref import current
 
 FIELDS: Final = ("address", "message_type", "message_id", "trace_id", "span_id")
 """What a record may get. `message_id` is there in actors with recovery, the last two inside of a span."""
