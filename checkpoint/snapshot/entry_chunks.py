@@ -61,9 +61,9 @@ class Table:
         self._borders: list[tuple[int, int]] = []  # in them
         self._is_made_anew = False  # each time it is looked at, as far as it seems
 
-    def fits(self, value: Any) -> bool:
+    def fits(self, value: object) -> bool:
         """Whether the variable is still one to be cut into chunks."""
-        return type(value) is self.kind and len(value) >= MANY
+        return isinstance(value, list | dict) and type(value) is self.kind and len(value) >= MANY
 
     def remember(self) -> list[Chunk]:
         """Keep those chunks that need not be encoded again if nothing changes; returns the others."""
@@ -130,8 +130,8 @@ class Table:
 
 def is_large(value: Any) -> bool:
     """Whether a variable should be cut into chunks: a list or dict of many entries, none of them large by itself."""
-    kind = type(value)
-    if not ((kind is list or kind is dict) and len(value) >= MANY):
+    kind: Any = type(value)
+    if not (kind in (list, dict) and len(value) >= MANY):
         return False
     step = len(value) // 32
     some: list[Any] = value[::step] if kind is list else [*value.items()][::step]

@@ -159,7 +159,8 @@ def write_changed(
         if chunk is not None and has_size and chunk.is_known_by(digests.get(before[0])):
             layout[key] = before
             continue
-        view = memoryview(piece if chunk is None else chunk.data()).cast("B")
+        data: Any = piece if chunk is None else chunk.data()
+        view = memoryview(data).cast("B")
         address = _address(view)
         places = layout[key] = []
         for index, begin in enumerate(range(0, len(view), BLOCK)):

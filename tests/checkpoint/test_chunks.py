@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import sys
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -154,7 +156,7 @@ def test_of_a_list_that_grows_only_the_end_is_made_and_written(images: Images, k
         int: lambda n: 10**9 + n,
     }[kind]
     log = [make(n) for n in range(40_000)]
-    images.take({"log": log, "n": 0})
+    data = images.take({"log": log, "n": 0})
     assert images.written >= size_of(log)
     for n in range(1, 50):
         log.append(make(40_000 + n))
@@ -180,7 +182,7 @@ def test_what_is_put_in_or_taken_out_moves_nothing_else(images: Images, at: int)
 
 def test_a_log_that_rolls_writes_its_two_ends(images: Images) -> None:
     log = [Scan(n / 8, "x" * 50) for n in range(20_000)]
-    images.take({"log": log})
+    data = images.take({"log": log})
     for n in range(30):
         del log[0]
         log.append(Scan(n / 8, "y"))
@@ -192,7 +194,7 @@ def test_a_log_that_rolls_writes_its_two_ends(images: Images) -> None:
 
 def test_of_a_dict_in_which_a_few_entries_change_only_their_chunks_are_made(images: Images) -> None:
     orders = {f"order-{n}": Order(n, "new", [{"line": n}]) for n in range(30_000)}
-    images.take({"orders": orders})
+    data = images.take({"orders": orders})
     for n in range(20):
         one = orders[f"order-{n * 1000}"]
         one.lines[0]["line"] += 1
@@ -231,6 +233,7 @@ def test_what_get_state_makes_anew_each_time_is_written_by_chunks_and_not_kept_a
 
 
 def test_numbers_that_are_all_new_each_time_keep_their_chunks(images: Images) -> None:
+    numbers: list[float] = []
     for n in range(4):
         numbers = [n + at / 8 for at in range(100_000)]
         assert back(images.take({"numbers": numbers})) == {"numbers": numbers}
@@ -265,14 +268,14 @@ def test_what_only_a_part_of_the_entries_has_is_seen(images: Images) -> None:
 
 def test_what_went_from_one_entry_to_the_next_is_seen(images: Images) -> None:
     """All that the entries hold is the same, in the same order."""
-    state = {"rows": [[n, str(n)] for n in range(20_000)]}
+    state: dict[str, Any] = {"rows": [[n, str(n)] for n in range(20_000)]}
     images.take(state)
     state["rows"][300].append(state["rows"][301].pop(0))
     assert alike(back(images.take(state)), state)
 
 
 def test_a_tuple_that_holds_a_list_is_looked_into(images: Images) -> None:
-    state = {"rows": [(n, [n], Scan(0.0, "x")) for n in range(20_000)]}
+    state: dict[str, Any] = {"rows": [(n, [n], Scan(0.0, "x")) for n in range(20_000)]}
     images.take(state)
     state["rows"][300][1].append("more")
     assert alike(back(images.take(state)), state)
@@ -332,6 +335,32 @@ def test_what_cannot_be_saved_is_named_and_the_next_image_is_right(images: Image
         images.take({"orders": orders, "n": 1})
     orders["order-501"].lines.clear()
     assert alike(back(images.take({"orders": orders, "n": 1})), {"orders": orders, "n": 1})
+
+
+@dataclass
+class Part:
+    """An entry of a class that changes."""
+
+    number: int
+
+
+def test_entries_of_another_version_of_their_class_are_mapped(images: Images, monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = [Part(n) for n in range(10_000)]
+    data = images.take({"parts": parts, "best": parts[3]})
+
+    @hf.renamed(count="number")
+    @dataclass
+    class Later:
+        count: int
+        note: str = "none"
+
+    Later.__qualname__ = "Part"
+    monkeypatch.setattr(sys.modules[__name__], "Part", Later)
+    came = back(data)
+    assert came["parts"][:2] == [Later(0), Later(1)]
+    assert came["best"] is came["parts"][3]
+    images.take(came)
+    assert images.written > 100_000, "all of them are written otherwise now"
 
 
 def test_entries_that_are_all_alike_have_chunks_of_their_own(images: Images) -> None:
