@@ -23,9 +23,10 @@ from .byte_parts import ByteParts, in_one
 from .forms import FORMAT, LENGTH
 from .value_describer import Describer, ValueDescription
 from .value_reader import Decoder, unpack
-from .value_writer import Links, pieces, walked_pieces
+from .value_writer import ALONE, Links, pieces, walked_pieces
 
 __all__ = [
+    "ALONE",
     "ByteParts",
     "DamagedValue",
     "Links",

@@ -52,13 +52,17 @@ class Links(NamedTuple):
     """What those behind it will refer to."""
 
 
+ALONE: Final = Links()
+"""Of a value that shares nothing with others."""
+
+
 def pieces(value: object, where: str, *, canonical: bool) -> list[Any]:
     """The bytes of a value, in parts to be joined; `canonical` as in `_Encoder`."""
     return walked_pieces(value, where, canonical=canonical)[0]
 
 
 def walked_pieces(
-    value: object, where: str, *, canonical: bool = False, links: Links | None = None
+    value: object, where: str, *, canonical: bool = False, links: Links = ALONE
 ) -> tuple[list[Any], dict[int, object]]:
     """As `pieces`, and what can change and was reached, by id: two values that share none of it can be kept apart.
 
@@ -68,7 +72,6 @@ def walked_pieces(
         canonical: as in `_Encoder`.
         links: what it shares with others, whose reader has the same `shared`.
     """
-    links = links or Links()
     try:
         encoder = _Encoder(canonical, {*links.given}, links)
         tree = encoder.lowered(value)
@@ -94,9 +97,9 @@ class _Encoder:
         self.shared = shared  # the ids of what is known to be reached twice
         self.met_again: set[int] = set()  # and of what turned out to be
         self.given = links.given
-        self.numbers: dict[int, int] = {**links.known}  # of the shared ones that can be referred to, by id
+        self.numbers: dict[int, int] = dict(links.known)  # of the shared ones that can be referred to, by id
         # by id: None while inside it, then itself, so that the id stays in use
-        self.walked: dict[int, object] = {**links.known}
+        self.walked: dict[int, object] = dict(links.known)
         self.trees: dict[int, Any] = {}  # what those became
         self.changing: dict[type, bool] = {}  # `can_change`, asked once
         self.classes: dict[type, tuple[ExtType, str, dict[str, Any]]] = {}

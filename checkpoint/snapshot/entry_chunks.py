@@ -65,14 +65,10 @@ class Table:
         """Whether the variable is still one to be cut into chunks."""
         return isinstance(value, list | dict) and type(value) is self.kind and len(value) >= MANY
 
-    def remember(self) -> list[Chunk]:
-        """Keep those chunks that need not be encoded again if nothing changes; returns the others."""
-        kept, others = list[Chunk](), list[Chunk]()
-        for chunk in self.chunks:
-            is_kept = not (self._is_made_anew and kept) and chunk.remember()
-            (kept if is_kept else others).append(chunk)
-        self.chunks = kept
-        return others
+    def remember(self) -> None:
+        """Keep those chunks that need not be encoded again if nothing changes."""
+        chunks = self.chunks[:1] if self._is_made_anew else self.chunks
+        self.chunks = [chunk for chunk in chunks if chunk.remember()]
 
     def take(self, value: list[Any] | dict[Any, Any]) -> None:
         """Look through the entries; chunks in which nothing has changed stay the objects that they were.

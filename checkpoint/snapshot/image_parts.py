@@ -8,14 +8,16 @@ The numbers come from names and contents, not from what a process remembers: the
 from __future__ import annotations
 
 import hashlib
+from array import array
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from itertools import chain
 from typing import Any, Final
 from zlib import crc32
 
-from ...actors.values import Links, walked_pieces
+from ...actors.values import ALONE, Links, walked_pieces
 from ...actors.values.same_objects import Level, is_as_seen, seen
 
-NO_LINKS: Final = Links()
 _LOW_BITS: Final = (1 << 30) - 1
 _CHUNK: Final = 1 << 30
 """Numbers of chunks are above it: below are those of the pieces of a variable."""
@@ -27,16 +29,22 @@ def digest(block: bytes | memoryview) -> bytes:
 
 
 class Part:
-    """Something that is encoded by itself, and what it reaches that can change."""
+    """Something that is encoded by itself.
 
-    __slots__ = ("links", "name", "number", "objects", "pieces", "size", "value", "where")
+    Attributes:
+        objects: what can change and is reached, by id; none once there is only `ids`.
+        ids: of these.
+    """
+
+    __slots__ = ("ids", "links", "name", "number", "objects", "pieces", "size", "value", "where")
 
     def __init__(self, name: str, value: object, where: str) -> None:
         self.name, self.value, self.where = name, value, where
         self.number = 0
-        self.links = NO_LINKS
+        self.links = ALONE
         self.pieces, found = walked_pieces(value, where)
         self.objects = {key: one for key, one in found.items() if one is not None}
+        self.ids: Iterable[int] = self.objects
         self.size = _size(self.pieces)
 
     def encode(self, links: Links) -> None:
@@ -52,6 +60,7 @@ class Chunk(Part):
     Attributes:
         is_open: whether it ends where the entries end, and not at a border.
         ending: a checksum of its last entry.
+        digest: of its bytes, if it is known.
     """
 
     __slots__ = ("_levels", "digest", "ending", "entries", "is_open")
@@ -62,14 +71,18 @@ class Chunk(Part):
         self.is_open, self.ending = True, 0
         self.digest = b""
         self._levels: list[Level] | None = None
-        self.objects.pop(id(entries))
+        del self.objects[id(entries)]
 
     def remember(self) -> bool:
         """Keep no bytes, but what is needed to see later whether the entries have changed; False: nobody can."""
         self.pieces = []
         if self._levels is None:
             self._levels = seen(self.entries, 2 * self.size)
-        return self._levels is not None
+        if self._levels is None:
+            return False
+        if self.objects:  # They hold each other.
+            self.ids, self.objects = array("Q", self.objects), {}
+        return True
 
     def is_unchanged(self) -> bool:
         """Whether the entries would be encoded as the same bytes."""
@@ -93,58 +106,55 @@ class Chunk(Part):
         return b"".join(self.pieces)
 
 
-class Sharing:
-    """Which objects that can change are reached by several parts."""
+def shared_ids(parts: Sequence[Part], before: set[int], held: Sequence[int]) -> set[int]:
+    """What is reached at several places.
 
-    def __init__(self) -> None:
-        self._counts: dict[int, int] = {}
-        self._several: set[int] = set()
+    Args:
+        parts: all of an image; those without `objects` have not changed since the last one.
+        before: what was reached at several places in that one.
+        held: places beside the parts: the lists and dicts whose chunks are among these.
+    """
+    fresh, again = set(held), set(before)
+    if len(fresh) < len(held):
+        again |= fresh
+    for part in parts:
+        again.update(fresh.intersection(part.objects))
+        fresh.update(part.objects)
+    for part in parts:
+        if not part.objects:
+            again |= fresh.intersection(part.ids)
+    if not again:
+        return again
+    counts = Counter(key for key in chain(held, *(part.ids for part in parts)) if key in again)
+    return {key for key, count in counts.items() if count > 1}
 
-    def __contains__(self, key: int) -> bool:
-        return key in self._counts
 
-    def add(self, part: Part) -> None:
-        """One more part."""
-        counts = self._counts
-        if counts.keys().isdisjoint(part.objects):
-            counts.update(dict.fromkeys(part.objects, 1))
-            return
-        for key in part.objects:
-            counts[key] = counts.get(key, 0) + 1
-            if counts[key] == 2:
-                self._several.add(key)
+def link(parts: Iterable[Part], shared: set[int]) -> None:
+    """Number the parts of an image in their order, and encode those anew that share something else now.
 
-    def remove(self, part: Part) -> None:
-        """It is no part any more."""
-        for key in part.objects:
-            self._counts[key] -= 1
-            if not self._counts[key]:
-                del self._counts[key]
-            elif self._counts[key] == 1:
-                self._several.discard(key)
-
-    def link(self, parts: Iterable[Part]) -> None:
-        """Number these parts, in the order of their image; those that share something else now are encoded anew."""
-        free, taken, known, last = dict[int, int](), set[int](), dict[int, int](), dict[str, int]()
-        for part in parts:
-            wish = crc32(part.name.encode(errors="surrogatepass"), last.get(part.name, 0)) & _LOW_BITS
-            number = free.get(wish, wish)
-            while number in taken:
-                number = (number + 1) & _LOW_BITS
-            taken.add(number)
-            free[wish] = number + 1
-            part.number = _CHUNK + number
-            if isinstance(part, Chunk):
-                last[part.name] = part.ending
-            links = NO_LINKS
-            if self._several:
-                own = [key for key in part.objects if key in self._several]
-                given = {key: -1 - (number << 32) - at for at, key in enumerate(key for key in own if key not in known)}
-                if own:
-                    links = Links({key: known[key] for key in own if key in known}, given)
-                known |= given
-            if links != part.links:
-                part.encode(links)
+    Args:
+        parts: all of them.
+        shared: what several of them reach, by id.
+    """
+    free, taken, known, last = dict[int, int](), set[int](), dict[int, int](), dict[str, int]()
+    for part in parts:
+        wish = crc32(part.name.encode(errors="surrogatepass"), last.get(part.name, 0)) & _LOW_BITS
+        number = free.get(wish, wish)
+        while number in taken:
+            number = (number + 1) & _LOW_BITS
+        taken.add(number)
+        free[wish] = number + 1
+        part.number = _CHUNK + number
+        if isinstance(part, Chunk):
+            last[part.name] = part.ending
+        links = ALONE
+        own = [key for key in part.ids if key in shared] if shared else []
+        if own:
+            given = {key: -1 - (number << 32) - at for at, key in enumerate(key for key in own if key not in known)}
+            links = Links({key: known[key] for key in own if key in known}, given)
+            known |= given
+        if links != part.links:
+            part.encode(links)
 
 
 def _size(pieces: Sequence[Any]) -> int:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Any, Final
@@ -22,9 +21,9 @@ import msgspec
 
 from ...actors.errors import DamagedValue, UnsavableValue
 from ...actors.kernel.actor import Actor
-from ...actors.values import ByteParts, decode_value, in_one
+from ...actors.values import ALONE, ByteParts, decode_value, in_one
 from .entry_chunks import Table, is_large
-from .image_parts import NO_LINKS, Part, Sharing
+from .image_parts import Part, link, shared_ids
 
 WHOLE, LINKED = 2, 3
 """The first byte of an image. (A state that was saved as one value begins with the format of values, 1.)"""
@@ -104,7 +103,7 @@ class Imager:
         self._unchanged: dict[str | None, tuple[object, Part]] = {}
         self._tables: dict[str | None, Table] = {}
         self._whole: dict[str | None, int] = {}  # tables that another variable holds too; for how many images
-        self._sharing = Sharing()
+        self._shared = set[int]()  # what the last image has at several places, by id
 
     def image(self, version: int, form: str, state: object, where: str) -> list[tuple[Key, Any]]:
         """The state's pieces in order; large buffers are still the actor's own memory, and chunks are `Chunk`s.
@@ -127,32 +126,24 @@ class Imager:
     def remember(self) -> None:
         """Note what the chunks of the last image are made of: in the next one, those that are the same are not made."""
         for table in self._tables.values():
-            for chunk in table.remember():
-                self._sharing.remove(chunk)
+            table.remember()
         self._whole = {name: left - 1 for name, left in self._whole.items() if left > 1}
 
     def _sections(self, state: dict[Any, Any], where: str) -> list[Section]:
         """As `sections`; the name None stands for a state that has no variables."""
         for gone in self._tables.keys() - state.keys():
-            self._drop(gone)
-        try:
-            made = [self._section(name, value, where) for name, value in state.items()]
-            made.sort(key=lambda one: (one.table is not None, not one.is_small))
-            passing = [part for one in made if one.table is None for part in one.parts]
-            for part in passing:
-                self._sharing.add(part)
-            twice = self._held_twice(made)
-            if not twice:
-                self._sharing.link(part for one in made for part in one.parts)
-            for part in passing:
-                self._sharing.remove(part)
-        except BaseException:  # What was noted so far is not of one state.
-            self._tables, self._sharing = {}, Sharing()
-            raise
-        if not twice:
-            return made
-        self._whole |= dict.fromkeys(twice, WHOLE_IMAGES)
-        return self._sections(state, where)
+            del self._tables[gone]
+        made = [self._section(name, value, where) for name, value in state.items()]
+        made.sort(key=lambda one: (one.table is not None, not one.is_small))
+        parts, tables = [part for one in made for part in one.parts], [one for one in made if one.table is not None]
+        shared = shared_ids(parts, self._shared, [id(one.table) for one in tables])
+        twice = [one.name for one in tables if id(one.table) in shared]
+        if twice:  # What stands elsewhere, too, is to be one object again.
+            self._whole |= dict.fromkeys(twice, WHOLE_IMAGES)
+            return self._sections(state, where)
+        link(parts, shared)
+        self._shared = shared
+        return made
 
     def _section(self, name: str | None, value: Any, where: str) -> Section:
         known = self._unchanged.pop(name, None)
@@ -172,42 +163,25 @@ class Imager:
         """The chunks of a large list or dict; None of another value."""
         table = self._tables.get(name)
         if table is not None and (name in self._whole or not table.fits(value)):
-            self._drop(name)
+            del self._tables[name]
             table = None
         if table is None:
             if not self._chunks or name in self._whole or not is_large(value):
                 return None
             table = self._tables[name] = Table(name or "", type(value), where)
-        before = {*table.chunks}
         try:
             table.take(value)
         except UnsavableValue:  # It is said of the whole variable, and where in it that is.
-            self._drop(name)
+            del self._tables[name]
             return None
-        now = {*table.chunks}
-        for chunk in before - now:
-            self._sharing.remove(chunk)
-        for chunk in table.chunks:
-            if chunk not in before:
-                self._sharing.add(chunk)
         return table
-
-    def _drop(self, name: str | None) -> None:
-        for chunk in self._tables.pop(name).chunks:
-            self._sharing.remove(chunk)
-
-    def _held_twice(self, sections: list[Section]) -> set[str | None]:
-        """The tables whose list or dict stands elsewhere in the state, too: it is to be one object again."""
-        keys = [(id(one.table), one.name) for one in sections if one.table is not None]
-        times = Counter(key for key, _ in keys)
-        return {name for key, name in keys if times[key] > 1 or key in self._sharing}
 
 
 def pieces_of(
     version: int, form: str, sections: list[Section], more: Sequence[tuple[list[str], int]] = ()
 ) -> list[tuple[Key, Any]]:
     """The pieces of an image; those of `more` (names, size) come behind them."""
-    is_linked = any(one.table is not None or one.parts[0].links != NO_LINKS for one in sections)
+    is_linked = any(one.table is not None or one.parts[0].links != ALONE for one in sections)
     head: Any = Head(version, form, [*((one.names, one.size) for one in sections), *more])
     if is_linked:
         chunks = [(one.names, one.kind, [(one.place_of(part), part.size) for part in one.parts]) for one in sections]

@@ -989,8 +989,8 @@ CHECKS = {
     ),
     "a list that stands twice is not cut": Check(
         "checkpoint/snapshot/state_image.py",
-        "if times[key] > 1 or key in self._sharing}",
-        "if False}",
+        "[one.name for one in tables if id(one.table) in shared]",
+        "[]",
         CHUNKS,
         "test_a_list_that_stands_twice",
     ),
@@ -1003,8 +1003,8 @@ CHECKS = {
     ),
     "entries that are made anew each time are not kept alive": Check(
         "checkpoint/snapshot/entry_chunks.py",
-        "not (self._is_made_anew and kept) and ",
-        "",
+        "self.chunks[:1] if self._is_made_anew else self.chunks",
+        "self.chunks",
         CHUNKS,
         "test_what_get_state_makes_anew",
     ),
