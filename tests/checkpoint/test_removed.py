@@ -982,8 +982,8 @@ CHECKS = {
     ),
     "an object that is shared with another chunk is numbered there": Check(
         "checkpoint/snapshot/image_parts.py",
-        "            if links != part.links:\n",
-        "            if links != part.links and part.pieces:\n",
+        "        if links != part.links:\n",
+        "        if links != part.links and part.pieces:\n",
         CHUNKS,
         "test_an_object_that_is_shared_by_ever_more",
     ),
