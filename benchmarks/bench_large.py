@@ -5,6 +5,10 @@ Time: from the kill to the first answer. Its limit, measured in turn: the same o
 bare system calls, a mapping of as many bytes (memory), or reading the same pack into memory with its checksum (sqlite).
 Delay: by how much the asks of the other actor take longer meanwhile, at the 99th percentile. Memory: of root and child
 together, as multiples of the state: what is theirs alone, and the nameless files that they hold.
+
+And what does a snapshot of a list of 200,000 records cost that has grown by ten, or of a dict of 100,000 orders ten of
+which have changed? Pause: how long the actor, a task, stands still. Its limit: the time in which the list or dict is
+encoded once. Written: bytes that go to the store.
 Command: python benchmarks/bench_large.py [--quick]
 """
 
@@ -12,6 +16,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import mmap
 import os
 import signal
@@ -25,6 +30,7 @@ import numpy as np
 from harness import Run, main
 
 import holdfast as hf
+from holdfast.actors.values import encode_value
 
 BYTES = 500_000_000
 BLOCK = 256 * 1024
@@ -209,6 +215,92 @@ async def _measure(run: Run, where: str) -> None:
             )
 
 
+class Scan(hf.Message[None]):
+    """A record that cannot change."""
+
+    at: float
+    robot: int
+    text: str
+
+
+@dataclasses.dataclass
+class Order:
+    """A record that can."""
+
+    number: int
+    customer: str
+    cents: int
+    state: str
+    lines: list[str]
+
+
+class Work(hf.Message[int]):
+    """Add ten scans, and change ten orders."""
+
+
+class Ledger(hf.Actor):
+    """Large lists and dicts of records."""
+
+    key_variables = ("entries",)
+
+    def __init__(self, kind: str, count: int) -> None:
+        self.entries: list[Scan] | dict[str, Order] = []
+        self.turns = 0
+        if kind == "dict":
+            self.entries = {f"order-{n}": Order(n, f"customer {n}", n, "new", ["a", str(n)]) for n in range(count)}
+        else:
+            self.entries = [Scan(n / 8, n % 7, f"text {n}") for n in range(count)]
+
+    @hf.on(Work)
+    def work(self, message: Work) -> int:
+        self.turns += 1
+        for n in range(10):
+            if isinstance(self.entries, dict):
+                order = self.entries[f"order-{(self.turns * 7919 + n * 104729) % len(self.entries)}"]
+                order.state, order.cents = "sent", order.cents + 1
+            else:
+                self.entries.append(Scan(n / 8, n, f"text {self.turns}"))
+        return self.turns
+
+
+async def _entries(run: Run, kind: str, count: int, what: str) -> None:
+    count = run.size(count)
+    written: list[int] = []
+    with tempfile.TemporaryDirectory() as folder:
+        async with hf.ActorSystem("bench", store=f"sqlite:{folder}/app.db", log=False) as system:
+            recovery = hf.hybrid(interval=3600.0)
+            ref = await system.start(hf.child("ledger", hf.start(Ledger, kind, count), recovery=recovery))
+            model: Any = Ledger.__new__(Ledger)
+            Ledger.__init__(model, kind, count)
+
+            async def saved() -> float:
+                await ref.ask(Work(), timeout=60.0)
+                with system.events() as stream:
+                    await system.checkpoint(ref, timeout=60.0)
+                    taken = [one for one in stream.take() if isinstance(one, hf.events.SnapshotTaken)]
+                written.append(taken[-1].written_bytes)
+                return taken[-1].pause
+
+            def encoded() -> float:
+                began = time.perf_counter()
+                encode_value(model.entries)
+                return time.perf_counter() - began
+
+            for _ in range(3):  # As one value, as an image, and once by chunks.
+                await saved()
+            written.clear()
+            await run.compare(f"{count} {what}: pause", saved, encoded, unit="s", target=4.0)
+            run.bound(f"{count} {what}: written", max(written) / 1e3, unit="kB", target=500.0)
+
+
+async def grown_list(run: Run) -> None:
+    await _entries(run, "list", 200_000, "records in a list, ten more")
+
+
+async def changed_dict(run: Run) -> None:
+    await _entries(run, "dict", 100_000, "orders in a dict, ten changed")
+
+
 async def memory(run: Run) -> None:
     await _measure(run, "memory")
 
@@ -218,4 +310,4 @@ async def sqlite(run: Run) -> None:
 
 
 if __name__ == "__main__":
-    main([memory, sqlite])
+    main([memory, sqlite, grown_list, changed_dict])

@@ -23,11 +23,13 @@ from .byte_parts import ByteParts, in_one
 from .forms import FORMAT, LENGTH
 from .value_describer import Describer, ValueDescription
 from .value_reader import Decoder, unpack
-from .value_writer import pieces, walked_pieces
+from .value_writer import ALONE, Links, pieces, walked_pieces
 
 __all__ = [
+    "ALONE",
     "ByteParts",
     "DamagedValue",
+    "Links",
     "ValueDescription",
     "UnsavableValue",
     "adopt_value",
@@ -83,7 +85,7 @@ def state_digest(value: object) -> bytes:
     return digest.digest()
 
 
-def decode_value(data: bytes | memoryview, *, imports: bool = True) -> object:
+def decode_value(data: bytes | memoryview, *, imports: bool = True, shared: dict[int, object] | None = None) -> object:
     """Read what `encode_value` wrote. Arrays are writable and own their memory.
 
     Classes are found by importing their module, and must be of the kind that was saved. No `__init__` is called; only
@@ -93,6 +95,7 @@ def decode_value(data: bytes | memoryview, *, imports: bool = True) -> object:
         data: the bytes. Whoever made them: keys that clash, lengths that lie and units that do not exist are refused.
         imports: False for bytes that another process made: it has nothing imported here, and no more lists and dicts
             made than `MOST_CONTAINERS`.
+        shared: what values that were written before it share with it (`Links`); what is read is added.
 
     Raises:
         DamagedValue: whatever is wrong with the bytes.
@@ -103,27 +106,30 @@ def decode_value(data: bytes | memoryview, *, imports: bool = True) -> object:
     Traceback (most recent call last):
     holdfast.actors.errors.DamagedValue: a saved value cannot be read: it is cut short; use an older one
     """
-    return _read(data, lambda buffers: Decoder(buffers, imports=imports), is_checked=not imports)
+    return _read(data, lambda buffers: Decoder(buffers, imports=imports, shared=shared), is_checked=not imports)
 
 
-def adopt_value(data: memoryview | ByteParts) -> object:
+def adopt_value(data: memoryview | ByteParts, *, shared: dict[int, object] | None = None) -> object:
     """Read what `encode_value` wrote into memory that is the reader's own: large arrays stay where they lie in it.
 
     Such an array is writable and keeps the memory alive; but it does not own it, so that it cannot be resized in place.
+    `shared` is as for `decode_value`.
 
     Raises:
         DamagedValue: whatever is wrong with the bytes.
     """
-    return _read(data, lambda buffers: Decoder(buffers, adopts=True), is_checked=False)
+    return _read(data, lambda buffers: Decoder(buffers, adopts=True, shared=shared), is_checked=False)
 
 
-def describe_value(data: bytes | memoryview) -> object:
+def describe_value(data: bytes | memoryview, *, shared: dict[int, object] | None = None) -> object:
     """Read what `encode_value` wrote without importing anything: each instance of a class is a `ValueDescription`.
+
+    `shared` is as for `decode_value`.
 
     Raises:
         DamagedValue: whatever is wrong with the bytes, or numpy is needed and not there.
     """
-    return _read(data, Describer, is_checked=False)
+    return _read(data, lambda buffers: Describer(buffers, shared=shared), is_checked=False)
 
 
 def _read(data: bytes | memoryview | ByteParts, decoder: Callable[[ByteParts], Decoder], *, is_checked: bool) -> object:

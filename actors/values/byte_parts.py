@@ -25,6 +25,10 @@ class ByteParts:
         """The next byte, if there is one."""
         return self._parts[0][0]
 
+    def again(self) -> ByteParts:
+        """The same bytes, to be read from here on once more."""
+        return ByteParts(self._parts)
+
     def take(self, size: int) -> memoryview | ByteParts:
         """Take the next bytes: a view where they lie in one piece, else a value of their own.
 

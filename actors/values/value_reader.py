@@ -72,11 +72,18 @@ _ADOPTS: Final[dict[int, Make]] = _MAKE | ADOPT_ARRAYS
 class Decoder:
     """What msgpack calls for each extension value and each list, inner ones first."""
 
-    def __init__(self, buffers: ByteParts, *, imports: bool = True, adopts: bool = False) -> None:
+    def __init__(
+        self,
+        buffers: ByteParts,
+        *,
+        imports: bool = True,
+        adopts: bool = False,
+        shared: dict[int, object] | None = None,
+    ) -> None:
         self._imports, self._make_int = imports, LargeInts().make
         self.buffers = buffers  # those not yet read: they lie in the order in which the tree names them
         self.open_marks = 0
-        self.shared: dict[int, object] = {}
+        self.shared: dict[int, object] = {} if shared is None else shared
         self.classes: dict[str, tuple[Any, ExtType | None, dict[str, Any], Defaults]] = {}
         self.make: dict[int, Make] = (_ADOPTS if adopts else _MAKE) | {
             BUFFER.code: self.make_buffer,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import reprlib
 import sys
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import date, time
 from itertools import chain
-from typing import Any, Final, cast
+from typing import Any, Final, NamedTuple, cast
 
 import msgpack
 import msgspec
@@ -43,18 +43,40 @@ MANY: Final = 8
 _PLAIN: Final = msgspec.msgpack.Encoder()
 
 
+class Links(NamedTuple):
+    """What a value shares with others that are written and read with it, by id and number; numbers are below 0."""
+
+    known: Mapping[int, int] = {}
+    """What one of those before it has, so that a reference is enough."""
+    given: Mapping[int, int] = {}
+    """What those behind it will refer to."""
+
+
+ALONE: Final = Links()
+"""Of a value that shares nothing with others."""
+
+
 def pieces(value: object, where: str, *, canonical: bool) -> list[Any]:
     """The bytes of a value, in parts to be joined; `canonical` as in `_Encoder`."""
     return walked_pieces(value, where, canonical=canonical)[0]
 
 
-def walked_pieces(value: object, where: str, *, canonical: bool = False) -> tuple[list[Any], dict[int, object]]:
-    """As `pieces`, and what can change and was reached, by id: two values that share none of it can be kept apart."""
+def walked_pieces(
+    value: object, where: str, *, canonical: bool = False, links: Links = ALONE
+) -> tuple[list[Any], dict[int, object]]:
+    """As `pieces`, and what can change and was reached, by id: two values that share none of it can be kept apart.
+
+    Args:
+        value: what is written.
+        where: its name in errors.
+        canonical: as in `_Encoder`.
+        links: what it shares with others, whose reader has the same `shared`.
+    """
     try:
-        encoder = _Encoder(canonical, shared=set())
+        encoder = _Encoder(canonical, {*links.given}, links)
         tree = encoder.lowered(value)
         while encoder.met_again and not canonical:
-            encoder = _Encoder(canonical, shared=encoder.shared | encoder.met_again)
+            encoder = _Encoder(canonical, encoder.shared | encoder.met_again, links)
             tree = encoder.lowered(value)
         packed = encoder.packed(tree, None)
     except UnsavableValue as refusal:
@@ -70,12 +92,14 @@ def walked_pieces(value: object, where: str, *, canonical: bool = False) -> tupl
 class _Encoder:
     """One walk through a value. `canonical`: the order of sets and arrays, and what is shared, leave no trace."""
 
-    def __init__(self, canonical: bool, shared: set[int]) -> None:
+    def __init__(self, canonical: bool, shared: set[int], links: Links) -> None:
         self.canonical = canonical
         self.shared = shared  # the ids of what is known to be reached twice
         self.met_again: set[int] = set()  # and of what turned out to be
-        self.numbers: dict[int, int] = {}  # of the shared ones that are in the tree already, by id
-        self.walked: dict[int, object] = {}  # by id: None while inside it, then itself, so that the id stays in use
+        self.given = links.given
+        self.numbers: dict[int, int] = dict(links.known)  # of the shared ones that can be referred to, by id
+        # by id: None while inside it, then itself, so that the id stays in use
+        self.walked: dict[int, object] = dict(links.known)
         self.trees: dict[int, Any] = {}  # what those became
         self.changing: dict[type, bool] = {}  # `can_change`, asked once
         self.classes: dict[type, tuple[ExtType, str, dict[str, Any]]] = {}
@@ -95,6 +119,7 @@ class _Encoder:
             if self.walked[key] is None:
                 raise UnsavableValue("", f"a {type_name(kind)} that contains itself")
             if key in self.numbers:
+                self.has_marks = True
                 return [AGAIN, self.numbers[key]]
             if not self.canonical:
                 return self.again(key, x)
@@ -108,7 +133,7 @@ class _Encoder:
     def number(self, key: int) -> int:
         """Give a number to an object that stands at several places."""
         self.has_marks = True
-        self.numbers[key] = number = len(self.numbers)
+        self.numbers[key] = number = self.given.get(key, len(self.numbers))
         return number
 
     def again(self, key: int, x: object) -> Any:

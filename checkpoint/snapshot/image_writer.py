@@ -14,6 +14,7 @@ import os
 import signal
 import threading
 import time
+from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -25,12 +26,14 @@ from ..protocol import Kept, Lent, Marked, Shared, Snapshot, Unsaved
 from .key_variables import state_of, variables
 from .mapped_image import map_image
 from .shared_blocks import (
+    NOWHERE,
     Digests,
     Layout,
     Place,
     Segment,
     by_segment,
     can_share,
+    known_places,
     layout_of,
     memory_file,
     new_number,
@@ -47,7 +50,7 @@ FORK_BYTES: Final = 16 * 1024 * 1024
 MOST_COPIED: Final = 200 * 1024 * 1024
 """Arrays up to this size that are rewritten between two snapshots are copied: a fault for each page takes longer."""
 MOST_SEGMENTS: Final = 32
-"""Segments that one image may be spread over before it is written anew."""
+"""Segments that one image may be spread over before what the smallest have is written anew."""
 _prctl = bind_prctl()
 
 
@@ -65,9 +68,9 @@ class Imaging:
         self._life, self._may_fork = life, may_fork
         self._imager = Imager()
         self._layout: Layout = {}
-        self._begun_with: list[Place] = []  # the blocks of the state that the life has begun with, in order
+        self._begun_with: Layout = {}  # of the state that the life has begun with, as far as it is known
         self._segments: dict[int, Segment] = {}
-        self._digests: Digests = {}  # of the blocks that are in none of these
+        self._digests: Digests = {}  # of chunks, and of the blocks that are in none of these
         self._written: tuple[Segment, Layout] | None = None  # what the home has not acknowledged yet
         self._writer: Writer | None = None
         self._is_again = False
@@ -90,8 +93,10 @@ class Imaging:
         Raises:
             HoldfastError: it is not there any more. OSError: there is no room for it.
         """
-        data, self._begun_with, self._segments = map_image(lent)
-        if not is_image(data):  # The home has no such blocks.
+        data, places, self._segments = map_image(lent)
+        if is_image(data):
+            self._begun_with = known_places(data, places)
+        else:  # The home has no such blocks.
             self.restart()
         return data
 
@@ -128,6 +133,7 @@ class Imaging:
                 job.pause = time.perf_counter() - begin
                 return
             layout = self.write(job, state)
+            self._imager.remember()
         except BaseException:
             if writer is not None:
                 writer.kill()
@@ -214,9 +220,11 @@ class Imaging:
                 self._digests[places[index]] = digest
             for number in {places[index][0] for index in record.digests} & self._segments.keys():
                 self._segments.pop(number).close()
-            self._layout, self._begun_with = layout, []
-            if self._forget() > MOST_SEGMENTS or record.is_full:
+            self._layout, self._begun_with = layout, {}
+            if record.is_full:
                 self.restart()
+            elif self._forget() > MOST_SEGMENTS:
+                self._gather()
         self._once_more()
 
     def _forget(self) -> int:
@@ -229,9 +237,20 @@ class Imaging:
             del self._digests[place]
         return len(wanted)
 
+    def _gather(self) -> None:
+        """Have the next image write what is scattered over the smallest segments anew, in one."""
+        sizes = Counter[int]()
+        for number, _, length in places_of(self._layout):
+            sizes[number] += length
+        kept = {number for number, _ in sizes.most_common(MOST_SEGMENTS // 2)}
+        self._layout = {
+            key: [place if place[0] in kept else NOWHERE for place in places] for key, places in self._layout.items()
+        }
+        self._forget()
+
     def restart(self) -> None:
         """Write the next image in full."""
-        self._layout, self._begun_with = {}, []
+        self._layout, self._begun_with = {}, {}
         for segment in self._segments.values():
             segment.close()
         self._segments.clear()

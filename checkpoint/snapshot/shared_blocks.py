@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import hashlib
 import mmap
 import os
 import sys
@@ -18,7 +17,9 @@ from typing import Any, Final
 
 from ...actors.errors import HoldfastError
 from ...actors.shared_memory import keep_contents, keep_size, unnamed
-from .state_image import Key
+from ...actors.values import ByteParts
+from .image_parts import Chunk, digest
+from .state_image import Key, outline
 
 BLOCK: Final = 256 * 1024
 PAGE: Final = mmap.PAGESIZE
@@ -30,10 +31,12 @@ _memcmp.restype = ctypes.c_int
 
 Place = tuple[int, int, int]
 """Where a block is: segment, offset, length."""
+NOWHERE: Final[Place] = (0, 0, 0)
+"""No block is there."""
 Layout = dict[Key, list[Place]]
 """Where the pieces of an image are, in its order."""
 Digests = dict[Place, bytes]
-"""Of blocks that are in a store, and in memory no more."""
+"""Of blocks that are in a store, and in memory no more, and of chunks."""
 
 
 def can_share() -> bool:
@@ -140,7 +143,8 @@ def write_changed(
 ) -> Layout:
     """Write into `file` the blocks that differ from the known ones; returns where all blocks of the image are.
 
-    A known block is compared where it lies in one of the segments, or else by its digest.
+    A known block is compared where it lies in one of the segments, or else by its digest. A chunk of entries whose
+    digest is known is not even made; the digests of others are added.
 
     Raises:
         OSError: there is no memory for it.
@@ -149,8 +153,14 @@ def write_changed(
     out: list[Any] = []
     end = 0
     for key, piece in image:
-        view = memoryview(piece).cast("B")
         before = known.get(key, [])
+        chunk = piece if isinstance(piece, Chunk) else None
+        has_size = chunk is not None and len(before) == 1 and before[0][2] == chunk.size
+        if chunk is not None and has_size and chunk.is_known_by(digests.get(before[0])):
+            layout[key] = before
+            continue
+        data: Any = piece if chunk is None else chunk.data()
+        view = memoryview(data).cast("B")
         address = _address(view)
         places = layout[key] = []
         for index, begin in enumerate(range(0, len(view), BLOCK)):
@@ -171,19 +181,44 @@ def write_changed(
                 pad = PAGE - len(block) % PAGE
                 out.append(_ZEROS[:pad])
                 end += pad
+        if chunk is not None and len(places) == 1:
+            chunk.digest = digests[places[0]] = chunk.digest or digest(view)
     _write(file, out)
     return layout
 
 
-def layout_of(image: list[tuple[Key, Any]], places: list[Place]) -> Layout:
-    """Where the pieces of an image may be among the places of an earlier one, which says no more than their order."""
+def layout_of(image: list[tuple[Key, Any]], earlier: Layout) -> Layout:
+    """Where the pieces of an image may be among those of an earlier one, of which `known_places` is known."""
     layout: Layout = {}
-    at = 0
+    left: dict[Key, list[Place]] = {}
     for key, piece in image:
+        if isinstance(piece, Chunk) or key == ("", 0):
+            layout[key] = earlier.get(key, [])
+            continue
+        name = key[0], 1
+        places = left.get(name, earlier.get(name, []))
         count = -(-len(memoryview(piece).cast("B")) // BLOCK)
-        layout[key] = places[at : at + count]
-        at += count
+        layout[key], left[name] = places[:count], places[count:]
     return layout
+
+
+def known_places(data: ByteParts, places: list[Place]) -> Layout:
+    """Where the pieces of an image are that lies at these places; the pieces of a large section that is whole are one.
+
+    Raises:
+        DamagedValue: its head cannot be read.
+    """
+    found: Layout = {}
+    at = 0
+    for key, size in outline(data):
+        begin = at
+        while size > 0 and at < len(places):
+            size -= places[at][2]
+            at += 1
+        if size:  # Its blocks are others: what follows is not known.
+            break
+        found[key] = places[begin:at]
+    return found
 
 
 def _write(file: int, buffers: list[Any]) -> None:
@@ -211,11 +246,6 @@ def _is_same(block: memoryview, address: int, place: Place, segment: Segment) ->
     if address:
         return bool(_memcmp(address, _address(kept), length) == 0)
     return bytes(block) == bytes(kept)
-
-
-def digest(block: memoryview) -> bytes:
-    """By which a block is known that is in memory no more."""
-    return hashlib.blake2b(block, digest_size=16).digest()
 
 
 def open_segment(number: int, pid: int, file: int, inode: int, *, is_lent: bool = False) -> Segment:

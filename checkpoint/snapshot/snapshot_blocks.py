@@ -17,7 +17,8 @@ from ...actors.errors import HoldfastError
 from ...actors.events import SnapshotTaken
 from ..journal import DamagedStore
 from ..protocol import PIECE, Kept, Lent, Marked, Restore, Shared, Snapshot
-from .shared_blocks import Place, Segment, by_segment, digest, new_number, open_segment
+from .image_parts import digest
+from .shared_blocks import Place, Segment, by_segment, new_number, open_segment
 from .snapshot_record import IMAGES, Meta, begin_with_older, keep, made_by, meta_now
 
 if TYPE_CHECKING:

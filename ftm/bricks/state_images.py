@@ -195,7 +195,7 @@ class Images:
     """Takes the images of one actor."""
 
     def __init__(self) -> None:
-        self._imager = Imager()
+        self._imager = Imager(chunks=False)
         self._rows: dict[str, Rows] = {}
 
     def take(self, actor: Actor, before: Image | None) -> Image:
@@ -213,7 +213,7 @@ class Images:
         rest = {name: value for name, value in state.value.items() if name not in rows}
         sections = self._imager.sections(rest, where)
         own = {id(state.value[name]) for name in rows}
-        if len(own) < len(rows) or not all(own.isdisjoint(one.seen) for one in sections):
+        if len(own) < len(rows) or not all(own.isdisjoint(part.objects) for one in sections for part in one.parts):
             rows, sections = {}, self._imager.sections(state.value, where)  # Two variables are one: so they stay.
         more = [([name], one.size) for name, one in rows.items()]
         pieces = _pieces(pieces_of(state.version, state.form, sections, more), before)

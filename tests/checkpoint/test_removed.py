@@ -9,6 +9,8 @@ from __future__ import annotations
 from tests.removing import Check, as_tests
 
 LARGE = "tests/checkpoint/test_large_states.py"
+CHUNKS = "tests/checkpoint/test_chunks.py"
+CHUNKS_KEPT = "tests/checkpoint/test_chunks_kept.py"
 
 CHECKS = {
     "what has diverged is not tried again": Check(
@@ -1022,8 +1024,8 @@ CHECKS = {
     ),
     "a life lets go of what the store has": Check(
         "checkpoint/snapshot/image_writer.py",
-        "                self._segments.pop(number).close()\n            self._layout, self._begun_with = layout, []\n",
-        "                self._segments.get(number)\n            self._layout, self._begun_with = layout, []\n",
+        "                self._segments.pop(number).close()\n            self._layout, self._begun_with = layout, {}\n",
+        "                self._segments.get(number)\n            self._layout, self._begun_with = layout, {}\n",
         LARGE,
         "test_what_the_store_has and process",
     ),
@@ -1033,6 +1035,76 @@ CHECKS = {
         "                        pass\n",
         LARGE,
         "test_what_the_store_has and process",
+    ),
+    "an entry that was changed in place is encoded again": Check(
+        "checkpoint/snapshot/entry_chunks.py",
+        "not item.is_unchanged() or ",
+        "",
+        CHUNKS,
+        "test_of_a_dict_in_which",
+    ),
+    "an entry from which something went to its neighbour is encoded again": Check(
+        "actors/values/same_objects.py",
+        "                if now != shape:\n                    return False\n",
+        "",
+        CHUNKS,
+        "test_what_went_from_one_entry",
+    ),
+    "a tuple that holds a list is looked into": Check(
+        "actors/values/same_objects.py",
+        "form.is_frozen and _never_change(held, most)",
+        "form.is_frozen",
+        CHUNKS,
+        "test_a_tuple_that_holds",
+    ),
+    "an object that is shared with another chunk is numbered there": Check(
+        "checkpoint/snapshot/image_parts.py",
+        "        if links != part.links:\n",
+        "        if links != part.links and part.pieces:\n",
+        CHUNKS,
+        "test_an_object_that_is_shared_by_ever_more",
+    ),
+    "a list that stands twice is not cut": Check(
+        "checkpoint/snapshot/state_image.py",
+        "[one.name for one in tables if id(one.table) in shared]",
+        "[]",
+        CHUNKS,
+        "test_a_list_that_stands_twice",
+    ),
+    "a chunk is known by its digest where it was kept": Check(
+        "checkpoint/snapshot/shared_blocks.py",
+        "has_size and chunk.is_known_by(digests.get(before[0])):",
+        "has_size:",
+        CHUNKS,
+        "test_numbers_that_are_all_new",
+    ),
+    "entries that are made anew each time are not kept alive": Check(
+        "checkpoint/snapshot/entry_chunks.py",
+        "self.chunks[:1] if self._is_made_anew else self.chunks",
+        "self.chunks",
+        CHUNKS,
+        "test_what_get_state_makes_anew",
+    ),
+    "a head that is no text is damage": Check(
+        "checkpoint/snapshot/state_image.py",
+        "msgspec.ValidationError, UnicodeDecodeError) as error:",
+        "msgspec.ValidationError) as error:",
+        CHUNKS,
+        "test_an_image_by_chunks_that_is_damaged",
+    ),
+    "what is scattered is gathered": Check(
+        "checkpoint/snapshot/image_writer.py",
+        "                self._gather()\n",
+        "                self.restart()\n",
+        CHUNKS_KEPT,
+        "test_a_state_that_is_saved_often and memory",
+    ),
+    "the next life knows which chunks are kept": Check(
+        "checkpoint/snapshot/image_writer.py",
+        "            self._begun_with = known_places(data, places)\n",
+        "            pass\n",
+        CHUNKS_KEPT,
+        "test_what_little_has_changed and memory and task-0",
     ),
 }
 
