@@ -11,6 +11,8 @@ import itertools
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from ...actors.errors import DIVERGES, ReplayDiverged
 from ..inputs import NO_POSITIONS, OVERHEAD, Input, Turn
 from ..life.replay_guard import StateDiverged
@@ -26,6 +28,7 @@ from ..protocol import (
     TICK,
     TIMED,
     Answer,
+    Ending,
     Out,
     TurnEnd,
 )
@@ -58,6 +61,9 @@ class InputLedger:
         positions: in the journal, of what belongs to a turn besides its input.
         rows: the same of the ends of several turns, by the last of them.
         dropped: the same of what the next snapshot need not be followed by.
+        ends: the actor is to end, as a turn has said, and its supervisor has not dealt with that yet.
+        ends_at: where in the journal that stands.
+        ended: the last turn that has said so, and that was dealt with.
     """
 
     path: str
@@ -78,6 +84,9 @@ class InputLedger:
     positions: dict[int, list[int]] = dataclasses.field(default_factory=dict)
     rows: dict[int, list[int]] = dataclasses.field(default_factory=dict)
     dropped: list[list[int]] = dataclasses.field(default_factory=list)
+    ends: Ending | None = None
+    ends_at: list[int] = dataclasses.field(default_factory=list)
+    ended: int = -1
 
     # -- what there is ----------------------------------------------------------------------------------------------
 
@@ -267,6 +276,21 @@ class InputLedger:
         self.outcomes[turn, k] = answer
         return True
 
+    # -- ends of its own --------------------------------------------------------------------------------------------
+
+    def end_with(self, ends: Ending | None) -> list[int]:
+        """The actor is to end, as a turn has said, or (None) that is over; returns where the place in the journal goes.
+
+        The next snapshot does not contain it: only when it is over it need not be read again.
+        """
+        if ends is not None:
+            self.ends_at = []
+        elif self.ends is not None:
+            self.ended = self.ends.turn
+            self.drop(self.ends_at)
+        self.ends = ends
+        return self.ends_at
+
     # -- deaths -----------------------------------------------------------------------------------------------------
 
     def blamed(self, running: int) -> Input | None:
@@ -391,7 +415,8 @@ class InputLedger:
         entries += [due_entry(*place, when) for place, when in self.dues.items()]
         # What was put aside once may have ended in a turn that was given up.
         ended = {turn.input.id for turn in self.turns.values() if turn.status != STASHED}
-        return entries + [("drop", key) for key in dict.fromkeys(self.ended_in_the_stash()) if key not in ended]
+        entries += [("drop", key) for key in dict.fromkeys(self.ended_in_the_stash()) if key not in ended]
+        return entries if self.ends is None else [*entries, stop_entry(self.ends)]
 
     def released_entry(self, turn: int, since: int = 0) -> Entry:
         """What the journal has of a turn that has not ended; `since`: so many of its outputs stand there already."""
@@ -433,6 +458,8 @@ class InputLedger:
                 self.positions_of(turn).append(position)
                 self.outcomes[turn, k] = Answer(kind, name, body)
                 self.lasts = self.lasts or (turn > self.turn and kind.startswith(TIMED))
+            case ("stop", *said):
+                self.end_with(Ending(*said) if said else None).append(position)
             case ("drop", key):
                 self.drop([position])
                 if key in self.open:
@@ -458,6 +485,11 @@ def said_of(out: Out) -> str:
     ('tell of shop:Sold to /app/cart', 'effect charge')
     """
     return f"{out.verb} of {out.name} to {out.to}" if ":" in out.name else f"{out.verb} {out.to}".strip()
+
+
+def stop_entry(ends: Ending | None) -> Entry:
+    """What the journal has of an end that a turn has asked for, or (None) of one that was dealt with."""
+    return ("stop",) if ends is None else ("stop", *msgspec.structs.astuple(ends))
 
 
 def outcome_entry(turn: int, k: int, answer: Answer) -> Entry:

@@ -11,6 +11,20 @@ from tests.removing import Check, as_tests
 LARGE = "tests/checkpoint/test_large_states.py"
 
 CHECKS = {
+    "who has said that it ends does so in the next program": Check(
+        "checkpoint/home/switch.py",
+        "begun, ledger.ends, ledger.ended))\n",
+        "begun, None, ledger.ended))\n",
+        "tests/checkpoint/test_restart_ends.py",
+        "test_it_says_good_bye",
+    ),
+    "an end that was dealt with is no end of the next life": Check(
+        "checkpoint/home/journal_home.py",
+        "            cell.node.loop.call_soon(self.switch.forget_end)\n",
+        "            pass\n",
+        "tests/checkpoint/test_restart_ends.py",
+        "test_a_child_of_a_list",
+    ),
     "who has asked somebody who was not started is answered": Check(
         "checkpoint/home/ask_recovery.py",
         "                    self._owed(home, source)\n                home.forward",
