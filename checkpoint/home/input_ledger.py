@@ -39,6 +39,21 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(slots=True)
+class OwnEnd:
+    """The end of an actor by its own `ctx.stop`.
+
+    Attributes:
+        wanted: a turn has said so, and the actor's supervisor has not dealt with that yet.
+        positions: where in the journal it stands.
+        past: the last turn that has said so, and that was dealt with.
+    """
+
+    wanted: Ending | None = None
+    positions: list[int] = dataclasses.field(default_factory=list)
+    past: int = -1
+
+
+@dataclasses.dataclass(slots=True)
 class InputLedger:
     """The inputs of one address, its turns, and where they stand in the journal.
 
@@ -61,9 +76,8 @@ class InputLedger:
         positions: in the journal, of what belongs to a turn besides its input.
         rows: the same of the ends of several turns, by the last of them.
         dropped: the same of what the next snapshot need not be followed by.
-        ends: the actor is to end, as a turn has said, and its supervisor has not dealt with that yet.
-        ends_at: where in the journal that stands.
-        ended: the last turn that has said so, and that was dealt with.
+        own_end: whether the actor is to end, as a turn has said.
+        read: the inputs before this number were there already when this program began.
     """
 
     path: str
@@ -84,9 +98,8 @@ class InputLedger:
     positions: dict[int, list[int]] = dataclasses.field(default_factory=dict)
     rows: dict[int, list[int]] = dataclasses.field(default_factory=dict)
     dropped: list[list[int]] = dataclasses.field(default_factory=list)
-    ends: Ending | None = None
-    ends_at: list[int] = dataclasses.field(default_factory=list)
-    ended: int = -1
+    own_end: OwnEnd = dataclasses.field(default_factory=lambda: OwnEnd())
+    read: int = 0
 
     # -- what there is ----------------------------------------------------------------------------------------------
 
@@ -276,20 +289,19 @@ class InputLedger:
         self.outcomes[turn, k] = answer
         return True
 
-    # -- ends of its own --------------------------------------------------------------------------------------------
-
-    def end_with(self, ends: Ending | None) -> list[int]:
+    def end_with(self, wanted: Ending | None) -> list[int]:
         """The actor is to end, as a turn has said, or (None) that is over; returns where the place in the journal goes.
 
         The next snapshot does not contain it: only when it is over it need not be read again.
         """
-        if ends is not None:
-            self.ends_at = []
-        elif self.ends is not None:
-            self.ended = self.ends.turn
-            self.drop(self.ends_at)
-        self.ends = ends
-        return self.ends_at
+        own = self.own_end
+        if wanted is not None:
+            own.positions = []
+        elif own.wanted is not None:
+            own.past = own.wanted.turn
+            self.drop(own.positions)
+        own.wanted = wanted
+        return own.positions
 
     # -- deaths -----------------------------------------------------------------------------------------------------
 
@@ -370,7 +382,7 @@ class InputLedger:
         ledger.open = {key: self.open.get(key, source) for key, source in ledger.open.items()}
         for turn in ledger.turns.values():
             turn.input = ledger.open.get(turn.input.id, turn.input)
-        ledger.next_id = self.next_id
+        ledger.next_id, ledger.read = self.next_id, self.read
         return ledger
 
     def begin_with(self, meta: Meta) -> None:
@@ -416,7 +428,7 @@ class InputLedger:
         # What was put aside once may have ended in a turn that was given up.
         ended = {turn.input.id for turn in self.turns.values() if turn.status != STASHED}
         entries += [("drop", key) for key in dict.fromkeys(self.ended_in_the_stash()) if key not in ended]
-        return entries if self.ends is None else [*entries, stop_entry(self.ends)]
+        return entries if self.own_end.wanted is None else [*entries, stop_entry(self.own_end.wanted)]
 
     def released_entry(self, turn: int, since: int = 0) -> Entry:
         """What the journal has of a turn that has not ended; `since`: so many of its outputs stand there already."""

@@ -339,8 +339,8 @@ class Switch:
         if first is not None:
             port.to_life(first.feed())
         gone, begun = self.ledger.ended_in_the_stash(), -1 if first is not None else self.ledger.begun
-        ledger = self.ledger
-        port.to_life(Go(recovered, ledger.turn, gone, self.timers.running(), begun, ledger.ends, ledger.ended))
+        ledger, own = self.ledger, self.ledger.own_end
+        port.to_life(Go(recovered, ledger.turn, gone, self.timers.running(), begun, own.wanted, own.past))
 
     def let_at(self) -> None:
         """Let the actor at what is new, if nobody else has a say in that."""
@@ -371,7 +371,7 @@ class Switch:
 
     def died(self, running: int, ordered: bool, reason: ExitReason) -> None:
         """The life is over. `running` is the input in hand, -1 if none; `ordered`: it was not its doing."""
-        ends = self.ledger.ends
+        ends = self.ledger.own_end.wanted
         self.life.has_ended = ends is not None and self.life.is_live and is_end_of(ends.exit_reason, reason)
         self.life.die()
         self.calls.rests.abandon()
@@ -507,7 +507,7 @@ class Switch:
 
     def forget_end(self) -> None:
         """The end that a turn has asked for is over: whoever supervises the actor has decided what comes of it."""
-        if self.ledger.ends is not None:
+        if self.ledger.own_end.wanted is not None:
             batch = Batch()
             self._end_with(None, batch)
             batch.commit(self.journal)

@@ -13,10 +13,17 @@ LARGE = "tests/checkpoint/test_large_states.py"
 CHECKS = {
     "who has said that it ends does so in the next program": Check(
         "checkpoint/home/switch.py",
-        "begun, ledger.ends, ledger.ended))\n",
-        "begun, None, ledger.ended))\n",
+        "begun, own.wanted, own.past))\n",
+        "begun, None, own.past))\n",
         "tests/checkpoint/test_restart_ends.py",
         "test_it_says_good_bye",
+    ),
+    "what was told before the restart asks whoever is started later": Check(
+        "checkpoint/home/outputs.py",
+        "        if target.state is GONE and 0 <= key < home.ledger.read:\n",
+        "        if False:\n",
+        "tests/checkpoint/test_restart_unrecorded.py",
+        "test_what_was_told_before",
     ),
     "an end that was dealt with is no end of the next life": Check(
         "checkpoint/home/journal_home.py",
