@@ -191,16 +191,18 @@ class WrongThread(
 class AskTimeout(HoldfastError):
     """No reply before the deadline.
 
-    `handled` is False when the turn never started (safe to send again), None when that is unknown.
+    `handled` is False when the turn never started (safe to send again), None when that is unknown. `why` says why
+    nobody waits any longer, if it is not the time.
     """
 
     actor: str
     seconds: float
     handled: bool | None = None
+    why: str = ""
 
     def __str__(self) -> str:
         known = "it was not handled" if self.handled is False else "it may have been handled"
-        return f"{self.actor} did not reply within {self.seconds:g} s; {known}"
+        return f"{self.actor} did not reply{f' ({self.why})' if self.why else f' within {self.seconds:g} s'}; {known}"
 
 
 class AskFailed(HoldfastError, text="{actor} ended while it handled the message: {reason}"):
@@ -240,7 +242,8 @@ class EffectFailed(HoldfastError, text="{effect} has failed at attempt {attempt}
     """An effect of a turn has failed: what `ctx.effect` called has raised, or has taken too long, at the last attempt.
 
     It is an outcome like any other: it is journaled, and a replay gets it again. `effect` is the effect's key, `error`
-    the class of what was raised, and `reason` its text.
+    the name of the class of what was raised ("builtins.OSError" is "OSError"), and `reason` its text: what was raised
+    need not be a value that a journal can keep.
     """
 
     effect: str

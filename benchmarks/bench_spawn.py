@@ -12,6 +12,7 @@ import os
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 
 import limits
@@ -80,6 +81,31 @@ async def actors(run: Run) -> float:
         await asyncio.sleep(0.1)
         gc.collect()
         return (resident_bytes() - before) / count
+
+
+async def idle_recorded_bytes(run: Run) -> None:
+    run.bound("memory of an idle recorded actor", run.fresh("recorded"), unit="bytes", target=16_384)
+
+
+async def recorded(run: Run) -> float:
+    """Bytes of an idle actor with recovery and a store, which has answered once, with its state."""
+    count = run.size(20_000)
+    template = hf.child(None, hf.start(Idle), restart="transient", recovery=hf.hybrid(interval=3600.0))
+    with tempfile.TemporaryDirectory() as folder:
+        async with hf.ActorSystem("bench", store=f"sqlite:{folder}/bench.db", log=False) as system:
+            top = await system.start(hf.dynamic("sessions", template=template, journal=True))
+
+            async def begin(first: int, last: int) -> None:
+                for low in range(first, last, 200):
+                    asked = (top.ask(hf.StartChild(id=f"{i:032x}"), 60.0) for i in range(low, min(low + 200, last)))
+                    await asyncio.gather(*(ref.ask(Ping()) for ref in await asyncio.gather(*asked) if ref is not None))
+                await asyncio.sleep(0.1)
+                gc.collect()
+
+            await begin(0, 100)
+            before = resident_bytes()
+            await begin(100, 100 + count)
+            return (resident_bytes() - before) / count
 
 
 class State:
@@ -157,6 +183,6 @@ async def import_time(run: Run) -> None:
 
 if __name__ == "__main__":
     main(
-        [spawn_and_stop, idle_bytes, million, idle_cpu, import_time],
-        {"actors": actors, "states": states, "crowd": crowd},
+        [spawn_and_stop, idle_bytes, idle_recorded_bytes, million, idle_cpu, import_time],
+        {"actors": actors, "states": states, "recorded": recorded, "crowd": crowd},
     )

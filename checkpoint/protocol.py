@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import msgspec
 
+from ..actors.exit_reasons import ExitReason, unpack_exit
 from ..actors.kernel.mailbox import Bounded
 from .method import Method
 
@@ -100,6 +101,22 @@ Clock = tuple[str, bytes, float]
 """What a timer says: type name and body of its message, and its interval (0: it comes once)."""
 
 
+class Ending(msgspec.Struct, array_like=True, gc=False):
+    """An actor is to end behind `turn`, because that has called `ctx.stop`; the `reason` is encoded.
+
+    `is_cut_off`: it is an EXIT that is not trapped, and no `on_stop` is called.
+    """
+
+    turn: int
+    reason: bytes
+    is_cut_off: bool = False
+
+    @property
+    def exit_reason(self) -> ExitReason:
+        """Why it ends."""
+        return unpack_exit(msgspec.msgpack.decode(self.reason))
+
+
 # -- home to life ----------------------------------------------------------------------------------------------------
 
 
@@ -155,6 +172,8 @@ class Go(msgspec.Struct, array_like=True, tag=3):
 
     Inputs in `gone` were stashed under replay and have ended since, in turns that are not replayed. `timers` run now.
     The input `begun` has sent something in a turn without an end: it comes first, before what a hook has put back.
+    `ends`: the life is to end instead of going on, as a turn has said and no life has done yet. What turns up to
+    `ended` have said of that is done.
     """
 
     recovered: bool
@@ -162,6 +181,8 @@ class Go(msgspec.Struct, array_like=True, tag=3):
     gone: tuple[int, ...] = ()
     timers: dict[str, Clock] = {}
     begun: int = -1
+    ends: Ending | None = None
+    ended: int = -1
 
 
 class SnapshotNow(msgspec.Struct, array_like=True, tag=4):
@@ -278,7 +299,7 @@ class Released(msgspec.Struct, array_like=True, tag=11):
 
 
 class TurnEnd(msgspec.Struct, array_like=True, tag=12, gc=False):
-    """A turn has ended; `outs` are those not released yet."""
+    """A turn has ended; `outs` are those not released yet. `ends`: the life ends behind it, as it has said itself."""
 
     turn: int
     id: int
@@ -286,6 +307,7 @@ class TurnEnd(msgspec.Struct, array_like=True, tag=12, gc=False):
     outs: list[Out]
     answer: Answer
     state: int = 0  # digest of the state it has left, if that is checked
+    ends: Ending | None = None
 
 
 class Hooked(msgspec.Struct, array_like=True, tag=21):

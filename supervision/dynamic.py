@@ -261,7 +261,9 @@ class DynamicSupervisor(Supervisor):
         if not is_there and "/" not in message.id and message.erase and keeper.knows(path):
             return self._answered(self._erase_below(path))  # If the store refuses, it can be deleted again.
         self._child(message.id)
-        raise NotSupported("a dynamic supervisor forgets stopped children by itself: use TerminateChild")
+        raise NotSupported(
+            f"{message.id} has not ended: stop it with TerminateChild, then DeleteChild erases what it has"
+        )
 
 
 async def stop_together(cells: list[Cell]) -> None:

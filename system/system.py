@@ -448,8 +448,11 @@ class ActorSystem(Recorded, Controls, Remembering):
     def ref(self, path: str, kind: type[Actor] = Actor) -> ActorRef[Any]:
         """Return a ref to the actor at an address; `kind` is its class, or a base of it, if you want the ref typed.
 
+        Between two lives of a child the address is there, and what is sent waits.
+
         Raises:
-            NoSuchActor: nobody lives there. WrongActor: another class does.
+            NoSuchActor: nobody lives there, or its supervisor is between two lives itself.
+            WrongActor: another class does.
         """
         return self._node.find_ref(path, kind)
 

@@ -36,6 +36,7 @@ from .clock import TICKS
 from .faults import Faults
 from .guard.leaks import Leaks
 from .guard.loop_leaks import LoopLeaks
+from .guard.loop_methods import LoopMethods
 from .guarded import GuardedSystem, UnexpectedEnd
 from .library_code import is_file_of_library
 from .schedules.charts import Recorder
@@ -317,6 +318,7 @@ def _kill(root: Root) -> None:
     if isinstance(pool, SimulatedWorkers):
         pool.end()
     loop.drop(root)
+    LoopMethods.of(type(loop)).actors_killed(loop, node)
     node.threads.close()
     cells = [] if node.root is None else [node.root]
     for cell in cells:  # It grows meanwhile.

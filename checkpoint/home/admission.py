@@ -167,7 +167,7 @@ class QuietEnds:
 
     def written(self, positions: Sequence[int]) -> None:
         """It stands there in the journal."""
-        self._home.ledger.rows.setdefault(self._first + len(self._inputs) - 1, []).append(positions[0])
+        self._home.ledger.shared.ends.setdefault(self._first + len(self._inputs) - 1, []).append(positions[0])
         self._home.outputs.rows.closed(self)
 
     def safe(self) -> None:

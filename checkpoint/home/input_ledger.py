@@ -11,6 +11,8 @@ import itertools
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from ...actors.errors import DIVERGES, ReplayDiverged
 from ..inputs import NO_POSITIONS, OVERHEAD, Input, RowPlace, Turn, spread
 from ..life.replay_guard import StateDiverged
@@ -26,6 +28,7 @@ from ..protocol import (
     TICK,
     TIMED,
     Answer,
+    Ending,
     Out,
     TurnEnd,
 )
@@ -33,6 +36,38 @@ from ..protocol import (
 if TYPE_CHECKING:
     from ..journal import Entry
     from ..snapshot.snapshot_record import Meta
+
+
+@dataclasses.dataclass(slots=True)
+class OwnEnd:
+    """The end of an actor by its own `ctx.stop`.
+
+    Attributes:
+        wanted: a turn has said so, and the actor's supervisor has not dealt with that yet.
+        positions: where in the journal it stands.
+        past: the last turn that has said so, and that was dealt with.
+    """
+
+    wanted: Ending | None = None
+    positions: list[int] = dataclasses.field(default_factory=list)
+    past: int = -1
+
+
+@dataclasses.dataclass(slots=True)
+class SharedRows:
+    """Rows of the journal that several inputs share, or the ends of several turns.
+
+    Attributes:
+        ends: where the ends of several turns stand, by the last of them.
+        gone: inputs that have ended without a turn since the newest snapshot, each with its row.
+        parted: rows of which the newest snapshot contains some inputs, and others not.
+        over: the inputs in such rows that it contains.
+    """
+
+    ends: dict[int, list[int]] = dataclasses.field(default_factory=dict)
+    gone: list[tuple[RowPlace, int]] = dataclasses.field(default_factory=list)
+    parted: list[RowPlace] = dataclasses.field(default_factory=list)
+    over: frozenset[int] = frozenset()
 
 
 @dataclasses.dataclass(slots=True)
@@ -56,11 +91,10 @@ class InputLedger:
         older: the one before it, if the store does not have it.
         stash: inputs that had been put aside when the newest snapshot was made.
         positions: in the journal, of what belongs to a turn besides its input.
-        rows: the same of the ends of several turns, by the last of them.
         dropped: the same of what the next snapshot need not be followed by.
-        gone: inputs that have ended without a turn since the newest snapshot, each with its row.
-        parted: rows of which the newest snapshot contains some inputs, and others not.
-        over: the inputs in such rows that the newest snapshot contains.
+        shared: rows of the journal that several inputs or ends share.
+        own_end: whether the actor is to end, as a turn has said.
+        read: the inputs before this number were there already when this program began.
     """
 
     path: str
@@ -79,11 +113,10 @@ class InputLedger:
     older: Meta | None = None
     stash: list[int] = dataclasses.field(default_factory=list)
     positions: dict[int, list[int]] = dataclasses.field(default_factory=dict)
-    rows: dict[int, list[int]] = dataclasses.field(default_factory=dict)
     dropped: list[list[int]] = dataclasses.field(default_factory=list)
-    gone: list[tuple[RowPlace, int]] = dataclasses.field(default_factory=list)
-    parted: list[RowPlace] = dataclasses.field(default_factory=list)
-    over: frozenset[int] = frozenset()
+    shared: SharedRows = dataclasses.field(default_factory=lambda: SharedRows())
+    own_end: OwnEnd = dataclasses.field(default_factory=lambda: OwnEnd())
+    read: int = 0
 
     # -- what there is ----------------------------------------------------------------------------------------------
 
@@ -275,6 +308,20 @@ class InputLedger:
         self.outcomes[turn, k] = answer
         return True
 
+    def end_with(self, wanted: Ending | None) -> list[int]:
+        """The actor is to end, as a turn has said, or (None) that is over; returns where the place in the journal goes.
+
+        The next snapshot does not contain it: only when it is over it need not be read again.
+        """
+        own = self.own_end
+        if wanted is not None:
+            own.positions = []
+        elif own.wanted is not None:
+            own.past = own.wanted.turn
+            self.drop(own.positions)
+        own.wanted = wanted
+        return own.positions
+
     # -- deaths -----------------------------------------------------------------------------------------------------
 
     def blamed(self, running: int) -> Input | None:
@@ -319,12 +366,14 @@ class InputLedger:
         """The same of an input that has ended without a turn."""
         self.drop(source.positions)
         if source.row is not None:
-            self.gone.append((source.row, source.id))
+            self.shared.gone.append((source.row, source.id))
 
     def contained_in(self, turn: int) -> list[int]:
         """The positions that need not follow a snapshot of the state after `turn`."""
         drop = [position for known in self.dropped for position in known]
-        for number, known in itertools.chain(self.positions.items(), self.rows.items()):  # Those of hooks are there.
+        for number, known in itertools.chain(
+            self.positions.items(), self.shared.ends.items()
+        ):  # Those of hooks are there.
             if number <= turn:
                 drop += known
         for source in self._contained_inputs(turn):
@@ -339,7 +388,7 @@ class InputLedger:
         contained = self._contained_places(turn)
         parted = [row for row in contained if row.left > len(contained[row])]
         over = [key for row in parted for key in (*row.over, *contained[row])]
-        return over + [key for row in self.parted if row not in contained for key in row.over]
+        return over + [key for row in self.shared.parted if row not in contained for key in row.over]
 
     def _contained_inputs(self, turn: int) -> Iterator[Input]:
         # An image may be behind: what was stashed when it was begun may have been handled since.
@@ -353,7 +402,7 @@ class InputLedger:
         """The rows of which a snapshot of the state after `turn` contains inputs that no other does, and those."""
         contained: dict[RowPlace, set[int]] = {}
         inputs = ((source.row, source.id) for source in self._contained_inputs(turn))
-        for row, key in itertools.chain(inputs, self.gone):
+        for row, key in itertools.chain(inputs, self.shared.gone):
             if row is not None and row.positions:  # What the store has refused stands nowhere.
                 contained.setdefault(row, set()).add(key)
         return contained
@@ -361,7 +410,7 @@ class InputLedger:
     def begin_after(self, meta: Meta) -> None:
         """Begin with a snapshot as the store has it; its entries follow."""
         self.newest, self.stash, self.turn, self.next_id = meta, meta.stash, meta.turn, meta.next_id
-        self.over = frozenset(meta.over)
+        self.shared.over = frozenset(meta.over)
 
     def read_anew(self, newest: Meta | None, entries: Sequence[tuple[int, Entry]]) -> InputLedger:
         """The same from an older snapshot on, as the store has it; whoever waits for an answer goes on waiting."""
@@ -384,7 +433,7 @@ class InputLedger:
         ledger.open = {key: self.open.get(key, source) for key, source in ledger.open.items()}
         for turn in ledger.turns.values():
             turn.input = ledger.open.get(turn.input.id, turn.input)
-        ledger.next_id = self.next_id
+        ledger.next_id, ledger.read = self.next_id, self.read
         return ledger
 
     def begin_with(self, meta: Meta) -> None:
@@ -393,15 +442,15 @@ class InputLedger:
         for row, keys in contained.items():
             row.left -= len(keys)
             row.over += keys
-        self.parted = [row for row in dict.fromkeys((*self.parted, *contained)) if row.left]
+        self.shared.parted = [row for row in dict.fromkeys((*self.shared.parted, *contained)) if row.left]
         self.dropped.clear()
-        self.gone.clear()
+        self.shared.gone.clear()
         self.newest, self.stash = meta, meta.stash
         for number in [number for number in self.turns if number <= meta.turn]:
             turn = self.turns.pop(number)
             if turn.status != STASHED:
                 self.journal_bytes -= turn.input.size
-        for known in (self.positions, self.rows, self.pipes_done):
+        for known in (self.positions, self.shared.ends, self.pipes_done):
             for number in [number for number in known if number <= meta.turn]:
                 del known[number]
         self._forget_outcomes(key for key in self.outcomes if key[0] <= meta.turn)
@@ -437,7 +486,8 @@ class InputLedger:
         entries += [due_entry(*place, when) for place, when in self.dues.items()]
         # What was put aside once may have ended in a turn that was given up.
         ended = {turn.input.id for turn in self.turns.values() if turn.status != STASHED}
-        return entries + [("drop", key) for key in dict.fromkeys(self.ended_in_the_stash()) if key not in ended]
+        entries += [("drop", key) for key in dict.fromkeys(self.ended_in_the_stash()) if key not in ended]
+        return entries if self.own_end.wanted is None else [*entries, stop_entry(self.own_end.wanted)]
 
     def released_entry(self, turn: int, since: int = 0) -> Entry:
         """What the journal has of a turn that has not ended; `since`: so many of its outputs stand there already."""
@@ -451,9 +501,9 @@ class InputLedger:
                 for one in spread(entry):
                     self._read_input(place, *one[1:])
                 if place.over:
-                    self.parted.append(place)
+                    self.shared.parted.append(place)
             case ("ends", first, keys):
-                self.rows[first + len(keys) - 1] = [position]
+                self.shared.ends[first + len(keys) - 1] = [position]
                 for number, key in enumerate(keys, first):
                     if key in self.open:  # Else the snapshot contains it.
                         self._read_end(self.open[key], number, OK, ())
@@ -474,6 +524,8 @@ class InputLedger:
                 self.positions_of(turn).append(position)
                 self.outcomes[turn, k] = Answer(kind, name, body)
                 self.lasts = self.lasts or (turn > self.turn and kind.startswith(TIMED))
+            case ("stop", *said):
+                self.end_with(Ending(*said) if said else None).append(position)
             case ("drop", key):
                 self.drop([position])
                 if key in self.open:
@@ -491,7 +543,7 @@ class InputLedger:
         self, row: RowPlace, key: int, kind: str, name: str, body: bytes, when: float, sender: str | None, origin: str,
         *end: Any,
     ) -> None:  # fmt: skip
-        if key in self.over:
+        if key in self.shared.over:
             row.over.append(key)
             return
         source = self.open[key] = Input(key, kind, name, body, when, sender)
@@ -518,6 +570,11 @@ def said_of(out: Out) -> str:
     ('tell of shop:Sold to /app/cart', 'effect charge')
     """
     return f"{out.verb} of {out.name} to {out.to}" if ":" in out.name else f"{out.verb} {out.to}".strip()
+
+
+def stop_entry(ends: Ending | None) -> Entry:
+    """What the journal has of an end that a turn has asked for, or (None) of one that was dealt with."""
+    return ("stop",) if ends is None else ("stop", *msgspec.structs.astuple(ends))
 
 
 def outcome_entry(turn: int, k: int, answer: Answer) -> Entry:

@@ -166,8 +166,8 @@ class JournalHome(RecordedHome):
         self.clock = RecoveryClock()
         self.clock.mark("noticed", noticed)
         self.clock.mark("detect")
-        switch.died(running, ordered=ordered)
         end = cell.extra().reason if reason is None else reason
+        switch.died(running, ordered=ordered, reason=end)
         if recovers is None:
             recovers = self.recovers(end) and cell.spec is not None and cell.spec.restarts(end)
         if recovers:
@@ -291,6 +291,10 @@ class JournalHome(RecordedHome):
         drop_all(self.switch, unfit if diverged is None else str(diverged), keep_tells=restarting)
         let_go(self.switch)
         self.switch.ties.untie()
+        if restarting:
+            self.switch.life.has_ended = False  # Nobody has dealt with its end yet.
+        else:  # Behind what its supervisor notes of it now: else it would be lost with this process.
+            cell.node.loop.call_soon(self.switch.forget_end)
         why = "its supervisor has ended" if restarting else "it is not started again"
         self.homes.recoveries.given_up(cell.path, why)
 

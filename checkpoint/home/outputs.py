@@ -174,10 +174,11 @@ class Outputs:
             return
 
         def send() -> None:
+            there = target.living
             try:
-                target.admit(target, Envelope(home.node.codec.message_in(target, out.name, out.body), cell))
+                there.admit(there, Envelope(home.node.codec.message_in(there, out.name, out.body), cell))
             except HoldfastError as error:
-                home.node.dead_letter(target, Parcel(out.name, out.body), str(error), cell)
+                home.node.dead_letter(there, Parcel(out.name, out.body), str(error), cell)
 
         batch.after.append(send)
 
@@ -219,7 +220,12 @@ class Outputs:
         home = self._home
         switch = switch_of(target)
         if switch is None:
-            batch.after.append(lambda: self._line_up(target, lambda: self._offer(target, out, over, wanted)))
+
+            def line_up() -> None:
+                there = target.living
+                self._line_up(there, lambda: self._offer(there, out, over, wanted))
+
+            batch.after.append(line_up)
             return
         bound = switch.intake.bound
         try:
@@ -294,7 +300,7 @@ class Outputs:
         home.node.deadlines.add(ask)
         switch = switch_of(target)
         if switch is None:
-            batch.after.append(lambda: self._send_ask(target, ask))
+            batch.after.append(lambda: self._send_ask(key, target, ask))
         elif switch.waits(ask):
             ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, waiters(chain)))), batch)
         elif (bound := switch.intake.bound) is None or bound.makes_room(ask, out.name, out.body, home.path):
@@ -302,8 +308,15 @@ class Outputs:
             asked.ask, asked.chain = ask, chain
             batch.after.append(lambda: switch.admitted(asked))
 
-    def _send_ask(self, target: Cell, ask: SwitchAsk) -> None:
-        home = self._home
+    def _send_ask(self, key: int, target: Cell, ask: SwitchAsk) -> None:
+        home, target = self._home, target.living
+        if ask.is_over:
+            return
+        if target.state is GONE and 0 <= key < home.ledger.read:
+            # The input is from before the restart: whom it leads to may be started later, as before.
+            come = functools.partial(self._ask_soon, key, target, ask)
+            home.node.awaited.setdefault(target.path, []).append(come)
+            return
         parcel: Any = ask.message
         try:
             ctx = target.ctx
@@ -313,6 +326,9 @@ class Outputs:
             target.admit(target, ask)
         except HoldfastError as error:
             ask.fail(error)
+
+    def _ask_soon(self, key: int, target: Cell, ask: SwitchAsk) -> None:
+        self._home.node.loop.call_soon(self._send_ask, key, target, ask)  # Whoever comes there is not started yet.
 
     def _forward(self, turn: int, key: int, out: Out, batch: Batch) -> None:
         home = self._home
@@ -326,11 +342,12 @@ class Outputs:
         source.ask = None  # From now on it is the receiver's to answer.
 
         def send() -> None:
+            there = target.living
             try:
                 message: Any = ask.message
                 if type(message) is Parcel:
-                    ask.message = home.node.codec.message_in(target, out.name, out.body)
-                target.admit(target, ask)
+                    ask.message = home.node.codec.message_in(there, out.name, out.body)
+                there.admit(there, ask)
             except HoldfastError as error:
                 ask.fail(error)
 

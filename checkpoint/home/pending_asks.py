@@ -183,7 +183,8 @@ class PendingCalls:
             answer = None if (turn, k) in self.sends else ACCEPTED
         elif answer is None and (turn, k) not in self.asks and not home.homes.rejoin.joins(home, turn, key, out):
             # The root itself was restarted meanwhile, and whoever was asked keeps no journal.
-            answer = Answer(*home.node.codec.encode_error(AskTimeout("(unknown since the restart)", 0.0, None)))
+            why = "the program was started again since, and what it had in hand was not recorded"
+            answer = Answer(*home.node.codec.encode_error(AskTimeout(out.to, out.seconds, None, why)))
         if answer is not None:
             self._tell(turn, k, answer)
 

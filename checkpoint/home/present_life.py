@@ -7,8 +7,11 @@ import dataclasses
 import time
 from typing import TYPE_CHECKING
 
+from ...actors.exit_reasons import Crash
+
 if TYPE_CHECKING:
     from ...actors.errors import ReplayDiverged
+    from ...actors.exit_reasons import ExitReason
     from ..protocol import LifePort
 
 
@@ -28,6 +31,7 @@ class PresentLife:
         is_void: whether a state was put in place from outside and could not be saved: nothing that it says counts.
         seen_turn: the last turn that it has handled again.
         seen_k: how many outputs of that turn have come again.
+        has_ended: whether the last one has ended as a turn of it has said; its supervisor decides what follows.
         token: the fencing token of its effects; a replica that leads after another one has one of its own.
     """
 
@@ -42,6 +46,7 @@ class PresentLife:
     is_void: bool = False
     seen_turn: int = -1
     seen_k: int = 0
+    has_ended: bool = False
     token: int = 0
 
     @property
@@ -70,7 +75,7 @@ class PresentLife:
 
     def expect(self, live: asyncio.Future[float]) -> None:
         """Wait for the next life: it is held back until it has caught up."""
-        self.is_released = self.waits_for_release = self.is_void = False
+        self.is_released = self.waits_for_release = self.is_void = self.has_ended = False
         self.replayed, self.diverged = 0, None
         self.abandon()
         self.live = live
@@ -117,3 +122,13 @@ class PresentLife:
     def seen_of(self, turn: int) -> int:
         """How many outputs of a turn have come again."""
         return self.seen_k if self.seen_turn == turn else 0
+
+
+def is_end_of(wanted: ExitReason, reason: ExitReason) -> bool:
+    """Whether a life that was to end for a reason has done so: `on_stop` may say otherwise, and nobody has cut it off.
+
+    >>> from holdfast.actors.exit_reasons import KILLED, NORMAL, SHUTDOWN
+    >>> is_end_of(NORMAL, SHUTDOWN), is_end_of(NORMAL, KILLED)
+    (True, False)
+    """
+    return reason == wanted or reason.is_clean or isinstance(reason, Crash)

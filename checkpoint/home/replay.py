@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from ..protocol import LifePort
     from .switch import Switch
 
+Due = tuple[float, int, Turn]
+"""When a turn is to be fed, on the loop's clock, and its number."""
 TELL_EVERY = 1.0
 """Seconds between two events that tell how long a paced replay will still take, at least."""
 
@@ -36,7 +38,6 @@ class PacedReplay:
 
     def __init__(self, home: Switch) -> None:
         self._home = home
-        self._waiting: deque[tuple[float, int, Turn]] = deque()  # due on the loop's clock, number, turn
         self._handle: asyncio.TimerHandle | None = None
         self._told_at = float("-inf")
         self._fed = -1  # the last turn that was fed
@@ -55,14 +56,15 @@ class PacedReplay:
             return
         due = self._home.node.loop.time()
         last: float | None = None
+        waiting = deque[Due]()
         for number, turn in turns:
             when = turn.input.time
             if last is not None and when > last:  # Turns need not be in the order of admission; clocks may be set back.
                 due += (when - last) / speed
             last = when if last is None else max(last, when)
-            self._waiting.append((due, number, turn))
+            waiting.append((due, number, turn))
         self._told_at = float("-inf")
-        self._go_on(port, then)
+        self._go_on(port, waiting, then)
 
     def _feed(self, port: LifePort, number: int, turn: Turn) -> None:
         pipes = self._home.ledger.pipes_done.get(number, ())
@@ -73,8 +75,8 @@ class PacedReplay:
         """Whether all that was fed is handled, up to this turn, and it is not yet time for the next."""
         return self._handle is not None and self._fed <= turn
 
-    def _go_on(self, port: LifePort, then: Callable[[], None]) -> None:
-        home, waiting = self._home, self._waiting
+    def _go_on(self, port: LifePort, waiting: deque[Due], then: Callable[[], None]) -> None:
+        home = self._home
         self._handle = None
         if home.life.port is not port:
             return  # That life is over, or not the one any more.
@@ -88,11 +90,10 @@ class PacedReplay:
         if home.node.events.has_listeners and now - self._told_at >= TELL_EVERY:
             self._told_at = now
             home.node.emit(ReplayPaced(home.path, len(waiting), waiting[-1][0] - now, home.ledger.backlog(-1)))
-        self._handle = home.node.loop.call_at(waiting[0][0], self._go_on, port, then)
+        self._handle = home.node.loop.call_at(waiting[0][0], self._go_on, port, waiting, then)
 
     def cancel(self) -> None:
         """Feed nothing more: that life is over."""
-        self._waiting.clear()
         if self._handle is not None:
             self._handle.cancel()
             self._handle = None

@@ -38,6 +38,7 @@ from ..protocol import (
     STASHED,
     Answer,
     Closed,
+    Ending,
     Glanced,
     Go,
     Hooked,
@@ -69,16 +70,17 @@ from ..upgrade.present_classes import REPLY_TO
 from .admission import taken_up
 from .disposal import lose, put_into_quarantine, undo_begun
 from .held_messages import Intake, let_go
-from .input_ledger import InputLedger
+from .input_ledger import InputLedger, stop_entry
 from .journal_limit import Limit
 from .life_ports import SENT
 from .outputs import Outputs
 from .pending_asks import PendingCalls, SwitchAsk, answer_ask, origin_of
-from .present_life import PresentLife
+from .present_life import PresentLife, is_end_of
 from .replay import PacedReplay, is_as_before, is_same_reply
 from .replay_filter import declared, turns_to_replay
 
 if TYPE_CHECKING:
+    from ...actors.exit_reasons import ExitReason
     from .homes import Homes
 
 
@@ -292,6 +294,8 @@ class Switch:
         self.due.restarted()
         self.timers.resume()
         self.timers.claimed.clear()
+        if self.life.has_ended:
+            self.forget_end()
         live: asyncio.Future[float] = self.node.loop.create_future()
         self.life.expect(live)
         self.life.token = self.node.numbers.next_token()
@@ -339,7 +343,8 @@ class Switch:
         if first is not None:
             port.to_life(first.feed())
         gone, begun = self.ledger.ended_in_the_stash(), -1 if first is not None else self.ledger.begun
-        port.to_life(Go(recovered, self.ledger.turn, gone, self.timers.running(), begun))
+        ledger, own = self.ledger, self.ledger.own_end
+        port.to_life(Go(recovered, ledger.turn, gone, self.timers.running(), begun, own.wanted, own.past))
 
     def let_at(self) -> None:
         """Let the actor at what is new, if nobody else has a say in that."""
@@ -368,8 +373,10 @@ class Switch:
         if holding is not None:
             holding.let_in()
 
-    def died(self, running: int, ordered: bool) -> None:
+    def died(self, running: int, ordered: bool, reason: ExitReason) -> None:
         """The life is over. `running` is the input in hand, -1 if none; `ordered`: it was not its doing."""
+        ends = self.ledger.own_end.wanted
+        self.life.has_ended = ends is not None and self.life.is_live and is_end_of(ends.exit_reason, reason)
         self.life.die()
         self.calls.rests.abandon()
         self.replay.cancel()
@@ -459,7 +466,8 @@ class Switch:
         if source.kind == START and end.status == FAILED:
             return  # Its start failed, and will be tried again.
         is_durable = self.journal.durable
-        if not end.outs and source.ask is None and not ledger.released and self.intake.bound is None:
+        is_quiet = not end.outs and end.ends is None and not ledger.released
+        if is_quiet and source.ask is None and self.intake.bound is None:
             # The shortest way: nothing leaves, nobody waits.
             if not is_durable:
                 ledger.end_turn(source, end.turn, end.status, end.state)
@@ -473,6 +481,8 @@ class Switch:
         batch = Batch()
         if end.outs or ledger.released:
             self._take(end.turn, end.id, end.outs, batch)
+        if end.ends is not None:
+            self._end_with(end.ends, batch)
         was_asked = source.ask is not None and end.status == OK
         if is_durable and end.answer.kind == "refusal":
             self.note_shape(shape_name(end.answer), batch)
@@ -492,6 +502,20 @@ class Switch:
         if self.journal.durable and (status == STASHED or not self.outputs.rows.end_with_input(number, turn, batch)):
             self.outputs.rows.close()
             batch.add(self.path, turn.entry(number), self.ledger.positions_of(number))
+
+    def _end_with(self, ends: Ending | None, batch: Batch) -> None:
+        """Journal that the actor is to end, as a turn has said, or (None) that this is over."""
+        position = self.ledger.end_with(ends)
+        if self.journal.durable:
+            self.outputs.rows.close()
+            batch.add(self.path, stop_entry(ends), position)
+
+    def forget_end(self) -> None:
+        """The end that a turn has asked for is over: whoever supervises the actor has decided what comes of it."""
+        if self.ledger.own_end.wanted is not None:
+            batch = Batch()
+            self._end_with(None, batch)
+            batch.commit(self.journal)
 
     def end_without_turn(self, source: Input, answer: Answer, batch: Batch) -> None:
         """End an input that will not be handled: it gets an end record all the same."""

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ...actors.exit_reasons import ExitReason
     from ...actors.kernel.envelope import Item
     from ...actors.kernel.message import Message
-    from ..protocol import Clock, Lent, Restore
+    from ..protocol import Clock, Ending, Go, Lent, Restore
 
 
 class Asked(NamedTuple):
@@ -151,7 +151,9 @@ class LifeStage:
         has_replayed: whether it has handled anything again.
         begins_suspended: whether it is suspended when it is live.
         postponed: orders from outside that wait until it is live.
+        ending: that it is to end behind the turn in hand, as that has said.
         stop_wanted: why it is to end when it is live.
+        stop_turn: the turn that has said so, if it was handled again; -1: it was none.
         begun: the input that has sent something in a turn without an end: it comes before what hooks have put back.
         is_cut_off: whether it ends by an EXIT that it does not trap.
         ignored_why: why the actor does not want to be started.
@@ -162,9 +164,18 @@ class LifeStage:
     has_replayed: bool = False
     begins_suspended: bool = False
     postponed: list[Item] = dataclasses.field(default_factory=list)
+    ending: Ending | None = None
     stop_wanted: ExitReason | None = None
+    stop_turn: int = -1
     begun: int = -1
     is_cut_off: bool = False
     ignored_why: str | None = None
     is_over: bool = False
     is_adrift: bool = False
+
+    def judge(self, go: Go) -> None:
+        """All was handled again: whether the life is to end now is for the home to say, which knows what was done."""
+        if go.ends is not None:
+            self.stop_wanted, self.is_cut_off = go.ends.exit_reason, go.ends.is_cut_off
+        elif 0 <= self.stop_turn <= go.ended:
+            self.stop_wanted, self.is_cut_off = None, False

@@ -22,7 +22,7 @@ from ...actors.errors import (
     remote_crash,
     type_name,
 )
-from ...actors.exit_reasons import NORMAL, ExitReason
+from ...actors.exit_reasons import NORMAL, ExitReason, pack_exit
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.context import ActorContext, StashError
@@ -32,7 +32,7 @@ from ...actors.kernel.message import Message, message_name, require_message
 from ...actors.kernel.ref import ActorRef, current
 from ...actors.seconds import check_seconds
 from ...actors.values import encode_value
-from ..protocol import REPLY, SINCE_THEN, Answer, Feed, Perform, Performed, PipeDone
+from ..protocol import REPLY, SINCE_THEN, Answer, Ending, Feed, Perform, Performed, PipeDone
 from .life_state import Asked
 from .recorded_inbox import INIT, STARTED, Fed
 
@@ -436,10 +436,15 @@ class RecordedContext(ActorContext):
         return [msgspec.msgpack.encode(piece) for piece in self.recorded.replaced_snapshot()]
 
     def stop(self, reason: ExitReason = NORMAL) -> None:
-        if self.recorded.is_live:
+        life = self.recorded
+        stage, feed = life.stage, life.feed
+        if feed is not None and self._in_turn() and stage.ending is None:
+            stage.ending = Ending(life.turn, msgspec.msgpack.encode(pack_exit(reason)), stage.is_cut_off)
+        if life.is_live:
             super().stop(reason)
-        else:  # A replayed turn: the life ends when it has caught up.
-            self.recorded.stage.stop_wanted = reason
+        else:  # A replayed turn, or a hook: the life ends when it has caught up.
+            stage.stop_wanted = reason
+            stage.stop_turn = -1 if feed is None else feed.turn
 
     def _close(self) -> None:
         super()._close()

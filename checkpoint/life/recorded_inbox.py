@@ -215,6 +215,7 @@ class GoLive(Hook):
     def over(self) -> None:
         super().over()
         self.life.stage.begun = self.go.begun
+        self.life.stage.judge(self.go)
         self.life.go_live(self.go.gone)
 
 

@@ -302,7 +302,7 @@ class Life:
             self.turn += 1
         if self.returned:
             self.returned.pop(feed.id, None)  # It has come again: its feed may have been here before it was put back.
-        self.feed, self.outs, self.last_k = feed, [], 0
+        self.feed, self.outs, self.last_k, self.stage.ending = feed, [], 0, None
         self.waits.begin()
         if self.page is not None:
             self.page[0] = feed.id + 1
@@ -348,7 +348,8 @@ class Life:
             else 0
         )
         self.feed = None
-        self.port.to_home(TurnEnd(self.turn, feed.id, status, self.outs, answer, state))
+        ends = None if status == FAILED else self.stage.ending
+        self.port.to_home(TurnEnd(self.turn, feed.id, status, self.outs, answer, state, ends))
         self.outs = []
         if self.page is not None:
             self.page[0] = 0

@@ -85,7 +85,7 @@ class LifeHere(LifePlace):
                 raise
             failed = start_failed(cell.path, cell.extra().reason)
             raise failed from failed.__cause__
-        self.home.clock = None
+        self.home.clock = self._starting = None
 
     def is_up(self, cell: Cell) -> bool:
         return True  # If its home is open.

@@ -43,6 +43,7 @@ def roll_back(home: Switch, to: OnEscalate, why: str) -> None:
     put(home, meta, 1)  # Nothing else stays: what was undone must not be what the next step back leads to.
     home.ledger.older = None
     home.images.tidy()
+    home.forget_end()
     go_back(home, meta)
     home.node.emit(RolledBack(home.path, first, meta.base, why))
 

@@ -238,6 +238,7 @@ def load(home: Switch, planted: Journaled | None = None) -> None:
         home.shapes.old.timers |= home.shapes.timer_mappers(meta.timers, meta.shapes)
     for position, entry in saved.entries:
         _reload(home, position, entry, timers)
+    home.ledger.read = home.ledger.next_id
     home.ties.untie()
     for key, (name, body, left, interval) in timers.items():
         home.timers.start(key, name, body, max(0.0, left), interval)

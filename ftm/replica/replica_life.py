@@ -254,7 +254,7 @@ class Skip(Item):
         life.turn += 1
         end: TurnEnd = item.end
         life.returned.pop(end.id, None)  # It may have been put back before: it is handled with that.
-        life.port.to_home(TurnEnd(life.turn, end.id, end.status, [], end.answer, end.state))
+        life.port.to_home(TurnEnd(life.turn, end.id, end.status, [], end.answer, end.state, end.ends))
         return None
 
 

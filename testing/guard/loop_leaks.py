@@ -5,10 +5,14 @@ from __future__ import annotations
 import asyncio
 import weakref
 from collections.abc import Collection, Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from ...actors.kernel.ref import current
 from ..library_code import is_module_of_library
 from .loop_methods import LoopMethods
+
+if TYPE_CHECKING:
+    from ...actors.kernel.node import Node
 
 TASK_GRACE = 10
 """Turns of the loop that a cancelled task may take to end."""
@@ -30,7 +34,7 @@ class LoopLeaks:
     def __init__(self, allowed: Collection[str] = ()) -> None:
         self._allowed = frozenset(allowed)
         self._timers: list[tuple[asyncio.Handle, float, Any]] = []  # with when they are due, and what they call
-        self._futures: list[weakref.ref[asyncio.Future[Any]]] = []
+        self._futures: list[tuple[weakref.ref[asyncio.Future[Any]], Node | None]] = []  # with whose actors made them
         self._most_timers = self._most_futures = MANY
         self._lost: list[tuple[str, BaseException]] = []
         self._loop: Any = None
@@ -53,9 +57,10 @@ class LoopLeaks:
 
     def future_made(self, made: asyncio.Future[Any]) -> None:
         """A future or task is new."""
-        self._futures.append(weakref.ref(made))  # A WeakSet takes ten times as long.
+        maker = current.get(None)  # A WeakSet takes ten times as long.
+        self._futures.append((weakref.ref(made), None if maker is None else maker._cell.node))
         if len(self._futures) > self._most_futures:
-            self._futures = [one for one in self._futures if one() is not None]
+            self._futures = [one for one in self._futures if one[0]() is not None]
             self._most_futures = max(MANY, 2 * len(self._futures))
 
     def exception_told(self, context: dict[str, Any]) -> None:
@@ -112,7 +117,7 @@ class LoopLeaks:
         found: dict[int, str] = {}
         for message, error in self._lost:
             found[id(error)] = f"{_text(error)} ({message})"
-        for noted in self._futures:
+        for noted, _ in self._futures:
             future = noted()
             failure = None if future is None else _unseen(future)
             if future is None or failure is None or id(failure) in found:
@@ -127,6 +132,11 @@ class LoopLeaks:
         """Nobody need see how these have ended."""
         for future in futures:
             _unseen(future)
+
+    def actors_killed(self, node: Node) -> None:
+        """The actors of a node were killed, all of them: what has come for them they could not see any more."""
+        made = (noted() for noted, maker in self._futures if maker is node)
+        self.forget(future for future in made if future is not None)
 
     def close(self) -> None:
         """Note nothing any more."""

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from ..swaps import Swaps
+
+if TYPE_CHECKING:
+    from ...actors.kernel.node import Node
 
 
 class LoopNotes(Protocol):
@@ -24,6 +27,9 @@ class LoopNotes(Protocol):
 
     def exception_told(self, context: dict[str, Any]) -> None:
         """The loop's handler of exceptions is about to hear of this."""
+
+    def actors_killed(self, node: Node) -> None:
+        """The actors of a node were killed, all of them."""
 
 
 class LoopMethods:
@@ -54,6 +60,11 @@ class LoopMethods:
         left = tuple(one for one in self._notes.pop(loop, ()) if one is not notes)
         if left:
             self._notes[loop] = left
+
+    def actors_killed(self, loop: asyncio.AbstractEventLoop, node: Node) -> None:
+        """Tell that the actors of a node in this loop were killed."""
+        for one in self._notes.get(loop, ()):
+            one.actors_killed(node)
 
     def _noting_timers(self, call: Any, origin: Callable[[Any], float]) -> Any:
         notes = self._notes

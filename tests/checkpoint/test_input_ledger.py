@@ -163,7 +163,7 @@ class Ledgers(RuleBasedStateMachine):
             self.deaths.pop(source.id, None)
             self.ended[source.id] = OK
         if keys:
-            self.write(("ends", first, tuple(keys)), ledger.rows.setdefault(ledger.turn, []))
+            self.write(("ends", first, tuple(keys)), ledger.shared.ends.setdefault(ledger.turn, []))
 
     @precondition(lambda self: self.next_input() is None)
     @rule(reply=st.sampled_from([0, answer_digest(Answer())]), status=st.sampled_from([OK, FAILED, DROPPED]))
@@ -236,7 +236,7 @@ class Ledgers(RuleBasedStateMachine):
             self.journal.pop(position, None)
         ledger.begin_with(meta)
         self.cut_at = meta
-        needed = {source.id for source in ledger.handled_and_open()} | {key for _, key in ledger.gone}
+        needed = {source.id for source in ledger.handled_and_open()} | {key for _, key in ledger.shared.gone}
         for entry in self.journal.values():
             if entry[0] == "ins":
                 keys = set(entry[3][::3])

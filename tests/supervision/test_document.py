@@ -133,11 +133,26 @@ async def test_admin_calls_to_a_dynamic_supervisor(call: str, state: str, expect
         top = await system.start(hf.dynamic("top", intensity=9))
         family = Family(system, plan)
         if state != "unknown":
-            await top.ask(hf.StartChild(kid(plan, "a", backoff=SLOW)))
+            one = kid(plan, "a", backoff=SLOW)
+            if "recorded" in state:
+                one = hf.child("a", hf.start(RecordedKid, plan, False), restart="transient", recovery=hf.hybrid())
+            await top.ask(hf.StartChild(one))
         if state == "restarting":
             await end(family, "a", "crash")
+        if state == "ended, recorded":
+            await end(family, "a", "NORMAL")
+            state = "unknown"
         assert (await family.states()).get("a", "unknown") == state
         assert await answer(top, call_of(call, plan)) == expected
+
+
+class RecordedKid(Kid):
+    """Has no state that is worth keeping, and is recorded."""
+
+    def get_state(self) -> int:
+        return 0
+
+    def set_state(self, state: int) -> None: ...
 
 
 class Lingers(hf.Actor):

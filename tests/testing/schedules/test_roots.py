@@ -11,7 +11,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.checkpoint.journal import StaleEpoch, StoreFailed
-from holdfast.testing import Faults, GuardedSystem, Simulation, advance, idle, simulate
+from holdfast.testing import Faults, GuardedSystem, Simulation, UnexpectedEnd, advance, idle, simulate
 from holdfast.testing.schedules.disk import NoRootToKill, SimulatedDisk
 from holdfast.testing.simulation import run_seed
 
@@ -357,3 +357,66 @@ async def test_whoever_waits_hears_of_the_kill(system: GuardedSystem, simulation
         assert ends[1] is None
         assert ends[2] is None or isinstance(ends[2], hf.AskFailed | hf.ActorStopped)
     assert asyncio.get_running_loop().time() < 10.0
+
+
+class Refused(hf.Refusal): ...
+
+
+class Refusing(hf.Actor):
+    @hf.on(Ping)
+    def refuse(self, message: Ping) -> int:
+        raise Refused
+
+
+class Asking(hf.Actor):
+    """Asks once, or twice at once, and takes a refusal for an answer."""
+
+    other: hf.Binding[Refusing]
+
+    def __init__(self) -> None:
+        self.refusals = 0
+
+    @hf.on(Told)
+    async def ask(self, message: Told) -> None:
+        try:
+            if message.number == 1:
+                await self.other.ask(Ping())
+            else:
+                await asyncio.gather(self.other.ask(Ping()), self.other.ask(Ping()))
+        except (Refused, hf.AskTimeout):
+            self.refusals += 1
+
+
+@pytest.mark.parametrize("asks", [1, 2])
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()])
+def test_a_refusal_that_a_killed_root_has_not_seen_is_no_leak(recovery: hf.Method | None, asks: int) -> None:
+    tree = [
+        hf.child("refusing", hf.start(Refusing), recovery=recovery),
+        hf.child("asking", hf.start(Asking), recovery=hf.hybrid(), bindings={"other": "/app/refusing"}),
+    ]
+
+    @simulate(seeds=60, store="simulated")
+    async def run(system: GuardedSystem, simulation: Simulation) -> None:
+        _, asking = [await system.start(spec) for spec in tree]
+        asking.tell(Told(asks))
+        await simulation.moment(12)
+        system = await simulation.crash_root()
+        for spec in tree:
+            await system.start(spec)
+        await advance(20.0)
+
+    run()
+
+
+def test_what_a_client_has_not_awaited_is_a_leak_also_if_the_root_is_killed_later() -> None:
+    left: list[asyncio.Future[int]] = []
+
+    @simulate(seed=0, store="simulated")
+    async def run(system: GuardedSystem, simulation: Simulation) -> None:
+        refusing = await system.start(hf.child("refusing", hf.start(Refusing)))
+        left.append(refusing.ask(Ping()))
+        await idle(system)
+        await simulation.crash_root()
+
+    with pytest.raises(UnexpectedEnd, match="nobody has awaited the ask of Ping"):
+        run()
