@@ -44,6 +44,7 @@ from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor, kill_starting
 from .controls import Controls
+from .full_collections import seldom_collected
 from .live_moves import Moves
 from .logs import LogSink
 from .mechanism_notes import MechanismNotes, check_no_part
@@ -360,7 +361,8 @@ class ActorSystem(Recorded, Controls):
             known.brought.discard(address)
             await root.ask(RemoveChild(spec.id), LONG)
         wanted: ChildSpec = known.in_force(address, spec, fresh=fresh)
-        ref = cast("ActorRef[A]", await root.ask(StartChild(wanted, fresh=fresh), LONG))
+        with seldom_collected():
+            ref = cast("ActorRef[A]", await root.ask(StartChild(wanted, fresh=fresh), LONG))
         known.started(address, spec, wanted, fresh=fresh)
         await known.start_added(lambda one: root.ask(StartChild(one), LONG))
         return ref

@@ -88,6 +88,8 @@ class Pending(asyncio.Future[Any]):
     Not when it has come: in a replay all comes at once, and `now()` has to say again what it said.
     """
 
+    __slots__ = ("_life", "is_out", "when")
+
     def __init__(self, life: Life) -> None:
         super().__init__(loop=life.cell.node.loop)
         self._life, self.when, self.is_out = life, 0.0, False
@@ -306,7 +308,7 @@ class RecordedContext(ActorContext):
         """Wait for what the home waits for: nothing of it is out."""
         life, outcome = self.recorded, self._awaited(verb, since, name, seconds, kinds)
         life.waits.resting += 1
-        outcome.add_done_callback(life.waits.rested)
+        outcome.add_done_callback(life.waits.rested, context=life.cell.context)  # Else it is given a copy of its own.
         return outcome
 
     def _slept(self, seconds: float, *, is_moment: bool) -> asyncio.Future[None]:

@@ -25,8 +25,23 @@ LINES = "tests/supervision/test_program_lines.py"
 NAMED = "tests/control/test_named_children.py"
 SLOW = "tests/supervision/test_slow_restarts.py"
 UPGRADE = "tests/system/upgrade/test_check_upgrade.py"
+COLLECTIONS = "tests/system/test_full_collections.py"
 
 CHECKS = {
+    "a start leaves the garbage collector as it was": Check(
+        "system/full_collections.py",
+        "            gc.set_threshold(young, middle, full)\n",
+        "            pass\n",
+        COLLECTIONS,
+        "test_full_collections_are_rare",
+    ),
+    "what others have set of the garbage collector stays": Check(
+        "system/full_collections.py",
+        "        if gc.get_threshold() == ours:\n",
+        "        if True:\n",
+        COLLECTIONS,
+        "test_what_is_set_meanwhile",
+    ),
     "background work of a turn that is checked is not begun": Check(
         "checkpoint/store_tools/rerun.py",
         '        """Whether background work is not begun: never again."""\n        return True\n',
