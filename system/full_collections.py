@@ -1,4 +1,4 @@
-"""Fewer full garbage collections while a tree starts: what it builds stays, and each of them looks at all of it again."""
+"""Fewer full garbage collections while a tree starts: what it builds stays, and each of them looks at all of it."""
 
 from __future__ import annotations
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
+from ...actors.control.orders_lane import QueuedOrder
 from ...actors.effects import EffectCall
 from ...actors.errors import (
     BadMessage,
@@ -415,6 +416,9 @@ class RecordedContext(ActorContext):
         return True
 
     def _postpones(self, call: Item) -> bool:
+        if self._is_adrift and isinstance(call, QueuedOrder):
+            self._cell.urge(call)  # The next life obeys it, before the turn that was left is run again.
+            return True
         if self.recorded.is_live:
             return False
         self.recorded.stage.postponed.append(call)
