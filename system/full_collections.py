@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import Final
 
 SELDOM: Final = 1_000
@@ -12,7 +12,7 @@ SELDOM: Final = 1_000
 
 
 @contextlib.contextmanager
-def seldom_collected() -> Iterator[None]:
+def seldom_collected() -> Generator[None]:
     """Have full collections be rarer within this block; the young generations are collected as always.
 
     Thresholds belong to the process. Where a program, or a start that is under way, has made full collections as rare

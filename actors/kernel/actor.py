@@ -296,14 +296,12 @@ class Start(msgspec.Struct, Generic[S], frozen=True):
 
     def check(self, *, is_partial: bool = False) -> None:
         """Raise TypeError if the arguments do not fit the class; if `is_partial`, more of them come later."""
-        signature = _signature(self.kind)
+        signature = signature_of(self.kind)
         (signature.bind_partial if is_partial else signature.bind)(*self.args, **self.kwargs)
 
 
-@functools.cache
-def _signature(kind: type) -> inspect.Signature:
-    """What a class takes. Found out once: that takes longer than all else that a spec is checked for."""
-    return inspect.signature(kind)
+signature_of: Callable[[type], inspect.Signature] = functools.cache(inspect.signature)
+"""What a class takes. Found out once: that takes longer than all else that a spec is checked for."""
 
 
 P = typing.ParamSpec("P")
