@@ -29,8 +29,8 @@ class DurableTies:
 
     def __init__(self, home: Switch) -> None:
         self._home = home
-        self._kept = Counter[Tie]()
-        self._untied = Counter[Tie]()  # as read back from the store
+        self._kept: Counter[Tie] = Counter()
+        self._untied: Counter[Tie] = Counter()  # as read back from the store
 
     def turn(self, verb: str, path: str) -> None:
         """A turn has tied or untied something."""
@@ -49,7 +49,8 @@ class DurableTies:
 
     def rename(self, now: Callable[[str], str]) -> None:
         """Some of the others have moved: `now` gives their addresses."""
-        self._kept, self._untied = _renamed(self._kept, now), _renamed(self._untied, now)
+        if self._kept or self._untied:
+            self._kept, self._untied = _renamed(self._kept, now), _renamed(self._untied, now)
 
     def go_back(self, ties: list[Tie]) -> None:
         """These again, as a snapshot has them: what was tied since is undone, and what was untied comes back."""
@@ -72,10 +73,13 @@ class DurableTies:
 
     def untie(self) -> None:
         """Nothing is tied until somebody lives here: it was read back from the store, or the address is free."""
-        self._untied = Counter(self._kept)
+        if self._kept or self._untied:
+            self._untied = Counter(self._kept)
 
     def tie(self) -> None:
         """The actor is live: tie what the last root had tied, now or when the other one is there."""
+        if not self._untied:
+            return
         untied, self._untied = self._untied, Counter()
         node = self._home.node
         for verb, path in untied.elements():

@@ -66,7 +66,7 @@ class Shapes:
         self.fields: dict[str, list[Shape]] = {}
         self.old = OldRecords(home.node.codec, self._class)
         self._first: dict[str, Shape] = {}  # with which the entries behind the newest snapshot begin
-        self._sinks: dict[str, list[list[int]]] = {}  # where the tables stand in the journal
+        self._sinks: list[tuple[str, list[int]]] = []  # of which type a table stands in the journal, and where
         self.noted: set[str] = set()
 
     @property
@@ -89,7 +89,7 @@ class Shapes:
 
     def stands_at(self, name: str, position: list[int]) -> None:
         """The table of a type stands in the journal there, or will."""
-        self._sinks.setdefault(name, []).append(position)
+        self._sinks.append((name, position))
 
     def now(self, name: str) -> Shape | None:
         """The table of what has this name, as it is written now; None if its class is not known here."""
@@ -105,13 +105,15 @@ class Shapes:
         Of types of which no entry is left it is only the newest, and where their tables stand in the journal is cut.
         What is written behind it is looked at anew, for code may have been loaded once more.
         """
-        left = self._left(turn)
+        left, gone = self._left(turn), set[str]()
         self.noted.clear()
         for name, known in self.fields.items():
             if known and left is not None and self._name_now(name) not in left:
-                self._home.ledger.drop(*self._sinks.pop(name, ()))
+                gone.add(name)
                 self._first[name] = known[-1]
                 del known[:-1]
+        self._home.ledger.drop(*(position for name, position in self._sinks if name in gone))
+        self._sinks = [sink for sink in self._sinks if sink[0] not in gone]
         return {name: _from(self._first.get(name, known[0]), known) for name, known in self.fields.items() if known}
 
     def as_now(self) -> dict[str, list[Shape]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import inspect
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Generic, Literal, Protocol, get_args
 
@@ -121,10 +120,7 @@ class ChildSpec(Generic[A_co]):
         if not isinstance(self.start, Start) or not issubclass(self.start.kind, Actor):
             raise SpecError(where, f"start must come from start(Class, ...), not be {self.start!r}")
         try:
-            if self.id == NAMELESS:  # Of a template: the rest of the arguments comes with each start.
-                inspect.signature(self.start.kind).bind_partial(*self.start.args, **self.start.kwargs)
-            else:
-                self.start.check()
+            self.start.check(is_partial=self.id == NAMELESS)  # Of a template: the rest comes with each start.
         except TypeError as error:
             raise SpecError(where, f"start({type_name(self.start.kind)}, ...): {error}") from error
         _choose(where, "restart", self.restart, Restart)

@@ -319,7 +319,7 @@ class Controls:
         return result
 
     async def _order(self, ref: ActorRef[Any], wanted: Order, timeout: float) -> Any:
-        return await order(ref._cell, wanted, timeout)
+        return await self._moves.given(ref._cell, wanted, timeout)
 
 
 def has_process(cell: Cell) -> bool:

@@ -8,7 +8,7 @@ import weakref
 from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
-from ..actors.control.orders import Ready
+from ..actors.control.orders import Order, Prepare, Ready, ReplaceCode, ReplaceState, Resume, Suspend
 from ..actors.control.orders_lane import order
 from ..actors.errors import AskTimeout, CannotMove, HoldfastError, SpecError
 from ..actors.events import Moved
@@ -25,7 +25,9 @@ from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.peer import OutsideHost
 from ..actors.seconds import check_seconds
 from ..checkpoint.home.journal_home import JournalHome
+from ..checkpoint.home.recorded_home import switch_of
 from ..checkpoint.places.far_parent import FarParent
+from ..checkpoint.places.life_here import LifeHere
 from ..checkpoint.places.recorded_moves import ToRecordedHere, ToRecordedWorker, leaving
 from ..supervision.respec import NO_RECIPE, recipe_spec, replace_mechanism, replace_place
 from ..supervision.spec import ChildSpec, Isolation
@@ -39,6 +41,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+BETWEEN_TURNS = (Suspend, ReplaceState, ReplaceCode, Prepare)
+"""The orders after which an actor is not what it was in the middle of a turn."""
+LOOK_AGAIN = 0.02
+"""Seconds between two looks at whether a turn that an order waits for rests."""
 LAST_LOOK = 0.05
 """Seconds for which a next life is waited for at least, also when the time of a change is nearly over."""
 
@@ -269,6 +275,37 @@ class Moves:
             seconds = change.gone_on_at - change.rest_at
             self._node.emit(MechanismChanged(cell.path, was, names, change.config, seconds))
 
+    async def given(self, cell: Cell, wanted: Order, timeout: float, *, is_alone: bool = False) -> Any:
+        """What comes of an order. A turn that rests does not keep it waiting: it is run again, behind it.
+
+        `is_alone`: whoever gives it has the actor's `lock`.
+        """
+        future, cell = order(cell, wanted, timeout), cell.living
+        if not isinstance(wanted, (Resume, *BETWEEN_TURNS)) or switch_of(cell) is None:
+            return await future
+        try:
+            while not future.done():
+                if rests(cell):
+                    if isinstance(wanted, Resume):
+                        return None  # It is in the middle of a turn, and so it is not suspended.
+                    renewed = self._renewed(cell, timeout)
+                    try:
+                        if is_alone:
+                            await renewed
+                        else:
+                            await self._alone(cell, renewed, f"end of the turn of {cell.path}", timeout, None)
+                    except HoldfastError:  # Then it waits for the turn, and says so when its time is over.
+                        await asyncio.wait((future,))
+                await asyncio.wait((future,), timeout=LOOK_AGAIN)
+        finally:
+            future.cancel()
+        return future.result()
+
+    async def _renewed(self, cell: Cell, timeout: float) -> None:
+        """Have the life at an address, a turn of which rests, begin anew where it is, before that turn."""
+        spec = _spec_of(cell)
+        await self._moved(cell, timeout, lambda: self._made(cell, spec, timeout), lambda: None)
+
     async def pause(self, cell: Cell, timeout: float, gate: Gate) -> None:
         """Bring a recorded or protected actor to rest where it lives; it goes on when the gate opens.
 
@@ -424,6 +461,15 @@ class _Attempts:
 
     def _too_often(self) -> CannotMove:
         return CannotMove(self._cell.path, f"not within {self._timeout:g} s: {ended_too_often(self._gate.lives_ended)}")
+
+
+def rests(cell: Cell) -> bool:
+    """Whether a turn of an actor waits for a moment or a message, perhaps for days, and can be left."""
+    switch, host = switch_of(cell), cell.host
+    if switch is None or not switch.method.replays:
+        return False
+    is_here = isinstance(host.place, (LifeHere, WorkerPlace)) and not isinstance(host.parent, FarParent)
+    return is_here and switch.calls.rests.is_busy
 
 
 def ended_too_often(lives: int) -> str:

@@ -47,6 +47,7 @@ from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor, kill_starting
 from .controls import Controls
+from .full_collections import seldom_collected
 from .history.calls import Remembering
 from .history.recorder import HistoryRecorder, expect_end
 from .live_moves import Moves
@@ -379,7 +380,8 @@ class ActorSystem(Recorded, Controls, Remembering):
             known.brought.discard(address)
             await root.ask(RemoveChild(spec.id), LONG)
         wanted: ChildSpec = known.in_force(address, spec, fresh=fresh)
-        ref = cast("ActorRef[A]", await root.ask(StartChild(wanted, fresh=fresh), LONG))
+        with seldom_collected():
+            ref = cast("ActorRef[A]", await root.ask(StartChild(wanted, fresh=fresh), LONG))
         known.started(address, spec, wanted, fresh=fresh)
         await known.start_added(lambda one: root.ask(StartChild(one), LONG))
         return ref

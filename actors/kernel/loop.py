@@ -8,6 +8,7 @@ in the name of a runner, an idle task; if it suspends, the runner stays with it 
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import threading
 import time
 import types
@@ -45,6 +46,7 @@ class RunLoop:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.loop = loop
+        self.base_context = contextvars.copy_context()
         self.thread = threading.get_ident()
         self.ready: deque[Cell] = deque()
         self.awake = False
@@ -398,11 +400,13 @@ class Suspended:
 class RunnerTask(asyncio.Task[None]):
     """A runner's task. It tells the run loop of a cancel, which may come from the very step that runs in its name."""
 
+    __slots__ = ("_run_loop", "_runner")
+
     def __init__(self, runner: Runner, loop: RunLoop) -> None:
         self._runner, self._run_loop = runner, loop
         work = runner._run()
         work.send(None)  # A task that is cancelled before its coroutine has begun would never run it.
-        super().__init__(work, loop=loop.loop, name="holdfast runner")
+        super().__init__(work, loop=loop.loop, name="holdfast runner", context=loop.base_context)
 
     def cancel(self, msg: Any = None) -> bool:
         self._run_loop.strike(self._runner)
@@ -417,7 +421,7 @@ class Runner:
     def __init__(self, loop: RunLoop) -> None:
         self._loop = loop
         self._turn: Suspended | None = None
-        self._call: asyncio.Future[None] = loop.loop.create_future()
+        self._call: asyncio.Future[None] | None = None  # while it waits for a turn
         self.task = RunnerTask(self, loop)
         loop.joined(self)
         self.task.add_done_callback(self._done)
@@ -425,7 +429,7 @@ class Runner:
     def take(self, turn: Suspended) -> None:
         """Wait with this turn from the next tick on."""
         self._turn = turn
-        if not self._call.done():
+        if self._call is not None and not self._call.done():
             self._call.set_result(None)
 
     def retire(self) -> None:
@@ -443,17 +447,17 @@ class Runner:
                 if not begun:
                     begun = True
                     await _task_begins()
-                if not self._call.done():
+                if self._turn is None:
+                    self._call = self._loop.loop.create_future()
                     await self._call
             except asyncio.CancelledError as error:
                 # A cancel can come between the turn's first wait and our taking it over: it belongs to the turn.
                 if self._turn is None:
                     raise
                 cancelled = error
-            turn, self._turn = self._turn, None
+            turn, self._turn, self._call = self._turn, None, None
             if turn is None:
                 return
-            self._call = self._loop.loop.create_future()
             error_left: BaseException | None = None
             try:
                 context = turn.cell.context

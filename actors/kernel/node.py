@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextvars
 import dataclasses
 import itertools
 import random
@@ -171,7 +170,6 @@ class Node(RunLoop):
         if not name or "/" in name:
             raise SpecError("ActorSystem", f"the name must be text without '/', not {name!r}")
         self.name = name
-        self.base_context = contextvars.copy_context()
         self.deadlines = Deadlines(loop)
         self.codec = Codec(self.cell_at)
         self.clock = Clock(loop)

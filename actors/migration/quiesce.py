@@ -92,16 +92,17 @@ class PackLife(Item):
     def hurry(self, cell: Cell) -> None:
         """Do not wait for a turn that rests, which may be for days: it is left, and run again at the new place.
 
-        Not while other commands come first, or something is out that would end with the life.
+        Not while other commands come first than orders, which the next life obeys, or something is out that would end
+        with this life.
         """
         ctx, more = cell.ctx, cell.extra()
         if ctx is None or not ctx._may_rest or self._stays or self.is_void or self.is_done:
             return
         if cell.state is not RUNNING:
             return
-        is_next = more.urgent is not None and next(iter(more.urgent), None) is self
+        first = next((one for one in more.urgent or () if not isinstance(one, QueuedOrder)), None)
         stays_behind = any(name not in self._ignored for name in cell.children or ())
-        if is_next and not stays_behind and not _busy(cell) and ctx._leaves_turn():
+        if first is self and not stays_behind and not _busy(cell) and ctx._leaves_turn():
             return
         cell.node.loop.call_later(LOOK_AGAIN, self.hurry, cell)
 
@@ -219,6 +220,13 @@ class Transit:
 
     def control(self, cell: Cell, call: QueuedOrder) -> None:
         self.waiting.append(lambda host: host.control(cell, call))
+
+    def control_first(self, cell: Cell, calls: list[QueuedOrder]) -> None:
+        """These orders were given before all that waits here."""
+        waiting, self.waiting = self.waiting, []
+        for call in calls:
+            self.control(cell, call)
+        self.waiting += waiting
 
     def is_up(self, cell: Cell) -> bool:
         return True

@@ -1,7 +1,8 @@
 """Processes for the functions of effects: one may compute for long, end by itself or be killed, and takes nobody along.
 
 Each runs one function at a time and nothing else; it is reused when that has returned, and killed when its time is over
-or nobody waits for it any more. When this process ends, however it does, they are killed.
+or nobody waits for it any more. When this process ends, however it does, they are killed. There are only so many at
+once, and functions wait for one in the order in which they came.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from ..values import decode_value, encode_value
 ENTRY: Final = "holdfast.actors.process.effect_main"
 MOST_IDLE: Final = 4
 """Processes that are kept for the next functions."""
+MOST: Final = max(MOST_IDLE, os.cpu_count() or 1)
+"""Functions that may compute at once: more than there are processors would only be in each other's way."""
 ENDED_WITHIN: Final = 1.0
 """Seconds until a process that has closed its socket, and does not end, is killed."""
 HEADER: Final = 8
@@ -96,10 +99,11 @@ class EffectProcess:
 
 
 class EffectProcesses:
-    """The processes for effects of one process of the system: begun when first needed."""
+    """The processes for effects of one process of the system: begun when first needed, `most` at once."""
 
-    def __init__(self, codec: Codec) -> None:
+    def __init__(self, codec: Codec, most: int = MOST) -> None:
         self._codec = codec
+        self._room = asyncio.Semaphore(most)
         self._idle: list[EffectProcess] = []
         self._all: set[EffectProcess] = set()
 
@@ -113,10 +117,20 @@ class EffectProcesses:
         """
         name, first, named = pack_function(function, "effect", "isolation='process'")
         given = [encode_value(value, where="the arguments") for value in ([*first, *args], named)]
-        request = msgspec.msgpack.encode((name, *given, fencing_token()))
+        async with self._room:
+            kind, *answer = await self._answered(msgspec.msgpack.encode((name, *given, fencing_token())))
+        match kind:
+            case "value":
+                return decode_value(answer[0])
+            case "error":
+                raise self._codec.decode_error(*answer)
+            case _:
+                raise FunctionRaised(*answer)
+
+    async def _answered(self, request: bytes) -> Any:
         process = self._take()
         try:
-            kind, *answer = msgspec.msgpack.decode(await process.call(request))
+            answer = msgspec.msgpack.decode(await process.call(request))
         except BaseException:
             self._all.discard(process)
             process.end()
@@ -126,13 +140,7 @@ class EffectProcesses:
         else:
             self._all.discard(process)
             process.end()
-        match kind:
-            case "value":
-                return decode_value(answer[0])
-            case "error":
-                raise self._codec.decode_error(*answer)
-            case _:
-                raise FunctionRaised(*answer)
+        return answer
 
     def _take(self) -> EffectProcess:
         """One that waits for a function, or a new one."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
+from ...actors.control.orders_lane import QueuedOrder
 from ...actors.effects import EffectCall
 from ...actors.errors import (
     BadMessage,
@@ -89,6 +90,8 @@ class Pending(asyncio.Future[Any]):
 
     Not when it has come: in a replay all comes at once, and `now()` has to say again what it said.
     """
+
+    __slots__ = ("_life", "is_out", "when")
 
     def __init__(self, life: Life) -> None:
         super().__init__(loop=life.cell.node.loop)
@@ -308,7 +311,7 @@ class RecordedContext(ActorContext):
         """Wait for what the home waits for: nothing of it is out."""
         life, outcome = self.recorded, self._awaited(verb, since, name, seconds, kinds)
         life.waits.resting += 1
-        outcome.add_done_callback(life.waits.rested)
+        outcome.add_done_callback(life.waits.rested, context=life.cell.context)  # Else it is given a copy of its own.
         return outcome
 
     def _slept(self, seconds: float, *, is_moment: bool) -> asyncio.Future[None]:
@@ -415,6 +418,9 @@ class RecordedContext(ActorContext):
         return True
 
     def _postpones(self, call: Item) -> bool:
+        if self._is_adrift and isinstance(call, QueuedOrder):
+            self._cell.urge(call)  # The next life obeys it, before the turn that was left is run again.
+            return True
         if self.recorded.is_live:
             return False
         self.recorded.stage.postponed.append(call)

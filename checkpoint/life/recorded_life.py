@@ -311,11 +311,11 @@ class Life:
     def drive(self, turn: Coroutine[Any, Any, T]) -> Generator[Any, Any, T]:
         """Run a turn to its end; the page says when it waits."""
         feed = self.feed
-        step: Callable[[Any], Any] = turn.send
         value: Any = None
+        thrown: BaseException | None = None
         while True:
             try:
-                yielded = step(value)
+                yielded = turn.send(value) if thrown is None else turn.throw(thrown)
             except StopIteration as done:
                 return done.value  # type: ignore[no-any-return]  # what the turn returns
             except BaseException:
@@ -323,12 +323,12 @@ class Life:
                 raise
             self._mark(feed, WAITS)
             try:
-                step, value = turn.send, (yield yielded)
+                value, thrown = (yield yielded), None
             except GeneratorExit:
                 turn.close()
                 raise
             except BaseException as error:
-                step, value = turn.throw, error
+                thrown = error
             self._mark(feed)
 
     def _mark(self, feed: Feed | None, how: int = 0) -> None:

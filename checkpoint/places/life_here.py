@@ -38,8 +38,13 @@ class LifeHere(LifePlace):
             self._begin(cell, entered)
             self._replay(cell, entered)
             begun = self._follow(cell, entered)
-        self._starting = lifecycle.outside_turn(cell, begun)
-        return self._starting
+        self._starting = starting = lifecycle.outside_turn(cell, begun)
+        starting.add_done_callback(self._started)
+        return starting
+
+    def _started(self, starting: asyncio.Future[None]) -> None:
+        if self._starting is starting:
+            self._starting = None
 
     def _begin(self, cell: Cell, entered: Entered) -> None:
         """S3, the new life with its state."""

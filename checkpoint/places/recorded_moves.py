@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
+from ...actors.control.orders_lane import take_orders
 from ...actors.errors import CannotMove, StartFailed
 from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.cell import Cell
@@ -148,6 +149,9 @@ class FromRecordedWorker(FromOwnWorker):
         self.taken.set_result(None)
 
     def part(self) -> list[Item]:
+        assert self.move.transit is not None
+        # Before the new life is fed, so that it obeys them between two turns.
+        self.move.transit.control_first(self.cell, take_orders(self.worker))
         return []
 
     def resume(self) -> None:

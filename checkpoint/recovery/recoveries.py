@@ -200,6 +200,8 @@ class Recoveries:
         """Whether there is anything to do at a stage."""
         if stage == "restart" and recovery.has_crashed and recovery.method.meanwhile.safe_state is not None:
             return True
+        if self.hooks is None and recovery.method.meanwhile.hooks is None:
+            return False
         return any(self.hooks_at(recovery, point) for point in STAGES[stage])
 
     def hooks_at(self, recovery: Recovery, point: Point) -> list[tuple[RecoveryHooks, Hook]]:

@@ -386,6 +386,8 @@ def take_over(home: Switch) -> str:
 
 
 def _taken_over(home: Switch, old: OldRecords) -> list[str]:
+    if not (old.inputs or old.outcomes or old.timers or old.kept):
+        return []
     ledger, clocks, messages = home.ledger, home.timers.saved(), home.homes.rejoin.kept_for(home.path)
     ended = (turn.input for turn in ledger.turns.values() if turn.status in (OK, STASHED) and home.method.replays)
     sources = {source.id: source for source in (*ended, *ledger.open.values())}

@@ -56,7 +56,13 @@ Shape: TypeAlias = "tuple[FieldRow, ...]"
 
 def as_shape(data: Any) -> Shape:
     """A table as the journal has it; stores of before have places, forms and names only."""
-    return tuple(_row(*row) for row in data)
+    return _known_shape(tuple(_row(*row) for row in data))
+
+
+@functools.cache
+def _known_shape(shape: Shape) -> Shape:
+    """The table itself, the same one for all homes: thousands of them may have written with it."""
+    return shape
 
 
 def as_data(shape: Shape) -> tuple[tuple[Any, ...], ...]:

@@ -112,11 +112,6 @@ class BodyMapper(_Walk):
         self._info = inspect.type_info(kind)
 
     @property
-    def is_needed(self) -> bool:
-        """Whether anything is not as it would be written now."""
-        return self.written != self.name or bool(self._difference)
-
-    @property
     def change(self) -> str:
         """What has changed, in words, as it goes on behind the name."""
         name = f", which is {self.name} now" if self.written != self.name else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeAlias
 
 from ...actors.kernel.actor import Actor
-from .field_tables import Shape
+from .field_tables import Shape, difference, shape_of
 from .mapping import BodyMapper
 from .present_classes import present_class
 
@@ -59,5 +59,7 @@ def mapper_of(name: str, table: Shape | None, kind: type[Actor] | None, codec: C
     found = present_class(name, kind)
     if found is None:
         return None
-    made = BodyMapper(name, *found, table, codec)
-    return made if made.is_needed else None
+    now, kind_now = found
+    if now == name and (table is None or not difference(table, shape_of(kind_now))):
+        return None
+    return BodyMapper(name, now, kind_now, table, codec)

@@ -85,7 +85,8 @@ class Rework(StagedWork):
             await self._claim(system, cell)
             life, self._held = cell.life, None
             try:
-                prepared = await order(cell, Prepare(self._attempt, tuple(self._wanted)), PREPARED_WITHIN)
+                wanted = Prepare(self._attempt, tuple(self._wanted))
+                prepared = await system._moves.given(cell, wanted, PREPARED_WITHIN, is_alone=True)
                 self._recipe, self._saved = prepared
             except (AskFailed, ActorStopped):
                 if cell.life == life and cell.host.is_up(cell):

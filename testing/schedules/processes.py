@@ -17,9 +17,14 @@ from collections.abc import Callable
 from contextvars import Context, copy_context
 from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
 
+import msgspec
+
+from ...actors.errors import HoldfastError
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.cell import Cell
-from ...actors.process import worker_node
+from ...actors.kernel.codec import Codec
+from ...actors.process import effect_processes, worker_node
+from ...actors.process.effect_main import answered
 from ...actors.process.fork.boot import PAGE_BYTES
 from ...actors.process.fork.child_processes import parent_of
 from ...actors.process.process_host import on_frame
@@ -282,6 +287,27 @@ class SimulatedWorker(Worker):
         """Never: whatever blocks it blocks the run."""
 
 
+class SimulatedEffectProcess:
+    """A process for the functions of effects: they run in that of the test, one at a time, and cannot end it."""
+
+    is_alive = True
+
+    def __init__(self) -> None:
+        self._codec = Codec(_no_refs)
+
+    async def call(self, request: bytes) -> bytes:
+        """Answer a request when all that is ready now has run."""
+        await asyncio.sleep(0)
+        return msgspec.msgpack.encode(answered(self._codec, request))
+
+    def end(self) -> None:
+        """Nothing is left of it."""
+
+
+def _no_refs(path: str) -> Cell:
+    raise HoldfastError(f"no ref comes to the function of an effect, and {path} has")
+
+
 class SimulatedWorkers(Workers):
     """The pool of a simulated run."""
 
@@ -295,6 +321,7 @@ class SimulatedWorkers(Workers):
         self._stub = SimulatedServer()
         self._swaps = Swaps()
         self._swaps.put(worker_node, "_apply", _no_limits)
+        self._swaps.put(effect_processes, "EffectProcess", SimulatedEffectProcess)
 
     def draw_from(self, choices: Choices, seconds: tuple[float, float]) -> None:
         """From now on what is written takes so many seconds, drawn, until it arrives."""

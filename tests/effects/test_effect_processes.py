@@ -15,7 +15,11 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.effects import FunctionRaised, begin_effect
+from holdfast.actors.kernel.codec import Codec
+from holdfast.actors.process.effect_processes import EffectProcesses
 from holdfast.ftm import LFR
+from holdfast.testing import GuardedSystem, simulate
 from tests.effects.clerk import IN_TIME, No, lines, note
 from tests.effects.test_effects_protected import whole
 
@@ -187,3 +191,54 @@ async def test_behind_a_mechanism_only_the_leader_begins_one(tmp_path: Path) -> 
         await whole(system, ref)
         assert await ref.ask(Run("plain", world), IN_TIME) == "plain!"
     assert lines(world) == ["plain"]
+
+
+def in_turn(file: str, number: int) -> int:
+    """Write down when it begins and when it ends."""
+    note(file, f"begins {number}")
+    time.sleep(0.05)
+    note(file, f"ends {number}")
+    return number
+
+
+@pytest.mark.parametrize("most", [1, 2])
+async def test_so_many_compute_at_once_and_others_wait_in_order(tmp_path: Path, most: int) -> None:
+    """Also behind one that has failed, and one that nobody waits for any more."""
+    world = str(tmp_path / "world")
+    processes = EffectProcesses(Codec(no_ref), most)
+    begin_effect(1)
+    try:
+        given = [asyncio.ensure_future(processes.run(in_turn, world, number)) for number in range(4)]
+        failed = asyncio.ensure_future(processes.run(run, "raise", "", 0))
+        unwanted = asyncio.ensure_future(processes.run(in_turn, world, 4))
+        last = asyncio.ensure_future(processes.run(in_turn, world, 5))
+        await asyncio.sleep(0)
+        unwanted.cancel()
+        assert await asyncio.gather(*given, last) == [0, 1, 2, 3, 5]
+        with pytest.raises(FunctionRaised):
+            await failed
+    finally:
+        processes.close()
+    said = lines(world)
+    if most == 1:  # Of two, one may be begun later and be there sooner.
+        assert [line for line in said if line.startswith("begins")] == [
+            f"begins {number}" for number in (0, 1, 2, 3, 5)
+        ]
+    begun = [sum(1 if line.startswith("begins") else -1 for line in said[: end + 1]) for end in range(len(said))]
+    assert max(begun) <= most
+
+
+def no_ref(path: str) -> Any:
+    raise LookupError(path)
+
+
+@simulate(seeds=3, latency=(0.0, 0.01), intensity=1000)
+async def test_they_are_simulated(system: GuardedSystem) -> None:
+    """Under a seed the function runs in the process of the test, behind the same codec."""
+    for isolation in ("task", "process"):
+        ref = await system.start(hf.child(isolation, hf.start(Runner), isolation=isolation, recovery=hf.hybrid()))
+        assert await ref.ask(Run("plain"), IN_TIME) == "plain!"
+        assert await ref.ask(Run("pid"), IN_TIME) == "False"
+        assert await ref.ask(Run("refuse"), IN_TIME) == "No: No(why='not so')"
+        assert "KeyError" in await ref.ask(Run("raise"), IN_TIME)
+        assert "UnsavableValue" in await ref.ask(Run("unsavable"), IN_TIME)

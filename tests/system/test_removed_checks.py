@@ -25,6 +25,9 @@ LINES = "tests/supervision/test_program_lines.py"
 NAMED = "tests/control/test_named_children.py"
 SLOW = "tests/supervision/test_slow_restarts.py"
 UPGRADE = "tests/system/upgrade/test_check_upgrade.py"
+COLLECTIONS = "tests/system/test_full_collections.py"
+ORDERS = "tests/effects/test_orders_while_resting.py"
+EFFECTS = "tests/effects/test_effect_processes.py"
 
 CHECKS = {
     "a replaced state has the variables of the one before": Check(
@@ -40,6 +43,48 @@ CHECKS = {
         "",
         "tests/supervision/test_dynamic.py",
         "test_a_changed_template_lasts",
+    ),
+    "an order is obeyed by the next life, not in the middle of a turn that was left": Check(
+        "checkpoint/life/recorded_context.py",
+        "        if self._is_adrift and isinstance(call, QueuedOrder):\n",
+        "        if False:\n",
+        ORDERS,
+        "test_what_the_turn_had_changed_so_far and task",
+    ),
+    "a turn that rests is left though an order comes first": Check(
+        "actors/migration/quiesce.py",
+        "(one for one in more.urgent or () if not isinstance(one, QueuedOrder))",
+        "iter(more.urgent or ())",
+        ORDERS,
+        "test_an_actor_gets_another_state and task",
+    ),
+    "who is not suspended is resumed at once": Check(
+        "system/live_moves.py",
+        "                    if isinstance(wanted, Resume):\n                        return None",
+        "                    if isinstance(wanted, Resume):\n                        pass",
+        ORDERS,
+        "test_who_is_not_suspended",
+    ),
+    "so many functions of effects compute at once": Check(
+        "actors/process/effect_processes.py",
+        "        async with self._room:\n",
+        "        if True:\n",
+        EFFECTS,
+        "test_so_many_compute",
+    ),
+    "a start leaves the garbage collector as it was": Check(
+        "system/full_collections.py",
+        "            gc.set_threshold(young, middle, full)\n",
+        "            pass\n",
+        COLLECTIONS,
+        "test_full_collections_are_rare",
+    ),
+    "what others have set of the garbage collector stays": Check(
+        "system/full_collections.py",
+        "        if gc.get_threshold() == ours:\n",
+        "        if True:\n",
+        COLLECTIONS,
+        "test_what_is_set_meanwhile",
     ),
     "background work of a turn that is checked is not begun": Check(
         "checkpoint/store_tools/rerun.py",

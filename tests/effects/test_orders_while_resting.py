@@ -1,0 +1,217 @@
+"""An operator need not wait for days: a turn that rests is left for an order, and run again behind it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.effects import test_glances
+from tests.effects.clerk import IN_TIME, lines
+from tests.effects.patient import Call, Count, Go, Look, Patient, patient
+from tests.effects.test_glances import sleeper
+from tests.effects.test_long_waits import end_of, running, waits
+
+
+class Newer(Patient):
+    """Says so in what its turns come to."""
+
+    @hf.on(Go)
+    async def go(self, message: Go) -> str:
+        return f"newer: {await super().go(message)}"
+
+
+def one_more(state: dict[str, Any]) -> dict[str, Any]:
+    return {**state, "count": state["count"] + 10}
+
+
+@pytest.mark.parametrize("durability", ["memory", "os"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_an_actor_is_suspended_while_its_turn_rests(tmp_path: Path, isolation: Any, durability: str) -> None:
+    """What it waits for may come meanwhile: it goes on after `resume`, and has done nothing twice."""
+    world = str(tmp_path / "world")
+    async with running(tmp_path, durability) as system:
+        ref = await system.start(patient(isolation))
+        asked = asyncio.ensure_future(ref.ask(Go(["e", "c", "e", "s0.01", "e", "c"], world), IN_TIME))
+        await waits(system)
+        with system.events() as stream:
+            await system.suspend(ref, timeout=IN_TIME)
+            assert (await system.get_status(ref)).state == "suspended"
+            call = ref.ask(Call("a"), IN_TIME)
+            count = ref.ask(Count(), IN_TIME)
+            await asyncio.sleep(0.05)
+            assert not asked.done()
+            assert len(lines(world)) == 1
+            await system.suspend(ref)  # Twice is once.
+            await system.resume(ref)
+            await call
+            ended = (hf.events.ActorCrashed, hf.events.ChildRestarted)
+            assert not [event for event in stream.take() if isinstance(event, ended)], "somebody has heard of an end"
+        await waits(system)
+        await ref.ask(Call("b"), IN_TIME)
+        assert await asked == "effect 1, call a, effect 2, slept, effect 3, call b"
+        assert await count == 1
+        assert await ref.ask(Look(), IN_TIME) == ["effect 1, call a, effect 2, slept, effect 3, call b"]
+        assert len(lines(world)) == 3
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_sleep_that_is_over_while_it_is_suspended_is_over_behind_that(tmp_path: Path, isolation: Any) -> None:
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(patient(isolation))
+        asked = asyncio.ensure_future(ref.ask(Go(["s0.2", "c0.1"]), IN_TIME))
+        await waits(system)
+        await system.suspend(ref, timeout=IN_TIME)
+        await asyncio.sleep(0.3)
+        assert not asked.done()
+        await system.resume(ref)
+        assert (await asked).startswith("slept, ")
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_it_ends_while_it_is_suspended_in_a_turn_that_was_left(tmp_path: Path, isolation: Any) -> None:
+    """A suspension ends with the life; the turn goes on in the next one."""
+    world = str(tmp_path / "world")
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(patient(isolation))
+        asked = ref.ask(Go(["e", "c", "e"], world), IN_TIME)
+        await waits(system)
+        await system.suspend(ref, timeout=IN_TIME)
+        await end_of(system, isolation)
+        await waits(system)
+        await ref.ask(Call("a"), IN_TIME)
+        assert await asked == "effect 1, call a, effect 2"
+        assert len(lines(world)) == 2
+
+
+@pytest.mark.parametrize("durability", ["memory", "os"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_an_actor_gets_other_code_while_its_turn_rests(tmp_path: Path, isolation: Any, durability: str) -> None:
+    """The turn is run again from its start by the new code, on the outcomes that it had; so it is after a kill."""
+    world = str(tmp_path / "world")
+    async with running(tmp_path, durability) as system:
+        ref = await system.start(patient(isolation))
+        asked = ref.ask(Go(["e", "c", "e", "c"], world), IN_TIME)
+        await waits(system)
+        await system.suspend(ref, timeout=IN_TIME)
+        await system.replace_code(ref, Newer, timeout=IN_TIME)
+        await system.resume(ref)
+        await waits(system)
+        await ref.ask(Call("a"), IN_TIME)
+        await waits(system)
+        await end_of(system, isolation)
+        await waits(system)
+        await ref.ask(Call("b"), IN_TIME)
+        assert await asked == "newer: effect 1, call a, effect 2, call b"
+        assert len(lines(world)) == 2
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_transaction_changes_an_actor_while_its_turn_rests(tmp_path: Path, isolation: Any) -> None:
+    world = str(tmp_path / "world")
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(patient(isolation))
+        asked = ref.ask(Go(["e", "c", "e"], world), IN_TIME)
+        await waits(system)
+        async with system.transaction(timeout=20) as change:
+            change.replace_code(ref, Newer)
+            change.replace_state(ref, one_more)
+        await waits(system)
+        await ref.ask(Call("a"), IN_TIME)
+        assert await asked == "newer: effect 1, call a, effect 2"
+        assert await ref.ask(Count(), IN_TIME) == 11
+        assert len(lines(world)) == 2
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_an_actor_gets_another_state_while_its_turn_rests(tmp_path: Path, isolation: Any) -> None:
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(patient(isolation))
+        asked = ref.ask(Go(["c"]), IN_TIME)
+        await waits(system)
+        state = await system.replace_state(ref, one_more, timeout=IN_TIME)
+        assert state["seen"] == []
+        await waits(system)
+        await end_of(system, isolation)
+        await waits(system)
+        await ref.ask(Call("a"), IN_TIME)
+        assert await asked == "call a"
+        assert await ref.ask(Count(), IN_TIME) == 11
+
+
+@pytest.mark.parametrize("step", [0, 1, 2, 3, 5, 8, 13, 21])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_it_is_killed_on_the_way(tmp_path: Path, isolation: Any, step: int) -> None:
+    """After so many ticks of the loop: nothing is lost, and nothing done twice, whether or not it was suspended."""
+    world = str(tmp_path / "world")
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(patient(isolation))
+        asked = ref.ask(Go(["e", "c", "e"], world), IN_TIME)
+        await waits(system)
+        with system.events() as stream:
+            ordered = asyncio.ensure_future(system.suspend(ref, timeout=IN_TIME))
+            for _ in range(step):
+                await asyncio.sleep(0)
+            pid = system.pid_of(ref) if isolation == "process" else None
+            ref.kill() if pid is None else os.kill(pid, signal.SIGKILL)
+            await asyncio.wait((ordered,))
+            if not isinstance(ordered.exception(), hf.HoldfastError):
+                ordered.result()
+            async with asyncio.timeout(IN_TIME):  # Killed when it was another life already, no life has ended.
+                while not [one for one in stream.take() if isinstance(one, hf.events.Recovered)] and pid is None:
+                    await asyncio.sleep(0.01)
+        await system.resume(ref, timeout=IN_TIME)
+        call = ref.ask(Call("a"), IN_TIME)
+        assert await asked == "effect 1, call a, effect 2"
+        await call
+        assert await ref.ask(Look(), IN_TIME) == ["effect 1, call a, effect 2"]
+        assert len(lines(world)) == 2
+
+
+async def test_the_program_ends_while_an_actor_is_suspended_in_a_turn_that_was_left(tmp_path: Path) -> None:
+    world = str(tmp_path / "world")
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(patient())
+        ref.tell(Go(["e", "c", "e"], world))
+        await waits(system)
+        await system.suspend(ref, timeout=IN_TIME)
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(patient())
+        await waits(system)
+        await ref.ask(Call("a"), IN_TIME)
+        assert await ref.ask(Look(), IN_TIME) == ["effect 1, call a, effect 2"]
+        assert len(lines(world)) == 2
+
+
+async def test_who_is_not_suspended_is_resumed_at_once(tmp_path: Path) -> None:
+    """Twice is once, also while its turn rests."""
+    async with running(tmp_path) as system:
+        ref = await system.start(patient())
+        asked = ref.ask(Go(["c"]), IN_TIME)
+        await waits(system)
+        life = system._node.cell_at(ref.path).actor
+        await system.resume(ref, timeout=IN_TIME)
+        assert system._node.cell_at(ref.path).actor is life, "its turn was left for nothing"
+        await ref.ask(Call("a"), IN_TIME)
+        assert await asked == "call a"
+
+
+def the_same(state: dict[str, Any]) -> dict[str, Any]:
+    return state
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_what_the_turn_had_changed_so_far_is_not_kept(tmp_path: Path, isolation: Any) -> None:
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(sleeper(isolation))
+        asked = ref.ask(test_glances.Go(), IN_TIME)
+        await waits(system, ref.path)
+        await system.replace_state(ref, the_same, timeout=IN_TIME)
+        await waits(system, ref.path)
+        await ref.ask(test_glances.Word("a"), IN_TIME)
+        assert await asked == ["begun", "a"]
