@@ -506,7 +506,7 @@ class GroupPlace(Place):
             if self._starting is not None and not self._starting.done():
                 self._starting.cancel()
             elif self.group is not None:  # Else it has ended already.
-                self._begin_end(cell, KILLED, -1, ordered=True)
+                self._begin_end(cell, KILLED, self.running(cell), ordered=True)
 
     def end(self, cell: Cell, reason: ExitReason) -> None:
         if self._starting is not None and not self._starting.done():

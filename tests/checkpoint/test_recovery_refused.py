@@ -88,19 +88,6 @@ async def test_a_message_that_kills_its_process_again_and_again_is_quarantined(
     assert await notes.ask(Notes()) == ["bad", "1", "good", "2"]
 
 
-async def test_deaths_that_the_runtime_ordered_do_not_quarantine(system: hf.ActorSystem, gate: Path) -> None:
-    ref = await doer(system, "process", max_deliveries=2)
-    asked = ref.ask(Do([f"gate {gate}"]), timeout=30.0)
-    for _ in range(4):
-        await until(gate.exists)
-        gate.unlink()
-        with system.events() as stream:
-            ref.kill()
-            await event(stream, hf.events.Recovered)
-    let_through(gate)
-    assert await asked == "0"
-
-
 async def test_stopped_and_started_again_the_state_comes_back(system: hf.ActorSystem, isolation: Any) -> None:
     own, above = below(isolation)
     spec = hf.child("doer", hf.start(Doer), isolation=own, recovery=hf.hybrid(interval=NEVER))
