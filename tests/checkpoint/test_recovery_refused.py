@@ -11,7 +11,7 @@ import pytest
 import holdfast as hf
 from holdfast.supervision.admin import RestartChild, TerminateChild
 from tests.checkpoint.players import Dice, Do, Doer, Honest, Note, Notes, Seen, until
-from tests.checkpoint.strikes import NEVER, doer, event, let_through, sink, strike, struck
+from tests.checkpoint.strikes import NEVER, doer, event, sink, strike, struck
 
 
 def below(isolation: Any) -> tuple[Any, Any]:
