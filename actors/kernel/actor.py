@@ -120,7 +120,8 @@ class Actor:
       that change made to an actor with the state before it. Mechanisms use them, recovery does not. Each delta is
       applied once, in order, or its state is replaced by a whole one; then the runtime calls `get_delta` and drops
       what it returns, so that the next one counts from there.
-    - `migrate(cls, state, version)`, a class method: the state of an older version of the class, as this one has it.
+    - `migrate(cls, state, old)`, a class method: the state of an older version of the class, or of another class, as
+      this one has it.
     """
 
     ctx: ActorContext
