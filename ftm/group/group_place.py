@@ -43,7 +43,7 @@ from .failover import FailoverManager
 from .group import Group
 from .join import Joiner
 from .membership import LookAgain, Membership
-from .probation import Probation
+from .probation import UNJUDGED, Probation
 from .proxy import Proxy, TakeAll
 from .reconfiguration import CannotAdapt, Reconfiguration, names_for
 from .replicas import fault_of
@@ -573,7 +573,7 @@ class GroupPlace(Place):
                 self.group.close("it has stopped")
             ftm.kill()
         if self.probation is not None:
-            self.probation.end(is_kept=True)
+            self.probation.end(is_kept=True, why=UNJUDGED)
         for task in self.left(cell):
             cell.node.end_after(task, cell.path)
 

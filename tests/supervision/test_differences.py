@@ -383,7 +383,8 @@ async def who_publishes_does_not_wait_for_handlers(system: hf.ActorSystem) -> No
     ref.tell(Hold())
     await system._node.settled()
     await system.publish("/words", Word("published"))
-    assert ref._cell.actor.told == []
+    actor: Any = ref._cell.actor
+    assert actor.told == []
     assert await ref.ask(Told()) == ["published"]
 
 

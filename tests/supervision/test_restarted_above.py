@@ -105,7 +105,7 @@ async def test_what_is_sent_while_a_siblings_crash_has_it_restarted(restarted: s
         ref = system.ref(path, Counter)
         assert await ref.ask(Add()) == 1
         with system.events() as stream:
-            asks = [ref.ask(Slow(), timeout=IN_TIME), ref.ask(Add(), timeout=IN_TIME)]
+            asks: list[Awaitable[Any]] = [ref.ask(Slow(), timeout=IN_TIME), ref.ask(Add(), timeout=IN_TIME)]
             ref.tell(Add())
             system.ref("/app/team/first", Fragile).tell(Boom())
             async for event in stream:
