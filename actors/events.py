@@ -168,7 +168,7 @@ class Recovered(Event, frozen=True, eq=False):
 
 
 class RecoveryFailed(Event, frozen=True, eq=False):
-    """An actor could not be brought back."""
+    """One attempt to bring an actor back has failed; its supervisor decides whether there is another."""
 
     reason: str
 

@@ -255,7 +255,9 @@ def hybrid(
         pacing: "fast" replays as quickly as the handlers run; "original" waits between messages as long as there was
             between them when they came; a number is a speed-up, 2.0 waits half as long. New messages are held
             meanwhile: at 1.0 or below, an actor that gets more than it can handle never catches up.
-        max_deliveries: process deaths in the turn of one and the same message after which it is quarantined.
+        max_deliveries: deaths and kills in the turn of one message, in a row and without progress, after which it is
+            quarantined. A new outcome of an ask, an effect or a long wait is progress; an end that a supervisor has
+            ordered does not count.
         journal_limit: bytes of messages kept since the last snapshot; when it is reached, sends wait or are refused.
         keep: snapshots that are kept in a store that lasts, newest first; 1 saves the memory or disk of the older one.
             In memory two are kept at most.

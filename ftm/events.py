@@ -29,7 +29,10 @@ class MechanismChanged(Event, frozen=True, eq=False):
 
 
 class MechanismSettled(Event, frozen=True, eq=False):
-    """The probation of a change of layers is over: they stay (`is_kept`), or those before are there again, and why."""
+    """The probation of a change of layers is over: they stay (`is_kept`), or those before are there again, and why.
+
+    `why` is empty if they have passed. Else it says why they are taken back, or what ended the probation early.
+    """
 
     before: tuple[str, ...]
     layers: tuple[str, ...]

@@ -113,6 +113,16 @@ class Actor:
 
     `ctx` is there before `__init__` runs. Construct in `__init__`, act in `on_start`: an actor that is restored runs
     `__init__` again.
+
+    A class may define these plain methods in pairs, and the base has none of them:
+
+    - `get_state(self) -> state` and `set_state(self, state)`: what a snapshot saves, instead of attributes.
+    - `get_delta(self) -> delta` and `apply_delta(self, delta)`: what has changed since `get_delta` was called last, and
+      that change made to an actor with the state before it. Mechanisms use them, recovery does not. Each delta is
+      applied once, in order, or its state is replaced by a whole one; then the runtime calls `get_delta` and drops
+      what it returns, so that the next one counts from there.
+    - `migrate(cls, state, old)`, a class method: the state of an older version of the class, or of another class, as
+      this one has it.
     """
 
     ctx: ActorContext

@@ -57,6 +57,9 @@ class Home:
         """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
         return True
 
+    def faulted(self, cell: Cell) -> None:
+        """The life is killed, and no supervisor has ordered that: a turn in hand counts it as any death."""
+
     def handed_to(self, parent: Parent) -> None:
         """Another supervisor has the address from now on."""
 

@@ -134,9 +134,12 @@ class ActorRef(Generic[A_co]):
         self._cell.living.request_stop()
 
     def kill(self) -> None:
-        """End this life at once, without its hooks. A supervisor treats it as a crash."""
+        """End this life at once, without its hooks. A supervisor treats it as a crash.
+
+        If the actor is recorded, the message in its turn counts it against `max_deliveries`, as any death.
+        """
         self._cell.node.check_thread(self.path)
-        self._cell.living.kill()
+        self._cell.living.kill(is_fault=True)
 
     def __repr__(self) -> str:
         return f"<ActorRef {self.path}>"

@@ -199,7 +199,7 @@ class Holding:
 
 
 def _why(rule: Held) -> str:
-    return f"held for too long ({rule.capacity}, {rule.overflow})"
+    return f"there was no room while messages were held (for {rule.capacity}, {rule.overflow})"
 
 
 class Inlet(Cell):

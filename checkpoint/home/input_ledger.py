@@ -305,8 +305,14 @@ class InputLedger:
         """Keep the outcome of the ask that was output (turn, k); False if no replay will want it."""
         if turn <= self.state_turn:
             return False
-        self.outcomes[turn, k] = answer
+        self._take_outcome(turn, k, answer)
         return True
+
+    def _take_outcome(self, turn: int, k: int, answer: Answer) -> None:
+        """A turn that gets further than before has not died of the same thing again: its deaths are counted anew."""
+        if turn > self.turn and (turn, k) not in self.outcomes and self.begun in self.open:
+            self.open[self.begun].deliveries = 0
+        self.outcomes[turn, k] = answer
 
     def end_with(self, wanted: Ending | None) -> list[int]:
         """The actor is to end, as a turn has said, or (None) that is over; returns where the place in the journal goes.
@@ -522,7 +528,7 @@ class InputLedger:
                     self.dues[turn, k], self.lasts = when, True
             case ("got", turn, k, kind, name, body):
                 self.positions_of(turn).append(position)
-                self.outcomes[turn, k] = Answer(kind, name, body)
+                self._take_outcome(turn, k, Answer(kind, name, body))
                 self.lasts = self.lasts or (turn > self.turn and kind.startswith(TIMED))
             case ("stop", *said):
                 self.end_with(Ending(*said) if said else None).append(position)

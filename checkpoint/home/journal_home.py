@@ -87,6 +87,7 @@ class JournalHome(RecordedHome):
         self.clock: RecoveryClock | None = None
         self.recovery: Recovery | None = None  # that of the life which is begun now
         self.page: memoryview | None = None  # of a life in this process: which input it has in hand
+        self.is_faulted = False  # the life is being killed, and no supervisor has ordered that
 
     def enter(self, cell: Cell) -> Entered:
         """As `open`, and it is a recovery if anything comes back, or if one is not over."""
@@ -153,7 +154,7 @@ class JournalHome(RecordedHome):
             cell: its address.
             running: the input in hand, -1 if none.
             why: in words.
-            ordered: we have killed it, or another life in its process has.
+            ordered: we have killed it, or another life in its process has; a kill that is a fault was not ordered.
             noticed: when its end was noticed, if before now.
             reason: why it has ended; that of the cell if left out.
             recovers: whether it is brought back; judged by its spec if left out.
@@ -167,7 +168,8 @@ class JournalHome(RecordedHome):
         self.clock.mark("noticed", noticed)
         self.clock.mark("detect")
         end = cell.extra().reason if reason is None else reason
-        switch.died(running, ordered=ordered, reason=end)
+        switch.died(running, ordered=ordered and not self.is_faulted, reason=end)
+        self.is_faulted = False
         if recovers is None:
             recovers = self.recovers(end) and cell.spec is not None and cell.spec.restarts(end)
         if recovers:
@@ -195,6 +197,11 @@ class JournalHome(RecordedHome):
     def recovers(self, reason: ExitReason) -> bool:
         """Whether an end for this reason is followed by a recovery."""
         return not reason.is_clean
+
+    def faulted(self, cell: Cell) -> None:
+        switch = self.switch
+        rests = switch is not None and switch.rests_in(cell.host.place.running(cell))
+        self.is_faulted = cell.state is RUNNING and not rests
 
     def is_open(self, cell: Cell) -> bool:
         return self.switch is not None and self.switch.life.is_released

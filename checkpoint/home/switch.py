@@ -386,6 +386,10 @@ class Switch:
         if poison is not None:
             put_into_quarantine(self, poison)
 
+    def rests_in(self, running: int) -> bool:
+        """Whether the turn of this input waits until a moment or for a message: for days, if that is wanted."""
+        return running == self.ledger.begun and self.calls.rests.is_busy
+
     # -- what the life says -----------------------------------------------------------------------------------------
 
     def from_life(self, record: ToHome) -> None:

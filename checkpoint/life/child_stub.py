@@ -15,7 +15,7 @@ from ...actors.errors import StartFailed
 from ...actors.exit_reasons import ExitReason, pack_exit
 from ...actors.kernel import links
 from ...actors.kernel.address_host import AddressHost, Home, Place
-from ...actors.kernel.cell import DOWN, Cell
+from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.envelope import Envelope, Item
 from ...actors.kernel.lifecycle import MAILBOX, NEAR
 from ...actors.kernel.mailbox import Bounded, Senders
@@ -111,6 +111,10 @@ class RootHome(Home):
 
     def recovers(self, reason: ExitReason) -> bool:
         return not reason.is_clean
+
+    def faulted(self, cell: Cell) -> None:
+        if cell.state is RUNNING:
+            self.guest.command(cell, "faulted", {})
 
     def retired(self, cell: Cell) -> None:
         if cell.queue:

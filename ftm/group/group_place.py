@@ -43,7 +43,7 @@ from .failover import FailoverManager
 from .group import Group
 from .join import Joiner
 from .membership import LookAgain, Membership
-from .probation import Probation
+from .probation import UNJUDGED, Probation
 from .proxy import Proxy, TakeAll
 from .reconfiguration import CannotAdapt, Reconfiguration, names_for
 from .replicas import fault_of
@@ -507,7 +507,7 @@ class GroupPlace(Place):
             if self._starting is not None and not self._starting.done():
                 self._starting.cancel()
             elif self.group is not None:  # Else it has ended already.
-                self._begin_end(cell, KILLED, -1, ordered=True)
+                self._begin_end(cell, KILLED, self.running(cell), ordered=True)
 
     def end(self, cell: Cell, reason: ExitReason) -> None:
         if self._starting is not None and not self._starting.done():
@@ -574,7 +574,7 @@ class GroupPlace(Place):
                 self.group.close("it has stopped")
             ftm.kill()
         if self.probation is not None:
-            self.probation.end(is_kept=True)
+            self.probation.end(is_kept=True, why=UNJUDGED)
         for task in self.left(cell):
             cell.node.end_after(task, cell.path)
 

@@ -54,7 +54,7 @@ class Stuck:
             if known.primary is not None and source is None:
                 replicas.suspect(name, life, why)
             return
-        if source is None or (number == self._switch.ledger.begun and self._switch.calls.rests.is_busy):
+        if source is None or self._switch.rests_in(number):
             return  # Its end is known: the turn is over by now. Or it waits until a moment, as it wants.
         self._counted = {one for one in self._counted if one[1] in waiting}
         if (known.epoch, number) not in self._counted:

@@ -105,6 +105,10 @@ def pauses() -> Iterator[float]:
         pause = min(2 * pause, LONGEST_PAUSE)
 
 
+UNJUDGED: Final = "it was ended before its time was over: the actor was stopped, or the mechanism was taken away"
+"""Why a stack is said to be kept that has not passed."""
+
+
 class Probation:
     """One stack of mechanisms that is not trusted yet.
 
@@ -177,15 +181,15 @@ class Probation:
             replicas.suspect(name, life, why)
         return not error.may_have_run or (bool(replicas.backups()) and (name is None or not replicas.is_well(name)))
 
-    def end(self, *, is_kept: bool) -> None:
-        """It is known what comes of it."""
+    def end(self, *, is_kept: bool, why: str = "") -> None:
+        """It is known what comes of it; `why`: it does not stay because it has passed."""
         if self.is_over:
             return
         self._timer.cancel()
         node, path = self._group.replicas.node, self._group.replicas.path
         stacks = self.before if self.before is not NOTHING else (), self.layers
         was, now = (tuple(one.name for one in layers) for layers in stacks)
-        event = MechanismSettled(path, was, now, is_kept, self.why, self._now() - self._begun)
+        event = MechanismSettled(path, was, now, is_kept, self.why or why, self._now() - self._begun)
         self.settled.set_result(event)
         if node.events.has_listeners:
             node.emit(event)
@@ -196,7 +200,7 @@ class Probation:
     def left(self) -> None:
         """There is no mechanism any more: because of this, or because somebody wants that."""
         if self._detaching is None:
-            self.end(is_kept=True)
+            self.end(is_kept=True, why=UNJUDGED)
 
     def went_back(self) -> None:
         """The stack before is there again; if that was none, all replicas but one have to go, and then that one."""
@@ -221,7 +225,7 @@ class Probation:
         if self.is_over:
             return
         if group.replicas.cell.is_dead:
-            self.end(is_kept=True)  # Nobody lives there any more.
+            self.end(is_kept=True, why=UNJUDGED)  # Nobody lives there any more.
             return
         now = loop.time()
         self._timer = loop.call_later(LOOK_EVERY, self._look)

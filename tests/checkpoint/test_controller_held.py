@@ -74,7 +74,9 @@ async def test_tells_beyond_the_capacity(
                     ref.tell(Note(str(n)))
                 except hf.MailboxFull:
                     failures += 1
-            letters = [one.message.text for one in stream.take() if isinstance(one, hf.events.DeadLetter)]
+            dead = [one for one in stream.take() if isinstance(one, hf.events.DeadLetter)]
+            letters = [one.message.text for one in dead]
+            assert all(one.why.startswith("there was no room while messages were held") for one in dead)
             if store is not None:  # What a root would find that is started now.
                 home: Any = ref._cell.host.home.switch  # type: ignore[attr-defined]
                 stored = Switch(system._homes, ref._cell, hf.hybrid(), system._homes.journal)

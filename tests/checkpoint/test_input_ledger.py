@@ -196,6 +196,9 @@ class Ledgers(RuleBasedStateMachine):
         ledger, answer = self.ledger, Answer(REPLY, "", b"1")
         turn = ledger.turn + 1 - back
         is_wanted = turn > ledger.state_turn
+        source = self.next_input()
+        if source is not None and self.left.get(ledger.turn + 1) and back == 0 and (turn, k) not in ledger.outcomes:
+            self.deaths.pop(source.id, None)  # The turn in hand has come further.
         assert ledger.note_outcome(turn, k, answer) == is_wanted, "only what will be replayed is kept"
         if is_wanted:
             self.write(outcome_entry(turn, k, answer), ledger.positions_of(turn))
@@ -330,6 +333,24 @@ def test_a_start_is_never_blamed() -> None:
     assert ledger.count_death(first.id, is_ordered=False, most=1) is None
     assert first.was_cut
     assert first.deliveries == 0
+
+
+def test_a_turn_that_comes_further_has_not_died_of_the_same() -> None:
+    """An outcome that it has for the first time says so, also to the next root; what has no outcome does not."""
+    ledger, read = InputLedger("/app/doer"), InputLedger("/app/doer")
+    source = ledger.admit(MESSAGE, "m:Do", b"", 0.0, None)
+    ledger.compare_outputs(0, source.id, outs_of(0, 1), same)
+    got = outcome_entry(0, 1, Answer(REPLY, "m:Done", b""))
+    for entry in (source.entry(), ledger.released_entry(0), ("tried", source.id, 2), got, ("tried", source.id, 1)):
+        assert read.read_entry(0, entry)
+    assert ledger.count_death(source.id, is_ordered=False, most=2) is None
+    assert ledger.note_outcome(0, 1, Answer(REPLY, "m:Done", b""))
+    assert ledger.count_death(source.id, is_ordered=False, most=2) is None
+    assert read.open[source.id].deliveries == source.deliveries == 1
+    assert ledger.note_outcome(0, 1, Answer(REPLY, "m:Done", b""))
+    assert ledger.count_death(source.id, is_ordered=False, most=2) is source
+    assert read.read_entry(0, got)
+    assert read.open[source.id].deliveries == 1
 
 
 def test_the_turn_that_has_begun_to_send_goes_first() -> None:

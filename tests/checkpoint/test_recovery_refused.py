@@ -11,7 +11,7 @@ import pytest
 import holdfast as hf
 from holdfast.supervision.admin import RestartChild, TerminateChild
 from tests.checkpoint.players import Dice, Do, Doer, Honest, Note, Notes, Seen, until
-from tests.checkpoint.strikes import NEVER, doer, event, let_through, sink, strike, struck
+from tests.checkpoint.strikes import NEVER, doer, event, sink, strike, struck
 
 
 def below(isolation: Any) -> tuple[Any, Any]:
@@ -96,19 +96,6 @@ async def test_a_message_that_kills_its_process_again_and_again_is_quarantined(
     assert (tmp_path / "deaths").read_text() == "xxx"
     assert await ref.ask(Seen()) == ["before", "good:3"]
     assert await notes.ask(Notes()) == ["bad", "1", "good", "2"]
-
-
-async def test_deaths_that_the_runtime_ordered_do_not_quarantine(system: hf.ActorSystem, gate: Path) -> None:
-    ref = await doer(system, "process", max_deliveries=2)
-    asked = ref.ask(Do([f"gate {gate}"]), timeout=30.0)
-    for _ in range(4):
-        await until(gate.exists)
-        gate.unlink()
-        with system.events() as stream:
-            ref.kill()
-            await event(stream, hf.events.Recovered)
-    let_through(gate)
-    assert await asked == "0"
 
 
 async def test_stopped_and_started_again_the_state_comes_back(system: hf.ActorSystem, isolation: Any) -> None:

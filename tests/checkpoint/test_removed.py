@@ -12,6 +12,8 @@ LARGE = "tests/checkpoint/test_large_states.py"
 CHUNKS = "tests/checkpoint/test_chunks.py"
 CHUNKS_KEPT = "tests/checkpoint/test_chunks_kept.py"
 
+KILLS = "tests/checkpoint/test_kill_counts.py"
+
 CHECKS = {
     "what has diverged is not tried again": Check(
         "actors/persistence.py",
@@ -54,6 +56,55 @@ CHECKS = {
         "            pass\n",
         "tests/checkpoint/test_restart_ends.py",
         "test_a_child_of_a_list",
+    ),
+    "a kill from outside is no order": Check(
+        "checkpoint/home/journal_home.py",
+        "ordered=ordered and not self.is_faulted",
+        "ordered=ordered",
+        KILLS,
+        "put_aside and task-root",
+    ),
+    "a supervisor's process says who was killed there from outside": Check(
+        "checkpoint/life/child_stub.py",
+        '            self.guest.command(cell, "faulted", {})\n',
+        "            pass\n",
+        KILLS,
+        "put_aside and subtree-sibling",
+    ),
+    "another process says whom it kills": Check(
+        "actors/process/wire/peer.py",
+        'connection.send(frames.Command(connection.names.to_wire(cell.path), "faulted", {}))',
+        "connection.flush()",
+        KILLS,
+        "put_aside and process-process",
+    ),
+    "whoever is behind a mechanism has a message in hand, too": Check(
+        "ftm/group/group_place.py",
+        "self._begin_end(cell, KILLED, self.running(cell), ordered=True)",
+        "self._begin_end(cell, KILLED, -1, ordered=True)",
+        KILLS,
+        "put_aside and PBR-root",
+    ),
+    "a turn that rests is not what it was killed for": Check(
+        "checkpoint/home/journal_home.py",
+        "cell.state is RUNNING and not rests\n",
+        "cell.state is RUNNING\n",
+        KILLS,
+        "rests_is_killed and task",
+    ),
+    "deaths count in a row without progress": Check(
+        "checkpoint/home/input_ledger.py",
+        "            self.open[self.begun].deliveries = 0\n",
+        "            pass\n",
+        KILLS,
+        "without_progress and process",
+    ),
+    "only what is new is progress": Check(
+        "checkpoint/home/input_ledger.py",
+        "(turn, k) not in self.outcomes and self.begun",
+        "self.begun",
+        "tests/checkpoint/test_input_ledger.py",
+        "comes_further",
     ),
     "who has asked somebody who was not started is answered": Check(
         "checkpoint/home/ask_recovery.py",

@@ -264,7 +264,19 @@ async def test_detaching_ends_the_probation_of_what_was_attached(system: hf.Acto
     async with asyncio.timeout(60):
         (outcome,) = await attached.settled()
     assert outcome.is_kept
+    assert "before its time was over" in outcome.why, "it has not passed"
     assert await change.settled() == ()
+
+
+async def test_who_is_stopped_during_the_probation_has_not_passed(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter)))
+    async with system.transaction(timeout=60) as change:
+        change.protect(ref, PBR())
+    await system.stop(ref)
+    async with asyncio.timeout(20):
+        (outcome,) = await change.settled()
+    assert (outcome.is_kept, outcome.layers) == (True, ("pbr",))
+    assert "before its time was over" in outcome.why
 
 
 @pytest.mark.parametrize("bad", [Dropping(), Ending()], ids=lambda one: one.name)

@@ -265,6 +265,160 @@ async def statistics_of_an_address(system: hf.ActorSystem) -> None:
     assert (found.messages_in, found.restarts) == (3, 1)
 
 
+# -- gen_server, gen_statem, gen_event -------------------------------------------------------------------------------
+
+
+class Word(hf.Message):
+    text: str
+
+
+class Hold(hf.Message): ...
+
+
+class Open(hf.Message): ...
+
+
+class Scribe(hf.Actor):
+    """Writes down what comes. While it is shut it puts that aside."""
+
+    def __init__(self) -> None:
+        self.told = list[str]()
+        self.is_open = True
+
+    def on_start(self, restored: bool) -> Any:
+        return self.ctx.subscribe("/words")
+
+    @hf.on(Word)
+    def word(self, message: Word) -> None:
+        if message.text == "crash":
+            raise ValueError("crash")
+        if message.text == "shut":
+            self.is_open = False
+        elif message.text == "later":
+            self.ctx.ref.tell(Word("told itself"))
+            self.ctx.tell_after(0.0, Word("time-out 0"))
+        elif self.is_open:
+            self.told.append(message.text)
+        else:
+            self.ctx.stash()
+
+    @hf.on(Hold)
+    async def hold(self, message: Hold) -> None:
+        await asyncio.sleep(1.0)
+
+    @hf.on(Open)
+    def open(self, message: Open) -> None:
+        self.is_open = True
+        self.ctx.unstash()
+
+    @hf.on(Told)
+    def look(self, message: Told) -> list[str]:
+        return self.told
+
+    def on_stop(self, reason: hf.ExitReason) -> None:
+        self.told.append(str(reason))
+
+
+class LoudScribe(Scribe):
+    @classmethod
+    def migrate(cls, state: dict[str, Any], old: Any) -> dict[str, Any]:
+        assert old is Scribe
+        return {**state, "told": [text.upper() for text in state["told"]]}
+
+
+async def scribe(system: hf.ActorSystem, name: str = "scribe", kind: type[Scribe] = Scribe) -> hf.ActorRef[Scribe]:
+    return await system.start(hf.child(name, hf.start(kind)))
+
+
+@entry("a call whose caller has given up while it was queued")
+async def a_late_call_is_not_handled(system: hf.ActorSystem) -> None:
+    ref = await scribe(system)
+    ref.tell(Hold())
+    with pytest.raises(hf.AskTimeout) as late:
+        await ref.ask(Word("late"), timeout=0.5)
+    assert late.value.handled is False
+    assert await ref.ask(Told()) == []
+
+
+@entry("`gen_server:call(Pid, Msg, infinity)`")
+async def no_call_waits_for_ever(system: hf.ActorSystem) -> None:
+    ref = await scribe(system)
+    with pytest.raises(hf.SpecError):
+        await ref.ask(Told(), timeout=float("inf"))
+
+
+@entry("new code and the children of a template")
+async def a_template_keeps_its_class(system: hf.ActorSystem) -> None:
+    top = await system.start(hf.dynamic("top", template=hf.child(None, hf.start(Scribe))))
+    one = await top.ask(hf.StartChild(id="one"))
+    await system.suspend(one)
+    await system.replace_code(one, LoudScribe)
+    await top.ask(hf.StartChild(id="two"))
+    kinds = [type(system.ref(f"/app/top/{name}", Scribe)._cell.actor) for name in ("one", "two")]
+    assert kinds == [LoudScribe, Scribe]
+
+
+@entry("`code_change`")
+async def migrate_is_of_the_new_class(system: hf.ActorSystem) -> None:
+    ref = await scribe(system)
+    ref.tell(Word("quiet"))
+    assert await ref.ask(Told()) == ["quiet"]
+    await system.suspend(ref)
+    await system.replace_code(ref, LoudScribe)
+    await system.resume(ref)
+    assert await ref.ask(Told()) == ["QUIET"]
+
+
+@entry("`exit(Pid, Reason)`")
+async def others_end_an_actor_in_good_order_or_kill_it(system: hf.ActorSystem) -> None:
+    ref = await scribe(system)
+    actor: Any = ref._cell.actor
+    assert await system.terminate(ref, hf.Shutdown("enough")) == hf.Shutdown("enough")
+    assert actor.told == ["shutdown (enough)"]
+
+
+@entry("`gen_event:sync_notify`")
+async def who_publishes_does_not_wait_for_handlers(system: hf.ActorSystem) -> None:
+    ref = await scribe(system)
+    ref.tell(Hold())
+    await system._node.settled()
+    await system.publish("/words", Word("published"))
+    actor: Any = ref._cell.actor
+    assert actor.told == []
+    assert await ref.ask(Told()) == ["published"]
+
+
+@entry("handlers of one event")
+async def handlers_have_no_order_and_a_supervisor(system: hf.ActorSystem) -> None:
+    slow, quick = await scribe(system, "slow"), await scribe(system, "quick")
+    slow.tell(Hold())
+    await system.publish("/words", Word("one"))
+    assert await quick.ask(Told()) == ["one"]  # The other one, which came first, has not seen it yet.
+    quick.tell(Word("crash"))
+    await system._node.settled()
+    await system.publish("/words", Word("two"))
+    assert await quick.ask(Told()) == ["two"]  # It was started again, and hears again.
+    assert await slow.ask(Told()) == ["one", "two"]
+
+
+@entry("`next_event`, and a time-out of 0")
+async def what_an_actor_tells_itself_comes_behind(system: hf.ActorSystem) -> None:
+    ref = await scribe(system)
+    for text in ("later", "queued"):
+        ref.tell(Word(text))
+    await system._node.settled()
+    assert await ref.ask(Told()) == ["queued", "told itself", "time-out 0"]
+
+
+@entry("postponed events after a crash")
+async def what_was_put_aside_outlives_a_crash(system: hf.ActorSystem) -> None:
+    ref = await scribe(system)
+    for text in ("shut", "aside", "crash"):
+        ref.tell(Word(text))
+    await system._node.settled()
+    assert await ref.ask(Told()) == ["aside"]
+
+
 REAL = ["specs_from_processes_stay_packed"]
 """Those that start a process, and so cannot live in virtual time."""
 

@@ -432,6 +432,11 @@ class RemoteHome(Home):
     def load(self, cell: Cell) -> int:
         return 0
 
+    def faulted(self, cell: Cell) -> None:
+        self.peer.require_granted(cell.path, "kill")
+        connection = self.peer.connection
+        connection.send(frames.Command(connection.names.to_wire(cell.path), "faulted", {}))
+
     def admit(self, cell: Cell, item: Any) -> None:
         """Stands in `cell.admit` of the stand-ins."""
         self.peer.send_item(cell, cell.path, item, 0)
@@ -514,6 +519,8 @@ def obey(node: Node, cell: Cell, name: str, frame: frames.Command, *, by_root: b
             cell.request_stop(unpack_exit(data.get("reason")))
         case "kill":
             cell.kill()
+        case "faulted":
+            cell.host.home.faulted(cell)
         case "exit":
             source, reason = named(node, frame, "source"), unpack_exit(data.get("reason"))
             known = cell.more.ties.links.get(source) if cell.more is not None else None

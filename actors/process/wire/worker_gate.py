@@ -446,6 +446,7 @@ COMMANDS: Final[dict[str, Callable[[WorkerGate, str, frames.Command], None]]] = 
     "keep": _keep,
     "stop": _order,
     "kill": _order,
+    "faulted": _order,
     "exit": _tie("source", both=True),
     "down": _tie("source", both=True),
     "monitor": _tie("watcher", both=False),
