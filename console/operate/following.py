@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from typing import Annotated, Any
 
@@ -29,7 +30,7 @@ def trace(
     """
     until = None if seconds is None else time.monotonic() + seconds
     shown = missed = 0
-    with reached("trace", system, socket) as remote:
+    with reached("trace", system, socket) as remote, contextlib.suppress(KeyboardInterrupt):
         (row,) = meant_rows(remote, [path])
         remote.follow(row.path)
         while until is None or time.monotonic() < until:

@@ -23,7 +23,7 @@ def test_it_prints_its_version() -> None:
     assert result.stdout.startswith("holdfast")
 
 
-@pytest.mark.parametrize("package", ["typer", "rich"])
+@pytest.mark.parametrize("package", ["typer", "rich", "textual"])
 def test_a_missing_package_is_named_with_what_to_install(package: str) -> None:
     text = cli.missing_extra(ModuleNotFoundError("gone", name=f"{package}.core"))
     assert f"'{package}'" in text

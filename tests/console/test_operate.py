@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -257,3 +258,20 @@ async def test_trace_follows_one_actor_and_gives_back_what_it_has_switched_on(na
     async with asyncio.timeout(20):
         while more is not None and more.tap is not None and more.tap.is_on:
             await asyncio.sleep(0.01)
+
+
+async def test_ctrl_c_ends_a_trace_in_good_order(named: hf.ActorSystem) -> None:
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "holdfast.console.cli", "trace", "/app/left/a"),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    line = asyncio.create_task(process.stdout.readline())
+    while not line.done():
+        await ref(named, "/app/left/a").ask(Add(1))
+        await asyncio.sleep(0)
+    process.send_signal(signal.SIGINT)
+    async with asyncio.timeout(20):
+        _, errors = await process.communicate()
+    assert (process.returncode, errors) == (DONE, b"")
