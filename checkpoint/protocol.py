@@ -101,7 +101,7 @@ Clock = tuple[str, bytes, float]
 """What a timer says: type name and body of its message, and its interval (0: it comes once)."""
 
 
-class Ending(msgspec.Struct, array_like=True, gc=False):
+class EndWanted(msgspec.Struct, array_like=True, gc=False):
     """An actor is to end behind `turn`, because that has called `ctx.stop`; the `reason` is encoded.
 
     `is_cut_off`: it is an EXIT that is not trapped, and no `on_stop` is called.
@@ -181,7 +181,7 @@ class Go(msgspec.Struct, array_like=True, tag=3):
     gone: tuple[int, ...] = ()
     timers: dict[str, Clock] = {}
     begun: int = -1
-    ends: Ending | None = None
+    ends: EndWanted | None = None
     ended: int = -1
 
 
@@ -307,7 +307,7 @@ class TurnEnd(msgspec.Struct, array_like=True, tag=12, gc=False):
     outs: list[Out]
     answer: Answer
     state: int = 0  # digest of the state it has left, if that is checked
-    ends: Ending | None = None
+    ends: EndWanted | None = None
 
 
 class Hooked(msgspec.Struct, array_like=True, tag=21):

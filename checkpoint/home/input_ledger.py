@@ -28,7 +28,7 @@ from ..protocol import (
     TICK,
     TIMED,
     Answer,
-    Ending,
+    EndWanted,
     Out,
     TurnEnd,
 )
@@ -48,7 +48,7 @@ class OwnEnd:
         past: the last turn that has said so, and that was dealt with.
     """
 
-    wanted: Ending | None = None
+    wanted: EndWanted | None = None
     positions: list[int] = dataclasses.field(default_factory=list)
     past: int = -1
 
@@ -314,7 +314,7 @@ class InputLedger:
             self.open[self.begun].deliveries = 0
         self.outcomes[turn, k] = answer
 
-    def end_with(self, wanted: Ending | None) -> list[int]:
+    def end_with(self, wanted: EndWanted | None) -> list[int]:
         """The actor is to end, as a turn has said, or (None) that is over; returns where the place in the journal goes.
 
         The next snapshot does not contain it: only when it is over it need not be read again.
@@ -531,7 +531,7 @@ class InputLedger:
                 self._take_outcome(turn, k, Answer(kind, name, body))
                 self.lasts = self.lasts or (turn > self.turn and kind.startswith(TIMED))
             case ("stop", *said):
-                self.end_with(Ending(*said) if said else None).append(position)
+                self.end_with(EndWanted(*said) if said else None).append(position)
             case ("drop", key):
                 self.drop([position])
                 if key in self.open:
@@ -578,7 +578,7 @@ def said_of(out: Out) -> str:
     return f"{out.verb} of {out.name} to {out.to}" if ":" in out.name else f"{out.verb} {out.to}".strip()
 
 
-def stop_entry(ends: Ending | None) -> Entry:
+def stop_entry(ends: EndWanted | None) -> Entry:
     """What the journal has of an end that a turn has asked for, or (None) of one that was dealt with."""
     return ("stop",) if ends is None else ("stop", *msgspec.structs.astuple(ends))
 

@@ -38,7 +38,7 @@ from ..protocol import (
     STASHED,
     Answer,
     Closed,
-    Ending,
+    EndWanted,
     Glanced,
     Go,
     Hooked,
@@ -507,7 +507,7 @@ class Switch:
             self.outputs.rows.close()
             batch.add(self.path, turn.entry(number), self.ledger.positions_of(number))
 
-    def _end_with(self, ends: Ending | None, batch: Batch) -> None:
+    def _end_with(self, ends: EndWanted | None, batch: Batch) -> None:
         """Journal that the actor is to end, as a turn has said, or (None) that this is over."""
         position = self.ledger.end_with(ends)
         if self.journal.durable:

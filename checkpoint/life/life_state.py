@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ...actors.exit_reasons import ExitReason
     from ...actors.kernel.envelope import Item
     from ...actors.kernel.message import Message
-    from ..protocol import Clock, Ending, Go, Lent, Restore
+    from ..protocol import Clock, EndWanted, Go, Lent, Restore
 
 
 class Asked(NamedTuple):
@@ -164,7 +164,7 @@ class LifeStage:
     has_replayed: bool = False
     begins_suspended: bool = False
     postponed: list[Item] = dataclasses.field(default_factory=list)
-    ending: Ending | None = None
+    ending: EndWanted | None = None
     stop_wanted: ExitReason | None = None
     stop_turn: int = -1
     begun: int = -1

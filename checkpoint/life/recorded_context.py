@@ -33,7 +33,7 @@ from ...actors.kernel.message import Message, message_name, require_message
 from ...actors.kernel.ref import ActorRef, current
 from ...actors.seconds import check_seconds
 from ...actors.values import encode_value
-from ..protocol import REPLY, SINCE_THEN, Answer, Ending, Feed, Perform, Performed, PipeDone
+from ..protocol import REPLY, SINCE_THEN, Answer, EndWanted, Feed, Perform, Performed, PipeDone
 from .life_state import Asked
 from .recorded_inbox import INIT, STARTED, Fed
 
@@ -445,7 +445,7 @@ class RecordedContext(ActorContext):
         life = self.recorded
         stage, feed = life.stage, life.feed
         if feed is not None and self._in_turn() and stage.ending is None:
-            stage.ending = Ending(life.turn, msgspec.msgpack.encode(pack_exit(reason)), stage.is_cut_off)
+            stage.ending = EndWanted(life.turn, msgspec.msgpack.encode(pack_exit(reason)), stage.is_cut_off)
         if life.is_live:
             super().stop(reason)
         else:  # A replayed turn, or a hook: the life ends when it has caught up.
