@@ -20,6 +20,11 @@ class Submission(Protocol):
         """What is written, by address."""
         ...
 
+    @property
+    def weight(self) -> int:
+        """How many messages it is worth."""
+        ...
+
     def written(self, positions: Sequence[int]) -> None:
         """It stands there in the journal."""
         ...
@@ -98,14 +103,23 @@ class CommitLanes:
             self.is_urgent = True
         self.pending.append((submission, number))
 
-    def take_written(self, count: int, positions: Sequence[int]) -> None:
-        """The first ones stand in the journal, each entry at its position: what need not be synced is ready."""
-        done = self.pending[:count]
-        del self.pending[:count]
+    def first(self, most: int) -> int:
+        """How many of what is pending are worth so many messages, or just more."""
+        weight = 0
+        for count, (submission, _) in enumerate(self.pending, 1):
+            weight += submission.weight
+            if weight >= most:
+                return count
+        return len(self.pending)
+
+    def take_written(self, counts: Sequence[int], positions: Sequence[int]) -> None:
+        """The first ones stand in the journal, each with so many entries there: what need not be synced is ready."""
+        done = self.pending[: len(counts)]
+        del self.pending[: len(counts)]
         self.is_urgent = any(not number for _, number in self.pending)
         begin = 0
-        for submission, number in done:
-            end = begin + len(submission.entries)
+        for (submission, number), count in zip(done, counts, strict=True):
+            end = begin + count
             submission.written(positions[begin:end])
             begin = end
             if number:

@@ -30,7 +30,7 @@ RETRY_SECONDS = 0.05
 """Until the first attempt after a store had no room; each further one comes twice as late, up to the next figure."""
 MOST_RETRY_SECONDS = 1.0
 MOST = 250
-"""Submissions written and let out in one go: about 2 ms of the loop's time."""
+"""Messages written and let out in one go, or their ends: about 2 ms of the loop's time."""
 PATIENCE_SECONDS = 0.05
 """How long the message handler may take to come, before the homes do its work themselves."""
 
@@ -69,7 +69,6 @@ class Commits:
         self._delay = RETRY_SECONDS
         self.blocked: HoldfastError | None = None  # why nothing is written at the moment
         self.stopped: HoldfastError | None = None  # why nothing is written any more
-        self.last: Submission | None = None  # that was submitted
 
     @property
     def in_hand(self) -> InHand | None:
@@ -113,7 +112,6 @@ class Commits:
             submission.abandoned(self.stopped)
             return
         self._lanes.submit(submission)
-        self.last = submission
         if not self._is_awake:
             self._wake()
 
@@ -169,11 +167,13 @@ class Commits:
         self.check()
 
     def _write(self, most: int | None = None) -> None:
-        """Write what was submitted, the first `most` of it if that is given."""
-        pending = self._lanes.pending[:most]
+        """Write what was submitted, of so many messages if `most` is given."""
+        lanes = self._lanes
+        pending = lanes.pending if most is None else lanes.pending[: lanes.first(most)]
         if not pending or self.stopped is not None:
             return
-        entries = [entry for submission, _ in pending for entry in submission.entries]
+        rows = [submission.entries for submission, _ in pending]
+        entries = [entry for own in rows for entry in own]
         try:
             positions = self.engine.append(entries) if entries else []
         except StoreFailed as error:
@@ -185,7 +185,7 @@ class Commits:
         except HoldfastError as error:
             self._stop(error)
             return
-        self._lanes.take_written(len(pending), positions)
+        lanes.take_written([len(own) for own in rows], positions)
         if self._lanes.unsynced and self._syncing is None:
             self._sync()
         if self.blocked is not None:
@@ -204,11 +204,13 @@ class Commits:
                 try:
                     submission.safe()
                 except Exception as error:  # One's trouble is not another's.
-                    self._loop.call_exception_handler(
-                        {"message": "an effect of a committed turn failed", "exception": error}
-                    )
+                    self.report(error)
         finally:
             self._is_running = False
+
+    def report(self, error: Exception) -> None:
+        """Tell whoever looks after the loop that what a committed turn leads to has failed."""
+        self._loop.call_exception_handler({"message": "an effect of a committed turn failed", "exception": error})
 
     def _block(self, error: HoldfastError) -> None:
         """Nothing was written: refuse what can be refused, and try again with the rest."""

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
 
 from ..actors.errors import HoldfastError
 from ..actors.kernel.envelope import Ask
 from .journal import Entry
-from .protocol import PIPE, TICK, Feed
+from .protocol import MESSAGE, PIPE, TICK, Feed
 
 if TYPE_CHECKING:
     from .group_commit import Commits, Unkept
@@ -28,6 +28,20 @@ NO_POSITIONS: list[int] = []
 """Of an input that is nowhere in a journal. Never added to: those that are get a list of their own."""
 
 
+class RowPlace(msgspec.Struct, gc=False, eq=False):
+    """A row of the journal in which inputs stand: it stays until a snapshot contains all of them.
+
+    Attributes:
+        positions: where it stands; none until it is written.
+        left: how many of its inputs no snapshot contains.
+        over: the others.
+    """
+
+    positions: list[int]
+    left: int
+    over: list[int]
+
+
 class Input(msgspec.Struct, gc=False, eq=False):
     """One journaled input. (Not seen by the garbage collector: there can be many, and nothing here refers back.)"""
 
@@ -42,9 +56,11 @@ class Input(msgspec.Struct, gc=False, eq=False):
     turn: int = 0  # the turn that ended it
     deliveries: int = 0  # deaths of the process in this very turn
     origin: str = ""  # the timer or pipe it comes from
-    positions: list[int] = NO_POSITIONS
+    positions: list[int] = NO_POSITIONS  # of rows of its own
+    row: RowPlace | None = None  # that it shares, perhaps
     held: bool = False  # not as safe yet as it has to be: it must not be fed
     was_cut: bool = False  # a life has ended in its turn
+    was_stashed: bool = False
 
     @property
     def size(self) -> int:
@@ -86,6 +102,24 @@ class Turn(msgspec.Struct, gc=False, eq=False):
         return "end", number, self.input.id, self.status, tuple(self.digests), *more
 
 
+def spread(entry: Entry) -> Iterable[tuple[Any, ...]]:
+    """The inputs of a row, each as if it had one of its own; anything else as it is.
+
+    >>> for one in spread(("ins", "app:Note", None, (4, 0.5, b"a", 5, 0.5, b"b"), (4, 9, "ok"))):
+    ...     print(one)
+    ('in', 4, 'message', 'app:Note', b'a', 0.5, None, '', 9, 'ok')
+    ('in', 5, 'message', 'app:Note', b'b', 0.5, None, '')
+    """
+    values: tuple[Any, ...] = entry
+    if values[0] != "ins":
+        yield entry
+        return
+    _, name, sender, inputs, *ended = values
+    ends = {key: end for key, *end in ended}
+    for key, time, body in zip(inputs[::3], inputs[1::3], inputs[2::3], strict=True):
+        yield "in", key, MESSAGE, name, body, time, sender, "", *ends.get(key, ())
+
+
 class TimerState:
     """A timer of the actor; its clock runs here, whoever lives."""
 
@@ -103,6 +137,7 @@ class Batch:
         is_taken: whether somebody else has it take effect.
     """
 
+    weight = 1
     __slots__ = ("after", "asks", "entries", "is_taken", "sinks")
 
     def __init__(self) -> None:

@@ -1,8 +1,9 @@
 """Admission to the journal, and the ends of turns there: as few rows as can be.
 
 A message from outside counts once it is as safe as it has to be. An ask may be handled before that: nobody hears of it
-until all of it is safe, and if its turn is over when it is written, both are one row. Turns in a row that have let
-nothing out, and that nobody waits for, have one row for all their ends.
+until all of it is safe, and if its turn is over when it is written, both are one row. Messages of one type that come in
+a row from one sender stand in one row, and so do the ends of turns in a row that have let nothing out, and that nobody
+waits for.
 """
 
 from __future__ import annotations
@@ -16,73 +17,135 @@ import msgspec
 from ...actors.errors import HoldfastError
 from ...actors.exit_reasons import pack_exit
 from ...actors.kernel import links
+from ..inputs import RowPlace
 from ..protocol import DOWN, EXIT, MESSAGE
 from .disposal import lose
 
 if TYPE_CHECKING:
     from ...actors.kernel.envelope import Ask, Item
     from ..inputs import Batch, Input, Turn
-    from ..journal import Entry
+    from ..journal import Entry, Primitive
     from .switch import Switch
 
 MOST_ENDS = 1_000
 """Turns whose ends become one row."""
+MOST_INPUTS = 128
+"""Messages that stand in one row."""
+MOST_BYTES = 16 << 10
+"""Bytes in a row from which on no more messages are added to it."""
 
 
-class InputAdmission:
-    """One input that stands alone in its submission, perhaps with the end of its turn."""
+class InputRow:
+    """Inputs that stand in one row of the journal, perhaps with the ends of their turns.
 
-    __slots__ = ("_accepted", "_end", "_home", "_source", "entries")
+    More can be added until it is written: messages of one type from one sender, which wait for that (`held`) all of
+    them or none.
+    """
+
+    __slots__ = ("_accepted", "_batches", "_ends", "_home", "_place", "_size", "sources")
 
     def __init__(self, home: Switch, source: Input) -> None:
-        self._home, self._source = home, source
-        self.entries = ((home.path, source.entry()),)
-        self._accepted: asyncio.Future[None] | None = None
-        self._end: Batch | None = None  # what follows from the end of its turn
+        self._home, self._place = home, RowPlace([], 0, [])
+        self.sources: list[Input] = []
+        self._size = 0
+        self._ends: dict[int, tuple[Primitive, ...]] = {}
+        self._batches: dict[int, Batch] = {}  # what follows from these ends
+        self._accepted: dict[int, asyncio.Future[None]] = {}
+        self.add(source)
+
+    def takes(self, source: Input) -> bool:
+        """Whether this input may stand here, too."""
+        first = self.sources[0]
+        return (
+            first.name == source.name
+            and first.sender == source.sender
+            and first.held == source.held
+            and first.kind == source.kind == MESSAGE
+            and not first.origin
+            and not source.origin
+            and len(self.sources) < MOST_INPUTS
+            and self._size < MOST_BYTES
+        )
+
+    def add(self, source: Input) -> None:
+        """One more input stands here."""
+        self.sources.append(source)
+        self._size += len(source.body)
+        source.row = place = self._place
+        place.left += 1
 
     def end(self, number: int, turn: Turn, batch: Batch) -> None:
-        """Its turn is over before it is written; `batch` has what follows when both are safe."""
+        """The turn of an input is over before it is written; `batch` has what follows when both are safe."""
         _, _, _, status, _, *more = turn.entry(number)
-        self.entries = ((self._home.path, (*self._source.entry(), number, status, *more)),)
-        self._end, batch.is_taken = batch, True
+        self._ends[turn.input.id] = (number, status, *more)
+        self._batches[turn.input.id], batch.is_taken = batch, True
 
-    def accepted(self) -> asyncio.Future[None]:
-        """For a sender that waits until it counts."""
-        self._accepted = self._home.node.loop.create_future()
-        return self._accepted
+    @property
+    def weight(self) -> int:
+        """How many messages it is worth."""
+        return len(self.sources)
+
+    @property
+    def entries(self) -> Sequence[tuple[str, Entry]]:
+        """The row, with all that has been added until now."""
+        sources, ends = self.sources, self._ends
+        first = sources[0]
+        if len(sources) == 1:
+            return ((self._home.path, (*first.entry(), *ends.get(first.id, ()))),)
+        inputs: list[Primitive] = []
+        for source in sources:
+            inputs += (source.id, source.time, source.body)
+        row = ("ins", first.name, first.sender, tuple(inputs), *((key, *end) for key, end in ends.items()))
+        return ((self._home.path, row),)
+
+    def accepted(self, source: Input) -> asyncio.Future[None]:
+        """For a sender that waits until its message counts."""
+        future = self._accepted[source.id] = self._home.node.loop.create_future()
+        return future
 
     def written(self, positions: Sequence[int]) -> None:
         """It stands there in the journal."""
-        self._source.positions.append(positions[0])
-        self._home.outputs.rows.written(self._source)
+        self._place.positions.append(positions[0])
+        self._home.outputs.rows.written(self)
 
     def safe(self) -> None:
-        """It counts, and is fed, or what its turn leads to takes effect."""
-        if self._source.held:
-            self._home.admitted(self._source)
-        elif self._end is not None:
-            self._end.safe()
-        if self._accepted is not None and not self._accepted.done():
-            self._accepted.set_result(None)
+        """Its inputs count, and are fed, or what their turns lead to takes effect."""
+        for source in self.sources:
+            try:
+                if source.held:
+                    self._home.admitted(source)
+                elif self._batches and (batch := self._batches.get(source.id)) is not None:
+                    batch.safe()
+            except Exception as error:  # One's trouble is not another's.
+                self._home.journal.commits.report(error)
+        for future in self._accepted.values():
+            if not future.done():
+                future.set_result(None)
 
     def refused(self, error: HoldfastError) -> bool:
         """It was not written: nobody has heard of it. What comes from the runtime, and what was fed already, waits."""
-        if not self._source.held or not take_back(self._home, self._source, error, told=self._accepted is not None):
+        if not self.sources[0].held or self.sources[0].kind != MESSAGE:
             return False
-        if self._accepted is not None and not self._accepted.done():
-            self._accepted.set_exception(error)
-            self._accepted.exception()  # The sender may have gone.
+        self._home.outputs.rows.written(self)
+        for source in self.sources:
+            source.row = None
+            future = self._accepted.get(source.id)
+            take_back(self._home, source, error, told=future is not None)
+            if future is not None and not future.done():
+                future.set_exception(error)
+                future.exception()  # The sender may have gone.
         return True
 
     def abandoned(self, error: HoldfastError) -> None:
         """Nobody waits for what comes from the runtime itself; who waits for the end of a turn is told."""
-        if self._end is not None:
-            self._end.abandoned(error)
+        for batch in self._batches.values():
+            batch.abandoned(error)
 
 
 class QuietEnds:
     """The ends of turns in a row that have let nothing out: the same turns come of their inputs if it is lost."""
 
+    weight = 1
     __slots__ = ("_first", "_home", "_inputs")
 
     def __init__(self, home: Switch, first: int) -> None:
@@ -124,7 +187,34 @@ class TurnRows:
     def __init__(self, home: Switch) -> None:
         self._home = home
         self._quiet: QuietEnds | None = None
-        self._ahead: dict[int, InputAdmission] = {}  # by input, behind the end of every turn that has ended
+        self._row: InputRow | None = None  # for inputs
+        self._ahead: dict[int, InputRow] = {}  # for the end of an input: it stands behind every end that there is
+
+    def admit(self, source: Input) -> None:
+        """Have an input journaled.
+
+        Raises:
+            HoldfastError: it comes from outside, and the store takes nothing now.
+        """
+        row = self._row
+        if row is not None and row.takes(source):
+            row.add(source)
+            return
+        row = InputRow(self._home, source)
+        if source.kind != MESSAGE:
+            self._home.journal.submit(row)
+        else:
+            try:
+                self._home.journal.admit(row)
+            except HoldfastError:
+                _forget(self._home, source)
+                raise
+        self._row = row
+
+    def accepted(self, source: Input) -> asyncio.Future[None] | None:
+        """For a sender that waits until its message counts; None if nothing waits for that."""
+        row = self._row
+        return row.accepted(source) if row is not None and row.sources[-1] is source else None
 
     def let_ahead(self, ask: Ask, name: str, body: bytes, sender: str | None) -> bool:
         """Have an ask handled before it stands in the journal, if nothing that came earlier waits for that.
@@ -145,8 +235,13 @@ class TurnRows:
         source = home.ledger.admit(MESSAGE, name, body, home.node.clock.wall(), sender)
         source.positions, source.ask, source.chain = [], ask, ask.chain
         home.forward(source)  # In front of the submission: the loop comes to its turn before it comes to the store.
-        self._ahead[source.id] = admission = InputAdmission(home, source)
-        commits.submit(admission)
+        row = self._row
+        if row is not None and row.takes(source):
+            row.add(source)
+        else:
+            self._row = row = InputRow(home, source)
+            commits.submit(row)
+        self._ahead[source.id] = row
         return True
 
     def end_quietly(self, number: int, key: int) -> None:
@@ -165,43 +260,30 @@ class TurnRows:
             return False
         self._quiet = None
         for before in list(self._ahead):
-            admission = self._ahead.pop(before)
+            row = self._ahead.pop(before)
             if before == key:
-                admission.end(number, turn, batch)
+                row.end(number, turn, batch)
                 break
         return True
 
     def close(self) -> None:
         """What comes now stands in a row of its own, behind all there are."""
-        self._quiet = None
+        self._quiet = self._row = None
         if self._ahead:
             self._ahead.clear()
 
-    def written(self, source: Input) -> None:
-        """The row of an input can be added to no more."""
-        self._ahead.pop(source.id, None)
+    def written(self, row: InputRow) -> None:
+        """A row of inputs can be added to no more."""
+        if self._row is row:
+            self._row = None
+        if self._ahead:
+            for source in row.sources:
+                self._ahead.pop(source.id, None)
 
     def closed(self, quiet: QuietEnds) -> None:
         """A row of ends can be added to no more."""
         if self._quiet is quiet:
             self._quiet = None
-
-
-def submit(home: Switch, source: Input) -> None:
-    """Have an input journaled.
-
-    Raises:
-        HoldfastError: it comes from outside, and the store takes nothing now.
-    """
-    admission = InputAdmission(home, source)
-    if source.kind != MESSAGE:
-        home.journal.submit(admission)
-        return
-    try:
-        home.journal.admit(admission)
-    except HoldfastError:
-        _forget(home, source)
-        raise
 
 
 def take_back(home: Switch, source: Input, error: HoldfastError, *, told: bool) -> bool:

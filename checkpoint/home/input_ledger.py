@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import DIVERGES, ReplayDiverged
-from ..inputs import NO_POSITIONS, OVERHEAD, Input, Turn
+from ..inputs import NO_POSITIONS, OVERHEAD, Input, RowPlace, Turn, spread
 from ..life.replay_guard import StateDiverged
 from ..long_waits import due_entry
 from ..protocol import (
@@ -58,6 +58,9 @@ class InputLedger:
         positions: in the journal, of what belongs to a turn besides its input.
         rows: the same of the ends of several turns, by the last of them.
         dropped: the same of what the next snapshot need not be followed by.
+        gone: inputs that have ended without a turn since the newest snapshot, each with its row.
+        parted: rows of which the newest snapshot contains some inputs, and others not.
+        over: the inputs in such rows that the newest snapshot contains.
     """
 
     path: str
@@ -78,6 +81,9 @@ class InputLedger:
     positions: dict[int, list[int]] = dataclasses.field(default_factory=dict)
     rows: dict[int, list[int]] = dataclasses.field(default_factory=dict)
     dropped: list[list[int]] = dataclasses.field(default_factory=list)
+    gone: list[tuple[RowPlace, int]] = dataclasses.field(default_factory=list)
+    parted: list[RowPlace] = dataclasses.field(default_factory=list)
+    over: frozenset[int] = frozenset()
 
     # -- what there is ----------------------------------------------------------------------------------------------
 
@@ -215,7 +221,9 @@ class InputLedger:
         self.dues.clear()
         self.turn = source.turn = number
         source.deliveries = 0
-        if status != STASHED:
+        if status == STASHED:
+            source.was_stashed = True
+        else:
             del self.open[source.id]
         return turn
 
@@ -307,23 +315,53 @@ class InputLedger:
         """Have the next snapshot cut what stands there, or will stand there when it is written."""
         self.dropped += (sink for sink in sinks if sink is not NO_POSITIONS)
 
+    def drop_input(self, source: Input) -> None:
+        """The same of an input that has ended without a turn."""
+        self.drop(source.positions)
+        if source.row is not None:
+            self.gone.append((source.row, source.id))
+
     def contained_in(self, turn: int) -> list[int]:
         """The positions that need not follow a snapshot of the state after `turn`."""
         drop = [position for known in self.dropped for position in known]
         for number, known in itertools.chain(self.positions.items(), self.rows.items()):  # Those of hooks are there.
             if number <= turn:
                 drop += known
+        for source in self._contained_inputs(turn):
+            drop += source.positions
+        for row, keys in self._contained_places(turn).items():
+            if row.left == len(keys):
+                drop += row.positions
+        return drop
+
+    def over_after(self, turn: int) -> list[int]:
+        """The inputs that a snapshot of the state after `turn` contains, though their rows have to follow it."""
+        contained = self._contained_places(turn)
+        parted = [row for row in contained if row.left > len(contained[row])]
+        over = [key for row in parted for key in (*row.over, *contained[row])]
+        return over + [key for row in self.parted if row not in contained for key in row.over]
+
+    def _contained_inputs(self, turn: int) -> Iterator[Input]:
         # An image may be behind: what was stashed when it was begun may have been handled since.
         later = {past.input.id for number, past in self.turns.items() if number > turn}
         for number, past in self.turns.items():
             source = past.input
             if number <= turn and source.id not in self.open and source.id not in later:  # Else it is only stashed.
-                drop += source.positions
-        return drop
+                yield source
+
+    def _contained_places(self, turn: int) -> dict[RowPlace, set[int]]:
+        """The rows of which a snapshot of the state after `turn` contains inputs that no other does, and those."""
+        contained: dict[RowPlace, set[int]] = {}
+        inputs = ((source.row, source.id) for source in self._contained_inputs(turn))
+        for row, key in itertools.chain(inputs, self.gone):
+            if row is not None and row.positions:  # What the store has refused stands nowhere.
+                contained.setdefault(row, set()).add(key)
+        return contained
 
     def begin_after(self, meta: Meta) -> None:
         """Begin with a snapshot as the store has it; its entries follow."""
         self.newest, self.stash, self.turn, self.next_id = meta, meta.stash, meta.turn, meta.next_id
+        self.over = frozenset(meta.over)
 
     def read_anew(self, newest: Meta | None, entries: Sequence[tuple[int, Entry]]) -> InputLedger:
         """The same from an older snapshot on, as the store has it; whoever waits for an answer goes on waiting."""
@@ -351,7 +389,13 @@ class InputLedger:
 
     def begin_with(self, meta: Meta) -> None:
         """Have the next life begin with this snapshot, and forget the turns that it contains."""
+        contained = self._contained_places(meta.turn)
+        for row, keys in contained.items():
+            row.left -= len(keys)
+            row.over += keys
+        self.parted = [row for row in dict.fromkeys((*self.parted, *contained)) if row.left]
         self.dropped.clear()
+        self.gone.clear()
         self.newest, self.stash = meta, meta.stash
         for number in [number for number in self.turns if number <= meta.turn]:
             turn = self.turns.pop(number)
@@ -365,9 +409,11 @@ class InputLedger:
     def give_up(self, number: int) -> Turn:
         """Forget an ended turn that nothing will replay. (In a store it stays until the next snapshot.)"""
         turn = self.turns.pop(number)
-        self.drop(self.positions.pop(number, NO_POSITIONS))  # Perhaps they stand nowhere yet.
-        if turn.input.id not in self.open:  # Else it was put aside, and waits again.
-            self.drop(turn.input.positions)
+        source = turn.input
+        if not (source.was_stashed and any(past.input is source for past in self.turns.values())):
+            self.drop(self.positions.pop(number, NO_POSITIONS))  # Perhaps they stand nowhere yet.
+            if source.id not in self.open:  # Else it was put aside, and waits again.
+                self.drop_input(source)
         if turn.status != STASHED:
             self.journal_bytes -= turn.input.size
         self.pipes_done.pop(number, None)
@@ -400,17 +446,12 @@ class InputLedger:
     def read_entry(self, position: int, entry: tuple[Any, ...]) -> bool:
         """Take a journal entry up again, in order; False if it is of another kind."""
         match entry:
-            case ("in", key, kind, name, body, when, sender, origin, *end):
-                source = self.open[key] = Input(key, kind, name, body, when, sender)
-                source.origin, source.positions = origin, [position]
-                self.next_id = max(self.next_id, key + 1)
-                self.journal_bytes += source.size
-                if kind == PIPE and origin:
-                    turn, k = map(int, origin.split("."))
-                    self.admit_result(turn, k)
-                if end:
-                    number, status, *more = end
-                    self._read_end(source, number, status, (), *more)
+            case ("in", _, _, _, _, _, _, _, *_) | ("ins", _, _, _, *_):
+                place = RowPlace([position], 0, [])
+                for one in spread(entry):
+                    self._read_input(place, *one[1:])
+                if place.over:
+                    self.parted.append(place)
             case ("ends", first, keys):
                 self.rows[first + len(keys) - 1] = [position]
                 for number, key in enumerate(keys, first):
@@ -436,7 +477,7 @@ class InputLedger:
             case ("drop", key):
                 self.drop([position])
                 if key in self.open:
-                    self.drop(self.open[key].positions)
+                    self.drop_input(self.open[key])
                     self.withdraw(self.open[key])
             case ("tried", key, count):
                 if key in self.open:
@@ -445,6 +486,25 @@ class InputLedger:
             case _:
                 return False
         return True
+
+    def _read_input(
+        self, row: RowPlace, key: int, kind: str, name: str, body: bytes, when: float, sender: str | None, origin: str,
+        *end: Any,
+    ) -> None:  # fmt: skip
+        if key in self.over:
+            row.over.append(key)
+            return
+        source = self.open[key] = Input(key, kind, name, body, when, sender)
+        source.origin, source.positions, source.row = origin, [], row
+        row.left += 1
+        self.next_id = max(self.next_id, key + 1)
+        self.journal_bytes += source.size
+        if kind == PIPE and origin:
+            turn, k = map(int, origin.split("."))
+            self.admit_result(turn, k)
+        if end:
+            number, status, *more = end
+            self._read_end(source, number, status, (), *more)
 
     def _read_end(self, source: Input, number: int, status: str, digests: Iterable[int], *more: int) -> None:
         self.released = list(digests)

@@ -24,7 +24,6 @@ from ..protocol import LifePort
 from ..recovery.recoveries import Recovery
 from ..snapshot.unreplayed import forget_turns
 from ..turn_word import input_of
-from .admission import InputAdmission
 from .disposal import drop_all
 from .held_messages import hold, inlet, let_go
 from .homes import ENDED, Homes
@@ -183,11 +182,11 @@ class JournalHome(RecordedHome):
 
     def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
         """Admit a message for a sender that waits until it counts."""
-        commits = self.homes.journal
-        before = commits.last
+        switch = self.switch
+        before = None if switch is None else switch.intake.last
         cell.admit(cell, item)
-        last = commits.last
-        return last.accepted() if last is not before and isinstance(last, InputAdmission) else None
+        last = None if switch is None else switch.intake.last
+        return None if switch is None or last is None or last is before else switch.outputs.rows.accepted(last)
 
     def progress(self, cell: Cell) -> object:
         """How far the replay has come."""

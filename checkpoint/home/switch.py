@@ -66,7 +66,7 @@ from ..snapshot.snapshot_record import load
 from ..snapshot.snapshot_schedule import SnapshotSchedule
 from ..snapshot.state_image import IMAGE_BYTES
 from ..upgrade.present_classes import REPLY_TO
-from .admission import submit, taken_up
+from .admission import taken_up
 from .disposal import lose, put_into_quarantine, undo_begun
 from .held_messages import Intake, let_go
 from .input_ledger import InputLedger
@@ -211,9 +211,10 @@ class Switch:
                 self.note_shape(name, batch)
                 self.note_reply(name, batch)
             if batch is not None:
+                self.outputs.rows.close()
                 batch.add(self.path, source.entry(), source.positions)
             else:
-                submit(self, source)
+                self.outputs.rows.admit(source)
         return source
 
     def note_shape(self, name: str, batch: Batch | None = None) -> None:
@@ -498,7 +499,8 @@ class Switch:
             self.intake.bound.ended(source)
         if self.journal.durable:
             position: list[int] = []
-            self.ledger.drop(source.positions, position)  # Perhaps they stand nowhere yet.
+            self.ledger.drop(position)  # Perhaps they stand nowhere yet.
+            self.ledger.drop_input(source)
             batch.add(self.path, ("drop", source.id), position)
         self.give(source, answer, batch)
 

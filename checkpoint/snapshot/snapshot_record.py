@@ -13,6 +13,7 @@ from ...actors.persistence import UNFIT
 from ..compression import PLAIN, compressor, decompress
 from ..durable_links import Tie
 from ..durable_timers import Saved
+from ..inputs import spread
 from ..journal import DamagedStore, Entry
 from ..journal import Saved as Journaled
 from ..protocol import DOWN, EXIT, OK, STASHED, TICK, TIMED, Answer, Snapshot, timed, untimed
@@ -47,7 +48,8 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     what is true of it, TRAPS and REPLACED (a bool in stores of before, which is the former).
 
     `kind`: the class whose state it is, `variables` those that it had when `__init__` had run, and `shapes` the fields
-    of its messages (see `schema.py`); stores of before do not say.
+    of its messages (see `schema.py`); stores of before do not say. `over`: inputs that it contains, and that stand in a
+    row of the journal with others.
     """
 
     format: int
@@ -70,6 +72,7 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     kind: str = ""
     variables: list[str] = []
     shapes: dict[str, list[Any]] = {}
+    over: list[int] = []
 
     @property
     def traps(self) -> bool:
@@ -197,6 +200,7 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
         meta = msgspec.structs.replace(meta, shapes=home.shapes.saved(meta.turn))
         home.journal.barrier()  # From here on it is known where everything stands.
         drop = home.ledger.contained_in(meta.turn)
+        meta = msgspec.structs.replace(meta, over=home.ledger.over_after(meta.turn))
         home.journal.cut(home.path, encode_meta(meta, home.method.compress), drop, turn=meta.turn, keep=keep)
     home.images.cancel()
     home.ledger.begin_with(meta)
@@ -286,13 +290,14 @@ def begin_with_older(home: Switch) -> None:
     for name, rows in ({} if newest is None else newest.shapes).items():
         old.read(name, first_of([as_shape(row) for row in rows]))
     for _, entry in saved.entries:
-        match entry:
-            case ("shape", str() as name, shape):
-                old.read(name, as_shape(shape))
-            case ("in", int() as key, *_) if key in home.ledger.open:
-                pass
-            case _:
-                _note_old(old, entry)
+        for one in spread(entry):
+            match one:
+                case ("shape", str() as name, shape):
+                    old.read(name, as_shape(shape))
+                case ("in", int() as key, *_) if key in home.ledger.open:
+                    pass
+                case _:
+                    _note_old(old, one)
     take_over(home)
 
 
@@ -302,6 +307,9 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
     ledger = home.ledger
     known = ledger.read_entry(position, values)
     match values:
+        case ("ins", *_):
+            for one in spread(entry):
+                _note_old(home.shapes.old, one)
         case ("in", _, kind, _, body, _, _, origin, *_):
             _note_old(home.shapes.old, entry)
             if kind == TICK and origin in timers and not timers[origin][3]:

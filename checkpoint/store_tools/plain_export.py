@@ -21,6 +21,7 @@ from ...actors.kernel.codec import ARRAY, PACKED, REF
 from ...actors.values import ValueDescription, describe_value
 from ..addresses import KEY
 from ..compression import LibraryMissing
+from ..inputs import spread
 from ..journal import DamagedStore, Entry, StoreFailed
 from ..protocol import REPLY, START, Answer, untimed
 from ..schema import Shape, as_shape, first_of, shape_name
@@ -158,7 +159,8 @@ class _Export:
             except DamagedStore as error:
                 yield _damage(error, addresses[key])
                 continue
-            yield {**self._entry(key, entry), "address": addresses[key], "position": position}
+            for one in spread(entry):
+                yield {**self._entry(key, one), "address": addresses[key], "position": position}
 
     def _entry(self, key: int, entry: Entry) -> Record:
         match entry:

@@ -175,6 +175,9 @@ def _count_address(view: StoreView, chain: Chain, address: str) -> AddressStats:
                     if kind == START:
                         found.kind = found.kind or body.decode(errors="replace")
                     entry = (*entry[:4], b"", *entry[5:])  # It is only counted: what it says need not be held.
+                case ("ins", _, _, tuple() as inputs, *_):
+                    bare = tuple(b"" if isinstance(part, bytes) else part for part in inputs)
+                    entry = (*entry[:3], bare, *entry[4:])
                 case _:
                     pass
             ledger.read_entry(position, entry)

@@ -15,6 +15,7 @@ from typing import Final, Literal
 from ...actors.errors import DIVERGES, HoldfastError, ReplayDiverged, StartFailed
 from ...actors.kernel.actor import Actor
 from ..home.homes import Homes
+from ..inputs import spread
 from ..journal import Entry
 from ..protocol import Feed
 from ..snapshot.snapshot_record import Meta
@@ -77,9 +78,9 @@ async def check_address(
     return AddressCheck(path, "fine", check.turns, note=check.note)
 
 
-def _has_digest(place: tuple[int, Entry]) -> bool:
+def _has_digest(entry: Entry) -> bool:
     """Whether an entry says what state a turn has left."""
-    match place[1]:
+    match entry:
         case ("end", _, _, _, _, digest, *_) | ("in", _, _, _, _, _, _, _, _, _, digest, *_):
             return bool(digest)
         case _:
@@ -96,7 +97,7 @@ class _Checking:
         """Check the turns behind one snapshot, up to the following one; None: all is fine."""
         self.note = life.saved.passed_over or self.note
         recipe = self._recipe
-        has_digests = any(map(_has_digest, life.saved.entries))
+        has_digests = any(_has_digest(one) for _, entry in life.saved.entries for one in spread(entry))
         if recipe.method.replays and has_digests != recipe.method.check_replay:
             recipe = recipe._replace(method=dataclasses.replace(recipe.method, check_replay=has_digests))
         try:

@@ -18,6 +18,8 @@ QUICK, SLOW, SLOW_TOO = "/app/quick", "/app/slow", "/app/slow2"
 class Note:
     """A submission of some homes; what becomes of it is noted."""
 
+    weight = 1
+
     def __init__(self, number: int, paths: list[str], *, may_be_refused: bool) -> None:
         self.number, self.may_be_refused = number, may_be_refused
         self.entries = tuple((path, ("in", number)) for path in paths)
@@ -65,7 +67,8 @@ class Lanes(RuleBasedStateMachine):
     def write(self, most: int) -> None:
         pending = self.lanes.pending[:most]
         count = sum(len(note.entries) for note, _ in pending)
-        self.lanes.take_written(len(pending), range(self.position, self.position + count))
+        counts = [len(note.entries) for note, _ in pending]
+        self.lanes.take_written(counts, range(self.position, self.position + count))
         self.position += count
 
     @rule(behind=st.integers(0, 2))

@@ -48,6 +48,8 @@ class Slow:
 
 
 class Effect:
+    weight = 1
+
     def __init__(self, name: str, done: list[str], paths: Sequence[str] = ("/a",), *, may_refuse: bool = False) -> None:
         self.entries = [(path, ("in", name)) for path in paths]
         self.name, self.done, self.may_refuse = name, done, may_refuse

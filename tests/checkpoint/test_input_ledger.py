@@ -15,7 +15,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from holdfast.actors.errors import ReplayDiverged
 from holdfast.checkpoint.home.input_ledger import InputLedger, outcome_entry
-from holdfast.checkpoint.inputs import OVERHEAD, Input
+from holdfast.checkpoint.inputs import OVERHEAD, Input, RowPlace
 from holdfast.checkpoint.protocol import (
     DROPPED,
     FAILED,
@@ -81,6 +81,27 @@ class Ledgers(RuleBasedStateMachine):
         assert source.id == len(self.admitted), "numbers go on, whatever was forgotten"
         self.admitted.append(source.id)
 
+    @rule(count=st.integers(2, 4), ended=st.integers(0, 3), gone=st.integers(0, 2))
+    def admit_together(self, count: int, ended: int, gone: int) -> None:
+        """Messages stand in one row; the turns of the first ones may be over, if nothing was in front of them."""
+        ledger, place, ends = self.ledger, RowPlace([], 0, []), list[tuple[Any, ...]]()
+        is_ahead = self.next_input() is None
+        sources = [ledger.admit(MESSAGE, "m:Do", b"%d" % number, 0.5, "/app/other") for number in range(count)]
+        for source in sources:
+            source.positions, source.row = [], place
+            place.left += 1
+            self.admitted.append(source.id)
+        for source in sources[: ended if is_ahead else 0]:
+            number = ledger.turn + 1
+            turn = ledger.end_turn(source, number, OK, 0, answer_digest(Answer()))
+            _, _, _, status, _, *more = turn.entry(number)
+            ends.append((source.id, number, status, *more))
+            self.left[number], self.ended[source.id] = 0, OK
+        inputs = tuple(part for source in sources for part in (source.id, source.time, source.body))
+        self.write(("ins", "m:Do", "/app/other", inputs, *ends), place.positions)
+        for source in [source for source in sources if source.id in ledger.open][:gone]:
+            self._drop(source)
+
     @precondition(lambda self: self.ledger.open)
     @rule(data=st.data())
     def drop(self, data: st.DataObject) -> None:
@@ -88,11 +109,14 @@ class Ledgers(RuleBasedStateMachine):
         waiting = [key for key in self.ledger.open if key not in self.stashed and key != self.ledger.begun]
         if not waiting:
             return
-        source = self.ledger.open[data.draw(st.sampled_from(waiting))]
+        self._drop(self.ledger.open[data.draw(st.sampled_from(waiting))])
+
+    def _drop(self, source: Input) -> None:
         assert self.ledger.withdraw(source)
         assert not self.ledger.withdraw(source), "it ends once"
         position: list[int] = []
-        self.ledger.drop(source.positions, position)
+        self.ledger.drop(position)
+        self.ledger.drop_input(source)
         self.write(("drop", source.id), position)
         self.ended[source.id] = "dropped"
 
@@ -206,11 +230,18 @@ class Ledgers(RuleBasedStateMachine):
         turn = data.draw(st.integers(ledger.state_turn + 1, ledger.turn))
         later = {past.input.id for number, past in ledger.turns.items() if number > turn and past.status == STASHED}
         stash = sorted(key for key in ledger.stashed() & ledger.open.keys() if key not in later)
-        meta = Meta(FORMAT, turn, ledger.next_id, stash, {}, [], 1, b"state", turn)
+        over = ledger.over_after(turn)
+        meta = Meta(FORMAT, turn, ledger.next_id, stash, {}, [], 1, b"state", turn, over=over)
         for position in ledger.contained_in(turn):
             self.journal.pop(position, None)
         ledger.begin_with(meta)
         self.cut_at = meta
+        needed = {source.id for source in ledger.handled_and_open()} | {key for _, key in ledger.gone}
+        for entry in self.journal.values():
+            if entry[0] == "ins":
+                keys = set(entry[3][::3])
+                assert keys & needed, "a row stays no longer than one of its inputs"
+                assert keys - needed <= set(over)
 
     @precondition(lambda self: self.ledger.turns)
     @rule(data=st.data())
@@ -315,3 +346,67 @@ def test_background_work_has_one_result() -> None:
     """A life that begins it again brings a second one."""
     ledger = InputLedger("/app/doer")
     assert [ledger.admit_result(3, 1), ledger.admit_result(3, 1), ledger.admit_result(3, 2)] == [True, False, True]
+
+
+def row_of(ledger: InputLedger, position: int, count: int) -> tuple[list[Input], tuple[Any, ...]]:
+    """Messages that stand in one row, and the row."""
+    place = RowPlace([position], count, [])
+    sources = [ledger.admit(MESSAGE, "m:Do", b"", 0.5, None) for _ in range(count)]
+    for source in sources:
+        source.positions, source.row = [], place
+    inputs = tuple(part for source in sources for part in (source.id, source.time, source.body))
+    return sources, ("ins", "m:Do", None, inputs)
+
+
+def snapshot(ledger: InputLedger, turn: int, journal: dict[int, tuple[Any, ...]]) -> Meta:
+    stash = sorted(ledger.stashed() & ledger.open.keys())
+    over = ledger.over_after(turn)
+    meta = Meta(FORMAT, turn, ledger.next_id, stash, {}, [], 1, b"state", turn, over=over)
+    for position in ledger.contained_in(turn):
+        journal.pop(position, None)
+    ledger.begin_with(meta)
+    return meta
+
+
+def read(meta: Meta, journal: dict[int, tuple[Any, ...]]) -> InputLedger:
+    found = InputLedger("/app/doer")
+    found.begin_after(meta)
+    for position, entry in journal.items():
+        assert found.read_entry(position, entry)
+    return found
+
+
+def test_a_row_of_which_much_is_over_for_long() -> None:
+    """One message of a row was put aside: the others are over in each snapshot, until that one is."""
+    ledger, journal = InputLedger("/app/doer"), dict[int, tuple[Any, ...]]()
+    sources, journal[1] = row_of(ledger, 1, 3)
+    ledger.end_turn(sources[0], 0, STASHED)
+    for number, source in enumerate(sources[1:], 1):
+        ledger.end_turn(source, number, OK)
+    for turn in (2, 3, 4):
+        meta = snapshot(ledger, turn, journal)
+        assert sorted(meta.over) == [1, 2]
+        found = read(meta, journal)
+        assert [*found.open] == [0]
+        assert sorted(found.over_after(turn)) == [1, 2], "the next program knows it, too"
+        [later], journal[turn + 10] = row_of(ledger, turn + 10, 1)
+        ledger.end_turn(later, turn + 1, OK)
+    ledger.end_turn(sources[0], 6, OK)
+    assert snapshot(ledger, 6, journal).over == []
+    assert journal == {}
+
+
+def test_what_was_put_aside_is_not_forgotten_before_the_turn_that_did_it() -> None:
+    ledger, journal = InputLedger("/app/doer"), dict[int, tuple[Any, ...]]()
+    sources, journal[1] = row_of(ledger, 1, 2)
+    for position, (source, number, status) in enumerate(
+        [(sources[0], 0, OK), (sources[1], 1, STASHED), (sources[1], 2, OK)], 2
+    ):
+        journal[position] = ledger.end_turn(source, number, status).entry(number)
+        ledger.positions_of(number).append(position)
+    ledger.give_up(2)
+    found = read(snapshot(ledger, 0, journal), journal)  # An image that was begun early.
+    assert found.open == {}
+    assert found.turns[1].status == STASHED
+    snapshot(ledger, 2, journal)
+    assert journal == {}
