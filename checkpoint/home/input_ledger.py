@@ -377,9 +377,8 @@ class InputLedger:
     def contained_in(self, turn: int) -> list[int]:
         """The positions that need not follow a snapshot of the state after `turn`."""
         drop = [position for known in self.dropped for position in known]
-        for number, known in itertools.chain(
-            self.positions.items(), self.shared.ends.items()
-        ):  # Those of hooks are there.
+        own = itertools.chain(self.positions.items(), self.shared.ends.items())
+        for number, known in own:  # Those of hooks are there.
             if number <= turn:
                 drop += known
         for source in self._contained_inputs(turn):
