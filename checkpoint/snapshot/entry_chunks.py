@@ -47,7 +47,7 @@ def _told(value: object) -> object:
 _told_by: Final = msgspec.msgpack.Encoder(enc_hook=_told).encode  # Only for checksums and sizes.
 
 
-class Table:
+class ChunkTable:
     """A variable that is a large list or dict, and its chunks as they were last.
 
     Attributes:

@@ -28,7 +28,7 @@ def digest(block: bytes | memoryview) -> bytes:
     return hashlib.blake2b(block, digest_size=16).digest()
 
 
-class Part:
+class ImagePart:
     """Something that is encoded by itself.
 
     Attributes:
@@ -54,7 +54,7 @@ class Part:
         self.size = _size(self.pieces)
 
 
-class Chunk(Part):
+class Chunk(ImagePart):
     """Some entries of a list, or keys and values in turn of a dict. Its bytes are made again when they are wanted.
 
     Attributes:
@@ -106,7 +106,7 @@ class Chunk(Part):
         return b"".join(self.pieces)
 
 
-def shared_ids(parts: Sequence[Part], before: set[int], held: Sequence[int]) -> set[int]:
+def shared_ids(parts: Sequence[ImagePart], before: set[int], held: Sequence[int]) -> set[int]:
     """What is reached at several places.
 
     Args:
@@ -129,7 +129,7 @@ def shared_ids(parts: Sequence[Part], before: set[int], held: Sequence[int]) -> 
     return {key for key, count in counts.items() if count > 1}
 
 
-def link(parts: Iterable[Part], shared: set[int]) -> None:
+def link(parts: Iterable[ImagePart], shared: set[int]) -> None:
     """Number the parts of an image in their order, and encode those anew that share something else now.
 
     Args:

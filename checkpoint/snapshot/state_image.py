@@ -22,8 +22,8 @@ import msgspec
 from ...actors.errors import DamagedValue, UnsavableValue
 from ...actors.kernel.actor import Actor
 from ...actors.values import ALONE, ByteParts, decode_value, in_one
-from .entry_chunks import Table, is_large
-from .image_parts import Part, link, shared_ids
+from .entry_chunks import ChunkTable, is_large
+from .image_parts import ImagePart, link, shared_ids
 
 WHOLE, LINKED = 2, 3
 """The first byte of an image. (A state that was saved as one value begins with the format of values, 1.)"""
@@ -67,7 +67,7 @@ class Section:
 
     __slots__ = ("is_small", "name", "parts", "table")
 
-    def __init__(self, name: str | None, parts: Sequence[Part], table: object = None) -> None:
+    def __init__(self, name: str | None, parts: Sequence[ImagePart], table: object = None) -> None:
         self.name, self.parts, self.table = name, parts, table
         self.is_small = table is None and self.size < LARGE
 
@@ -81,7 +81,7 @@ class Section:
         """Of what its chunks are the entries; "" if it is whole."""
         return "" if self.table is None else type(self.table).__name__
 
-    def place_of(self, part: Part) -> int:
+    def place_of(self, part: ImagePart) -> int:
         """The number of the first piece of one of its parts."""
         return part.number if self.table is not None else int(not self.is_small)
 
@@ -100,8 +100,8 @@ class Imager:
 
     def __init__(self, *, chunks: bool = True) -> None:
         self._chunks = chunks
-        self._unchanged: dict[str | None, tuple[object, Part]] = {}
-        self._tables: dict[str | None, Table] = {}
+        self._unchanged: dict[str | None, tuple[object, ImagePart]] = {}
+        self._tables: dict[str | None, ChunkTable] = {}
         self._whole: dict[str | None, int] = {}  # tables that another variable holds too; for how many images
         self._shared = set[int]()  # what the last image has at several places, by id
 
@@ -154,12 +154,12 @@ class Imager:
         table = self._table(name, value, where)
         if table is not None:
             return Section(name, table.chunks, value)
-        part = Part(name or "", value if name is None else {name: value}, where)
+        part = ImagePart(name or "", value if name is None else {name: value}, where)
         if type(value) in _UNCHANGING:
             self._unchanged[name] = value, part
         return Section(name, [part])
 
-    def _table(self, name: str | None, value: Any, where: str) -> Table | None:
+    def _table(self, name: str | None, value: Any, where: str) -> ChunkTable | None:
         """The chunks of a large list or dict; None of another value."""
         table = self._tables.get(name)
         if table is not None and (name in self._whole or not table.fits(value)):
@@ -168,7 +168,7 @@ class Imager:
         if table is None:
             if not self._chunks or name in self._whole or not is_large(value):
                 return None
-            table = self._tables[name] = Table(name or "", type(value), where)
+            table = self._tables[name] = ChunkTable(name or "", type(value), where)
         try:
             table.take(value)
         except UnsavableValue:  # It is said of the whole variable, and where in it that is.
