@@ -48,7 +48,7 @@ from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor, kill_starting
 from .controls import Controls
 from .full_collections import seldom_collected
-from .history.calls import Remembering
+from .history.calls import HistoryCalls
 from .history.recorder import HistoryRecorder, expect_end
 from .live_moves import Moves
 from .logs import LogSink
@@ -78,7 +78,7 @@ LONG = 365 * 86_400.0
 """Seconds `start` and `stop` wait: no limit of their own, the child specs say how long a start or an end may take."""
 
 
-class ActorSystem(Recorded, Controls, Remembering):
+class ActorSystem(Recorded, Controls, HistoryCalls):
     """A tree of actors: an async context manager that lives in whatever loop it is entered in.
 
     Args:

@@ -26,7 +26,7 @@ BETWEEN = 0.2
 """Seconds between the two looks."""
 
 
-class Remembering:
+class HistoryCalls:
     """What a system knows of its past."""
 
     _history: HistoryRecorder | None
