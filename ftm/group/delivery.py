@@ -93,8 +93,8 @@ class Delivery:
                     self.earlier.setdefault(record.id, []).append(before)
                 self.fed[record.id] = record
                 self.waiting.append(record)
-            case Go():
-                self.waiting.append(record)
+            case Go():  # Whoever leads does not end in the middle of the start: its place ends it behind that.
+                self.waiting.append(msgspec.structs.replace(record, ends=None, ended=record.turn))
             case Outcome() | Perform() | SnapshotNow():
                 self.inward.append(record)
                 if isinstance(record, Outcome) and self.fed.pop(record.taken, None) is not None:

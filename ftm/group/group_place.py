@@ -145,6 +145,9 @@ class GroupPlace(Place):
             if start is not None and not start.kind.state_access and not switch.turns:
                 group.joins_early = True  # Nobody can be brought to what it has when it has handled something.
                 await self.protected(group)
+            ends = switch.ledger.own_end.wanted
+            if ends is not None:
+                self._stop_wanted = ends.exit_reason
             await home.replay(cell, group, entered)
             await self.protected(group)
         except BaseException as error:
