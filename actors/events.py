@@ -522,12 +522,14 @@ class EventHub:
 
     def emit(self, event: Event) -> None:
         """Give the event to every listener and sink."""
-        if self._recorder is not None:
-            self._recorder(event)
         for stream in self._streams:
             stream.put(event)
-        for sink in self._sinks:
-            sink(event)
+        for sink in self._sinks if self._recorder is None else (self._recorder, *self._sinks):
+            try:
+                sink(event)
+            except Exception as error:  # A user's log or tracer may be behind it, and a supervisor may be telling this.
+                context = {"message": "what listens to events has failed", "exception": error}
+                asyncio.get_running_loop().call_exception_handler(context)
 
     def add_sink(self, sink: Callable[[Event], None]) -> None:
         """Call `sink` with every event, at once."""

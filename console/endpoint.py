@@ -206,7 +206,9 @@ class Endpoint:
             async with asyncio.timeout(LONGEST):
                 value = await session.answer(request)
             return ControlResponse(encode_value(value))
-        except Exception as error:  # It is the client's to know; a bug in a user's code must not end the endpoint.
+        except (asyncio.CancelledError, GeneratorExit):
+            raise
+        except BaseException as error:  # It is the client's to know: whatever a user's code raises ends nobody here.
             return failure(error)
 
 

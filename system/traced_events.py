@@ -9,7 +9,7 @@ from opentelemetry import context as otel
 from opentelemetry import trace
 from opentelemetry.trace import Link, Span, Tracer
 
-from ..actors.control.spans import Spans, leave_node, spans_of, trace_node
+from ..actors.control.spans import Spans, end, leave_node, report, spans_of, trace_node
 from ..actors.events import ActorStarted, ChildRestarted, Event, Recovered
 from ..ftm.events import FailedOver, MechanismAttached, MechanismChanged, MechanismDetached
 
@@ -51,19 +51,19 @@ class EventSpans:
                 begun, why = self._restarted.pop(address)
                 span = _begin(spans, "restart", event, begun)
                 span.set_attributes({"holdfast.reason": why, "holdfast.life": event.life})
-                span.end()
+                end(span)
             case Recovered():
                 _recovery(spans, event)
             case FailedOver(replica=replica, epoch=epoch, seconds=seconds, why=why):
                 span = _begin(spans, "failover", event, _ago(seconds))
                 span.set_attributes({"holdfast.replica": replica, "holdfast.epoch": epoch, "holdfast.reason": why})
-                span.end()
+                end(span)
             case MechanismAttached(seconds=seconds) | MechanismDetached(seconds=seconds):
-                _begin(spans, "change mechanism", event, _ago(seconds)).end()
+                end(_begin(spans, "change mechanism", event, _ago(seconds)))
             case MechanismChanged(seconds=seconds, layers=layers):
                 span = _begin(spans, "change mechanism", event, _ago(seconds))
                 span.set_attribute("holdfast.mechanism", "+".join(layers))
-                span.end()
+                end(span)
             case _:
                 pass
 
@@ -72,11 +72,15 @@ def _ago(seconds: float) -> int:
     return time.time_ns() - int(seconds * 1e9)
 
 
-def _begin(spans: Spans, name: str, event: Event, begun: int) -> Span:
-    last = spans.last.get(event.address)
+def _begin(spans: Spans, name: str, event: Event, begun: int, below: otel.Context | None = None) -> Span:
+    last = spans.last.get(event.address) if below is None else None
     links = () if last is None else (Link(last),)
-    about = {"holdfast.address": event.address}
-    return spans.tracer.start_span(name, otel.Context(), attributes=about, links=links, start_time=begun)
+    about = {"holdfast.address": event.address} if below is None else {}
+    try:
+        return spans.tracer.start_span(name, below or otel.Context(), attributes=about, links=links, start_time=begun)
+    except Exception as error:
+        report(error)
+        return trace.INVALID_SPAN
 
 
 def _recovery(spans: Spans, event: Recovered) -> None:
@@ -87,7 +91,7 @@ def _recovery(spans: Spans, event: Recovered) -> None:
     below = trace.set_span_in_context(whole, otel.Context())
     for phase in PHASES:
         if phase in event.phases:
-            end = begun + int(event.phases[phase] * 1e9)
-            spans.tracer.start_span(phase, below, start_time=begun).end(end)
-            begun = end
-    whole.end(begun)
+            until = begun + int(event.phases[phase] * 1e9)
+            end(_begin(spans, phase, event, begun, below), until)
+            begun = until
+    end(whole, begun)

@@ -6,6 +6,7 @@ methods, and what stands in a mailbox has another `run`, for as long as a system
 
 from __future__ import annotations
 
+import asyncio
 import contextvars
 import functools
 import random
@@ -117,7 +118,11 @@ class Spans:
 
     def begin(self, verb: str, kind: SpanKind, cell: Cell, message: str, parent: otel.Context) -> Span:
         """A span about one message, of which the type is given, to one address."""
-        return self.tracer.start_span(_title(verb, message), parent, kind, {ADDRESS: cell.path})
+        try:
+            return self.tracer.start_span(_title(verb, message), parent, kind, {ADDRESS: cell.path})
+        except Exception as error:
+            report(error)
+            return trace.INVALID_SPAN
 
     def tail(self, at: SpanContext, around: otel.Context) -> str:
         """What goes along with a message whose parent is this span."""
@@ -154,7 +159,7 @@ class Spans:
             tail = BEGIN
         else:
             span = self.begin("tell", SpanKind.PRODUCER, cell, type_name(type(message)), around)
-            span.end()
+            end(span)
             tail = self.tail(span.get_span_context(), around)
         sender = None if ctx is None else ctx._cell
         cell.admit(cell, TracedEnvelope(message, sender, ((tail, 0),)))
@@ -288,6 +293,20 @@ def leave_node(node: Node) -> None:
 # -- a turn -----------------------------------------------------------------------------------------------------------
 
 
+def end(span: Span, at: int | None = None) -> None:
+    """End a span. What the user's tracer raises is told, and hurts no actor."""
+    try:
+        span.end(at)
+    except Exception as error:
+        report(error)
+
+
+def report(error: Exception) -> None:
+    """Tell whoever looks after the loop that the user's tracer has failed."""
+    context = {"message": "the tracer has failed; actors go on", "exception": error}
+    asyncio.get_running_loop().call_exception_handler(context)
+
+
 def in_span(run: Callable[[Any, Any], object], actor: Any, item: Any) -> object:
     """Run the turn of an item whose chain ends with a trace: it is a span, and so is current in the handler."""
     cell: Cell = actor.ctx._cell
@@ -337,7 +356,7 @@ def _over(span: Span | None, token: Token[otel.Context], error: BaseException | 
         if isinstance(error, Exception):
             span.record_exception(error)
         span.set_status(Status(StatusCode.ERROR, type(error).__name__))
-    span.end()
+    end(span)
 
 
 def _outcome(span: Span, done: Any) -> None:
@@ -347,4 +366,4 @@ def _outcome(span: Span, done: Any) -> None:
     elif (error := done.exception()) is not None:
         span.set_attribute("error.type", type_name(type(error)))
         span.set_status(Status(StatusCode.ERROR, str(error)))
-    span.end()
+    end(span)

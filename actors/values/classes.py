@@ -37,7 +37,7 @@ def find_class(name: str, *, imports: bool = True) -> type:
         found: object = sys.modules.get(module) or import_module(module)
         for part in qualname.split("."):
             found = cast(object, vars(found)[part])
-    except (Exception, SystemExit) as error:
+    except BaseException as error:  # A module may raise anything, and whoever asks for it may be a supervisor.
         raise DamagedValue(f"class {name} is not there ({type(error).__name__}: {error})") from error
     if not isinstance(found, type):
         raise DamagedValue(f"{name} is no class")

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from .reaching import Json, OnePath, Socket, System, meant_rows, reached, show_json
+from .reaching import FAILED, Json, OnePath, Socket, System, ended, meant_rows, reached, show_json
 
 SLICE = 1.0
 """Seconds that one request for more waits."""
@@ -31,7 +31,9 @@ def trace(
     until = None if seconds is None else time.monotonic() + seconds
     shown = missed = 0
     with reached("trace", system, socket) as remote, contextlib.suppress(KeyboardInterrupt):
-        (row,) = meant_rows(remote, [path])
+        row, *others = meant_rows(remote, [path])
+        if others:
+            raise ended("trace", f"{path} means {1 + len(others)} actors: name the one to follow", FAILED)
         remote.follow(row.path)
         while until is None or time.monotonic() < until:
             told = remote.next_events(SLICE if until is None else max(0.01, min(SLICE, until - time.monotonic())))

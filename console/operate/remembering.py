@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import difflib
 import time
 from collections.abc import Iterable
 from typing import Annotated
@@ -10,13 +11,16 @@ from typing import Annotated
 import msgspec
 import typer
 
+from ... import events as events_of_all
 from ...system import PastEvent, PastLife
-from .reaching import Json, OnePath, Socket, System, reached, show_json
+from .reaching import FAILED, UNUSABLE, Json, OnePath, Socket, System, ended, reached, show_json
 
 ONE_LOOK = 30.0
 """Seconds that one request of `--follow` waits for the next event."""
 HIDDEN = frozenset({"traceback", "reason_kind"})
 """Fields of events that stand in `--json` only: their line would become too long."""
+KINDS = frozenset(events_of_all.__all__) | {"SystemStarted", "SystemStopped", "EventsLeftOut"}
+"""The names of the events that there are."""
 UNPRINTED = dict.fromkeys((*range(32), *range(127, 160)), "?")
 """Characters that make a terminal do something."""
 
@@ -28,6 +32,8 @@ def why(path: OnePath, system: System = None, socket: Socket = None, as_json: Js
     """Say in a few sentences why an actor restarts, has ended, or does not get on."""
     with reached("why", system, socket) as remote:
         sentences = asyncio.run(remote.why(path))
+        if not remote.lives(path) and path not in remote.tree():
+            raise ended("why", " ".join(sentences), FAILED)
     if as_json:
         show_json({"address": path, "why": sentences})
     else:
@@ -38,10 +44,12 @@ def history(path: OnePath, system: System = None, socket: Socket = None, as_json
     """List the last lives of an actor: when each began and ended, why, and by whom."""
     with reached("history", system, socket) as remote:
         lives = remote.lives(path)
+        if not lives:
+            raise ended("history", f"the history knows of no life at {path}", FAILED)
     if as_json:
         show_json({"address": path, "lives": msgspec.to_builtins(lives)})
     else:
-        _print_lines(map(life_line, lives) if lives else [f"the history knows of no life at {path}"])
+        _print_lines(map(life_line, lives))
 
 
 def events(
@@ -57,6 +65,11 @@ def events(
     as_json: Json = False,
 ) -> None:
     """Print past events, oldest first; with --json one object on each line."""
+    wrong = sorted(set(kinds or ()) - KINDS)
+    if wrong:
+        known = difflib.get_close_matches(wrong[0], KINDS)
+        hint = f"; there are {', '.join(known)}" if known else ", as docs/events.md lists them"
+        raise ended("events", f"there is no kind of event {wrong[0]!r}{hint}", UNUSABLE)
     try:
         with reached("events", system, socket) as remote:
             since = 0.0 if seconds is None else time.time() - seconds

@@ -71,7 +71,7 @@ class ProjectModules:
                     importlib.reload(modules[name])
                 except HoldfastError:
                     raise
-                except Exception as error:
+                except BaseException as error:  # A module may raise anything, SystemExit too: the program goes on.
                     raise SpecError(name, f"it raised {type_name(type(error))}: {error_text(error)}") from error
             yield names
         except BaseException:

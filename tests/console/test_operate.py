@@ -275,3 +275,26 @@ async def test_ctrl_c_ends_a_trace_in_good_order(named: hf.ActorSystem) -> None:
     async with asyncio.timeout(20):
         _, errors = await process.communicate()
     assert (process.returncode, errors) == (DONE, b"")
+
+
+async def test_a_trace_is_of_one_actor(named: hf.ActorSystem) -> None:
+    status, _, errors = await holdfast("trace", "/app/left/*", "--seconds", "0.2")
+    assert status == FAILED
+    assert "name the one to follow" in errors
+
+
+@pytest.mark.parametrize("error", ["KeyboardInterrupt", "SystemExit(3)", "GeneratorExit", "Odd"])
+async def test_a_module_that_raises_anything_ends_nobody(
+    named: hf.ActorSystem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: str
+) -> None:
+    """A tree in a file names a class whose module raises what is no Exception when it is imported."""
+    module = f"raises_{error.partition('(')[0].lower()}"
+    (tmp_path / f"{module}.py").write_text(f"class Odd(BaseException): ...\n\n\nraise {error}\n")
+    (tmp_path / "tree.toml").write_text(f'["/app/odd"]\nclass = "{module}:Actor"\n')
+    for file in (tmp_path / f"{module}.py", tmp_path / "tree.toml"):
+        file.chmod(0o600)
+    monkeypatch.syspath_prepend(tmp_path)
+    for command in (("plan",), ("apply", "--yes")):
+        status, _, errors = await holdfast(*command, tmp_path / "tree.toml")
+        assert (status, error.partition("(")[0] in errors) == (FAILED, True), errors
+    assert (await holdfast("tree", "--paths"))[0] == DONE

@@ -137,8 +137,13 @@ async def test_the_commands_in_words(system: hf.ActorSystem, path: Path) -> None
     code, said, _ = await command(path, "events", "/app/worker", "--kind", "ActorCrashed")
     assert code == 0
     assert "/app/worker ActorCrashed life=1 reason=ZeroDivisionError: nothing to divide" in said
-    code, said, _ = await command(path, "history", "/app/nobody")
-    assert (code, said) == (0, "the history knows of no life at /app/nobody\n")
+    for verb in ("history", "why"):  # A typo is told, not taken for "all is well".
+        code, said, errors = await command(path, verb, "/app/nobody")
+        assert (code, said) == (1, "")
+        assert f"holdfast {verb}:" in errors and "the history knows of no life" in errors
+    code, said, errors = await command(path, "events", "--kind", "ActorCrash")
+    assert (code, said) == (2, "")
+    assert "there is no kind of event 'ActorCrash'; there are ActorCrashed" in errors
 
 
 async def test_the_commands_in_json(system: hf.ActorSystem, path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import pytest
 from opentelemetry import baggage
 from opentelemetry import context as otel
-from opentelemetry.sdk.trace import ReadableSpan, TracerProvider
+from opentelemetry.sdk.trace import ReadableSpan, Span, SpanProcessor, TracerProvider
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from opentelemetry.sdk.trace.sampling import ALWAYS_OFF
@@ -414,3 +414,39 @@ async def test_an_endpoint_in_a_thread_continues_its_span(traced: Traced) -> Non
         told = await asyncio.to_thread(endpoint)
     assert told.split()[0] == f"{trace_of(traced.one('request')):032x}"
     assert parent_of(traced.one("ask Where")) == id_of(traced.one("request"))
+
+
+class Raising(SpanProcessor):
+    """A processor with a bug."""
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+
+    def on_start(self, span: Span, parent_context: Any = None) -> None:
+        if self._where == "start":
+            raise RuntimeError("of a start")
+
+    def on_end(self, span: ReadableSpan) -> None:
+        if self._where == "end":
+            raise RuntimeError("of an end")
+
+
+@pytest.mark.parametrize("where", ["start", "end"])
+async def test_a_tracer_that_raises_hurts_no_actor(where: str) -> None:
+    """Neither in the span of an ask, nor in that of a turn, of a restart, or of a recovery."""
+    troubles: list[str] = []
+    loop = asyncio.get_running_loop()
+    loop.set_exception_handler(lambda _, context: troubles.append(str(context["exception"])))
+    provider = TracerProvider()
+    provider.add_span_processor(Raising(where))
+    async with hf.ActorSystem("app", log=False, intensity=100) as system:
+        one = await system.start(hf.child("one", hf.start(Clerk)))
+        kept = await system.start(hf.child("kept", hf.start(Clerk), isolation="process", recovery=hf.hybrid()))
+        system.trace_with(provider.get_tracer("test"), one_in=1)
+        for ref in (one, kept):
+            assert await ref.ask(Count(), timeout=30.0) == 1
+            ref.kill()
+            await ref.ask(Count(), timeout=30.0)
+        system.trace_with(None)
+        assert await system.ref("/app").ask(hf.supervision.CountChildren())
+    assert set(troubles) == {f"of {'a start' if where == 'start' else 'an end'}"}
