@@ -15,7 +15,7 @@ from ..overview import ActorRow, SystemLook
 from ..remote import RemoteSystem
 from ..runtime_folder import found_sockets, sweep
 from .patterns import select
-from .reaching import FAILED, Json, Paths, Socket, System, complete_path, ended, reached, show_json, told
+from .reaching import FAILED, Json, Paths, Socket, System, complete_path, ended, printable, reached, show_json, told
 
 COLOURS = {"running": "green", "suspended": "yellow", "restarting": "magenta", "starting": "magenta", "stopped": "red"}
 MEASURED = 0.2
@@ -86,7 +86,7 @@ def tree(
     if as_json:
         show_json(as_plain_look(look, rows))
     elif paths:
-        typer.echo("\n".join(row.path for row in rows))
+        typer.echo("\n".join(printable(row.path) for row in rows))
     else:
         typer.echo("\n".join(tree_lines(with_ancestors(look.rows, rows))))
 
@@ -136,11 +136,11 @@ def row_line(row: ActorRow, *, is_top: bool) -> str:
     said += [f"{row.place} {row.pid or '-'}"] if row.place != "task" or is_top else []
     said += [typer.style(f"restarts {row.restarts}", fg="yellow")] if row.restarts else []
     said += [f"queued {row.queued}"] if row.queued else []
-    said += [f"in {_short(row.turn)} for {row.turn_seconds:.1f} s"] if row.turn else []
+    said += [f"in {printable(_short(row.turn))} for {row.turn_seconds:.1f} s"] if row.turn else []
     said += [row.recovery] if row.recovery else []
     said += [" + ".join(row.mechanism)] if row.mechanism else []
-    said += [f"named {', '.join(row.names)}"] if row.names else []
-    return f"{typer.style(name, bold=True)}  {_short(row.kind)}  {', '.join(said)}"
+    said += [f"named {printable(', '.join(row.names))}"] if row.names else []
+    return f"{typer.style(printable(name), bold=True)}  {printable(_short(row.kind))}  {', '.join(said)}"
 
 
 def _short(kind: str) -> str:

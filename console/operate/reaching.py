@@ -23,6 +23,21 @@ FAILED: Final = 1
 UNUSABLE: Final = 2
 
 
+UNPRINTED: Final = dict.fromkeys(
+    (*range(32), *range(127, 160), 0x200E, 0x200F, *range(0x2028, 0x202F), *range(0x2066, 0x206A)), "?"
+)
+"""Characters that make a terminal do something, or that make a line look like another one."""
+
+
+def printable(text: str) -> str:
+    """A text from a running system as one line of a terminal.
+
+    >>> printable("/app/till\\x1b[31m\\n/app/safe")
+    '/app/till?[31m?/app/safe'
+    """
+    return text.translate(UNPRINTED)
+
+
 class NoSystem(HoldfastError, text="{problem}"):
     """There is no running system that is meant, or there are several."""
 
@@ -110,7 +125,7 @@ def told(command: str) -> Generator[None, None, None]:
 
 def ended(command: str, error: Exception | str, code: int) -> typer.Exit:
     """The end of a command that has failed, told on standard error."""
-    typer.echo(f"holdfast {command}: {error}", err=True)
+    typer.echo("\n".join(map(printable, f"holdfast {command}: {error}".split("\n"))), err=True)
     return typer.Exit(code)
 
 

@@ -13,7 +13,7 @@ import typer
 
 from ... import events as events_of_all
 from ...system import PastEvent, PastLife
-from .reaching import FAILED, UNUSABLE, Json, OnePath, Socket, System, ended, reached, show_json
+from .reaching import FAILED, UNUSABLE, Json, OnePath, Socket, System, ended, printable, reached, show_json
 
 ONE_LOOK = 30.0
 """Seconds that one request of `--follow` waits for the next event."""
@@ -21,8 +21,6 @@ HIDDEN = frozenset({"traceback", "reason_kind"})
 """Fields of events that stand in `--json` only: their line would become too long."""
 KINDS = frozenset(events_of_all.__all__) | {"SystemStarted", "SystemStopped", "EventsLeftOut"}
 """The names of the events that there are."""
-UNPRINTED = dict.fromkeys((*range(32), *range(127, 160)), "?")
-"""Characters that make a terminal do something."""
 
 Pattern = Annotated[str, typer.Argument(help="An address, or a pattern such as '/app/bank/**'.")]
 Limit = Annotated[int, typer.Option("--limit", min=1, max=1000, help="How many, the newest.")]
@@ -112,7 +110,7 @@ def quarantine(
 
 def _print_lines(lines: Iterable[str]) -> None:
     for line in lines:
-        typer.echo(line.translate(UNPRINTED))
+        typer.echo(printable(line))
 
 
 def _print_events(found: Iterable[PastEvent], *, as_json: bool) -> None:

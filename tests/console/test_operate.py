@@ -298,3 +298,12 @@ async def test_a_module_that_raises_anything_ends_nobody(
         status, _, errors = await holdfast(*command, tmp_path / "tree.toml")
         assert (status, error.partition("(")[0] in errors) == (FAILED, True), errors
     assert (await holdfast("tree", "--paths"))[0] == DONE
+
+
+async def test_an_address_is_one_line_whatever_is_in_it(named: hf.ActorSystem) -> None:
+    """Else a child could pass for another in a script, or make a terminal do something."""
+    await named.start(hf.child("e\x1b[31m\n\u202ex", hf.start(Counter)))
+    status, output, _ = await holdfast("tree", "--paths")
+    assert (status, "/app/e?[31m??x" in output.split("\n")) == (DONE, True)
+    status, output, _ = await holdfast("tree")
+    assert (status, "\x1b" in output, sum("e?[31m??x" in line for line in output.split("\n"))) == (DONE, False, 1)

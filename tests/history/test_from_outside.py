@@ -140,7 +140,8 @@ async def test_the_commands_in_words(system: hf.ActorSystem, path: Path) -> None
     for verb in ("history", "why"):  # A typo is told, not taken for "all is well".
         code, said, errors = await command(path, verb, "/app/nobody")
         assert (code, said) == (1, "")
-        assert f"holdfast {verb}:" in errors and "the history knows of no life" in errors
+        assert f"holdfast {verb}:" in errors
+        assert "the history knows of no life" in errors
     code, said, errors = await command(path, "events", "--kind", "ActorCrash")
     assert (code, said) == (2, "")
     assert "there is no kind of event 'ActorCrash'; there are ActorCrashed" in errors

@@ -185,7 +185,7 @@ CHECKS = {
     ),
     "a terminal obeys no event": Check(
         "console/operate/remembering.py",
-        "        typer.echo(line.translate(UNPRINTED))\n",
+        "        typer.echo(printable(line))\n",
         "        typer.echo(line)\n",
         OUTSIDE,
         "test_what_a_terminal_would_obey_is_not_printed",
