@@ -13,7 +13,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import msgspec
 
@@ -98,14 +98,31 @@ class EffectProcess:
         self._process.wait()
 
 
+class FunctionProcess(Protocol):
+    """What runs functions, one after another: a process, or what stands for one in a simulated run."""
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether it can be given a function."""
+        ...
+
+    async def call(self, request: bytes) -> bytes:
+        """Have a function run; see `EffectProcess`."""
+        ...
+
+    def end(self) -> None:
+        """Kill it, whatever it does."""
+        ...
+
+
 class EffectProcesses:
     """The processes for effects of one process of the system: begun when first needed, `most` at once."""
 
-    def __init__(self, codec: Codec, most: int = MOST) -> None:
-        self._codec = codec
+    def __init__(self, codec: Codec, kind: Callable[[], FunctionProcess] = EffectProcess, most: int = MOST) -> None:
+        self._codec, self._kind = codec, kind
         self._room = asyncio.Semaphore(most)
-        self._idle: list[EffectProcess] = []
-        self._all: set[EffectProcess] = set()
+        self._idle: list[FunctionProcess] = []
+        self._all: set[FunctionProcess] = set()
 
     async def run(self, function: Callable[..., Any], *args: Any) -> object:
         """Run a function of a module in a process, and return what it returns. Cancelled, the process is killed.
@@ -142,7 +159,7 @@ class EffectProcesses:
             process.end()
         return answer
 
-    def _take(self) -> EffectProcess:
+    def _take(self) -> FunctionProcess:
         """One that waits for a function, or a new one."""
         while self._idle:
             process = self._idle.pop()
@@ -150,7 +167,7 @@ class EffectProcesses:
                 return process
             self._all.discard(process)
             process.end()
-        process = EffectProcess()
+        process = self._kind()
         self._all.add(process)
         return process
 

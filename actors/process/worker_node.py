@@ -32,7 +32,7 @@ from ..kernel.ref import current
 from ..kernel.topics import Topics
 from ..migration.worker_moves import Attempt, GuestMoves, Replaced, hand_on_stash
 from ..persistence import Keeper
-from .effect_processes import EffectProcesses
+from .effect_processes import EffectProcess, EffectProcesses, FunctionProcess
 from .wire import frames
 from .wire.connection import Connection
 from .wire.frames import BadFrame
@@ -165,7 +165,12 @@ class Guest(Peer):
     """The child's end of the connection, and its node."""
 
     def __init__(
-        self, loop: asyncio.AbstractEventLoop, page: memoryview, compose: Compose, overdue: Overdue | None
+        self,
+        loop: asyncio.AbstractEventLoop,
+        page: memoryview,
+        compose: Compose,
+        overdue: Overdue | None,
+        effect_process: Callable[[], FunctionProcess] = EffectProcess,
     ) -> None:
         super().__init__(Node("guest", loop, topics=GuestTopics(self)))
         self.page: Any = page
@@ -189,7 +194,9 @@ class Guest(Peer):
                 keeper=composition.keeper,
                 uplink=self,
                 overdue=overdue,
-                run_in_process=EffectProcesses(self.node.codec).run,  # They are killed when this process ends.
+                run_in_process=EffectProcesses(
+                    self.node.codec, effect_process
+                ).run,  # They are killed when this process ends.
             )
         )
         self.node.events.add_sink(self._on_event)

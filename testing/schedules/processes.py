@@ -23,8 +23,9 @@ from ...actors.errors import HoldfastError
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Codec
-from ...actors.process import effect_processes, worker_node
+from ...actors.process import worker_node
 from ...actors.process.effect_main import answered
+from ...actors.process.effect_processes import EffectProcesses
 from ...actors.process.fork.boot import PAGE_BYTES
 from ...actors.process.fork.child_processes import parent_of
 from ...actors.process.process_host import on_frame
@@ -209,7 +210,9 @@ class SimulatedProcess(SimulatedPlace):
 
     def _boot(self, ours: Connection) -> None:
         loop = asyncio.get_running_loop()
-        guest = self.guest = worker_node.Guest(loop, memoryview(self.page).cast("Q"), WorkerComposition, None)
+        guest = self.guest = worker_node.Guest(
+            loop, memoryview(self.page).cast("Q"), WorkerComposition, None, SimulatedEffectProcess
+        )
         self.node = guest.node
         theirs = Connection(guest.on_frame, guest.on_lost, guest.on_batch)
         guest.join(theirs)
@@ -321,7 +324,7 @@ class SimulatedWorkers(Workers):
         self._stub = SimulatedServer()
         self._swaps = Swaps()
         self._swaps.put(worker_node, "_apply", _no_limits)
-        self._swaps.put(effect_processes, "EffectProcess", SimulatedEffectProcess)
+        self.effects = EffectProcesses(node.codec, SimulatedEffectProcess)
 
     def draw_from(self, choices: Choices, seconds: tuple[float, float]) -> None:
         """From now on what is written takes so many seconds, drawn, until it arrives."""

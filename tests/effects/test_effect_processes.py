@@ -205,7 +205,7 @@ def in_turn(file: str, number: int) -> int:
 async def test_so_many_compute_at_once_and_others_wait_in_order(tmp_path: Path, most: int) -> None:
     """Also behind one that has failed, and one that nobody waits for any more."""
     world = str(tmp_path / "world")
-    processes = EffectProcesses(Codec(no_ref), most)
+    processes = EffectProcesses(Codec(no_ref), most=most)
     begin_effect(1)
     try:
         given = [asyncio.ensure_future(processes.run(in_turn, world, number)) for number in range(4)]
