@@ -125,11 +125,7 @@ def as_named_now(
     Raises:
         StateMismatch: variables have gone and others have come: perhaps they were renamed, and nobody has said so.
     """
-    kind = type(actor._state_root())
-    names: dict[str, str] = {}
-    for new, olds in former_members(kind).items():
-        found = [old for old in olds if old in state and new not in state]
-        names |= dict.fromkeys(found[:1], new)
+    kind, names = type(actor._state_root()), renames_in(actor, state)
     state = {names.get(name, name): value for name, value in state.items()}
     before = [names.get(name, name) for name in before]
     gone = [name for name in before if name in state and name not in now] if now else []
@@ -142,6 +138,15 @@ def as_named_now(
             "class; else raise its schema_version, and say in migrate(state, from_version) what becomes of it",
         )
     return {name: value for name, value in state.items() if name not in gone}, gone
+
+
+def renames_in(actor: Actor, state: dict[str, Any]) -> dict[str, str]:
+    """What the variables of a saved state are called now, by what they were called then, where that is another name."""
+    names: dict[str, str] = {}
+    for new, olds in former_members(type(actor._state_root())).items():
+        found = [old for old in olds if old in state and new not in state]
+        names |= dict.fromkeys(found[:1], new)
+    return names
 
 
 def put_back(actor: Actor, saved: Any) -> None:

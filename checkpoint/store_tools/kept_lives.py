@@ -12,7 +12,7 @@ from ...actors.state_hooks import migrated
 from ...actors.values import decode_value, state_digest
 from ..home.homes import Homes
 from ..journal import Saved
-from ..snapshot.key_variables import save_state
+from ..snapshot.key_variables import renames_in, save_state
 from ..snapshot.shared_blocks import by_segment
 from ..snapshot.snapshot_record import Meta, decode_meta, encode_meta
 from ..snapshot.state_image import is_image, read_image
@@ -97,8 +97,11 @@ def state_differences(actor: Actor, saved: bytes) -> list[str]:
 def _read(actor: Actor, data: bytes) -> Any:
     """A saved state as the actor's class now wants it."""
     saved: Any = read_image(data) if is_image(data) else decode_value(data)
-    version, _, state = saved
+    version, form, state = saved
     kind = type(actor)
+    if form == "keys" and isinstance(state, dict):
+        names = renames_in(actor, state)
+        state = {names.get(name, name): value for name, value in state.items()}
     return state if version == kind.schema_version else migrated(kind, state, version, actor.ctx.path)
 
 

@@ -130,6 +130,13 @@ def test_what_goes_on_as_before_is_fine(
     assert everything(store.parent) == before
 
 
+def test_a_variable_that_was_renamed_is_fine(store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its states are compared under the names that they have now."""
+    renamed = ("class Account(", '@hf.renamed(texts="memos")\nclass Account(')
+    status, found, errors = check(monkeypatch, store, newer(tmp_path, ("memos", "texts"), renamed))
+    assert (status, errors, found[ALICE]["verdict"]) == (0, "", "fine")
+
+
 def test_a_hook_that_waits_for_others_cannot_be_checked(
     store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
