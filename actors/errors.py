@@ -293,6 +293,8 @@ class ReplayDiverged(HoldfastError):
         return f"{where}, output {self.output}{now}: it is not what it was before the crash; {DIVERGES}"
 
 
+RAISED_AGAIN = "handling it again raised"
+"""In the text of a divergence that may pass."""
 DIVERGED = "diverged at turn"
 """In the text of every divergence, and so in the reason of a start that has failed because of one."""
 DIVERGES = (

@@ -5,15 +5,18 @@ from __future__ import annotations
 import asyncio
 from typing import Protocol
 
-from .errors import DIVERGED, ControlFailed
+from .errors import DIVERGED, RAISED_AGAIN, ControlFailed
 
 UNFIT = "what is recorded of it does not fit the code"
 """How the reason of a failed start begins if only other code can help, and no older state."""
 
 
 def is_in_vain(why: str) -> bool:
-    """Whether a start that has failed for this reason fails again: the code does not fit what it has recorded."""
-    return UNFIT in why or DIVERGED in why
+    """Whether a start that has failed for this reason fails again: the code does not fit what it has recorded.
+
+    A handler that raises when it handles something again may have met trouble that passes.
+    """
+    return UNFIT in why or (DIVERGED in why and RAISED_AGAIN not in why)
 
 
 class Keeper(Protocol):

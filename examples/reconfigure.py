@@ -40,7 +40,7 @@ async def main() -> None:
             _, status = await holdfast("apply", str(SCRIPT), *target)
             print(status, system.whereis("auditor").path)  # 0 /app/bank/auditor
 
-            said, _ = await holdfast("tree", *target)
+            said, _ = await holdfast("tree", "--paths", *target)
             print(said.split())  # ['/app', '/app/bank', '/app/bank/auditor', '/app/bank/alice']
 
             said, status = await holdfast("apply", str(SCRIPT), *target)  # Twice is refused; nothing changes.

@@ -572,7 +572,8 @@ class Supervisor(Inquiries):
         if cell.state is not DOWN:
             one.state = STOPPING
             await one.spec.stop(cell, reason)
-            tell_stopped(cell, self.ctx.path if by is None else by, because)
+            if cell.parent is self.ctx._cell:  # Else it was moved meanwhile, and is another's to tell of.
+                tell_stopped(cell, self.ctx.path if by is None else by, because)
         elif starting is not None:
             cell.kill()
         if one.row is row:
@@ -593,7 +594,7 @@ class Supervisor(Inquiries):
             if child.parent is self.ctx._cell:  # Else it was given to another supervisor while we stopped others.
                 is_living = child.state not in (DOWN, GONE)
                 await child.node.stop_child(child)
-                if is_living:
+                if is_living and child.parent is self.ctx._cell:
                     tell_stopped(child, self.ctx.path, "its supervisor has ended")
 
     def _is_parked(self, name: str) -> bool:

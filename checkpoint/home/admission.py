@@ -137,7 +137,8 @@ class InputRow:
         return True
 
     def abandoned(self, error: HoldfastError) -> None:
-        """Nobody waits for what comes from the runtime itself; who waits for the end of a turn is told."""
+        """Nobody waits for what comes from the runtime itself; who waits for the end of a turn is told, also later."""
+        self._home.outputs.rows.written(self)
         for batch in self._batches.values():
             batch.abandoned(error)
 

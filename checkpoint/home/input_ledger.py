@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ...actors.errors import DIVERGES, ReplayDiverged
+from ...actors.errors import DIVERGES, RAISED_AGAIN, ReplayDiverged
 from ..inputs import NO_POSITIONS, OVERHEAD, Input, RowPlace, Turn, spread
 from ..life.replay_guard import StateDiverged
 from ..long_waits import due_entry
@@ -278,7 +278,7 @@ class InputLedger:
         if end.status == FAILED and past is not None and past.input.kind == START and past.status != FAILED:
             return  # It has not become anything else: its start failed, and will be tried again.
         if past is not None and end.status in (FAILED, DROPPED) and end.status != past.status:
-            what = "handling it again raised" if end.status == FAILED else "it cannot be handled any more:"
+            what = RAISED_AGAIN if end.status == FAILED else "it cannot be handled any more:"
             hint = DIVERGES if end.status == FAILED else "the class has been changed since; what is recorded stays"
             name, error = past.input.name or past.input.kind, explain(end.answer)
             cause = f"{name} was handled well before the crash; {what} {error} ({hint})"

@@ -17,7 +17,7 @@ KILLS = "tests/checkpoint/test_kill_counts.py"
 CHECKS = {
     "what has diverged is not tried again": Check(
         "actors/persistence.py",
-        " or DIVERGED in why\n",
+        " or (DIVERGED in why and RAISED_AGAIN not in why)\n",
         "\n",
         "tests/checkpoint/test_recovery_refused.py",
         "test_replay_of_an_actor_that_is_not_deterministic and task",

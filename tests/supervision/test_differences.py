@@ -320,9 +320,11 @@ class Scribe(hf.Actor):
 
 
 class LoudScribe(Scribe):
+    schema_version = 2
+
     @classmethod
-    def migrate(cls, state: dict[str, Any], old: Any) -> dict[str, Any]:
-        assert old is Scribe
+    def migrate(cls, state: dict[str, Any], from_version: int) -> dict[str, Any]:
+        assert from_version == 1
         return {**state, "told": [text.upper() for text in state["told"]]}
 
 

@@ -240,7 +240,8 @@ for parameter in cells("what happens to the child"):
     FATES.setdefault(parameter.values[0], []).append(parameter.values[2])
 
 
-@pytest.mark.parametrize(("what", "expected"), list(FATES.items()))
+# That of a supervisor above has tests of its own, in test_restarted_above.py.
+@pytest.mark.parametrize(("what", "expected"), [fate for fate in FATES.items() if "above" not in fate[0]])
 async def test_the_fate_of_messages(what: str, expected: list[str]) -> None:
     what = what.replace("`", "")
     plan = Plan()

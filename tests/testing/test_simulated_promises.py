@@ -10,6 +10,8 @@ import holdfast as hf
 from holdfast.testing import Faults, GuardedSystem, Simulation, idle, probe, simulate
 from holdfast.testing.simulation import run_seed
 
+KEPT = hf.hybrid(interval=0.02, max_deliveries=1000)  # Kills by the dozen, and no message is to blame.
+
 
 class Put(hf.Message[int]):
     source: str
@@ -53,7 +55,7 @@ async def test_a_killed_recorded_actor_applies_each_accepted_message_once_and_in
     system: GuardedSystem, simulation: Simulation
 ) -> None:
     """T14, T20: kills fall anywhere, in the middle of turns too."""
-    store = await system.start(hf.child("store", hf.start(Store), recovery=hf.hybrid(interval=0.02)))
+    store = await system.start(hf.child("store", hf.start(Store), recovery=KEPT))
     for name in ("a", "b"):
         system.spawn(hf.start(Source), name).tell(Send(store, 10))
     asked = [store.ask(Put("test", n), timeout=3600.0) for n in range(5)]
@@ -73,7 +75,7 @@ async def test_a_killed_recorded_actor_applies_each_accepted_message_once_and_in
 async def test_a_crash_loses_its_own_message_and_no_other(system: GuardedSystem, faults: Faults) -> None:
     """T20: whoever asked gets an answer or a typed failure; per sender the order stays."""
     system.expect_crashes()
-    store = await system.start(hf.child("store", hf.start(Store), recovery=hf.hybrid(interval=0.02)))
+    store = await system.start(hf.child("store", hf.start(Store), recovery=KEPT))
     async with faults.on(store, at="turn end", crash=0.2), faults.on(store, at="turn begin", crash=0.1, delay=0.1):
         asked = [store.ask(Put("test", n), timeout=3600.0) for n in range(10)]
         outcomes: list[Any] = await asyncio.gather(*asked, return_exceptions=True)
@@ -124,7 +126,7 @@ async def test_one_for_all_brings_all_back_whoever_crashes_and_however_they_coin
 def test_runs_with_recovery_are_exact_too() -> None:
     def trace(seed: int) -> list[Any]:
         async def run(system: GuardedSystem) -> None:
-            store = await system.start(hf.child("store", hf.start(Store), recovery=hf.hybrid(interval=0.02)))
+            store = await system.start(hf.child("store", hf.start(Store), recovery=KEPT))
             for name in "abcd":
                 system.spawn(hf.start(Source), name).tell(Send(store, 5))
             await asyncio.sleep(0.02)

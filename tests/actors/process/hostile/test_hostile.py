@@ -142,7 +142,7 @@ async def test_an_error_that_cannot_be_made_is_an_error(world: World) -> None:
 
 async def test_a_dead_letter_for_another_says_who_tells_it(world: World) -> None:
     with world.system.events() as events:
-        await world.write(note("DeadLetter", address=VICTIM, message="m", why="none \x1b[2J"))
+        await world.write(note("DeadLetter", address=VICTIM, message="m", why="none \x1b[2J", sender=""))
         letter = await next_event(events, hf.events.DeadLetter)
     assert (letter.address, letter.why) == (VICTIM, f"none ?[2J (told by {EVIL})")
 
