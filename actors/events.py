@@ -518,13 +518,14 @@ class EventHub:
         self._streams: list[EventStream] = []
         self._sinks: list[Callable[[Event], None]] = []
         self._recorder: Callable[[Event], None] | None = None
+        self._listening: tuple[Callable[[Event], None], ...] = ()  # the recorder, if there is one, and the sinks
         self._resting: set[Restful] = set()  # of what the recorder has had enough for now
 
     def emit(self, event: Event) -> None:
         """Give the event to every listener and sink."""
         for stream in self._streams:
             stream.put(event)
-        for sink in self._sinks if self._recorder is None else (self._recorder, *self._sinks):
+        for sink in self._listening:
             try:
                 sink(event)
             except Exception as error:  # A user's log or tracer may be behind it, and a supervisor may be telling this.
@@ -552,7 +553,7 @@ class EventHub:
         self._count()
 
     def remove_sink(self, sink: Callable[[Event], None]) -> None:
-        """Call it no more."""
+        """Call a sink no more that `add_sink` was given."""
         self._sinks.remove(sink)
         self._count()
 
@@ -570,6 +571,7 @@ class EventHub:
         self._count()
 
     def _count(self) -> None:
+        self._listening = (*(() if self._recorder is None else (self._recorder,)), *self._sinks)
         anybody = bool(self._streams or self._sinks)
         records = self._recorder is not None
         self.has_listeners = anybody or (records and "others" not in self._resting)

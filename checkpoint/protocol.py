@@ -113,7 +113,7 @@ class EndWanted(msgspec.Struct, array_like=True, gc=False):
 
     @property
     def exit_reason(self) -> ExitReason:
-        """Why it ends."""
+        """Why the actor ends, as its supervisor is told."""
         return unpack_exit(msgspec.msgpack.decode(self.reason))
 
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from .. import HoldfastError, run
 from . import upgrade_commands
 from .operate import changing, declaring, following, looking, remembering
-from .service import doctor, project, running
+from .service import doctor, project, service_run
 from .store_commands import store
 
 commands = typer.Typer(
@@ -95,7 +95,7 @@ for command in (
     remembering.quarantine,
     declaring.plan,
     declaring.apply,
-    running.run,
+    service_run.run,
     project.new,
     doctor.doctor,
 ):

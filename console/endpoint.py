@@ -21,8 +21,8 @@ from ..actors.values import encode_value
 from ..system.history.authors import ACTING, OPERATOR
 from ..system.system import ActorSystem
 from .claims import EndpointInUse, absolute, claimed, listen, remove
+from .client_session import LONGEST, ClientSession
 from .runtime_folder import socket_path
-from .session import LONGEST, ClientSession
 from .wire import (
     REQUEST,
     AnyRequest,

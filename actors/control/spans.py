@@ -248,14 +248,14 @@ class TracedSends:
 
     @classmethod
     def take_out(cls) -> None:
-        """One less is."""
+        """One node less is traced; behind the last one nobody pays."""
         cls.nodes -= 1
         if not cls.nodes:
             cast("Any", ActorRef).tell = cls.tell_plainly
 
 
 def _tell(ref: ActorRef[Any], message: Message[Any]) -> None:
-    """What `ActorRef.tell` says."""
+    """Tell as `ActorRef.tell` does, with the trace of whoever tells."""
     ctx, cell = current.get(None), ref._cell
     spans = spans_of(cell.node)
     around = None if spans is None or (ctx is not None and ctx._may_rest) else spans.around(ctx)
@@ -282,7 +282,7 @@ def trace_node(node: Node, tracer: Tracer, share: float, *, baggage: bool) -> Sp
 
 
 def leave_node(node: Node) -> None:
-    """Trace it no more."""
+    """Make no more spans of what a node sends and runs."""
     if spans_of(node) is not None:
         deadlines: Any = node.deadlines
         del deadlines.spans

@@ -319,7 +319,7 @@ class Switch:
         else:
             parts = [Restore(piece) for piece in pieces(newest.state)]
         parts[0].timers, parts[0].traps = self.timers.at(newest), newest.traps
-        parts[0].variables = newest.variables
+        parts[0].variables = newest.made.variables
         return parts
 
     def attach(self, port: LifePort) -> None:

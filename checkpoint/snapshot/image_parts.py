@@ -100,7 +100,7 @@ class Chunk(ImagePart):
         return self.digest == known
 
     def data(self) -> bytes:
-        """Its bytes."""
+        """The bytes of the chunk, made again if they were let go."""
         if not self.pieces:
             self.encode(self.links)
         return b"".join(self.pieces)

@@ -61,5 +61,5 @@ def older_snapshot(home: Switch) -> Meta | None:
     if saved.snapshot is None or newest is None:
         return None
     meta = decode_meta(saved.snapshot)
-    timers = home.shapes.timers_now(meta.timers, meta.shapes)
+    timers = home.shapes.timers_now(meta.timers, meta.made.shapes)
     return msgspec.structs.replace(meta, timers=timers) if 0 <= meta.base < newest.base else None

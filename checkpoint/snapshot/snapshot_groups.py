@@ -180,6 +180,6 @@ def _image(home: Switch) -> HomeImage:
         earlier=[],
         owed=home.calls.debts(),
         ties=home.ties.saved(),
-        shapes=home.shapes.as_now(),
+        made=msgspec.structs.replace(newest.made, shapes=home.shapes.as_now()),
     )
     return HomeImage(home.path, msgspec.msgpack.encode(meta), [list(entry) for entry in home.ledger.entries()])

@@ -34,6 +34,20 @@ TRAPS, REPLACED = 1, 2
 """What may be true of a snapshot: the actor traps exits; its state was put in place from outside."""
 
 
+class ClassRecord(msgspec.Struct, array_like=True, frozen=True):
+    """What a snapshot says of the class whose state it is.
+
+    Attributes:
+        kind: the class, as "module:Class"; "" if nobody has said.
+        variables: those that it had when `__init__` had run.
+        shapes: the fields of its messages (see `schema.py`).
+    """
+
+    kind: str = ""
+    variables: list[str] = []
+    shapes: dict[str, list[Any]] = {}
+
+
 class Meta(msgspec.Struct, array_like=True, frozen=True):
     """A snapshot, with what the home knew when it came.
 
@@ -47,9 +61,8 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     were undone (stores of before do not say). An empty `state` stands for none: the actor begins afresh. `marks`:
     what is true of it, TRAPS and REPLACED (a bool in stores of before, which is the former).
 
-    `kind`: the class whose state it is, `variables` those that it had when `__init__` had run, and `shapes` the fields
-    of its messages (see `schema.py`); stores of before do not say. `over`: inputs that it contains, and that stand in a
-    row of the journal with others.
+    `made`: of what class its state is; stores of before do not say. `over`: inputs that it contains, and that stand in
+    a row of the journal with others.
     """
 
     format: int
@@ -69,9 +82,7 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     owed: dict[int, tuple[str, str]] = {}
     ties: list[Tie] = []
     marks: int | bool = 0
-    kind: str = ""
-    variables: list[str] = []
-    shapes: dict[str, list[Any]] = {}
+    made: ClassRecord = ClassRecord()
     over: list[int] = []
 
     @property
@@ -134,8 +145,7 @@ def meta_now(home: Switch, turn: int, stash: list[int], state: bytes = b"") -> M
         time=now,
         owed=home.calls.debts(),
         ties=home.ties.saved(),
-        kind=home.shapes.kind,
-        variables=[] if home.ledger.newest is None else home.ledger.newest.variables,
+        made=ClassRecord(home.shapes.kind, [] if home.ledger.newest is None else home.ledger.newest.made.variables),
     )
 
 
@@ -166,7 +176,7 @@ def made_by(home: Switch, record: Snapshot) -> dict[str, Any]:
     """Whose state a snapshot is, as the life says that has made it."""
     if record.kind:
         home.shapes.kind = record.kind
-    return {"kind": home.shapes.kind, "variables": record.variables, "marks": marks_of(record)}
+    return {"made": ClassRecord(home.shapes.kind, record.variables), "marks": marks_of(record)}
 
 
 def marks_of(record: Snapshot) -> int:
@@ -197,7 +207,8 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
         HoldfastError: it could not be kept, and nothing has changed.
     """
     if home.journal.durable:
-        meta = msgspec.structs.replace(meta, shapes=home.shapes.saved(meta.turn))
+        made = msgspec.structs.replace(meta.made, shapes=home.shapes.saved(meta.turn))
+        meta = msgspec.structs.replace(meta, made=made)
         home.journal.barrier()  # From here on it is known where everything stands.
         drop = home.ledger.contained_in(meta.turn)
         meta = msgspec.structs.replace(meta, over=home.ledger.over_after(meta.turn))
@@ -230,12 +241,12 @@ def load(home: Switch, planted: Journaled | None = None) -> None:
         home.ledger.begin_after(meta)
         home.topics, home.calls.owed = dict.fromkeys(meta.topics), dict(meta.owed)
         home.ties.replace(meta.ties)
-        home.shapes.loaded(meta.kind, meta.shapes)
+        home.shapes.loaded(meta.made.kind, meta.made.shapes)
         timers = {
             key: (name, body, left - elapsed(home, meta.time), interval)
             for key, (name, body, left, interval) in meta.timers.items()
         }
-        home.shapes.old.timers |= home.shapes.timer_mappers(meta.timers, meta.shapes)
+        home.shapes.old.timers |= home.shapes.timer_mappers(meta.timers, meta.made.shapes)
     for position, entry in saved.entries:
         _reload(home, position, entry, timers)
     home.ledger.read = home.ledger.next_id
@@ -288,7 +299,7 @@ def begin_with_older(home: Switch) -> None:
     saved, newest = load_newest(home)
     home.ledger = home.ledger.read_anew(newest, saved.entries)
     old = home.shapes.old  # What is open was mapped when the home was read.
-    for name, rows in ({} if newest is None else newest.shapes).items():
+    for name, rows in ({} if newest is None else newest.made.shapes).items():
         old.read(name, first_of([as_shape(row) for row in rows]))
     for _, entry in saved.entries:
         for one in spread(entry):

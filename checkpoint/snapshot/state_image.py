@@ -87,7 +87,7 @@ class Section:
 
     @property
     def size(self) -> int:
-        """Its bytes."""
+        """How many bytes all parts of the image have."""
         return sum(part.size for part in self.parts)
 
 

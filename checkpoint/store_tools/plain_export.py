@@ -123,7 +123,7 @@ class _Export:
             if self._view.is_kept(number):  # Else the running system has a newer one now.
                 yield _damage(error, address)
             return
-        tables = {name: [*map(as_shape, known)] for name, known in meta.shapes.items() if known}
+        tables = {name: [*map(as_shape, known)] for name, known in meta.made.shapes.items() if known}
         self._shapes.setdefault(chain.id, {name: first_of(known) for name, known in tables.items()})
         newest = {name: known[-1] for name, known in tables.items()}
         yield {
@@ -131,7 +131,7 @@ class _Export:
             "address": address,
             "turn": meta.turn,
             "time": meta.time,
-            "class": meta.kind,
+            "class": meta.made.kind,
             "next_input": meta.next_id,
             "stashed": meta.stash,
             "topics": meta.topics,

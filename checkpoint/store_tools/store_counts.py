@@ -162,7 +162,7 @@ def _count_address(view: StoreView, chain: Chain, address: str) -> AddressStats:
             continue
         size = len(meta.state) + sum(length for _, _, length in meta.blocks)
         found.snapshots.append(SnapshotStats(meta.turn, size, meta.time))
-        found.kind = meta.kind
+        found.kind = meta.made.kind
         ledger.begin_after(msgspec.structs.replace(meta, state=b""))
     try:
         for position, size, entry in entries_of(view, chain):

@@ -18,7 +18,7 @@ from ...ftm.model.mechanism import find
 from ...supervision.dynamic import dynamic
 from ...supervision.spec import ChildSpec, Flags, child
 from ...supervision.tree import supervisor
-from .wanted import WantedActor
+from .wanted_tree import WantedActor
 
 FLAGS: Final = ("strategy", "intensity", "period", "auto_shutdown", "max_children", "journal")
 SUPERVISOR: Final = ("supervisor", *FLAGS[1:], "restart", "shutdown", "isolation", "limits", "significant")

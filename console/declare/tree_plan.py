@@ -26,7 +26,7 @@ from ...system.transaction.wiring import Bind, RegisterName, Unbind, UnregisterN
 from ..overview import is_far
 from ..trust import Needed, trusted_imports
 from .tree_file import TreeFile
-from .wanted import WantedActor, WantedTree
+from .wanted_tree import WantedActor, WantedTree
 
 if TYPE_CHECKING:
     from ...system.system import ActorSystem

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,20 @@ from ..overview import ActorRow, SystemLook
 from ..remote import RemoteSystem
 from ..runtime_folder import found_sockets, sweep
 from .patterns import select
-from .reaching import FAILED, Json, Paths, Socket, System, complete_path, ended, printable, reached, show_json, told
+from .reaching import (
+    FAILED,
+    UNUSABLE,
+    Json,
+    Paths,
+    Socket,
+    System,
+    complete_path,
+    ended,
+    printable,
+    reached,
+    show_json,
+    told,
+)
 
 COLOURS = {"running": "green", "suspended": "yellow", "restarting": "magenta", "starting": "magenta", "stopped": "red"}
 MEASURED = 0.2
@@ -164,6 +178,8 @@ def top(
     """
     from .top import Top  # only now: Textual takes a while to import
 
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise ended("top", "it needs a terminal; holdfast tree prints the same once", UNUSABLE)
     with reached("top", system, socket) as remote:
         why = Top(remote, seconds=seconds, patterns=tuple(patterns or ())).run()
     if why:

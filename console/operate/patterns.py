@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 from ...actors.errors import HoldfastError, NoSuchActor
+from ...system.history.paths import matcher
 from ..overview import ActorRow
 
 COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {
@@ -59,7 +60,7 @@ class Pattern:
     """
 
     text: str
-    glob: re.Pattern[str]
+    is_like: Callable[[str], bool]
     conditions: tuple[Condition, ...]
     is_one: bool
     """Whether it is one address or name, which has to be there."""
@@ -67,7 +68,7 @@ class Pattern:
     def matches(self, row: ActorRow) -> bool:
         """Whether an actor is meant."""
         named = self.is_one and self.text in row.names
-        return (named or self.glob.fullmatch(row.path) is not None) and all(one.holds(row) for one in self.conditions)
+        return (named or self.is_like(row.path)) and all(one.holds(row) for one in self.conditions)
 
 
 def read_pattern(text: str) -> Pattern:
@@ -80,7 +81,7 @@ def read_pattern(text: str) -> Pattern:
     is_one = given is None and "*" not in glob and "?" not in glob
     if not glob.startswith("/") and not is_one:
         raise BadPattern(text, "an address begins with '/', as /app/bank does")
-    return Pattern(text, _regex(glob.rstrip("/") or "/"), conditions, is_one)
+    return Pattern(text, _below(glob.rstrip("/") or "/"), conditions, is_one)
 
 
 def _condition(pattern: str, text: str) -> Condition:
@@ -100,22 +101,15 @@ def _condition(pattern: str, text: str) -> Condition:
     return one
 
 
-def _regex(glob: str) -> re.Pattern[str]:
-    """What a path is matched with.
+def _below(glob: str) -> Callable[[str], bool]:
+    """A test for addresses. At its end `**` is whoever is below, and not the one above them: a change is for those.
 
-    >>> [bool(_regex("/app/**").fullmatch(path)) for path in ("/app", "/app/a", "/app/a/b")]
+    >>> [_below("/app/**")(path) for path in ("/app", "/app/a", "/app/a/b")]
     [False, True, True]
-    >>> [bool(_regex("/app/**/x*").fullmatch(path)) for path in ("/app/x", "/app/a/x1", "/app/a")]
+    >>> [_below("/app/**/x*")(path) for path in ("/app/x", "/app/a/x1", "/app/a")]
     [True, True, False]
     """
-    parts = glob.split("/")
-    made = ""
-    for number, part in enumerate(parts):
-        if part == "**":
-            made += "(?:/[^/]+)+" if number == len(parts) - 1 else "(?:/[^/]+)*"
-        elif part or number:
-            made += "/" + re.escape(part).replace(r"\*", "[^/]*").replace(r"\?", "[^/]")
-    return re.compile(made)
+    return matcher(f"{glob}/*" if glob.endswith("**") else glob)
 
 
 def _values(row: ActorRow) -> tuple[Any, ...]:

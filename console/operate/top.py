@@ -63,7 +63,7 @@ class Question(ModalScreen[bool]):
         yield Static(f"{self._text}\n\ny: go on, n: leave it", markup=False)
 
     def action_answer(self, answer: bool) -> None:
-        """It is answered."""
+        """Close the question with the answer."""
         self.dismiss(answer)
 
 
@@ -235,7 +235,7 @@ class Top(App[str]):
         self._begin(self.look_again())
 
     def action_pattern(self) -> None:
-        """Ask for a pattern."""
+        """Show the field for a pattern, and type there."""
         field = self.query_one("#pattern", Input)
         field.styles.display = "block"
         field.focus()
@@ -267,5 +267,5 @@ class Top(App[str]):
 
 
 def style_of(column: str, text: str) -> Style | None:
-    """States have colours."""
+    """The style of a cell: states have colours."""
     return STYLES.get(text, STYLES["restarting"]) if column == "state" else None

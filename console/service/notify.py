@@ -71,7 +71,7 @@ class Notifier:
         self._tell("STOPPING=1", "STATUS=stopping")
 
     def close(self) -> None:
-        """Say nothing any more."""
+        """Close the socket: the service manager is told nothing more."""
         for timer in (self._beat, self._again):
             if timer is not None:
                 timer.cancel()

@@ -9,7 +9,7 @@ import sys
 import sysconfig
 from collections.abc import Generator
 from pathlib import Path
-from types import ModuleType
+from types import FunctionType, ModuleType
 
 from ...actors.errors import HoldfastError, SpecError, error_text, type_name
 from ...actors.kernel.message import Message
@@ -107,5 +107,4 @@ def _origin(value: object) -> str:
     """The module that a value is, or in which it was defined; empty if that is not known."""
     if isinstance(value, ModuleType):
         return value.__name__
-    found = value.__dict__.get("__module__") if isinstance(value, type) else getattr(value, "__module__", None)
-    return found if isinstance(found, str) else ""
+    return (value if isinstance(value, type | FunctionType) else type(value)).__module__

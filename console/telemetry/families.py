@@ -87,7 +87,7 @@ class Filled:
             self.put(name, value, *labels)
 
     def spread(self, name: str, values: Spread, *labels: str) -> None:
-        """A histogram."""
+        """Put a histogram into its family."""
         made = self._made[name]
         assert isinstance(made, HistogramMetricFamily)
         buckets, total = values.buckets()

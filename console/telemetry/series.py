@@ -44,7 +44,7 @@ class Tallies:
         self._counts[labels] = self._counts.get(labels, 0.0) + by
 
     def values(self) -> dict[tuple[str, ...], float]:
-        """The counts so far."""
+        """The counts so far, by labels."""
         return dict(self._counts)
 
 
@@ -62,7 +62,7 @@ class Spread:
         self._lock = threading.Lock()  # A store is called in threads, too.
 
     def add(self, value: float) -> None:
-        """Count a value."""
+        """Count a value in its bucket."""
         with self._lock:
             self._counts[bisect.bisect_left(self.bounds, value)] += 1
             self._sum += value

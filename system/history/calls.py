@@ -37,7 +37,7 @@ class HistoryCalls:
         raise NotImplementedError
 
     async def get_status(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Status:
-        """How an actor is."""
+        """Say how an actor is now; see `Controls`."""
         raise NotImplementedError
 
     def quarantined(self, actor: ActorRef[Any] | str | None = None) -> list[QuarantinedMessage]:

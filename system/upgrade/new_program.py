@@ -73,7 +73,7 @@ def specs_in(target: str, found: Any) -> Named:
         _collect(target, found() if callable(found) else found, specs)
     except HoldfastError:
         raise
-    except Exception as error:
+    except BaseException as error:  # A program that reads its specs again goes on, whatever they raise.
         raise SpecError(target, f"it raised {type_name(type(error))}: {error_text(error)}") from error
     return specs
 

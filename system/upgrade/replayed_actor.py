@@ -152,7 +152,7 @@ def _chosen(recipe: Recipe | AddressCheck) -> Recipe:
 def _recorded(address: str, lives: list[KeptLife]) -> Recipe:
     """The class that is recorded, without arguments."""
     meta = lives[-1].meta
-    name = meta.kind if meta is not None else ""
+    name = meta.made.kind if meta is not None else ""
     for _, entry in lives[0].saved.entries:
         if entry[0] == "in" and entry[2] == START:
             name = name or cast("bytes", entry[4]).decode()

@@ -163,3 +163,25 @@ def test_events_cross_a_process_border_with_their_fields(event: hf.events.Event)
 )
 def test_an_event_that_does_not_fit_is_no_event(kind: str, data: dict[str, Any]) -> None:
     assert event_from(kind, data) is None
+
+
+async def test_what_listens_and_raises_hurts_nobody_who_tells() -> None:
+    """A user's log or tracer may be behind it, and a supervisor may be in the middle of a restart."""
+    troubles: list[str] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: troubles.append(str(context["exception"])))
+
+    def raises(event: hf.events.Event) -> None:
+        raise RuntimeError("a log that is broken")
+
+    async with hf.ActorSystem("app", log=False) as system:
+        heard: list[hf.events.Event] = []
+        system._node.events.add_sink(raises)
+        system._node.events.add_sink(heard.append)
+        one = await system.start(hf.child("one", hf.start(hf.Actor)))
+        one.kill()
+        with system.events() as events:
+            one.kill()
+            await events.until(hf.events.ChildRestarted)
+        system._node.events.remove_sink(raises)
+        assert [event for event in heard if isinstance(event, hf.events.ChildRestarted)]
+    assert set(troubles) == {"a log that is broken"}

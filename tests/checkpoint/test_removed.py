@@ -162,6 +162,13 @@ CHECKS = {
         "tests/checkpoint/test_input_ledger.py",
         "TestLedgers",
     ),
+    "what becomes of a turn whose row was given up is told": Check(
+        "checkpoint/home/admission.py",
+        'told, also later."""\n        self._home.outputs.rows.written(self)\n',
+        'told, also later."""\n',
+        "tests/checkpoint/test_turn_rows.py",
+        "test_an_ask_whose_store_stops",
+    ),
     "a row stays until a snapshot contains all of its inputs": Check(
         "checkpoint/home/input_ledger.py",
         "            if row.left == len(keys):\n",

@@ -31,7 +31,10 @@ class Noted:
     def __init__(self, path: Path) -> None:
         self.real = SqliteJournal(path)
         self.rows: list[Entry] = []
-        self.is_full = False
+        self.is_full = self.is_broken = False
+
+    def has_failed(self) -> bool:
+        return self.is_broken or self.real.has_failed()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.real, name)
@@ -362,6 +365,20 @@ async def test_a_kill_of_the_actor_costs_no_ask_that_runs_ahead(engine: Any, iso
         engine.is_full = False
         await asyncio.gather(*begun)
         assert await doer.ask(Seen(), timeout=30.0) == list("abcd")
+
+
+async def test_an_ask_whose_store_stops_before_its_turn_ends_is_told(engine: Any, tmp_path: Path) -> None:
+    """Its row is given up while the turn goes on: what comes of the turn has nothing to stand in, and says so."""
+    gate = str(tmp_path / "gate")
+    async with hf.ActorSystem("app", log=False, store=engine) as system:
+        doer = await system.start(hf.child("doer", hf.start(Doer), recovery=RECOVERY))
+        await doer.ask(Do(["add a"]))
+        engine.is_full = engine.is_broken = True
+        asked = doer.ask(Do([f"gate {gate}"]), timeout=25.0)
+        await until(lambda: system._homes.journal.stopped is not None)
+        Path(f"{gate}.open").touch()
+        with pytest.raises(hf.errors.StoreFailed):
+            await asked
 
 
 PROGRAM = """

@@ -21,9 +21,9 @@ from holdfast.actors.values import encode_value
 from holdfast.console import claims
 from holdfast.console import endpoint as endpoint_module
 from holdfast.console.claims import EndpointInUse, claimed
+from holdfast.console.client_session import ClientSession
 from holdfast.console.endpoint import Endpoint, control_endpoint
 from holdfast.console.remote import Client, NotReached, RemoteRef, RemoteSystem
-from holdfast.console.session import ClientSession
 from holdfast.console.wire import (
     RESPONSE,
     BadRequest,

@@ -307,3 +307,9 @@ async def test_an_address_is_one_line_whatever_is_in_it(named: hf.ActorSystem) -
     assert (status, "/app/e?[31m??x" in output.split("\n")) == (DONE, True)
     status, output, _ = await holdfast("tree")
     assert (status, "\x1b" in output, sum("e?[31m??x" in line for line in output.split("\n"))) == (DONE, False, 1)
+
+
+async def test_top_needs_a_terminal(named: hf.ActorSystem) -> None:
+    status, output, errors = await holdfast("top")
+    assert (status, output) == (UNUSABLE, "")
+    assert "it needs a terminal" in errors

@@ -56,6 +56,26 @@ async def main(system):
 async def brief(system):
     await system.start(tree()[0])
 """
+STUBBORN = """
+import asyncio
+from pathlib import Path
+import holdfast as hf
+
+
+class Polite(hf.Actor):
+    def on_stop(self, reason):
+        Path("stopped").touch()
+
+
+async def main(system):
+    await system.start(hf.child("polite", hf.start(Polite)))
+    Path("up").touch()
+    while True:
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            pass
+"""
 FILE = '["/app/clock"]\nclass = "clock:Clock"\nrecovery = "hybrid"\n'
 
 
@@ -137,6 +157,25 @@ async def test_the_manager_hears_of_the_start_the_loop_and_the_end(project: Path
             assert await service.process.wait() == 143
 
 
+async def test_a_main_that_does_not_end_does_not_hold_up_the_end_of_the_system(project: Path) -> None:
+    """Its actors stop in good order all the same; what is left of the process another signal ends."""
+    (project / "stubborn.py").write_text(STUBBORN)
+    async with running("stubborn:main") as service, asyncio.timeout(25):
+        while not (project / "up").exists():
+            await asyncio.sleep(0.01)
+        service.process.send_signal(signal.SIGTERM)
+        await service.hears("STOPPING=1")
+        while not (project / "stopped").exists():
+            await asyncio.sleep(0.01)
+        assert service.process.stderr is not None
+        while b"SIGTERM ends the rest" not in (line := await service.process.stderr.readline()):
+            assert line, "it has ended, or says nothing more"
+        while service.process.returncode is None:  # The last lines of the program still hear the signal.
+            service.process.send_signal(signal.SIGTERM)
+            await asyncio.sleep(0.05)
+        assert service.process.returncode in (-signal.SIGTERM, 143)
+
+
 @pytest.mark.parametrize("target", ["tree:tree", "tree:main"])
 async def test_sighup_has_changed_code_taken_up_with_state_kept(project: Path, target: str) -> None:
     async with running(target) as service:
@@ -167,6 +206,7 @@ async def test_sighup_has_another_tree_planted(project: Path) -> None:
         ("words.py", WORDS + "\n\nclass Tock(hf.Message): ...\n", "words: it defines messages"),
         ("tree.py", TREE.replace('"clock", hf', '"/", hf'), "the id must be text without '/'"),
         ("tree.py", TREE.replace("Clock)", "Clock, 7)"), "too many positional arguments"),
+        ("tree.py", TREE.replace("    return [", "    raise SystemExit(3)\n    return ["), "SystemExit"),
     ],
 )
 async def test_a_reload_that_fails_changes_nothing(project: Path, file: str, text: str, problem: str) -> None:

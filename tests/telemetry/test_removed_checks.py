@@ -12,6 +12,20 @@ METRICS = "tests/telemetry/test_metrics.py"
 TRACES = "tests/telemetry/test_traces.py"
 
 CHECKS = {
+    "a tracer that raises when a span ends hurts no actor": Check(
+        "actors/control/spans.py",
+        "        span.end(at)\n    except Exception as error:\n",
+        "        span.end(at)\n    except ZeroDivisionError as error:\n",
+        TRACES,
+        "test_a_tracer_that_raises and end",
+    ),
+    "a tracer that raises when a span begins hurts no actor": Check(
+        "actors/control/spans.py",
+        "kind, {ADDRESS: cell.path})\n        except Exception as error:\n",
+        "kind, {ADDRESS: cell.path})\n        except ZeroDivisionError as error:\n",
+        TRACES,
+        "test_a_tracer_that_raises and start",
+    ),
     "what is handled again is in no trace": Check(
         "checkpoint/life/recorded_life.py",
         "if feed.chain and feed.turn < 0:  # What",

@@ -28,7 +28,7 @@ EVERY = 1 if "HOLDFAST_CUTS" in os.environ else 5
 WRITER = """
 import os, random, sys
 import msgspec
-from holdfast.checkpoint.snapshot.snapshot_record import IMAGES, Meta
+from holdfast.checkpoint.snapshot.snapshot_record import IMAGES, ClassRecord, Meta
 from holdfast.checkpoint.sqlite import SqliteJournal, append_log, open_store
 path, seed, steps, key = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), bytes.fromhex(sys.argv[4]) or None
 append_log.MOST_ROWS, open_store._CHECKPOINT_BYTES = 12, 1 << 20
@@ -54,7 +54,8 @@ for step in range(1, steps + 1):
             blocks = [(step, 0, len(pack))]
             packs[owner].append(step)
         earlier = packs[owner][-2:]
-        meta = Meta(IMAGES, number, number, [], {}, [], 1, state, number, blocks, earlier, time=1.0, kind="app:Writer")
+        made = ClassRecord("app:Writer")
+        meta = Meta(IMAGES, number, number, [], {}, [], 1, state, number, blocks, earlier, time=1.0, made=made)
         journal.cut(address, msgspec.msgpack.encode(meta), live[owner], turn=number)
         live[owner] = []
         journal.forget_blocks(address, packs[owner][:-2])

@@ -23,7 +23,7 @@ from ...system.transaction.change import Change
 from ...system.transaction.living import ReplaceActorCode
 from ...system.upgrade.new_program import load_named, specs_in
 from ..declare.tree_plan import actor_places, change_to, declare, other_code
-from ..declare.wanted import WantedSpecs
+from ..declare.wanted_tree import WantedSpecs
 from ..endpoint import control_endpoint
 from ..operate.reaching import FAILED, UNUSABLE, ended
 from .notify import Notifier
@@ -31,6 +31,8 @@ from .reloading import ProjectModules
 
 RELOAD_TIMEOUT = 60.0
 """Seconds that a reload may take."""
+MAIN_TIMEOUT = 5.0
+"""Seconds that a main may take to end when it is cancelled."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -141,7 +143,9 @@ async def serve(program: ServedProgram, make: Callable[[], ActorSystem], notifie
                 notifier.stopping()
                 if main is not None and not main.done():
                     main.cancel()
-                    await asyncio.wait({main})
+                    if not (await asyncio.wait({main}, timeout=MAIN_TIMEOUT))[0]:
+                        left = "the system stops, and SIGTERM ends the rest"
+                        tell(f"its main has not ended within {MAIN_TIMEOUT:g} s: {left}")
 
 
 def tell(text: str) -> None:

@@ -32,7 +32,7 @@ class WantedActor:
 
     @property
     def bindings(self) -> Mapping[str, str]:
-        """Port to address."""
+        """Where its ports are to lead: address by port."""
         return self.spec.bindings if self.spec is not None else {}
 
     @property
