@@ -443,10 +443,12 @@ async def test_a_tracer_that_raises_hurts_no_actor(where: str) -> None:
         one = await system.start(hf.child("one", hf.start(Clerk)))
         kept = await system.start(hf.child("kept", hf.start(Clerk), isolation="process", recovery=hf.hybrid()))
         system.trace_with(provider.get_tracer("test"), one_in=1)
-        for ref in (one, kept):
-            assert await ref.ask(Count(), timeout=30.0) == 1
-            ref.kill()
-            await ref.ask(Count(), timeout=30.0)
+        with system.events() as events:
+            for ref in (one, kept):
+                assert await ref.ask(Count(), timeout=30.0) == 1
+                ref.kill()
+                await ref.ask(Count(), timeout=30.0)
+            assert not [event for event in events.take() if isinstance(event, hf.events.ActorCrashed)]
         system.trace_with(None)
         assert await system.ref("/app").ask(hf.supervision.CountChildren())
     assert set(troubles) == {f"of {'a start' if where == 'start' else 'an end'}"}
