@@ -233,6 +233,17 @@ class TracedDeadlines(Deadlines):
         if around is not None:
             spans.ask(ask, around)
 
+    def close(self) -> list[Ask]:
+        """Forget all timers; whoever ends so is traced no more, however it ends."""
+        left = Deadlines.close(self)
+        self._leave()
+        return left
+
+    def _leave(self) -> None:
+        del self.spans
+        cast("Any", self).__class__ = Deadlines
+        TracedSends.take_out()
+
 
 class TracedSends:
     """The methods that refs have while any node of this process is traced."""
@@ -283,11 +294,8 @@ def trace_node(node: Node, tracer: Tracer, share: float, *, baggage: bool) -> Sp
 
 def leave_node(node: Node) -> None:
     """Make no more spans of what a node sends and runs."""
-    if spans_of(node) is not None:
-        deadlines: Any = node.deadlines
-        del deadlines.spans
-        deadlines.__class__ = Deadlines
-        TracedSends.take_out()
+    if isinstance(node.deadlines, TracedDeadlines):
+        node.deadlines._leave()
 
 
 # -- a turn -----------------------------------------------------------------------------------------------------------

@@ -244,13 +244,14 @@ class SimulatedProcess(SimulatedPlace):
         self.pool.loop.call_soon(self._on_exit, status, context=self.pool.root_context)
 
     def _give_back(self) -> None:
-        """Close the memory in which its actors had images of their states, as the kernel does for a real one."""
+        """Give back the memory in which its actors had images of their states, and its timers, as the kernel does."""
         waiting = [cell for cell in (self.guest.node.root,) if cell is not None]
         while waiting:
             cell = waiting.pop()
             if isinstance(cell.ctx, RecordedContext):
                 cell.ctx.recorded.images.close()
             waiting.extend((cell.children or {}).values())
+        self.guest.node.deadlines.close()
 
 
 class SimulatedServer:

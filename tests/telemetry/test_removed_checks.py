@@ -75,6 +75,13 @@ CHECKS = {
         TRACES,
         "test_a_trace_is_begun_once",
     ),
+    "who ends is traced no more": Check(
+        "actors/control/spans.py",
+        "        self._leave()\n        return left",
+        "        return left",
+        TRACES,
+        "test_a_simulated_end_leaves_nobody_traced",
+    ),
     "labels are bounded": Check(
         "console/telemetry/series.py",
         "if len(self._known) >= self._most:",

@@ -19,6 +19,7 @@ import holdfast as hf
 from holdfast.actors.control.trace_tail import tail_of
 from holdfast.actors.kernel.context import ActorContext
 from holdfast.actors.kernel.ref import ActorRef
+from holdfast.testing import GuardedSystem, Simulation, simulate
 from tests.telemetry.scrapes import until
 from tests.telemetry.traced_shop import (
     Clerk,
@@ -452,3 +453,23 @@ async def test_a_tracer_that_raises_hurts_no_actor(where: str) -> None:
         system.trace_with(None)
         assert await system.ref("/app").ask(hf.supervision.CountChildren())
     assert set(troubles) == {f"of {'a start' if where == 'start' else 'an end'}"}
+
+
+@pytest.mark.parametrize("end", ["crash", "close"])
+def test_a_simulated_end_leaves_nobody_traced(traced: Traced, end: str) -> None:
+    """Roots and processes of a simulated run live in that of the test: what tracing puts in goes with them."""
+
+    async def play(system: GuardedSystem, simulation: Simulation) -> None:
+        near = await system.start(hf.child("near", hf.start(Clerk)))
+        far = await system.start(hf.child("far", hf.start(Clerk), isolation="process"))
+        system.trace_with(traced.tracer, one_in=1)
+        for ref in (near, far):
+            await ref.ask(Count())
+        far.kill()
+        await far.ask(Count())
+        if end == "crash":
+            await simulation.crash_root()
+
+    before = ActorRef.tell
+    simulate(seeds=3, intensity=100)(play)()
+    assert ActorRef.tell is before
