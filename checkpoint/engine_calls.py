@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from collections.abc import Callable, Collection, Generator, Sequence
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 from ..actors.errors import HoldfastError
-from .journal import Entry, InHand, Journal, Saved, StoreFailed, StoreFile
+from .journal import Entry, InHand, Journal, SafeAt, Saved, StoreFailed, StoreFile
 
 if TYPE_CHECKING:
     from .snapshot.shared_blocks import Segment
@@ -38,6 +39,7 @@ class Called:
         self.durable = engine.durable
         self.epoch = self._call(lambda: engine.epoch)
         self.in_hand: InHand | None = getattr(engine, "in_hand", None)
+        self.safe_at: SafeAt = getattr(engine, "safe_at", "append")
 
     def _call(self, method: Callable[P, T], *args: P.args, **named: P.kwargs) -> T:
         try:
@@ -93,6 +95,14 @@ class Called:
         """Have everything outlive the machine; a failure is for good."""
         with self._for_good():
             self._engine.sync()
+
+    def synced(self) -> asyncio.Future[None] | None:
+        """Done when all is as safe as a `sync` makes it, if the engine can say so; a failure is for good."""
+        synced: Callable[[], asyncio.Future[None]] | None = getattr(self._engine, "synced", None)
+        if synced is None:
+            return None
+        with self._for_good():
+            return synced()
 
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """Keep a snapshot, and forget what it contains."""

@@ -1,7 +1,8 @@
 """Group commit: one append per tick for all homes; each submission takes effect once it is safe enough.
 
 Two lanes, each in order. What is only to outlive this process (`durability="os"`) takes effect when it is written; what
-is to outlive the machine (`"fsync"`) when it is synced too, which a thread does for all that has gathered meanwhile.
+is to outlive the machine (`"fsync"`) when it is synced too, which a thread does for all that has gathered meanwhile. In
+a store that is safe only when it is synced, there is one lane, the slower one.
 Whoever has something in the slow lane stays there with all that follows, so that nobody's outputs change their order.
 
 What is submitted lives here, not in the message handler that has it written: that one may be killed at any moment.
@@ -79,7 +80,8 @@ class Commits:
 
     def want(self, path: str, durability: Durability | None) -> None:
         """How safe what this home submits has to be."""
-        self._lanes.want(path, is_synced=(durability or self.durability) == "fsync")
+        is_synced = self.engine.safe_at == "sync" or (durability or self.durability) == "fsync"
+        self._lanes.want(path, is_synced=is_synced)
 
     def rename(self, paths: Mapping[str, str]) -> None:
         """Homes have other addresses from now on; nothing of theirs waits to be written."""
@@ -243,21 +245,25 @@ class Commits:
     # -- syncing ----------------------------------------------------------------------------------------------------
 
     def _sync(self) -> None:
-        """Have a thread sync all that is written so far."""
-        if self._thread is None:
-            self._thread = ThreadPoolExecutor(1, "holdfast-sync")
+        """Have the engine, or a thread, sync all that is written so far."""
         written = self._lanes.written
         try:
-            self._syncing = self._loop.run_in_executor(self._thread, self.engine.sync)
-        except RuntimeError:  # No thread can be started now: everybody waits for the disk, this once.
+            self._syncing = self.engine.synced() or self._synced_in_thread()
+        except Exception as error:
             self._syncing = self._loop.create_future()
-            try:
-                self.engine.sync()
-            except Exception as error:
-                self._syncing.set_exception(error)
-            else:
-                self._syncing.set_result(None)
+            self._syncing.set_exception(error)
         self._syncing.add_done_callback(functools.partial(self._synced_to, written), context=self._context)
+
+    def _synced_in_thread(self) -> asyncio.Future[None]:
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, "holdfast-sync")
+        try:
+            return self._loop.run_in_executor(self._thread, self.engine.sync)
+        except RuntimeError:  # No thread can be started now: everybody waits for the disk, this once.
+            self.engine.sync()
+            done = self._loop.create_future()
+            done.set_result(None)
+            return done
 
     def _synced_to(self, number: int, done: asyncio.Future[None]) -> None:
         self._syncing = None

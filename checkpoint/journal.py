@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import dataclasses
 from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeAlias
 
 from ..actors.errors import StoreError
 
@@ -21,6 +22,7 @@ __all__ = [
     "MemoryJournal",
     "NotCopied",
     "Primitive",
+    "SafeAt",
     "Saved",
     "StaleEpoch",
     "StoreEngine",
@@ -35,13 +37,26 @@ Entry: TypeAlias = "tuple[Primitive, ...]"
 """What the switch writes: a short `str` kind ("in", "out", "got", "end", "note"), then what that kind needs."""
 
 
+SafeAt: TypeAlias = Literal["append", "sync"]
+"""When what was appended outlives the death of the process: at once, or only when a `sync` has come back."""
+
+
 class StoreInUse(StoreError):
-    """A live process has the store open: stop it, or open with `takeover=True`."""
+    """A live process has the store open: stop it, or open with `takeover=True`.
+
+    Attributes:
+        path: of the store.
+        pid: of that process; 0 if it cannot be seen from here.
+        owner: what it calls itself, if it is on another machine.
+    """
 
     path: str
     pid: int
+    owner: str = ""
 
     def __str__(self) -> str:
+        if self.owner:
+            return f"store {self.path} is in use: {self.owner}, leads; stop it, or wait for it with standby='warm'"
         if not self.pid:
             return f"store {self.path} is open in a process that cannot be seen from here (another container?): stop it"
         return f"store {self.path} is open in process {self.pid}: stop it, or open with takeover=True, which kills it"
@@ -258,6 +273,15 @@ class StoreEngine(Journal, Protocol):
         """Which inputs are in hand, if the engine keeps that."""
         ...
 
+    @property
+    def safe_at(self) -> SafeAt:
+        """When what was appended outlives the death of the process."""
+        ...
+
+    def synced(self) -> asyncio.Future[None] | None:
+        """Done when all that was written so far is as safe as a `sync` makes it; `None`: call that, in a thread."""
+        ...
+
     def has_failed(self) -> bool:
         """Whether the engine refuses for good."""
         ...
@@ -293,6 +317,7 @@ class MemoryJournal:
     __slots__ = ("_last", "_notes", "durable", "epoch")
     in_hand = None
     file = None
+    safe_at: SafeAt = "append"
 
     def __init__(self) -> None:
         self.durable = False
@@ -320,6 +345,9 @@ class MemoryJournal:
 
     def sync(self) -> None:
         """Do nothing, since nothing survives the process."""
+
+    def synced(self) -> None:
+        """Return nothing to wait for: `sync` does nothing."""
 
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """Do nothing: the switch keeps the snapshot."""

@@ -21,7 +21,7 @@ Layout     Entries are clustered by position and have no index by address: it wo
 Read `engine.py` first: it has the journal, as far as it is not about the file. `open_store.py` opens, writes and closes
 the file, `append_log.py` is in front of it, `ownership.py` decides who owns it, `entry_chains.py` finds what is in it,
 `read_back.py` reads an address back, `position_mark.py` and `snapshot_files.py` keep what is beside it, `row_codec.py`
-has the bytes.
+has the bytes of rows.
 """
 
 from __future__ import annotations

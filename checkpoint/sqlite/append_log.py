@@ -22,8 +22,8 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Final, TypeAlias
 
+from ..entry_codec import decode_entry
 from ..journal import Primitive
-from .row_codec import decode_entry
 from .snapshot_files import Word, read_own, refuse_shared, sync
 
 Row: TypeAlias = tuple[int, int, int, Primitive, bytes, int]

@@ -12,6 +12,7 @@ from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager
 from typing import Final, Literal
 
+from ..entry_codec import check_entry, entry_packer, is_plain
 from ..journal import DamagedStore, Entry, Saved, StaleEpoch, StoreFailed
 from ..snapshot.shared_blocks import Segment
 from ..store_key import StoreKey, read_store_key
@@ -20,7 +21,7 @@ from .block_packs import Packs
 from .entry_chains import MODULUS, Chain
 from .open_store import INSERT, Store
 from .read_back import ChainReader, dropped_by
-from .row_codec import CHUNK, PLACE, check_entry, entry_packer, is_plain, pack_positions, snapshot_digest
+from .row_codec import CHUNK, PLACE, pack_positions, snapshot_digest
 from .sealing import SEALED_KIND, drops_place, entry_sealer, note_name, note_row, snapshot_place
 
 _FEW: Final = 128  # More entries at a time, or more bytes, are worth a transaction of their own.

@@ -8,9 +8,10 @@ import zlib
 from array import array
 from collections.abc import Sequence
 
+from ..entry_codec import decode_entry
 from ..journal import DamagedStore, Entry, Saved
 from .entry_chains import Chain
-from .row_codec import CHUNK, PLACE, decode_entry, row_crc, snapshot_digest, unpack_positions
+from .row_codec import CHUNK, PLACE, row_crc, snapshot_digest, unpack_positions
 from .sealing import Cipher, drops_place, kept_kind, snapshot_place, unseal_entry
 from .snapshot_files import SnapshotFiles
 

@@ -20,8 +20,9 @@ from itertools import count
 from typing import TYPE_CHECKING, Final, Protocol
 
 from ...actors.errors import SpecError
+from ..entry_codec import decode_entry, entry_packer
 from ..journal import Entry, Primitive
-from .row_codec import crc_of, decode_entry, entry_packer
+from .row_codec import crc_of
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM

@@ -12,12 +12,13 @@ import functools
 import random
 from array import array
 from collections.abc import Callable, Collection, Generator, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from ...actors.errors import HoldfastError
 from ...checkpoint.journal import DamagedStore, Entry, Saved, StaleEpoch, StoreFailed
 from ...checkpoint.snapshot.shared_blocks import Segment
 from ...checkpoint.turn_word import blamed, is_at_work
+from ...cluster.store_contents import Change, StoreContents
 from .choices import DELAY, LEVELS, LOSS, Choices
 
 PATH: Final = "simulated"
@@ -46,66 +47,6 @@ class Latency:
         return least + (longest - least) * level / (LEVELS - 1)
 
 
-class KeptSnapshot(NamedTuple):
-    """A snapshot, with the positions of all entries that it contains."""
-
-    data: bytes
-    turn: int
-    contains: frozenset[int]
-
-
-Change = tuple[str, tuple[Any, ...]]
-"""A method of `Contents`, and its arguments."""
-
-
-class Contents:
-    """All that a store holds. Each change is a method, so that it can be made twice: when it is written, and when it is
-    synced."""
-
-    def __init__(self) -> None:
-        self.last = 0
-        self.entries: dict[str, dict[int, Entry]] = {}
-        self.snapshots: dict[str, list[KeptSnapshot]] = {}
-        self.blocks: dict[tuple[str, int], dict[tuple[int, int], bytes]] = {}
-        self.notes: dict[str, bytes] = {}
-
-    def append(self, entries: Sequence[tuple[str, Entry]]) -> None:
-        """Add entries behind the last position."""
-        for address, entry in entries:
-            self.last += 1
-            self.entries.setdefault(address, {})[self.last] = entry
-
-    def cut(self, address: str, snapshot: bytes, drop: Collection[int], turn: int, keep: int) -> None:
-        """Add a snapshot, and forget what the oldest one that is kept contains."""
-        kept, entries = self.snapshots.setdefault(address, []), self.entries.get(address, {})
-        before = kept[-1].contains if kept else frozenset[int]()
-        kept.append(KeptSnapshot(snapshot, turn, frozenset(p for p in entries if p in before or p in drop)))
-        del kept[:-keep]
-        for position in kept[0].contains:
-            entries.pop(position, None)
-
-    def erase(self, address: str) -> None:
-        """Forget an address."""
-        self.entries.pop(address, None)
-        self.snapshots.pop(address, None)
-        self.blocks = {key: pack for key, pack in self.blocks.items() if key[0] != address}
-
-    def keep_blocks(self, address: str, number: int, blocks: dict[tuple[int, int], bytes]) -> None:
-        """Add a pack of blocks."""
-        self.blocks[address, number] = blocks
-
-    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
-        """Forget packs of an address."""
-        for number in numbers:
-            self.blocks.pop((address, number), None)
-
-    def note(self, key: str, value: bytes | None) -> None:
-        """Set or forget a note."""
-        self.notes.pop(key, None)
-        if value is not None:
-            self.notes[key] = value
-
-
 class SimulatedDisk:
     """What outlives a root of a simulated run.
 
@@ -116,10 +57,10 @@ class SimulatedDisk:
     """
 
     def __init__(self) -> None:
-        self.written = Contents()
+        self.written = StoreContents()
         self.epoch = 0
         self.words: dict[str, array[int]] = {}
-        self._synced = Contents()
+        self._synced = StoreContents()
         self._unsynced: list[list[Change]] = []  # what stands together is lost together
 
     def open(self) -> SimulatedJournal:
@@ -129,7 +70,7 @@ class SimulatedDisk:
 
     def write(self, change: str, *args: Any) -> None:
         """Make a change."""
-        getattr(self.written, change)(*args)
+        self.written.make((change, args))
         self._unsynced.append([(change, args)])
 
     @contextlib.contextmanager
@@ -148,7 +89,7 @@ class SimulatedDisk:
     def write_through(self, change: str, *args: Any) -> None:
         """Make a change that no power cut undoes; it must have nothing to do with those that are not synced."""
         for contents in (self.written, self._synced):
-            getattr(contents, change)(*args)
+            contents.make((change, args))
 
     def newest(self) -> list[Change] | None:
         """The last write that is not synced: a sync that begins now covers all up to it, and none that comes later."""
@@ -159,8 +100,8 @@ class SimulatedDisk:
         count = next((number for number, made in enumerate(self._unsynced, 1) if made is newest), 0)
         synced, self._unsynced = self._unsynced[:count], self._unsynced[count:]
         for changes in synced:
-            for change, args in changes:
-                getattr(self._synced, change)(*args)
+            for change in changes:
+                self._synced.make(change)
 
     def cut_power(self, choices: Choices) -> None:
         """Lose what was not synced, from some change on, and which inputs are in hand."""
@@ -201,7 +142,7 @@ class SimulatedJournal:
         self._is_open = True
 
     @property
-    def _contents(self) -> Contents:
+    def _contents(self) -> StoreContents:
         return self.disk.written
 
     def _check(self) -> None:
@@ -250,13 +191,8 @@ class SimulatedJournal:
 
     def load(self, address: str, *, older: int = False) -> Saved:
         """See `Journal`."""
-        contents = self._contents
-        kept, entries = contents.snapshots.get(address), contents.entries.get(address, {})
-        if not kept:
-            return Saved(None, 0, list(entries.items()))
-        newest = kept[max(0, len(kept) - 1 - int(older))]
-        rest = [(position, entry) for position, entry in entries.items() if position not in newest.contains]
-        return Saved(newest.data, newest.turn, rest)
+        found, entries = self._contents.load(address, int(older))
+        return Saved(None, 0, entries) if found is None else Saved(found.data, found.turn, entries)
 
     def erase(self, address: str) -> None:
         """See `Journal`."""
@@ -269,11 +205,11 @@ class SimulatedJournal:
         """See `Journal`."""
         self._check()
         pack = {(offset, len(block)): bytes(block) for offset, block in blocks}
-        self.disk.write_through("keep_blocks", address, number, pack)
+        self.disk.write_through("keep_pack", address, number, pack)
 
     def read_blocks(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
         """See `Journal`."""
-        pack = self._contents.blocks.get((address, number), {})
+        pack = self._contents.packs.get(address, {}).get(number, {})
         missing = [place for place in places if place not in pack]
         if missing:
             raise DamagedStore(PATH, address, None, f"pack {number} has no block at {missing[0]}")
@@ -281,18 +217,16 @@ class SimulatedJournal:
 
     def packs(self, address: str) -> set[int]:
         """Return the packs of an address that the disk has."""
-        return {number for owner, number in self._contents.blocks if owner == address}
+        return set(self._contents.packs.get(address, ()))
 
     def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
         """See `Journal`."""
         self._check()
-        self.disk.write("forget_blocks", address, frozenset(numbers))
+        self.disk.write("forget_packs", address, frozenset(numbers))
 
     def addresses(self) -> list[str]:
         """See `Journal`."""
-        contents = self._contents
-        used = {*contents.snapshots, *(address for address, _ in contents.blocks)}
-        return sorted(used | {address for address, entries in contents.entries.items() if entries})
+        return self._contents.addresses()
 
     def note(self, key: str, value: bytes | None) -> None:
         """See `Journal`."""
@@ -305,7 +239,7 @@ class SimulatedJournal:
 
     def notes(self, prefix: str) -> dict[str, bytes]:
         """See `Journal`."""
-        return {key: value for key, value in self._contents.notes.items() if key.startswith(prefix)}
+        return self._contents.notes_from(prefix)
 
     def close(self) -> None:
         """See `Journal`. In good order nothing is in hand."""

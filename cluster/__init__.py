@@ -1,0 +1,1 @@
+"""Many machines: a journal that is replicated, and who leads."""

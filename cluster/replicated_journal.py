@@ -1,0 +1,443 @@
+"""The journal of a leader: its store is in memory, and all that it does goes to the log, in order.
+
+A call that writes changes the memory and is queued for the log at once, and nothing waits for that, except `sync`: what
+has to be safe is safe when that returns. So the log always has a prefix of what was done, and whoever leads next begins
+with such a prefix, which contains all that anybody was told of.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+import uuid
+import zlib
+from collections import deque
+from collections.abc import Callable, Collection, Generator, Sequence
+from concurrent.futures import Future
+from typing import Final
+
+import msgspec
+
+from ..actors.errors import HoldfastError
+from ..checkpoint.compression import LibraryMissing, compressor, decompress
+from ..checkpoint.entry_codec import check_entry, is_plain
+from ..checkpoint.journal import DamagedStore, Entry, SafeAt, Saved, StaleEpoch, StoreFailed
+from ..checkpoint.snapshot.shared_blocks import Segment
+from .engine_thread import EngineLoop
+from .leadership import Leading, LeaseKeeper
+from .log_writer import Deposed, LogWriter, Write
+from .ports import Engine, Unanswered
+from .store_contents import Change
+
+LARGE: Final = 64 << 10
+"""Bytes of a snapshot from which on it is kept beside the log."""
+MOST_UNSENT: Final = 64 << 20
+"""Bytes beside the log that may wait to be sent, before whoever has more waits for them."""
+CLOSE_SECONDS: Final = 5.0
+"""How long a journal that is closed waits for what is not in the log yet."""
+READ_SECONDS: Final = 30.0
+"""How long a read of something large waits for the engine."""
+_ENTRY_BYTES: Final = 60  # about, beside its bodies
+
+
+class PackedBlock(msgspec.Struct, array_like=True, gc=False):
+    """A block of a large snapshot, as it is kept: where it is in its pack, and its bytes as `codec` has made them."""
+
+    offset: int
+    length: int
+    codec: int
+    crc: int
+    data: bytes
+
+
+class ReplicatedJournal:
+    """A `Journal` whose log survives the loss of machines. All methods may be called from any thread.
+
+    Args:
+        engine: keeps the log.
+        loop: on which the engine's work runs.
+        leading: what this leader begins with.
+        me: what it calls itself.
+        lost: told, on the engine's loop, why nothing can be written any more: another leads, or the log is damaged.
+    """
+
+    durable = True
+    in_hand = None
+    safe_at: SafeAt = "sync"
+
+    def __init__(
+        self,
+        engine: Engine,
+        loop: EngineLoop,
+        leading: Leading,
+        me: str,
+        *,
+        lost: Callable[[HoldfastError], None] = lambda error: None,
+    ) -> None:
+        self.path = engine.name
+        self.epoch = leading.maker.epoch
+        self._engine, self._loop, self._lost = engine, loop, lost
+        self._contents = leading.contents
+        self._lock = threading.RLock()
+        self._joint: list[Write] | None = None
+        self._submitted = self._written = 0
+        self._waiting: deque[tuple[int, Callable[[HoldfastError | None], None]]] = deque()
+        self._unsent: dict[str, bytes] = {}
+        self._sending: deque[tuple[int, str]] = deque()
+        self._unsent_bytes = 0
+        self._failure: HoldfastError | None = None
+        self._is_open = True
+        self._is_awake = False
+        loop.wait(self._begin(leading, me))
+
+    async def _begin(self, leading: Leading, me: str) -> None:
+        self._writer = writer = LogWriter(
+            self._engine,
+            leading.maker,
+            grown=leading.grown,
+            written=self._take_written,
+            want_base=self._submit_base,
+        )
+        self._keeper = LeaseKeeper(
+            self._engine, me, leading, hold=writer.hold, go_on=writer.go_on, look=lambda: self._submit(Write())
+        )
+        self._tasks = [asyncio.ensure_future(one) for one in (self._write(), self._keeper.run(), self._drop_orphans())]
+
+    async def _write(self) -> None:
+        try:
+            await self._writer.run()
+        except Deposed as error:
+            self._fail(StaleEpoch(self.path, error.epoch, error.current), error)
+        except HoldfastError as error:
+            self._fail(StoreFailed(self.path, str(error)), error)
+
+    async def _drop_orphans(self) -> None:
+        """Remove what earlier leaders have kept beside the log and nothing in it refers to."""
+        with self._lock:
+            known = {name for name in self._contents.kept() if isinstance(name, str)}
+        with contextlib.suppress(Unanswered):  # The next leader does it.
+            orphans = await self._engine.blobs.names() - known
+            if orphans:  # Once a look is written, nobody led before it who could have kept any of these since.
+                with self._lock:
+                    orphans -= self._unsent.keys()
+                    self._submit(Write(drops=sorted(orphans)))
+
+    # -- from the engine's loop -------------------------------------------------------------------------------------
+
+    def _take_written(self, count: int) -> None:
+        """So many of the writes that were submitted stand in the log."""
+        with self._lock:
+            self._written = count
+            while self._sending and self._sending[0][0] <= count:
+                self._unsent_bytes -= len(self._unsent.pop(self._sending.popleft()[1]))
+            ready: list[Callable[[HoldfastError | None], None]] = []
+            while self._waiting and self._waiting[0][0] <= count:
+                ready.append(self._waiting.popleft()[1])
+        for tell in ready:
+            tell(None)
+
+    def _fail(self, failure: HoldfastError, cause: HoldfastError) -> None:
+        with self._lock:
+            self._failure = failure
+            waiting = [tell for _, tell in self._waiting]
+            self._waiting.clear()
+        for tell in waiting:
+            tell(failure)
+        self._lost(cause)
+
+    def _submit_base(self) -> None:
+        with self._lock:
+            self._submit(Write(base=self._contents.copy()))
+
+    # -- writing ----------------------------------------------------------------------------------------------------
+
+    def _refuse_failed(self) -> None:
+        """Raise why nothing can be written any more, if that is so.
+
+        Raises:
+            StaleEpoch, StoreFailed: it is.
+        """
+        failure = self._failure
+        if failure is not None:
+            raise type(failure)(*failure.args)
+        if not self._is_open:
+            raise StoreFailed(self.path, "it is closed")
+
+    def _submit(self, write: Write) -> None:
+        """Queue a write for the log; the lock is held."""
+        if self._joint is not None:
+            self._joint.append(write)
+            return
+        self._submitted += 1
+        for name, data in write.puts:
+            self._unsent[name] = data
+            self._unsent_bytes += len(data)
+            self._sending.append((self._submitted, name))
+        self._writer.submit(write)
+        if not self._is_awake:
+            self._is_awake = True
+            self._loop.soon(self._wake)
+
+    def _wake(self) -> None:
+        self._is_awake = False
+        self._writer.wake()
+
+    def _change(self, change: Change, size: int, puts: Sequence[tuple[str, bytes]] = ()) -> None:
+        """Make a change here, and have it made in the log."""
+        with self._lock:
+            self._refuse_failed()
+            drops = [one for one in self._contents.make(change) if isinstance(one, str)]
+            self._submit(Write((change,), size, puts, drops))
+
+    def append(self, entries: Sequence[tuple[str, Entry]]) -> list[int]:
+        """Append (address, entry) pairs as one; see `Journal`."""
+        if not entries:
+            return []
+        size = 0
+        for _, entry in entries:
+            if not is_plain(entry):
+                check_entry(entry)
+            size += _ENTRY_BYTES + sum(len(part) for part in entry if isinstance(part, (bytes, str)))
+        with self._lock:
+            self._change(("append", (tuple(entries),)), size)
+            last = self._contents.last
+        return list(range(last - len(entries) + 1, last + 1))
+
+    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
+        """Keep a snapshot, and forget what it contains; see `Journal`."""
+        data = bytes(snapshot)
+        with self._lock:
+            last = self._contents.last
+            dropped = tuple(sorted({position for position in drop if position <= last}))
+            if len(data) < LARGE:
+                self._change(("cut", (address, data, dropped, turn, keep)), len(data) + 9 * len(dropped))
+            else:
+                name = uuid.uuid4().hex
+                self._change(("cut", (address, name, dropped, turn, keep)), 9 * len(dropped), [(name, data)])
+        self._wait_for_room()
+
+    def erase(self, address: str) -> None:
+        """Forget an address; see `Journal`."""
+        self._change(("erase", (address,)), len(address))
+
+    def keep_blocks(
+        self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int
+    ) -> None:
+        """Keep blocks of a large snapshot; see `Journal`."""
+        deflate = compressor(compress)
+        packed: list[PackedBlock] = []
+        for offset, block in blocks:
+            codec, data = deflate(block)
+            packed.append(PackedBlock(offset, len(block), codec, zlib.crc32(block), bytes(data)))
+        name = uuid.uuid4().hex
+        self._change(("keep_pack", (address, number, name)), 0, [(name, msgspec.msgpack.encode(packed))])
+        self._wait_for_room()
+
+    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
+        """Remove packs of an address; see `Journal`."""
+        self._change(("forget_packs", (address, tuple(numbers))), 8 * len(numbers))
+
+    def note(self, key: str, value: bytes | None) -> None:
+        """Keep a small fact; see `Journal`."""
+        kept = None if value is None else bytes(value)
+        self._change(("note", (key, kept)), len(key) + len(kept or b""))
+
+    @contextlib.contextmanager
+    def together(self) -> Generator[None, None, None]:
+        """Have all that this thread writes meanwhile be in the log completely, or not at all; see `Journal`."""
+        with self._lock:
+            self._refuse_failed()
+            before = self._contents.copy()
+            joint: list[Write] = []
+            self._joint = joint
+            try:
+                yield
+            except BaseException:
+                self._contents = before
+                raise
+            finally:
+                self._joint = None
+            changes = tuple(change for write in joint for change in write.changes)
+            puts = tuple(put for write in joint for put in write.puts)
+            drops = tuple(name for write in joint for name in write.drops)
+            self._submit(Write(changes, sum(write.size for write in joint), puts, drops))
+
+    # -- waiting ----------------------------------------------------------------------------------------------------
+
+    def _tell_written(self, tell: Callable[[HoldfastError | None], None]) -> None:
+        """Have it called, on any thread, when all that was submitted is in the log, or never will be."""
+        with self._lock:
+            self._refuse_failed()
+            if self._written < self._submitted:
+                self._waiting.append((self._submitted, tell))
+                return
+        tell(None)
+
+    def synced(self) -> asyncio.Future[None]:
+        """Done when all that was written so far survives the loss of machines; for the running loop.
+
+        Raises:
+            StaleEpoch, StoreFailed: it never will; the future may end with them, too.
+        """
+        loop = asyncio.get_running_loop()
+        done: asyncio.Future[None] = loop.create_future()
+
+        def finish(error: HoldfastError | None) -> None:
+            if done.done():
+                return
+            if error is None:
+                done.set_result(None)
+            else:
+                done.set_exception(type(error)(*error.args))
+
+        def tell(error: HoldfastError | None) -> None:
+            with contextlib.suppress(RuntimeError):  # That loop has ended.
+                loop.call_soon_threadsafe(finish, error)
+
+        self._tell_written(tell)
+        return done
+
+    def sync(self) -> None:
+        """Wait until all that was written so far survives the loss of machines; see `Journal`.
+
+        Raises:
+            StaleEpoch: another leads. StoreFailed: the log cannot be written.
+        """
+        self._wait_written(None)
+
+    def _wait_written(self, seconds: float | None) -> None:
+        done: Future[None] = Future()
+
+        def tell(error: HoldfastError | None) -> None:
+            if error is None:
+                done.set_result(None)
+            else:
+                done.set_exception(type(error)(*error.args))
+
+        self._tell_written(tell)
+        done.result(seconds)
+
+    def _wait_for_room(self) -> None:
+        if self._unsent_bytes > MOST_UNSENT and self._joint is None:
+            self.sync()
+
+    # -- reading ----------------------------------------------------------------------------------------------------
+
+    def load(self, address: str, *, older: int = False) -> Saved:
+        """Read an address back; see `Journal`."""
+        with self._lock:
+            self._refuse_failed()
+            found, entries = self._contents.load(address, int(older))
+        if found is None:
+            return Saved(None, 0, entries)
+        data = found.data
+        if isinstance(data, str):
+            data = self._blob(data)
+            if data is None:
+                raise DamagedStore(self.path, address, None, f"its snapshot of turn {found.turn} is missing")
+        return Saved(data, found.turn, entries)
+
+    def read_blocks(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
+        """Blocks of a pack, verified; see `Journal`."""
+        with self._lock:
+            name = self._contents.packs.get(address, {}).get(number)
+        data = None if name is None else self._blob(name)
+        if data is None:
+            raise DamagedStore(self.path, address, None, f"pack {number} is missing")
+        wanted = set(places)
+        blocks: list[tuple[int, bytes]] = []
+        try:
+            for one in msgspec.msgpack.decode(data, type=list[PackedBlock]):
+                if (one.offset, one.length) in wanted:
+                    block = decompress(one.codec, one.data, one.length)
+                    if zlib.crc32(block) != one.crc:
+                        raise ValueError(f"the checksum of the block at {one.offset} is wrong")
+                    blocks.append((one.offset, block))
+                    wanted.discard((one.offset, one.length))
+        except LibraryMissing as error:
+            raise StoreFailed(self.path, str(error)) from error
+        except ValueError as error:
+            raise DamagedStore(self.path, address, None, f"pack {number}: {error}") from error
+        if wanted:
+            raise DamagedStore(self.path, address, None, f"pack {number} has no block at {min(wanted)[0]}")
+        return Segment.of(number, blocks)
+
+    def _blob(self, name: str) -> bytes | None:
+        """A large value, from memory if it is not sent yet.
+
+        Raises:
+            StoreFailed: the engine does not answer.
+        """
+        with self._lock:
+            unsent = self._unsent.get(name)
+            if unsent is None and self._joint is not None:
+                unsent = next((data for write in self._joint for known, data in write.puts if known == name), None)
+        if unsent is not None:
+            return unsent
+        try:
+            return self._loop.wait(self._engine.blobs.get(name), READ_SECONDS)
+        except (Unanswered, TimeoutError) as error:
+            raise StoreFailed(self.path, f"{error or 'no answer'}; try again") from error
+
+    def packs(self, address: str) -> set[int]:
+        """Return the packs of an address; see `Journal`."""
+        with self._lock:
+            return set(self._contents.packs.get(address, ()))
+
+    def addresses(self) -> list[str]:
+        """Every address that has something stored, sorted."""
+        with self._lock:
+            return self._contents.addresses()
+
+    def noted(self, key: str) -> bytes | None:
+        """The fact of that name, or `None`."""
+        with self._lock:
+            return self._contents.notes.get(key)
+
+    def notes(self, prefix: str) -> dict[str, bytes]:
+        """All facts whose keys begin so; see `Journal`."""
+        with self._lock:
+            return self._contents.notes_from(prefix)
+
+    def has_failed(self) -> bool:
+        """Whether everything is refused from now on."""
+        return self._failure is not None
+
+    # -- the end ----------------------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Have what was written reach the log, give the lease up, and let go of the engine; a second call does nothing.
+
+        Raises:
+            StoreFailed: the engine has not answered in time: what was not acknowledged may be lost.
+        """
+        with self._lock:
+            if not self._is_open:
+                return
+            left = 0
+            if self._failure is None:
+                done: Future[None] = Future()
+                self._waiting.append((self._submitted, lambda error: done.set_result(None)))
+                if self._written >= self._submitted:
+                    self._waiting.pop()
+                    done.set_result(None)
+            self._is_open = False
+        if self._failure is None:
+            with contextlib.suppress(TimeoutError):
+                done.result(CLOSE_SECONDS)
+            with self._lock:
+                left = self._submitted - self._written if self._failure is None else 0
+        with contextlib.suppress(TimeoutError):
+            self._loop.wait(self._end(), CLOSE_SECONDS)
+        self._loop.close()
+        if left:
+            raise StoreFailed(self.path, f"it has not answered for {CLOSE_SECONDS:g} s: {left} writes may be lost")
+
+    async def _end(self) -> None:
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.wait(self._tasks)
+        if self._failure is None:
+            await self._keeper.release()
+        await self._engine.close()

@@ -1,0 +1,1 @@
+"""Programs on several machines, simulated on the virtual clock."""
