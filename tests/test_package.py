@@ -55,7 +55,16 @@ def test_pytest_holds_one_copy_of_the_package() -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["nats", "nkeys", "numpy", "holdfast.cluster", "holdfast.console", "holdfast.diagnosis", "holdfast.testing", "opentelemetry"],
+    [
+        "nats",
+        "nkeys",
+        "numpy",
+        "holdfast.cluster",
+        "holdfast.console",
+        "holdfast.diagnosis",
+        "holdfast.testing",
+        "opentelemetry",
+    ],
 )
 def test_importing_holdfast_leaves_alone(name: str) -> None:
     assert name not in modules_after_import()
