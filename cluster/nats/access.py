@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import ssl
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +19,7 @@ from .server_file import check_name, inbox_of, is_loopback, public_key
 DEFAULT_PORT: Final = 4222
 SETTINGS: Final = ("ca", "certificate", "creds", "insecure", "key", "nkey", "replicas")
 """What may stand behind the question mark of a store, and in the settings."""
+_SEED: Final = re.compile(r"S[A-Z2-7]{50,}")
 _WHERE: Final = "store"
 _EXAMPLE: Final = "nats://HOST[:PORT][,HOST,HOST]/SYSTEM"
 _BOOLS: Final = {"": True, "1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
@@ -85,7 +87,10 @@ def access_of(store: str, settings: Mapping[str, str | bool | int] | None = None
     scheme, colon, rest = store.partition("://")
     if not colon or scheme not in ("nats", "tls"):
         raise SpecError(_WHERE, f"{_hidden(store)!r} must be {_EXAMPLE}, or the same with tls://")
-    parts = urlsplit(f"//{rest}")
+    try:
+        parts = urlsplit(f"//{rest}")
+    except ValueError as error:  # brackets that do not close
+        raise SpecError(_WHERE, f"{_hidden(store)!r} is no address: write {_EXAMPLE}") from error
     if parts.fragment or "@" in parts.netloc:
         raise SpecError(
             _WHERE, "an address has no user, no password and no #: name a file, ?nkey=/path or ?creds=/path"
@@ -205,10 +210,14 @@ def _path(name: str, told: str | bool | int | None) -> str | None:
         return None
     if not isinstance(told, str) or not told:
         raise SpecError(_WHERE, f"{name} must be the path of a file, not {told!r}")
+    if _SEED.fullmatch(told):
+        raise SpecError(
+            _WHERE, f"{name} must be the path of a file; this is a private key: make a new one, and keep it in a file"
+        )
     return os.path.abspath(os.path.expanduser(told))
 
 
 def _hidden(store: str) -> str:
     """An address without what may be a password."""
-    head, at, tail = store.rpartition("@")
-    return f"{head.partition('://')[0]}://...@{tail}" if at else store
+    _, at, tail = store.rpartition("@")
+    return f"...@{tail}" if at else store

@@ -7,6 +7,7 @@ trust each other; a client may send to the system, and an observer may look at w
 from __future__ import annotations
 
 import contextlib
+import importlib
 import ipaddress
 import os
 import re
@@ -14,6 +15,7 @@ import secrets
 from collections.abc import Callable, Iterable, Sequence
 from enum import StrEnum
 from pathlib import Path
+from types import ModuleType
 from typing import Final, NamedTuple
 
 import msgspec
@@ -233,9 +235,12 @@ def seed_file(folder: Path, system: str, role: Role) -> Path:
 
 
 def new_seed() -> str:
-    """A new private key of a user."""
-    import nkeys
+    """A new private key of a user.
 
+    Raises:
+        SpecError: the extra `nats` is not installed.
+    """
+    nkeys = _library()
     return bytes(nkeys.encode_seed(os.urandom(32), nkeys.PREFIX_BYTE_USER)).decode()
 
 
@@ -243,10 +248,9 @@ def public_key(seed: str) -> str:
     """The public key that belongs to a private one.
 
     Raises:
-        SpecError: this is no private key of a user. The text does not show it.
+        SpecError: this is no private key of a user, which the text does not show; or the extra `nats` is not installed.
     """
-    import nkeys
-
+    nkeys = _library()
     try:
         key = bytes(nkeys.from_seed(bytearray(seed.strip().encode())).public_key).decode()
     except (nkeys.NkeysError, ValueError):
@@ -254,6 +258,13 @@ def public_key(seed: str) -> str:
     if not key.startswith("U"):
         raise SpecError("nkey", "this is no private key (seed) of a user, which begins with SU: write a new one")
     return key
+
+
+def _library() -> ModuleType:
+    try:
+        return importlib.import_module("nkeys")
+    except ImportError as error:
+        raise SpecError("store", "a store on NATS needs the library nats-py: pip install 'holdfast[nats]'") from error
 
 
 def _kept(file: Path, make: Callable[[], str]) -> str:
