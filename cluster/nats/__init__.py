@@ -1,0 +1,1 @@
+"""The engine for several machines over NATS JetStream (extra `holdfast[nats]`)."""
