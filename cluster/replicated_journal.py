@@ -415,23 +415,20 @@ class ReplicatedJournal:
         with self._lock:
             if not self._is_open:
                 return
-            left = 0
+            submitted = self._submitted
+            done: Future[None] = Future()
             if self._failure is None:
-                done: Future[None] = Future()
-                self._waiting.append((self._submitted, lambda error: done.set_result(None)))
-                if self._written >= self._submitted:
-                    self._waiting.pop()
-                    done.set_result(None)
+                self._tell_written(lambda error: done.set_result(None))
+            else:
+                done.set_result(None)  # Nothing more will be written.
             self._is_open = False
-        if self._failure is None:
-            with contextlib.suppress(TimeoutError):
-                done.result(CLOSE_SECONDS)
-            with self._lock:
-                left = self._submitted - self._written if self._failure is None else 0
+        with contextlib.suppress(TimeoutError):
+            done.result(CLOSE_SECONDS)
+        left = submitted - self._written if self._failure is None else 0
         with contextlib.suppress(TimeoutError):
             self._loop.wait(self._end(), CLOSE_SECONDS)
         self._loop.close()
-        if left:
+        if left > 0:
             raise StoreFailed(self.path, f"it has not answered for {CLOSE_SECONDS:g} s: {left} writes may be lost")
 
     async def _end(self) -> None:

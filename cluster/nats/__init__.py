@@ -1,1 +1,1 @@
-"""NATS JetStream: the one folder that knows its client. It needs the extra `nats`: `pip install 'holdfast[nats]'`."""
+"""The engine for several machines over NATS JetStream (extra `holdfast[nats]`)."""

@@ -1,0 +1,367 @@
+"""A system's log, lease and blobs in NATS JetStream.
+
+Each is a stream of its own. The log is one subject: `Nats-Expected-Last-Subject-Sequence` makes the server compare the
+predecessor, at whoever leads the stream, on one server and on three alike. Streams answer reads through their leaders
+only (`allow_direct=False`). The lease is one message with a time to live.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Generator, Mapping, Sequence
+from typing import Any, Final, TypeVar
+from urllib.parse import quote
+
+import nats.errors
+from nats.aio.client import Client
+from nats.js import JetStreamContext, api
+from nats.js.errors import APIError, NotFoundError
+from nats.js.errors import Error as JetStreamError
+
+from ..log_records import PART
+from ..ports import LogReader, OutOfTurn, Record, Unanswered
+from .access import access_of, connect_options
+
+T = TypeVar("T")
+ANSWER_SECONDS: Final = 2.0
+"""How long one request waits for its answer."""
+LEASE_SECONDS: Final = 3
+"""How long a lease lasts after each renewal, in whole seconds, as the server counts them."""
+BATCH: Final = 256
+"""Records that are asked for at once."""
+AT_ONCE: Final = 8
+"""Parts of a blob that are under way at one time."""
+IDLE_SECONDS: Final = 60.0
+"""After so long without a request the server forgets a reader."""
+_WRONG_PREDECESSOR: Final = (10071, 10164)
+"""What the server says if the last record is another one, or may be: a majority has not come so far."""
+
+
+def token_of(name: str) -> str:
+    """A name as a part of a subject or of a stream's name: no dots, blanks, stars or slashes.
+
+    >>> token_of("shop.eu 1")
+    'shop%2Eeu%201'
+    """
+    return quote(name, safe="-_").replace(".", "%2E").replace("~", "%7E")
+
+
+class Names:
+    """What a system's subjects and streams are called.
+
+    Args:
+        system: its name.
+    """
+
+    def __init__(self, system: str) -> None:
+        token = token_of(system)
+        self.log = f"hf.{token}.root.log"
+        self.lease = f"hf.{token}.root.lease"
+        self.blobs = f"hf.{token}.blob"
+        self.log_stream = f"HF-{token}-LOG"
+        self.lease_stream = f"HF-{token}-LEASE"
+        self.blob_stream = f"HF-{token}-BLOB"
+
+
+def stream_settings(names: Names, replicas: int) -> list[api.StreamConfig]:
+    """The streams of a system, as they have to be."""
+    common: dict[str, Any] = {"storage": api.StorageType.FILE, "num_replicas": replicas, "allow_direct": False}
+    keeps: dict[str, Any] = {**common, "discard": api.DiscardPolicy.NEW}
+    return [
+        api.StreamConfig(name=names.log_stream, subjects=[names.log], **keeps),
+        api.StreamConfig(name=names.blob_stream, subjects=[f"{names.blobs}.>"], max_msgs_per_subject=1, **keeps),
+        api.StreamConfig(
+            name=names.lease_stream,
+            subjects=[names.lease],
+            max_msgs_per_subject=1,
+            allow_msg_ttl=True,
+            discard=api.DiscardPolicy.OLD,
+            **common,
+        ),
+    ]
+
+
+class NatsEngine:
+    """One system's engine in NATS JetStream; see `cluster.ports.Engine`.
+
+    Args:
+        client: connected, and closed with the engine.
+        name: what errors call it, without secrets.
+        system: its name.
+    """
+
+    def __init__(self, client: Client, name: str, system: str) -> None:
+        self.name = name
+        self._client = client
+        stream = client.jetstream(timeout=ANSWER_SECONDS)
+        self.names = names = Names(system)
+        self.log = NatsLog(stream, names, name)
+        self.lease = NatsLease(stream, names, name)
+        self.blobs = NatsBlobs(stream, names, name)
+
+    @staticmethod
+    async def connect(options: Mapping[str, Any], name: str, system: str, *, replicas: int) -> NatsEngine:
+        """Connect, and make the streams of the system if they are not there.
+
+        Args:
+            options: of `nats.connect`.
+            name: what errors call the engine, without secrets.
+            system: the name of the system.
+            replicas: on how many servers everything is kept: 1 or 3.
+
+        Raises:
+            Unanswered: no server can be reached, or they do not make the streams.
+        """
+        client = Client()
+        with answering(name):
+            await client.connect(**options)
+        engine = NatsEngine(client, name, system)
+        try:
+            await engine._make_streams(replicas)
+        except BaseException:
+            await engine.close()
+            raise
+        return engine
+
+    async def _make_streams(self, replicas: int) -> None:
+        stream = self._client.jetstream(timeout=5 * ANSWER_SECONDS)
+        with answering(self.name):
+            for settings in stream_settings(self.names, replicas):
+                try:
+                    await stream.stream_info(settings.name or "")
+                except NotFoundError:
+                    await stream.add_stream(settings)
+
+    async def close(self) -> None:
+        """Close the connection; see `Engine`."""
+        with contextlib.suppress(nats.errors.Error, TimeoutError, OSError):
+            await asyncio.wait_for(self._client.flush(timeout=1), 1.0)
+        with contextlib.suppress(nats.errors.Error, TimeoutError, OSError):
+            await self._client.close()
+
+
+async def open_engine(store: str, system: str) -> NatsEngine:
+    """Connect to the servers that a store names, and refuse those that may lose what they have acknowledged.
+
+    Args:
+        store: "nats://HOST,HOST/NAME", see `access_of`.
+        system: the name of the system.
+
+    Raises:
+        SpecError: the store cannot be read, or its files must not be used.
+        UnsafeServer: its servers or streams are not set as they have to be.
+        Unanswered: no server can be reached.
+    """
+    access = access_of(store)
+    return await NatsEngine.connect(connect_options(access), access.name, system, replicas=access.replicas)
+
+
+@contextlib.contextmanager
+def answering(name: str) -> Generator[None, None, None]:
+    """Whatever means that nobody knows is `Unanswered`.
+
+    Raises:
+        Unanswered: the server has not answered, or has answered that it cannot do that now.
+    """
+    try:
+        yield
+    except (nats.errors.Error, JetStreamError, TimeoutError, OSError) as error:
+        said = getattr(error, "description", None) or str(error) or type(error).__name__
+        raise Unanswered(name, str(said)) from error
+
+
+class NatsLog:
+    """The log: one subject of one stream; see `cluster.ports.Log`."""
+
+    def __init__(self, stream: JetStreamContext, names: Names, name: str) -> None:
+        self._stream, self._names, self._name = stream, names, name
+
+    async def append(self, data: bytes, after: int) -> int:
+        """Append a record behind the one with the number `after`; see `Log`."""
+        return await _publish(self._stream, self._names.log, data, after, self._name)
+
+    async def last(self) -> Record | None:
+        """The last record, from whoever leads the stream; see `Log`."""
+        return await _last(self._stream, self._names.log_stream, self._names.log, self._name)
+
+    async def read(self, after: int) -> LogReader:
+        """A reader of what stands behind the record with that number; see `Log`."""
+        config = _reading(after + 1)
+        with answering(self._name):
+            return NatsReader(
+                await self._stream.pull_subscribe(self._names.log, stream=self._names.log_stream, config=config),
+                self._name,
+            )
+
+    async def forget(self, before: int) -> None:
+        """Remove all records with smaller numbers; see `Log`."""
+        with answering(self._name):
+            await self._stream.purge_stream(self._names.log_stream, seq=before, subject=self._names.log)
+
+
+def _reading(start: int) -> api.ConsumerConfig:
+    """A reader that the server forgets by itself."""
+    return api.ConsumerConfig(
+        deliver_policy=api.DeliverPolicy.BY_START_SEQUENCE,
+        opt_start_seq=start,
+        ack_policy=api.AckPolicy.NONE,
+        inactive_threshold=IDLE_SECONDS,
+        mem_storage=True,
+        num_replicas=1,
+    )
+
+
+class NatsReader:
+    """Reads the log through a consumer of its own; see `cluster.ports.LogReader`."""
+
+    def __init__(self, consumer: JetStreamContext.PullSubscription, name: str) -> None:
+        self._consumer, self._name = consumer, name
+
+    async def next(self, seconds: float) -> Sequence[Record]:
+        """The next records; see `LogReader`."""
+        try:
+            messages = await self._consumer.fetch(BATCH, timeout=seconds)
+        except TimeoutError:
+            return []
+        except (nats.errors.Error, JetStreamError, OSError) as error:
+            raise Unanswered(self._name, str(error) or type(error).__name__) from error
+        return [Record(message.metadata.sequence.stream, message.data) for message in messages]
+
+    async def close(self) -> None:
+        """Have the server forget the consumer; see `LogReader`."""
+        with contextlib.suppress(nats.errors.Error, JetStreamError, TimeoutError, OSError):
+            await self._consumer.unsubscribe()
+
+
+class NatsLease:
+    """The lease: one message with a time to live; see `cluster.ports.Lease`."""
+
+    def __init__(self, stream: JetStreamContext, names: Names, name: str) -> None:
+        self._stream, self._names, self._name = stream, names, name
+        self.seconds = float(LEASE_SECONDS)
+
+    async def acquire(self, holder: str) -> int | None:
+        """Take the lease if nobody has it; see `Lease`."""
+        last = await self._last()
+        if last is not None:
+            return last.sequence if last.data.decode() == holder else None
+        return await self._publish(holder, 0)
+
+    async def renew(self, holder: str, token: int) -> int | None:
+        """Renew what was acquired; see `Lease`."""
+        renewed = await self._publish(holder, token)
+        if renewed is None:
+            last = await self._last()  # The answer to an earlier renewal may have been lost.
+            if last is not None and last.data.decode() == holder:
+                renewed = await self._publish(holder, last.sequence)
+        return renewed
+
+    async def release(self, token: int) -> None:
+        """Give the lease up; see `Lease`."""
+        with answering(self._name):
+            await self._stream.purge_stream(self._names.lease_stream, seq=token + 1, subject=self._names.lease)
+
+    async def holder(self) -> str:
+        """Who has the lease; see `Lease`."""
+        last = await self._last()
+        return "" if last is None else last.data.decode()
+
+    async def _last(self) -> Record | None:
+        return await _last(self._stream, self._names.lease_stream, self._names.lease, self._name)
+
+    async def _publish(self, holder: str, after: int) -> int | None:
+        try:
+            return await _publish(
+                self._stream, self._names.lease, holder.encode(), after, self._name, msg_ttl=self.seconds
+            )
+        except OutOfTurn:
+            return None
+
+
+class NatsBlobs:
+    """Large values in parts, each a subject of its own; see `cluster.ports.Blobs`."""
+
+    def __init__(self, stream: JetStreamContext, names: Names, name: str) -> None:
+        self._stream, self._names, self._name = stream, names, name
+
+    def _subject(self, name: str) -> str:
+        return f"{self._names.blobs}.{name}"
+
+    async def put(self, name: str, data: bytes) -> None:
+        """Keep a value; see `Blobs`."""
+        subject = self._subject(name)
+        parts = [(f"{subject}.{at // PART}", data[at : at + PART]) for at in range(0, len(data), PART)]
+        for at in range(0, len(parts), AT_ONCE):
+            await asyncio.gather(*(self._put(*part) for part in parts[at : at + AT_ONCE]))
+        await self._put(f"{subject}.size", str(len(data)).encode())  # The last one: now it is there.
+
+    async def _put(self, subject: str, data: bytes) -> None:
+        with answering(self._name):
+            await self._stream.publish(subject, data)
+
+    async def get(self, name: str) -> bytes | None:
+        """A value, or `None`; see `Blobs`."""
+        stream, subject = self._names.blob_stream, self._subject(name)
+        size = await _last(self._stream, stream, f"{subject}.size", self._name)
+        if size is None:
+            return None
+        wanted = -(-int(size.data) // PART)
+        parts: dict[int, bytes] = {}
+        with answering(self._name):
+            consumer = await self._stream.pull_subscribe(f"{subject}.*", stream=stream, config=_reading(1))
+        try:
+            while len(parts) < wanted:
+                try:
+                    messages = await consumer.fetch(BATCH, timeout=ANSWER_SECONDS)
+                except TimeoutError:
+                    return None
+                for message in messages:
+                    part = message.subject.rpartition(".")[2]
+                    if part != "size":
+                        parts[int(part)] = message.data
+        except (nats.errors.Error, JetStreamError, OSError) as error:
+            raise Unanswered(self._name, str(error)) from error
+        finally:
+            with contextlib.suppress(nats.errors.Error, JetStreamError, TimeoutError, OSError):
+                await consumer.unsubscribe()
+        return b"".join(parts[number] for number in range(wanted))
+
+    async def drop(self, name: str) -> None:
+        """Remove a value; see `Blobs`."""
+        with answering(self._name):
+            await self._stream.purge_stream(self._names.blob_stream, subject=f"{self._subject(name)}.>")
+
+    async def names(self) -> set[str]:
+        """The names of all values; see `Blobs`."""
+        with answering(self._name):
+            info = await self._stream.stream_info(self._names.blob_stream, subjects_filter=f"{self._names.blobs}.>")
+        at = len(self._names.blobs) + 1
+        return {subject[at:].partition(".")[0] for subject in info.state.subjects or {}}
+
+
+async def _publish(
+    stream: JetStreamContext, subject: str, data: bytes, after: int, name: str, *, msg_ttl: float | None = None
+) -> int:
+    """Publish behind the last message of the subject, which has to have the number `after`; return the new number."""
+    headers = {str(api.Header.EXPECTED_LAST_SUBJECT_SEQUENCE.value): str(after)}
+    try:
+        with answering(name):
+            return (await stream.publish(subject, data, headers=headers, msg_ttl=msg_ttl)).seq
+    except Unanswered as error:
+        cause = error.__cause__
+        if isinstance(cause, APIError) and cause.err_code in _WRONG_PREDECESSOR:
+            raise OutOfTurn(after) from error
+        raise
+
+
+async def _last(stream: JetStreamContext, stream_name: str, subject: str, name: str) -> Record | None:
+    """The last message of a subject, from whoever leads the stream."""
+    try:
+        with answering(name):
+            found = await stream.get_last_msg(stream_name, subject)
+    except Unanswered as error:
+        if isinstance(error.__cause__, NotFoundError):
+            return None
+        raise
+    return Record(found.seq or 0, found.data or b"")
