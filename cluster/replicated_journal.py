@@ -24,7 +24,7 @@ from ..checkpoint.compression import LibraryMissing, compressor, decompress
 from ..checkpoint.entry_codec import check_entry, is_plain
 from ..checkpoint.journal import DamagedStore, Entry, SafeAt, Saved, StaleEpoch, StoreFailed
 from ..checkpoint.snapshot.shared_blocks import Segment
-from .engine_thread import EngineLoop
+from .engine_thread import EngineLoop, end_tasks
 from .leadership import Leading, LeaseKeeper
 from .log_writer import Deposed, LogWriter, Write
 from .ports import Engine, Unanswered
@@ -432,9 +432,7 @@ class ReplicatedJournal:
             raise StoreFailed(self.path, f"it has not answered for {CLOSE_SECONDS:g} s: {left} writes may be lost")
 
     async def _end(self) -> None:
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.wait(self._tasks)
+        await end_tasks(*self._tasks)
         if self._failure is None:
             await self._keeper.release()
         await self._engine.close()
