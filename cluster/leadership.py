@@ -25,6 +25,7 @@ from ..actors.errors import HoldfastError
 from .log_records import (
     EPOCH,
     FORMAT,
+    DamagedLog,
     EpochBegun,
     GapInLog,
     RecordMaker,
@@ -147,8 +148,11 @@ class Follower:
             if said.kind == EPOCH:
                 self.leader = decode_epoch(said.data).leader
                 continue
-            for change in decode_changes(said.data):
-                self.contents.make(change)
+            try:
+                for change in decode_changes(said.data):
+                    self.contents.make(change)
+            except ValueError as error:
+                raise DamagedLog(said.sequence, str(error)) from error
 
 
 @dataclass(slots=True)
@@ -267,6 +271,7 @@ async def _begin_epoch(engine: Engine, me: str, follower: Follower, until: float
         record = maker.beginning(EpochBegun(me, attempt, FORMAT, time.time()))
         stands = await append_behind(engine, record, reader.at)
         if isinstance(stands, int):
+            reader.check_whole()
             maker.after = stands
             return maker
         if loop.time() > until:
@@ -283,9 +288,9 @@ class LeaseKeeper:
         engine: keeps the lease.
         me: what the holder calls itself.
         leading: what it began with.
-        hold: called when another has the lease: nothing more is to be written.
+        hold: called when another has the lease: nothing more is to be written, until `go_on`.
         go_on: called when it is ours again.
-        look: called when it was lost: the leader is to look whether it still leads.
+        look: called when it was lost, and when another has it: the leader is to look whether it still leads.
     """
 
     def __init__(
@@ -301,6 +306,7 @@ class LeaseKeeper:
         self._lease, self._me = engine.lease, me
         self._token: int | None = leading.token
         self._hold, self._go_on, self._look = hold, go_on, look
+        self._is_held = False
         self.deadline = leading.deadline
 
     async def run(self) -> None:
@@ -314,9 +320,12 @@ class LeaseKeeper:
                 if self._token is None:
                     self._token = await lease.acquire(self._me)
                     if self._token is None:
-                        if await lease.holder():
+                        if not self._is_held and await lease.holder():
+                            self._is_held = True
                             self._hold()
+                            self._look()
                         continue
+                    self._is_held = False
                     self._go_on()
                 else:
                     self._token = await lease.renew(self._me, self._token)
