@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import copy
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -68,6 +68,7 @@ class SimBroker:
         faults: how often what goes wrong; may be changed at any time.
         blobs: the large values, by name.
         lease_holder, lease_token: who has the lease, and its token.
+        on_request: told of every request that arrives, by its number, before it is done.
 
     Args:
         seed: decides all that is drawn.
@@ -82,6 +83,8 @@ class SimBroker:
         self.faults, self.latency = faults, latency
         self.blobs: dict[str, bytes] = {}
         self.lease_holder, self.lease_token = "", 0
+        self.on_request: Callable[[int], None] = lambda number: None
+        self.requests = 0
         self._lease_until = 0.0
         self._log: list[_Kept] = []
         self._last, self._begins = 0, 0
@@ -103,6 +106,11 @@ class SimBroker:
     def strikes(self, share: float) -> bool:
         """Draw whether something goes wrong of which this share does."""
         return share > 0.0 and self.draw.random() < share
+
+    def arrived(self) -> None:
+        """A request is here."""
+        self.requests += 1
+        self.on_request(self.requests)
 
     def one_way(self) -> float:
         """Draw how many seconds a message takes."""

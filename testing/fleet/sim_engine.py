@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Final, TypeVar
 
@@ -18,7 +17,6 @@ BATCH: Final = 40
 """Records that a read returns at most."""
 
 
-@dataclass(slots=True)
 class Link:
     """What gets through between one program and the servers.
 
@@ -28,9 +26,23 @@ class Link:
         stale_since: a server that is cut off with the program answers reads as of then; `None`: there is none.
     """
 
-    sends: bool = True
-    hears: bool = True
-    stale_since: float | None = None
+    def __init__(self) -> None:
+        self.sends = self.hears = True
+        self.stale_since: float | None = None
+        self._goes_on = asyncio.Event()
+        self._goes_on.set()
+
+    def freeze(self) -> None:
+        """Have the program stop where it sends something or hears of it, as a process that is paused does."""
+        self._goes_on.clear()
+
+    def thaw(self) -> None:
+        """Have it go on, with what it has heard meanwhile."""
+        self._goes_on.set()
+
+    async def awake(self) -> None:
+        """Wait until the program goes on."""
+        await self._goes_on.wait()
 
     def cut(self, *, sends: bool = False, hears: bool = False, stale_since: float | None = None) -> None:
         """Have requests or answers, or both, get through no more."""
@@ -82,8 +94,10 @@ class _Asks:
         broker, link, faults = self.broker, self.link, self.broker.faults
         loop = asyncio.get_running_loop()
         answer: asyncio.Future[T] = loop.create_future()
+        await link.awake()
 
         def arrive(is_heard: bool) -> None:
+            broker.arrived()
             if not link.sends or broker.is_away():
                 return
             try:
@@ -114,11 +128,12 @@ class _Asks:
             loop.call_later(broker.one_way(), arrive, not broker.strikes(faults.lost_answers))
             if broker.strikes(faults.doubled):
                 loop.call_later(broker.draw.uniform(0, LATE), arrive, False)
-        try:
-            async with asyncio.timeout(ANSWER_SECONDS):
-                return await answer
-        except TimeoutError:
-            raise Unanswered(PATH, f"no answer for {ANSWER_SECONDS:g} s") from None
+        await asyncio.wait([answer], timeout=ANSWER_SECONDS)
+        await link.awake()
+        if not answer.done():
+            answer.cancel()
+            raise Unanswered(PATH, f"no answer for {ANSWER_SECONDS:g} s")
+        return answer.result()
 
 
 def _set(answer: asyncio.Future[T], result: T) -> None:
@@ -186,6 +201,7 @@ class SimReader:
                 del found[broker.draw.randrange(len(found) - 1)]
             self._at = found[-1].sequence
             await asyncio.sleep(broker.one_way())
+            await link.awake()
             return found
         return []
 
