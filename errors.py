@@ -57,6 +57,7 @@ from .checkpoint.life.replay_guard import StateDiverged
 from .checkpoint.snapshot.snapshot_groups import NoSuchGroup
 from .checkpoint.snapshot.snapshot_schedule import CheckpointFailed
 from .checkpoint.upgrade.mapping import NotMapped
+from .cluster.leadership import LeadershipLost
 from .ftm.group.reconfiguration import CannotAdapt
 from .ftm.mechanisms.rb import NotAccepted
 from .ftm.model.mechanism import MechanismRefused
@@ -107,6 +108,7 @@ __all__ = [
     "Ignore",
     "InOtherHands",
     "InputRefused",
+    "LeadershipLost",
     "MailboxFull",
     "MaxChildren",
     "MechanismRefused",

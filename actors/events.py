@@ -363,6 +363,18 @@ class JournalStopped(Event, frozen=True, eq=False):
     reason: str
 
 
+class StandingBy(Event, frozen=True, eq=False):
+    """This program waits: `leader` leads the system. Told each time that another one does."""
+
+    leader: str
+
+
+class LeadershipTaken(Event, frozen=True, eq=False):
+    """This program leads the system from now on, in this `epoch`; its tree is started next."""
+
+    epoch: int
+
+
 class TurnSlow(Event, frozen=True, eq=False):
     """A turn occupied the event loop for at least `seconds`: nothing else ran meanwhile; `message` is its type.
 

@@ -55,6 +55,23 @@ class LeaderElsewhere(HoldfastError, text="{leader} leads this system"):
     leader: str
 
 
+class LeadershipLost(
+    HoldfastError,
+    text="this program leads {system} no more: {leader} does, in epoch {epoch}; start it again, and it stands by",
+):
+    """Another program leads the system: the tree of this one was stopped, and what it had not acknowledged is void.
+
+    Attributes:
+        system: its name.
+        leader: what the other program calls itself: its machine and process.
+        epoch: in which it leads.
+    """
+
+    system: str
+    leader: str
+    epoch: int
+
+
 def leader_name() -> str:
     """What this process calls itself, for people: the machine and the process."""
     return f"{socket.gethostname()}, process {os.getpid()}"

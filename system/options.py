@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from typing import get_args
 
 from ..actors.errors import SpecError
 from ..actors.loop_watchdog import check_limits
@@ -13,6 +14,8 @@ from ..checkpoint.recovery_file import RecoveryFile, load_recovery
 from ..checkpoint.recovery_settings import RecoveryHooks
 from ..checkpoint.store_key import StoreKey
 from ..checkpoint.store_opening import check_durability, check_store_key
+from ..cluster.joining import is_replicated
+from ..cluster.leadership import Standby
 from ..supervision.spec import Flags
 
 
@@ -28,6 +31,7 @@ class SystemOptions:
     store: str | Journal | None
     store_key: StoreKey | None = dataclasses.field(repr=False)
     durability: Durability | None
+    standby: Standby | None
     flags: Flags
     preload: tuple[str, ...]
     log: bool
@@ -45,6 +49,13 @@ class SystemOptions:
             raise SpecError("ActorSystem", f"the name must be text without '/', not {self.name!r}")
         check_durability(self.store, self.durability)
         check_store_key(self.store, self.store_key)
+        if self.standby is not None:
+            if self.standby not in get_args(Standby):
+                known = ", ".join(map(repr, get_args(Standby)))
+                raise SpecError("ActorSystem", f"standby must be one of {known} or left out, not {self.standby!r}")
+            if not is_replicated(self.store):
+                problem = f"standby={self.standby!r} needs a store that several machines keep: store='nats://HOST/NAME'"
+                raise SpecError("ActorSystem", problem)
         hooks = self.recovery_hooks
         if hooks is not None and not isinstance(hooks, RecoveryHooks):
             raise SpecError("ActorSystem", f"recovery_hooks must come from recovery_hooks(...), not be {hooks!r}")

@@ -5,27 +5,43 @@ from __future__ import annotations
 import asyncio
 import signal
 import sys
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
 from ..actors.errors import SpecError
+from ..cluster.leadership import LeadershipLost
 
 T = TypeVar("T")
 
 
-def run(main: Coroutine[Any, Any, T], *, debug: bool | None = None) -> T:
+def run(
+    main: Coroutine[Any, Any, T] | Callable[[], Coroutine[Any, Any, T]],
+    *,
+    again: bool = False,
+    debug: bool | None = None,
+) -> T:
     """Run a coroutine on uvloop, like `asyncio.run`; SIGTERM and SIGINT cancel it, so that systems stop in order.
+
+    Args:
+        main: the coroutine; or the function that makes it, called without arguments.
+        again: call the function anew when it ends with LeadershipLost: the program stands by, and may lead once more.
+        debug: as for `asyncio.run`.
 
     Where there is no uvloop it is run on asyncio's own loop. Where loops handle no signals, which is on Windows, SIGINT
     cancels it, too, and SIGTERM ends the process at once.
 
     Raises:
-        SpecError: an event loop runs in this thread already, as in a notebook.
+        SpecError: an event loop runs in this thread already, as in a notebook; or `again` was given a coroutine, which
+            can run only once.
         KeyboardInterrupt: it was ended by SIGINT.
         SystemExit: it was ended by SIGTERM (with code 143, as a shell reports it).
     """
-    if asyncio._get_running_loop() is not None:
+    if again and not callable(main):
         main.close()
+        raise SpecError("hf.run", "again=True needs the function: hf.run(main, again=True), not main()")
+    if asyncio._get_running_loop() is not None:
+        if not callable(main):
+            main.close()
         problem = "an event loop runs here already (a notebook, or another framework's): await the coroutine there"
         raise SpecError("hf.run", problem)
     stopped_by: list[int] = []
@@ -46,7 +62,12 @@ def run(main: Coroutine[Any, Any, T], *, debug: bool | None = None) -> T:
         except NotImplementedError:
             pass  # On Windows `asyncio.Runner` cancels the coroutine on SIGINT.
         try:
-            return await main
+            while True:
+                try:
+                    return await (main() if callable(main) else main)
+                except LeadershipLost:
+                    if not again:
+                        raise
         finally:
             for number in handled:
                 loop.remove_signal_handler(number)

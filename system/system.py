@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
 
 from ..actors.control.drain import drain as drain_queue
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, TreeFailed
-from ..actors.events import EventStream, RecoveryTableUnused
+from ..actors.events import EventStream, LeadershipTaken, RecoveryTableUnused, StandingBy
 from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, pack_exit
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
@@ -28,9 +28,10 @@ from ..actors.kernel.topics import publish
 from ..actors.loop_watchdog import LoopWatch
 from ..actors.process.process_host import WorkerPlace, in_process, on_frame
 from ..actors.process.worker_pool import Workers
+from ..checkpoint.engine_calls import Called
 from ..checkpoint.home.homes import Homes
 from ..checkpoint.home.journal_home import JournalHome
-from ..checkpoint.journal import Journal
+from ..checkpoint.journal import Journal, StoreEngine
 from ..checkpoint.method import Durability
 from ..checkpoint.places.far_parent import FarParent
 from ..checkpoint.places.life_here import recorded_here
@@ -40,6 +41,9 @@ from ..checkpoint.recovery_file import RecoveryFile
 from ..checkpoint.recovery_settings import RecoveryHooks
 from ..checkpoint.store_key import StoreKey
 from ..checkpoint.store_opening import check_system, open_journal
+from ..cluster.joining import is_replicated, join
+from ..cluster.leadership import LeadershipLost, Standby
+from ..cluster.log_writer import Deposed
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.children import tell_stopped
 from ..supervision.patience import end_within
@@ -74,6 +78,9 @@ REPLICA = f"{__name__.rpartition('.')[0].rpartition('.')[0]}.ftm.replica"
 PATIENCE = 10.0
 """Seconds after which a table of the recovery file should have found somebody whom it is for."""
 
+SETTLE_SECONDS = 5.0
+"""Seconds that a shutdown waits until a store on other machines has what was written last."""
+
 LONG = 365 * 86_400.0
 """Seconds `start` and `stop` wait: no limit of their own, the child specs say how long a start or an end may take."""
 
@@ -84,12 +91,15 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
     Args:
         name: the first part of all addresses.
         store: where journals and snapshots go: None (memory: survives any process but this one), or
-            "sqlite:PATH", or an engine of your own: anything that keeps to `Journal` (see holdfast.testing.stores).
+            "sqlite:PATH", or "nats://HOST,HOST/NAME": on several machines (docs/many-machines.md), or an engine of your
+            own: anything that keeps to `Journal` (see holdfast.testing.stores).
         store_key: encrypts the store "sqlite:PATH", from its making on: 32 bytes, the path of a file that has them and
             that only its owner may read, or a function that returns them (docs/recovery/encryption.md).
         durability: what an admission outlives when it is told of (send returns, an ask is fed, a reply leaves):
             "memory" (without a store) any process but this one, "os" (with one) this one too, "fsync" the machine.
             Each child may say otherwise: `hybrid(durability=...)`.
+        standby: with a store on several machines: wait while another program leads the system, until this one does:
+            "warm" with what is stored in memory, "cold" without. None: StoreInUse names who leads.
         intensity, period: how many restarts of its direct children the root allows before the tree fails.
         preload: modules the fork server imports beforehand, besides those of the actors it starts.
         log: write crashes, dead letters, output of processes and the like to structlog or standard logging, whichever
@@ -105,7 +115,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             not say, and their key variables.
 
     Leaving the context stops all actors, newest first. If the root supervisor gives up, the body is cancelled and
-    TreeFailed is raised.
+    TreeFailed is raised; LeadershipLost, if another program has come to lead the system.
     """
 
     def __init__(
@@ -115,6 +125,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         store: str | Journal | None = None,
         store_key: StoreKey | None = None,
         durability: Durability | None = None,
+        standby: Standby | None = None,
         intensity: int = 3,
         period: float = 5.0,
         preload: Sequence[str] = (),
@@ -133,6 +144,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             store=store,
             store_key=store_key,
             durability=durability,
+            standby=standby,
             flags=Flags("one_for_one", intensity, period),
             preload=tuple(preload),
             log=log,
@@ -151,7 +163,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         self._root: Cell | None = None
         self._body: asyncio.Task[Any] | None = None
         self._closing: asyncio.Task[None] | None = None
-        self._failure: TreeFailed | None = None
+        self._failure: TreeFailed | LeadershipLost | None = None
         self._stopping: set[asyncio.Task[None]] = set()
         self._transactions = Transactions()
         self._patience: asyncio.TimerHandle | None = None
@@ -169,13 +181,23 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         options = self._options
         file = options.read_recovery_file()
         node = self._running = Node(self.name, asyncio.get_running_loop(), seed=options.seed)
-        engine = open_journal(options.store, takeover=options.takeover, key=options.store_key)
+        if options.log:
+            self._sink = LogSink(self.name, node.loop, log_payloads=options.log_payloads)
+            node.events.add_sink(self._sink)
+        try:
+            engine = await self._open_store(node)
+        except BaseException:
+            if self._sink is not None:
+                self._sink.close()
+            raise
         try:
             check_system(engine, self.name)
             self._homes = Homes(node, engine, durability=options.durability, file=file, hooks=options.recovery_hooks)
         except HoldfastError:
             with contextlib.suppress(HoldfastError):  # What it says now is only what follows from that.
                 engine.close()
+            if self._sink is not None:
+                self._sink.close()
             raise
         if options.history:
             store = self._homes if self._homes.journal.durable else None
@@ -187,9 +209,6 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         self._moves = Moves(node)
         self._watch = LoopWatch(node, options.watch_lag, options.watch_turns)
         self._watch.open()
-        if options.log:
-            self._sink = LogSink(self.name, node.loop, log_payloads=options.log_payloads)
-            node.events.add_sink(self._sink)
         self._specifications = Specifications(self._homes, is_kept=options.store is not None)
         self._mechanism_notes = MechanismNotes(self._homes)
         node.connect(
@@ -205,12 +224,39 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         self._body = asyncio.current_task()
         root = self._root = node.root = node.cell_below(None, f"/{self.name}")
         flags = self._specifications.root_in_force(root.path, options.flags)
-        up = lifecycle.begin(root, Start(Supervisor, (flags, ())))
-        if up is not None:
-            await up
-        root.ended().add_done_callback(self._root_ended)
-        await self._specifications.start_added(lambda spec: root.ref.ask(StartChild(spec), LONG))
+        try:
+            up = lifecycle.begin(root, Start(Supervisor, (flags, ())))
+            if up is not None:
+                await up
+            root.ended().add_done_callback(self._root_ended)
+            await self._specifications.start_added(lambda spec: root.ref.ask(StartChild(spec), LONG))
+        except asyncio.CancelledError as error:
+            if self._failure is not None:  # Nobody is in the body yet who would hear of it.
+                await self.__aexit__(type(error), error, error.__traceback__)
+            raise
         return self
+
+    async def _open_store(self, node: Node) -> StoreEngine:
+        """The journal of the store; of one on several machines, once this program leads the system."""
+        options = self._options
+        if not (isinstance(options.store, str) and is_replicated(options.store)):
+            return open_journal(options.store, takeover=options.takeover, key=options.store_key)
+        where = f"/{self.name}"
+        journal = await join(
+            options.store,
+            self.name,
+            options.standby,
+            waits=lambda leader: node.emit(StandingBy(where, leader)),
+            deposed=self._deposed,
+        )
+        node.emit(LeadershipTaken(where, journal.epoch))
+        return Called(journal)
+
+    def _deposed(self, by: Deposed) -> None:
+        """Another program leads: the tree ends, and the body hears of it."""
+        if self._body is not None:
+            self._failure = LeadershipLost(self.name, by.leader, by.current)
+            self._body.cancel()
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -259,7 +305,9 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             self.trace_with(None)
         await self._workers.close()
         await node.close()
-        await self._homes.settled()
+        with contextlib.suppress(TimeoutError):  # Who keeps the store elsewhere may be away.
+            async with asyncio.timeout(SETTLE_SECONDS if self._homes.journal.engine.safe_at == "sync" else None):
+                await self._homes.settled()
         if self._history is not None:
             self._history.close()
         try:

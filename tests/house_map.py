@@ -7,7 +7,7 @@ import ast
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-ROOMS = ("actors", "supervision", "checkpoint", "ftm", "system", "diagnosis", "console", "testing")
+ROOMS = ("actors", "supervision", "checkpoint", "cluster", "ftm", "system", "diagnosis", "console", "testing")
 HEAD = """# The map
 
 Every folder and file of the package, with the first line of its docstring. `python -m tests.house_map` writes it.

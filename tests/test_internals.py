@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = [DOCS / "internals" / "index.md", DOCS / "internals" / "walks.md", DOCS / "papers.md"]
-SHIPPED = ("actors", "supervision", "checkpoint", "ftm", "diagnosis", "system", "console", "testing")
+SHIPPED = ("actors", "supervision", "checkpoint", "cluster", "ftm", "diagnosis", "system", "console", "testing")
 NAMED = re.compile(r"`(?P<file>[\w/]+\.py)(::(?P<test>\w+))?`")
 LISTED = re.compile(r"^(?P<folder>[\w/]+)/: (?P<files>[\w., \n]+?\.py)$", re.M)
 PICTURES = sorted((DOCS / "pictures").glob("*.txt"))

@@ -55,7 +55,16 @@ def test_pytest_holds_one_copy_of_the_package() -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["numpy", "holdfast.console", "holdfast.diagnosis", "holdfast.testing", "opentelemetry"],
+    [
+        "nats",
+        "nkeys",
+        "numpy",
+        "holdfast.cluster",
+        "holdfast.console",
+        "holdfast.diagnosis",
+        "holdfast.testing",
+        "opentelemetry",
+    ],
 )
 def test_importing_holdfast_leaves_alone(name: str) -> None:
     assert name not in modules_after_import()
@@ -116,6 +125,7 @@ def test_a_bare_install_has_all_public_names() -> None:
     modules = {
         "clingo",
         "cryptography",
+        "nats",
         "numpy",
         "pddl",
         "PIL",
@@ -157,6 +167,16 @@ def test_no_module_imports_pickle() -> None:
     found = [(str(path), name) for path in SOURCES for _, name in imports(path)]
     assert len(SOURCES) > 200
     assert not [one for one in found if one[1].split(".")[0] in {"pickle", "_pickle", "cloudpickle", "dill"}]
+
+
+def test_one_folder_knows_the_client_of_nats() -> None:
+    """What else is in the package works where the extra `nats` is not installed."""
+    found = {path.parent for path in SOURCES for level, name in imports(path) if level == 0 and is_of_nats(name)}
+    assert found <= {Path("cluster", "nats")}
+
+
+def is_of_nats(name: str) -> bool:
+    return name.split(".")[0] in {"nats", "nkeys"}
 
 
 def test_every_refusal_says_a_sentence() -> None:

@@ -21,6 +21,7 @@ from nats.js.errors import Error as JetStreamError
 
 from ..log_records import PART
 from ..ports import LogReader, OutOfTurn, Record, Unanswered
+from .access import access_of, connect_options
 
 T = TypeVar("T")
 ANSWER_SECONDS: Final = 2.0
@@ -138,6 +139,22 @@ class NatsEngine:
             await asyncio.wait_for(self._client.flush(timeout=1), 1.0)
         with contextlib.suppress(nats.errors.Error, TimeoutError, OSError):
             await self._client.close()
+
+
+async def open_engine(store: str, system: str) -> NatsEngine:
+    """Connect to the servers that a store names, and refuse those that may lose what they have acknowledged.
+
+    Args:
+        store: "nats://HOST,HOST/NAME", see `access_of`.
+        system: the name of the system.
+
+    Raises:
+        SpecError: the store cannot be read, or its files must not be used.
+        UnsafeServer: its servers or streams are not set as they have to be.
+        Unanswered: no server can be reached.
+    """
+    access = access_of(store)
+    return await NatsEngine.connect(connect_options(access), access.name, system, replicas=access.replicas)
 
 
 @contextlib.contextmanager
