@@ -43,6 +43,8 @@ LOOK_SECONDS: Final = 0.2
 """How often a candidate looks whether the lease is free."""
 QUIET_SECONDS: Final = 2.0
 """Without a record for so long, a follower asks the log whether it has missed any."""
+MOST_READERS: Final = 5
+"""Readers that have to begin a log with a record that begins nothing, before it is the log that is damaged."""
 RENEWALS: Final = 6
 """How often a leader renews its lease in the time that it lasts."""
 TRUSTED: Final = 0.75
@@ -90,6 +92,7 @@ class Follower:
         self._engine = engine
         self._stream: LogReader | None = None
         self._is_new = True
+        self._wrong_beginnings = 0
         self.contents = StoreContents()
         self.reader = RecordReader()
         self.leader = ""
@@ -113,7 +116,7 @@ class Follower:
                 self._take(record)
             except GapInLog:
                 if self._is_new:  # What this follower has not read yet is gone: all of it stands in a base.
-                    self.contents, self.reader, self.leader = StoreContents(), RecordReader(), ""
+                    self._begin_again(record)
                 await self.begin_anew()
                 break
             self._is_new = False
@@ -157,6 +160,20 @@ class Follower:
         if stream is not None:
             with contextlib.suppress(Unanswered):
                 await stream.close()
+
+    def _begin_again(self, record: Record) -> None:
+        """Read the log from its beginning, which is not this record.
+
+        Raises:
+            DamagedLog: again and again it is, whichever reader is asked.
+        """
+        if self.reader.at == 0:
+            self._wrong_beginnings += 1
+            if self._wrong_beginnings == MOST_READERS:
+                raise DamagedLog(record.sequence, "what stood before it is gone, and it begins no base")
+        else:
+            self._wrong_beginnings = 0
+        self.contents, self.reader, self.leader = StoreContents(), RecordReader(), ""
 
     def _take(self, record: Record) -> None:
         if record.sequence <= self.reader.at:

@@ -243,8 +243,6 @@ class RecordReader:
         part = read_part(record)
         begins = self.at == 0 and part.kind == BASE and part.part == 0
         if part.previous != self.at and not begins:
-            if self.at == 0:
-                raise DamagedLog(record.sequence, "what stood before it is gone, and it begins no base")
             raise GapInLog(part.previous, self.at)
         if not (begins or (part.epoch > self.epoch if part.kind == EPOCH else part.epoch == self.epoch)):
             raise DamagedLog(record.sequence, f"it is of epoch {part.epoch}, and stands behind epoch {self.epoch}")

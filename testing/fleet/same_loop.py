@@ -55,7 +55,7 @@ class SameLoop:
             result: T = done.value
             return result
         work.close()
-        raise WouldWait(work.__qualname__)
+        raise WouldWait(getattr(work, "__qualname__", "this"))
 
     def close(self) -> None:
         """Do nothing: the loop is the program's."""
