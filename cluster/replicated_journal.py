@@ -445,7 +445,7 @@ class ReplicatedJournal:
             StoreFailed: the engine has not answered in time: what was not acknowledged may be lost.
         """
         with self._count_lock:
-            if not self._is_open:
+            if not self._is_open and self._leading.done():
                 return
             self._is_open = False
             submitted = self._submitted

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import contextvars
 import random
 from collections.abc import Callable, Coroutine, Generator
-from contextvars import ContextVar
 from typing import Any
 
 import pytest
@@ -26,7 +26,7 @@ from holdfast.testing.fleet.sim_engine import SimEngine
 ADDRESSES = ("/app/a", "/app/b", "/app/c")
 LARGE = 400
 """Bytes of a snapshot that these programs keep beside the log."""
-_RUNNING: ContextVar[Program | None] = ContextVar("running", default=None)
+_RUNNING: contextvars.ContextVar[Program | None] = contextvars.ContextVar("running", default=None)
 
 
 @contextlib.contextmanager
@@ -82,7 +82,7 @@ class Judge:
 
     def _begin(self) -> None:
         self.reader, self.contents = RecordReader(), StoreContents()
-        self.ids: list[tuple[str, int]] = []
+        self.ids: list[Any] = []
         self._read = 0
 
     def read(self, until: int | None = None) -> None:
@@ -95,7 +95,7 @@ class Judge:
                 assert said.kind in (EPOCH, CHANGES)
                 for change in decode_changes(said.data) if said.kind == CHANGES else ():
                     if change[0] == "append":
-                        self.ids += [(entry[1], entry[2]) for _, entry in change[1][0]]
+                        self.ids += [entry[1:3] for _, entry in change[1][0]]
                     self.contents.make(change)
             self._read += 1
 
@@ -134,8 +134,6 @@ class Program:
         def begin() -> asyncio.Task[None]:
             _RUNNING.set(self)
             return asyncio.ensure_future(self._run())
-
-        import contextvars
 
         self.task = contextvars.copy_context().run(begin)
 
