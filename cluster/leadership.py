@@ -361,6 +361,8 @@ class LeaseKeeper:
                         continue
                     self._is_held = False
                     self._go_on()
+                    self._look()  # Another may have led meanwhile: nothing is relied on before the next renewal.
+                    continue
                 else:
                     self._token = await lease.renew(self._me, self._token)
                     if self._token is None:

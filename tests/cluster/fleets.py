@@ -273,10 +273,9 @@ class Fleet:
             assert loop.time() < until, f"nobody writes for {seconds:g} s though all is well"
             await asyncio.sleep(0.5)
             self.check()
-        await asyncio.sleep(10.0)  # What was late has arrived.
         for program in [*self.programs]:
             program.kill()
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(10.0)  # What was late has arrived.
         self.check()
         follower = Follower(SimEngine(self.broker))
         await follower.catch_up()
