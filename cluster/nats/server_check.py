@@ -277,7 +277,7 @@ def _of_stream(stream: StreamSetting, access: NatsAccess) -> list[Problem]:
         (stream.discard != "new", "when it is full, the oldest records go", f"{edit} --discard new"),
         (stream.max_age > 0, f"records go after {stream.max_age / 1e9:.0f} s", f"{edit} --max-age 0"),
         (
-            stream.max_msgs_per_subject > 0,
+            stream.max_msgs_per_subject > 0 and any(one.endswith(".log") for one in stream.subjects),
             f"only {stream.max_msgs_per_subject} records of a log stay",
             f"{edit} --max-msgs-per-subject=-1",
         ),
