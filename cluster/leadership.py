@@ -197,15 +197,13 @@ class Leading:
         contents: all that its predecessors have written.
         maker: of its own records.
         grown: bytes that the log has beside the newest base.
-        token: of the lease.
-        deadline: until when it relies on the lease, on the clock of the loop.
+        keeper: of its lease.
     """
 
     contents: StoreContents
     maker: RecordMaker
     grown: int
-    token: int
-    deadline: float
+    keeper: LeaseKeeper
 
 
 async def lead(
@@ -228,22 +226,25 @@ async def lead(
     following = asyncio.ensure_future(follower.follow()) if standby == "warm" else None
     try:
         while True:
-            taken, asked = await _take_lease(engine, me, standby, waits, following)
+            keeper = await _take_lease(engine, me, standby, waits, following)
             if following is not None:
                 following.cancel()
                 await asyncio.wait([following])
                 if not following.cancelled():
                     following.result()
                 await follower.begin_anew()
+            renewing = asyncio.ensure_future(keeper.renew_while_reading(follower))
             try:
-                maker = await _begin_epoch(engine, me, follower, asked + engine.lease.seconds)
+                maker = await _begin_epoch(engine, me, follower, keeper)
             except Unanswered:
                 if standby is None:
                     raise
                 maker = None
+            finally:
+                renewing.cancel()
+                await asyncio.wait([renewing])
             if maker is not None:
-                deadline = asked + TRUSTED * engine.lease.seconds
-                return Leading(follower.contents, maker, follower.reader.grown, taken, deadline)
+                return Leading(follower.contents, maker, follower.reader.grown, keeper)
             if standby == "warm":
                 following = asyncio.ensure_future(follower.follow())
     finally:
@@ -258,8 +259,8 @@ async def _take_lease(
     standby: Standby | None,
     waits: Callable[[str], None],
     following: asyncio.Future[None] | None,
-) -> tuple[int, float]:
-    """Wait for the lease; return its token, and when it was asked for."""
+) -> LeaseKeeper:
+    """Wait for the lease, and return what keeps it."""
     loop = asyncio.get_running_loop()
     known = ""
     has_failed = False
@@ -271,7 +272,7 @@ async def _take_lease(
             token = await engine.lease.acquire(me)
             if token is not None:
                 if not has_failed:
-                    return token, asked
+                    return LeaseKeeper(engine, me, token, asked)
                 # After an outage that this process has seen, too, whoever led goes first: with its state in memory.
                 await engine.lease.release(token)
                 await asyncio.sleep(engine.lease.seconds)
@@ -294,7 +295,7 @@ async def _take_lease(
         await asyncio.sleep(LOOK_SECONDS * random.uniform(0.5, 1.0))
 
 
-async def _begin_epoch(engine: Engine, me: str, follower: Follower, until: float) -> RecordMaker | None:
+async def _begin_epoch(engine: Engine, me: str, follower: Follower, keeper: LeaseKeeper) -> RecordMaker | None:
     """Append the beginning of an epoch behind all that stands in the log; `None` if the lease is over before that."""
     loop = asyncio.get_running_loop()
     attempt = uuid.uuid4().hex
@@ -308,43 +309,53 @@ async def _begin_epoch(engine: Engine, me: str, follower: Follower, until: float
             reader.check_whole()
             maker.after = stands
             return maker
-        if loop.time() > until:
+        if loop.time() > keeper.deadline:
             return None
 
 
 class LeaseKeeper:
-    """Keeps a leader's lease. All methods are for the loop of the engine.
+    """Keeps a lease that was taken. All methods are for the loop of the engine.
 
     Attributes:
-        deadline: until when the leader relies on it, on the clock of the loop.
+        deadline: until when its holder relies on it, on the clock of the loop.
 
     Args:
         engine: keeps the lease.
         me: what the holder calls itself.
-        leading: what it began with.
-        hold: called when another has the lease: nothing more is to be written, until `go_on`.
-        go_on: called when it is ours again.
-        look: called when it was lost, and when another has it: the leader is to look whether it still leads.
+        token: of the lease.
+        asked: when it was asked for, on the clock of the loop.
     """
 
-    def __init__(
-        self,
-        engine: Engine,
-        me: str,
-        leading: Leading,
-        *,
-        hold: Callable[[], None],
-        go_on: Callable[[], None],
-        look: Callable[[], None],
-    ) -> None:
+    def __init__(self, engine: Engine, me: str, token: int, asked: float) -> None:
         self._lease, self._me = engine.lease, me
-        self._token: int | None = leading.token
-        self._hold, self._go_on, self._look = hold, go_on, look
+        self._token: int | None = token
         self._is_held = False
-        self.deadline = leading.deadline
+        self.deadline = asked + TRUSTED * engine.lease.seconds
 
-    async def run(self) -> None:
-        """Renew the lease, for ever."""
+    async def renew_while_reading(self, follower: Follower) -> None:
+        """Renew the lease for as long as a candidate that has it gets on with reading the log, which may be long.
+
+        One that does not lets the lease expire: others may be able to.
+        """
+        loop = asyncio.get_running_loop()
+        at = follower.reader.at
+        while self._token is not None:
+            await asyncio.sleep(self._lease.seconds / RENEWALS)
+            if follower.reader.at == at:
+                continue
+            at, asked = follower.reader.at, loop.time()
+            with contextlib.suppress(Unanswered):
+                self._token = await self._lease.renew(self._me, self._token)
+                self.deadline = asked + TRUSTED * self._lease.seconds if self._token is not None else self.deadline
+
+    async def run(self, *, hold: Callable[[], None], go_on: Callable[[], None], look: Callable[[], None]) -> None:
+        """Renew the lease of a leader, for ever.
+
+        Args:
+            hold: called when another has the lease: nothing more is to be written, until `go_on`.
+            go_on: called when it is ours again.
+            look: called when it was lost, and when another has it: the leader is to look whether it still leads.
+        """
         loop = asyncio.get_running_loop()
         lease = self._lease
         while True:
@@ -356,18 +367,17 @@ class LeaseKeeper:
                     if self._token is None:
                         if not self._is_held and await lease.holder():
                             self._is_held = True
-                            self._hold()
-                            self._look()
+                            hold()
+                            look()
                         continue
                     self._is_held = False
-                    self._go_on()
-                    self._look()  # Another may have led meanwhile: nothing is relied on before the next renewal.
+                    go_on()
+                    look()  # Another may have led meanwhile: nothing is relied on before the next renewal.
                     continue
-                else:
-                    self._token = await lease.renew(self._me, self._token)
-                    if self._token is None:
-                        self._look()
-                        continue
+                self._token = await lease.renew(self._me, self._token)
+                if self._token is None:
+                    look()
+                    continue
             except Unanswered:
                 continue
             self.deadline = asked + TRUSTED * lease.seconds

@@ -25,7 +25,7 @@ from ..checkpoint.entry_codec import check_entry, is_plain
 from ..checkpoint.journal import DamagedStore, Entry, SafeAt, Saved, StaleEpoch, StoreFailed
 from ..checkpoint.snapshot.shared_blocks import Segment
 from .engine_thread import EngineLoop
-from .leadership import Leading, LeaseKeeper
+from .leadership import Leading
 from .log_writer import Deposed, LogWriter, Write
 from .ports import Engine, Unanswered
 from .store_contents import Change
@@ -58,7 +58,6 @@ class ReplicatedJournal:
         engine: keeps the log.
         loop: on which the engine's work runs.
         leading: what this leader begins with.
-        me: what it calls itself.
         lost: told, on the engine's loop, why nothing can be written any more: another leads, or the log is damaged.
     """
 
@@ -71,7 +70,6 @@ class ReplicatedJournal:
         engine: Engine,
         loop: EngineLoop,
         leading: Leading,
-        me: str,
         *,
         lost: Callable[[Exception], None] = lambda error: None,
     ) -> None:
@@ -92,18 +90,16 @@ class ReplicatedJournal:
         self._failure: HoldfastError | None = None
         self._is_open = True
         self._is_awake = False
-        loop.wait(self._begin(leading, me))
+        self._keeper = leading.keeper
+        loop.wait(self._begin(leading))
 
-    async def _begin(self, leading: Leading, me: str) -> None:
-        self._writer = writer = LogWriter(
+    async def _begin(self, leading: Leading) -> None:
+        self._writer = LogWriter(
             self._engine,
             leading.maker,
             grown=leading.grown,
             written=self._take_written,
             want_base=self._want_base,
-        )
-        self._keeper = LeaseKeeper(
-            self._engine, me, leading, hold=writer.hold, go_on=writer.go_on, look=lambda: self._queue(Write())
         )
         self._leading = asyncio.ensure_future(self._lead())
 
@@ -111,7 +107,7 @@ class ReplicatedJournal:
         """Write, keep the lease and tidy up, until the journal is closed or another leads."""
         try:
             async with asyncio.TaskGroup() as group:
-                for work in (self._writer.run(), self._keeper.run(), self._drop_orphans()):
+                for work in (self._writer.run(), self._keep_lease(), self._drop_orphans()):
                     group.create_task(work)
         except ExceptionGroup as errors:
             cause = _first(errors)
@@ -121,6 +117,9 @@ class ReplicatedJournal:
                 self._fail(StoreFailed(self.path, f"{cause}" or type(cause).__name__))
             self._lost(cause)
         await self._keeper.release()  # Whoever leads next need not wait for its end.
+
+    async def _keep_lease(self) -> None:
+        await self._keeper.run(hold=self._writer.hold, go_on=self._writer.go_on, look=lambda: self._queue(Write()))
 
     async def _drop_orphans(self) -> None:
         """Remove what earlier leaders have kept beside the log and nothing in it refers to."""

@@ -150,7 +150,7 @@ class Program:
             self.fleet.begins(leading.contents, leading.maker.after, tag)
             lost = asyncio.Event()
             self.journal = journal = ReplicatedJournal(
-                self.engine, SameLoop(), leading, self.name, lost=lambda error, lost=lost: lost.set()
+                self.engine, SameLoop(), leading, lost=lambda error, lost=lost: lost.set()
             )
             self.is_to_close.clear()
             writing = asyncio.ensure_future(self._write(journal, tag))
@@ -287,7 +287,7 @@ class Fleet:
         engine = SimEngine(self.broker)
         leading = await lead(engine, "the last one", standby="cold")
         self.begins(leading.contents, leading.maker.after, "the last one")
-        journal = ReplicatedJournal(engine, SameLoop(), leading, "the last one")
+        journal = ReplicatedJournal(engine, SameLoop(), leading)
         await asyncio.sleep(1.0)
         journal.note("the end", b"")
         await journal.synced()

@@ -67,7 +67,7 @@ def opened(folder: Path) -> Journal:
         broker.expire_lease()
         return await lead(engine, me, standby=None)
 
-    return ReplicatedJournal(engine, thread, thread.wait(leading()), me)
+    return ReplicatedJournal(engine, thread, thread.wait(leading()))
 
 
 def left(journal: Journal, folder: Path) -> Path:

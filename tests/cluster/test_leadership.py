@@ -31,10 +31,10 @@ class Leader:
         lost: why it leads no more.
     """
 
-    def __init__(self, engine: SimEngine, leading: Leading, name: str) -> None:
+    def __init__(self, engine: SimEngine, leading: Leading) -> None:
         self.engine = engine
         self.lost: list[Exception] = []
-        self.journal = ReplicatedJournal(engine, SameLoop(), leading, name, lost=self.lost.append)
+        self.journal = ReplicatedJournal(engine, SameLoop(), leading, lost=self.lost.append)
 
     def write(self, count: int = 1) -> None:
         self.journal.append([(A, ("in", number)) for number in range(count)])
@@ -49,7 +49,7 @@ class Stage:
 
     async def leader(self, name: str, engine: SimEngine | None = None) -> Leader:
         engine = engine or SimEngine(self.broker)
-        made = Leader(engine, await lead(engine, name, standby="warm"), name)
+        made = Leader(engine, await lead(engine, name, standby="warm"))
         self._leaders.append(made)
         return made
 
@@ -229,6 +229,33 @@ async def test_a_simulated_journal_says_what_it_cannot_wait_for(stage: Stage) ->
         first.journal.close()
 
 
+async def test_whoever_reads_long_keeps_the_lease_meanwhile() -> None:
+    """Or two candidates that begin with nothing would depose each other for ever."""
+    stage = Stage(SimBroker(latency=(0.02, 0.02)))
+    first = await stage.leader("first")
+    for _ in range(600):
+        first.write()
+        await first.journal.synced()
+    await first.journal.end()
+
+    async def candidate(name: str) -> None:
+        engine = SimEngine(stage.broker, seconds=0.3)
+        while True:
+            leader = Leader(engine, await lead(engine, name, standby="cold"))
+            while not leader.lost:
+                await asyncio.sleep(0.1)
+            await leader.journal.end()
+
+    candidates = [asyncio.ensure_future(candidate(name)) for name in ("second", "third")]
+    await asyncio.sleep(20.0)
+    for task in asyncio.all_tasks() - {asyncio.current_task()}:
+        task.cancel()
+    await asyncio.wait(candidates)
+    judge = Judge(stage.broker)
+    judge.read()
+    assert judge.reader.epoch == 2
+
+
 async def test_what_was_kept_since_is_no_orphan(stage: Stage) -> None:
     """The names of what is kept come late: what this leader has kept meanwhile is among them."""
     first = await stage.leader("first")
@@ -247,7 +274,7 @@ async def test_what_was_kept_since_is_no_orphan(stage: Stage) -> None:
         return found
 
     engine.blobs.names = slow  # type: ignore[method-assign]
-    second = Leader(engine, leading, "second")
+    second = Leader(engine, leading)
     snapshot = b"x" * (LARGE + 1)
     second.journal.cut(A, snapshot, [], turn=1)
     await second.journal.synced()
@@ -266,7 +293,7 @@ async def test_orphans_stay_until_the_log_says_who_leads(stage: Stage) -> None:
     second = await stage.leader("second")
     second.journal.cut(A, b"x" * (LARGE + 1), [], turn=1)
     await second.journal.synced()
-    first = Leader(engine, leading, "first")
+    first = Leader(engine, leading)
     await asyncio.sleep(2.0)
     assert isinstance(first.lost[0], Deposed)
     assert second.journal.load(A).snapshot == b"x" * (LARGE + 1)
@@ -302,7 +329,7 @@ async def test_a_transaction_keeps_nobody_waiting() -> None:
     broker = SimBroker(latency=(0.0, 0.0))
     engine = SimEngine(broker)
     leading = await thread.run(lead(engine, "first", standby="cold"))
-    journal = ReplicatedJournal(engine, thread, leading, "first")
+    journal = ReplicatedJournal(engine, thread, leading)
     snapshot = b"x" * (1 << 20)
 
     def transact() -> bytes | None:
