@@ -118,6 +118,13 @@ CHECKS = {
         LEADERSHIP,
         "nobody_leads_before",
     ),
+    "whoever reads a long log renews its lease": Check(
+        "cluster/leadership.py",
+        "            if follower.reader.at == at:\n",
+        "            if True:\n",
+        LEADERSHIP,
+        "whoever_reads_long",
+    ),
     "whoever led goes first after an outage": Check(
         "cluster/leadership.py",
         "                if not has_failed:\n",
