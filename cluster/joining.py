@@ -72,7 +72,7 @@ async def join(
             if isinstance(error, Deposed):
                 _tell(loop, deposed, error)
 
-        return ReplicatedJournal(engine, thread, leading, me, lost=lost)
+        return ReplicatedJournal(engine, thread, leading, lost=lost)
     except BaseException as error:
         if engine is not None:
             with contextlib.suppress(asyncio.CancelledError, TimeoutError):
