@@ -51,6 +51,12 @@ class NatsAccess(msgspec.Struct, frozen=True, kw_only=True):
     insecure: bool = False
 
     @property
+    def name(self) -> str:
+        """What errors call the store: its servers and its system, without the files of secrets."""
+        scheme = self.servers[0].partition("://")[0]
+        return f"{scheme}://{','.join(one.partition('://')[2] for one in self.servers)}/{self.system}"
+
+    @property
     def is_encrypted(self) -> bool:
         """Whether what is sent to the servers is."""
         return self.ca is not None or any(one.startswith("tls:") for one in self.servers)
