@@ -11,7 +11,6 @@ import asyncio
 import contextlib
 from collections.abc import Generator, Mapping, Sequence
 from typing import Any, Final, TypeVar
-from urllib.parse import quote
 
 import nats.errors
 from nats.aio.client import Client
@@ -22,6 +21,7 @@ from nats.js.errors import Error as JetStreamError
 from ..log_records import PART
 from ..ports import LogReader, OutOfTurn, Record, Unanswered
 from .access import access_of, connect_options
+from .streams import Names, stream_settings
 
 T = TypeVar("T")
 ANSWER_SECONDS: Final = 2.0
@@ -36,50 +36,6 @@ IDLE_SECONDS: Final = 60.0
 """After so long without a request the server forgets a reader."""
 _WRONG_PREDECESSOR: Final = (10071, 10164)
 """What the server says if the last record is another one, or may be: a majority has not come so far."""
-
-
-def token_of(name: str) -> str:
-    """A name as a part of a subject or of a stream's name: no dots, blanks, stars or slashes.
-
-    >>> token_of("shop.eu 1")
-    'shop%2Eeu%201'
-    """
-    return quote(name, safe="-_").replace(".", "%2E").replace("~", "%7E")
-
-
-class Names:
-    """What a system's subjects and streams are called.
-
-    Args:
-        system: its name.
-    """
-
-    def __init__(self, system: str) -> None:
-        token = token_of(system)
-        self.log = f"hf.{token}.root.log"
-        self.lease = f"hf.{token}.root.lease"
-        self.blobs = f"hf.{token}.blob"
-        self.log_stream = f"HF-{token}-LOG"
-        self.lease_stream = f"HF-{token}-LEASE"
-        self.blob_stream = f"HF-{token}-BLOB"
-
-
-def stream_settings(names: Names, replicas: int) -> list[api.StreamConfig]:
-    """The streams of a system, as they have to be."""
-    common: dict[str, Any] = {"storage": api.StorageType.FILE, "num_replicas": replicas, "allow_direct": False}
-    keeps: dict[str, Any] = {**common, "discard": api.DiscardPolicy.NEW}
-    return [
-        api.StreamConfig(name=names.log_stream, subjects=[names.log], **keeps),
-        api.StreamConfig(name=names.blob_stream, subjects=[f"{names.blobs}.>"], max_msgs_per_subject=1, **keeps),
-        api.StreamConfig(
-            name=names.lease_stream,
-            subjects=[names.lease],
-            max_msgs_per_subject=1,
-            allow_msg_ttl=True,
-            discard=api.DiscardPolicy.OLD,
-            **common,
-        ),
-    ]
 
 
 class NatsEngine:
