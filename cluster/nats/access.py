@@ -7,7 +7,7 @@ import re
 import ssl
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final, TypedDict
+from typing import Any, Final, TypedDict
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 import msgspec
@@ -69,8 +69,8 @@ class ConnectOptions(TypedDict, total=False):
     name: str
     allow_reconnect: bool
     max_reconnect_attempts: int
-    reconnect_time_wait: float
-    connect_timeout: float
+    reconnect_time_wait: Any  # nats-py says int, and sleeps for it: a fraction of a second is right
+    connect_timeout: int
     ping_interval: int
     max_outstanding_pings: int
     inbox_prefix: str
@@ -133,7 +133,7 @@ def connect_options(access: NatsAccess) -> ConnectOptions:
         allow_reconnect=True,
         max_reconnect_attempts=-1,
         reconnect_time_wait=0.1,
-        connect_timeout=2.0,
+        connect_timeout=2,
         ping_interval=2,
         max_outstanding_pings=2,
     )

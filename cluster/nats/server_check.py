@@ -6,6 +6,7 @@ a warning; `holdfast nats check` prints them all.
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Sequence
 from time import monotonic
@@ -15,8 +16,8 @@ import msgspec
 
 from ...actors.errors import HoldfastError, SpecError
 from ..ports import Unanswered
-from .access import NatsAccess
-from .server_file import MOST_BYTES, VARZ
+from .access import NatsAccess, access_of, connect_options
+from .server_file import MOST_BYTES, NEEDS, VARZ
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -192,6 +193,42 @@ async def refuse_unsafe(client: Client, access: NatsAccess, *, seconds: float = 
     if fatal:
         raise UnsafeServer(", ".join(access.servers), fatal)
     return found
+
+
+async def check_store(store: str, *, seconds: float = 5.0) -> list[Problem]:
+    """What is wrong with the servers and streams that a store names: connect, look, and go.
+
+    Args:
+        store: `nats://host,host/system?...`, see `access_of`.
+        seconds: how long it may take to connect, and each answer.
+
+    Raises:
+        SpecError: the store cannot be read, or the library for it is missing.
+        Unanswered: no server lets us in, or one has not answered in time.
+    """
+    access = access_of(store)
+    options = connect_options(access)
+    options["max_reconnect_attempts"] = 2
+    try:
+        from nats.aio.client import Client
+        from nats.errors import Error
+    except ImportError as error:
+        raise SpecError("store", NEEDS) from error
+    told: list[str] = []
+
+    async def note(error: Exception) -> None:
+        told.append(str(error) or type(error).__name__)
+
+    client = Client()
+    try:
+        async with asyncio.timeout(seconds):
+            await client.connect(**options, error_cb=note)
+        return await check_server(client, access, seconds=seconds)
+    except (Error, OSError) as error:  # TimeoutError is one of these
+        last = told[-1] if told else str(error) or type(error).__name__
+        raise Unanswered(access.name, f"no server lets us in: {last}") from error
+    finally:
+        await client.close()
 
 
 async def look_at(client: Client, access: NatsAccess, *, seconds: float = 5.0) -> Seen:
