@@ -72,8 +72,8 @@ class LeadershipLost(
 
 
 def leader_name() -> str:
-    """What this process calls itself, for people: the machine and the process."""
-    return f"{socket.gethostname()}, process {os.getpid()}"
+    """What a candidate calls itself: machine and process, for people, and what tells it from all others there."""
+    return f"{socket.gethostname()}, process {os.getpid()} ({uuid.uuid4().hex[:8]})"
 
 
 class Follower:

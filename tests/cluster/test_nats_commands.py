@@ -59,7 +59,7 @@ def test_servers_are_checked(nats1: NatsServers) -> None:
     asyncio.run(_in_memory(nats1, system))
     bad = nats("check", nats1.store(system))
     assert bad.exit_code == 1
-    assert f"PROBLEM: the stream HF-{system}-LOG: storage is memory" in bad.output
+    assert f"PROBLEM: the stream hf-{system}-log: storage is memory" in bad.output
     told = json.loads(nats("check", nats1.store(system), "--json").output)
     assert {one["is_warning"] for one in told} == {False}
 

@@ -48,7 +48,7 @@ def seen(*servers: ServerSeen, **more: Any) -> Seen:
 
 def stream(replicas: int = 1, **more: Any) -> StreamSetting:
     access = msgspec.structs.replace(ACCESS, replicas=replicas)
-    return msgspec.structs.replace(wanted_streams(access)["HF-app-LOG"], **more)
+    return msgspec.structs.replace(wanted_streams(access)["hf-app-log"], **more)
 
 
 async def test_a_server_of_our_own_configuration_has_no_problem(nats1: NatsServers) -> None:
@@ -137,8 +137,8 @@ async def test_the_streams_of_a_system_are_all_looked_at(nats1: NatsServers) -> 
     await client.jetstream().add_stream(StreamConfig(name="other", subjects=["other"], storage=StorageType.MEMORY))
     found = await check_server(client, nats1.access(system))
     assert sorted((one.where, one.problem) for one in found) == [
-        (f"the stream HF-{system}-{kind}", "storage is memory, and a restart loses all")
-        for kind in ("BLOB", "LEASE", "LOG")
+        (f"the stream hf-{system}-{kind}", "storage is memory, and a restart loses all")
+        for kind in ("blob", "lease", "log")
     ]
     await client.close()
 
