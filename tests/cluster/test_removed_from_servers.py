@@ -1,7 +1,7 @@
 """Each safety check of servers and their files is there for a reason: take it out, and a test fails.
 
-`HOLDFAST_REMOVED=1 python -m pytest tests/cluster/test_removed_from_servers.py` does so, in a copy; otherwise it is only
-looked whether the checks and the tests are where this table says.
+`HOLDFAST_REMOVED=1 python -m pytest tests/cluster/test_removed_from_servers.py` does so, in a copy; otherwise it is
+only looked whether the checks and the tests are where this table says.
 """
 
 from __future__ import annotations
