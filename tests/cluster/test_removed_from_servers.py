@@ -52,7 +52,7 @@ CHECKS = {
     "records are on the disk before they are acknowledged": Check(
         "cluster/nats/server_file.py",
         "sync_interval: always #",
-        'sync_interval: "2m" #',
+        "sync_interval: 2m #",
         CHECK,
         "test_a_server_of_our_own_configuration",
     ),
