@@ -11,7 +11,7 @@ import msgspec
 from ..actors.errors import SpecError, type_name
 from ..actors.kernel.actor import Actor
 from ..actors.seconds import check_seconds
-from .compression import check_compress
+from .encoding.compression import check_compress
 from .recovery_settings import (
     NOTHING_MEANWHILE,
     SAFE_STATE_TIMEOUT,

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 from importlib.util import find_spec
 from typing import TypeVar
 
-from ..actors.errors import HoldfastError, SpecError
+from ..actors.errors import SpecError
 from ..checkpoint.journal import DamagedStore, StoreFailed, StoreInUse
 from .engine_thread import EngineThread
 from .leadership import LeaderElsewhere, Standby, lead, leader_name
@@ -68,7 +68,7 @@ async def join(
         engine = await thread.run(_connected(lambda: open_engine(access), insists=standby is not None))
         leading = await thread.run(lead(engine, me, standby=standby, waits=lambda leader: _tell(loop, waits, leader)))
 
-        def lost(error: HoldfastError) -> None:
+        def lost(error: Exception) -> None:
             if isinstance(error, Deposed):
                 _tell(loop, deposed, error)
 

@@ -241,8 +241,7 @@ async def lead(
                     raise
                 maker = None
             finally:
-                renewing.cancel()
-                await asyncio.wait([renewing])
+                await end_tasks(renewing)
             if maker is not None:
                 return Leading(follower.contents, maker, follower.reader.grown, keeper)
             if standby == "warm":

@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from ..actors.errors import HoldfastError
-from ..checkpoint.entry_codec import decode_entries, entry_packer
+from ..checkpoint.encoding.entry_codec import decode_entries, entry_packer
 from .ports import Record
 from .store_contents import Change
 

@@ -20,8 +20,8 @@ from typing import Final
 import msgspec
 
 from ..actors.errors import HoldfastError
-from ..checkpoint.compression import LibraryMissing, compressor, decompress
-from ..checkpoint.entry_codec import check_entry, is_plain
+from ..checkpoint.encoding.compression import LibraryMissing, compressor, decompress
+from ..checkpoint.encoding.entry_codec import check_entry, is_plain
 from ..checkpoint.journal import DamagedStore, Entry, SafeAt, Saved, StaleEpoch, StoreFailed
 from ..checkpoint.snapshot.shared_blocks import Segment
 from .engine_thread import EngineLoop, end_tasks

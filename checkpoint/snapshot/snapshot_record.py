@@ -10,9 +10,9 @@ import msgspec
 from ...actors.errors import HoldfastError, StartFailed
 from ...actors.events import SnapshotDamaged
 from ...actors.persistence import UNFIT
-from ..compression import PLAIN, compressor, decompress
 from ..durable_links import Tie
 from ..durable_timers import Saved
+from ..encoding.compression import PLAIN, compressor, decompress
 from ..inputs import spread
 from ..journal import DamagedStore, Entry
 from ..journal import Saved as Journaled

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Final, TypeAlias
 
-from ..entry_codec import decode_entry
+from ..encoding.entry_codec import decode_entry
 from ..journal import Primitive
 from .snapshot_files import Word, read_own, refuse_shared, sync
 

@@ -17,7 +17,7 @@ from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 from hashlib import blake2b
 from typing import IO, Final
 
-from ..compression import PLAIN, Compress, LibraryMissing, compressor, decompress
+from ..encoding.compression import PLAIN, Compress, LibraryMissing, compressor, decompress
 from ..journal import DamagedStore, StoreFailed
 from ..snapshot.shared_blocks import PAGE, Segment, memory_file
 from .sealing import Bytes, block_place

@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager
 from typing import Final, Literal
 
-from ..entry_codec import check_entry, entry_packer, is_plain
+from ..encoding.entry_codec import check_entry, entry_packer, is_plain
 from ..journal import DamagedStore, Entry, Saved, StaleEpoch, StoreFailed
 from ..snapshot.shared_blocks import Segment
 from ..store_key import StoreKey, read_store_key

@@ -8,7 +8,7 @@ import zlib
 from array import array
 from collections.abc import Sequence
 
-from ..entry_codec import decode_entry
+from ..encoding.entry_codec import decode_entry
 from ..journal import DamagedStore, Entry, Saved
 from .entry_chains import Chain
 from .row_codec import CHUNK, PLACE, row_crc, snapshot_digest, unpack_positions

@@ -20,7 +20,7 @@ from itertools import count
 from typing import TYPE_CHECKING, Final, Protocol
 
 from ...actors.errors import SpecError
-from ..entry_codec import decode_entry, entry_packer
+from ..encoding.entry_codec import decode_entry, entry_packer
 from ..journal import Entry, Primitive
 from .row_codec import crc_of
 

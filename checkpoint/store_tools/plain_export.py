@@ -20,7 +20,7 @@ from ...actors.errors import DamagedValue, HoldfastError, type_name
 from ...actors.kernel.codec import ARRAY, PACKED, REF
 from ...actors.values import ValueDescription, describe_value
 from ..addresses import KEY
-from ..compression import LibraryMissing
+from ..encoding.compression import LibraryMissing
 from ..inputs import spread
 from ..journal import DamagedStore, Entry, StoreFailed
 from ..protocol import REPLY, START, Answer, untimed

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import os
 import signal
 import sys
 from pathlib import Path
@@ -122,18 +121,3 @@ class Client:
             streams[1].close()
             with contextlib.suppress(OSError):
                 await streams[1].wait_closed()
-
-
-def paused(process: asyncio.subprocess.Process) -> contextlib.AbstractContextManager[None]:
-    """Have a process stand still meanwhile, with all its connections."""
-
-    @contextlib.contextmanager
-    def standing() -> object:
-        os.kill(process.pid, signal.SIGSTOP)
-        try:
-            yield
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process.pid, signal.SIGCONT)
-
-    return standing()

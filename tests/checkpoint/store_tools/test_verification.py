@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.checkpoint import compression
+from holdfast.checkpoint.encoding import compression
 from holdfast.checkpoint.journal import DamagedStore, ForeignStore, StoreFailed
 from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.store_tools import Damage, export_store, verify_store

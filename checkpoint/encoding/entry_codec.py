@@ -7,7 +7,7 @@ from typing import Final, cast
 
 import msgpack
 
-from .journal import Entry, Primitive
+from ..journal import Entry, Primitive
 
 _PLAIN: Final = frozenset({int, float, str, bytes, bool, type(None)})
 _BIG_INT: Final = 1  # msgpack extension type

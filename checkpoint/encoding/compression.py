@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Callable
 from typing import Any, Final
 
-from ..actors.errors import SpecError
+from ...actors.errors import SpecError
 
 PLAIN: Final = 0
 ZSTD: Final = 1
