@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
+from holdfast.actors.errors import HoldfastError
 from holdfast.checkpoint.journal import StaleEpoch, StoreFailed
 from holdfast.cluster.engine_thread import EngineThread
 from holdfast.cluster.leadership import Follower, LeaderElsewhere, Leading, lead
@@ -33,7 +34,7 @@ class Leader:
 
     def __init__(self, engine: SimEngine, leading: Leading) -> None:
         self.engine = engine
-        self.lost: list[Exception] = []
+        self.lost: list[HoldfastError] = []
         self.journal = ReplicatedJournal(engine, SameLoop(), leading, lost=self.lost.append)
 
     def write(self, count: int = 1) -> None:
@@ -209,7 +210,7 @@ async def test_what_an_engine_was_not_to_raise_is_told(stage: Stage, monkeypatch
     with pytest.raises(StoreFailed, match="no such thing"):
         await first.journal.synced()
     assert first.journal.has_failed()
-    assert isinstance(first.lost[0], ValueError)
+    assert isinstance(first.lost[0], StoreFailed)
 
 
 async def test_the_end_tells_whoever_waits(stage: Stage) -> None:
@@ -335,6 +336,7 @@ async def test_a_transaction_keeps_nobody_waiting() -> None:
     def transact() -> bytes | None:
         journal.cut(A, snapshot, [], turn=1)
         journal.sync()
+        found: bytes | None = None
         for _ in range(20):
             journal.note("key", b"under way")
             with journal.together():
