@@ -107,7 +107,7 @@ class ReplicatedJournal:
         """Write, keep the lease and tidy up, until the journal is closed or another leads."""
         try:
             async with asyncio.TaskGroup() as group:
-                for work in (self._writer.run(), self._keep_lease(), self._drop_orphans()):
+                for work in (self._writer.run(), self._writer.drop_freed(), self._keep_lease(), self._drop_orphans()):
                     group.create_task(work)
         except ExceptionGroup as errors:
             cause = _first(errors)
@@ -435,7 +435,9 @@ class ReplicatedJournal:
         if not self._is_open:
             return
         try:
-            self._loop.wait(self.end())
+            self._loop.wait(self.end(), 3 * CLOSE_SECONDS)
+        except TimeoutError as error:
+            raise StoreFailed(self.path, "its work for the engine does not end") from error
         finally:
             self._loop.close()
 

@@ -181,6 +181,14 @@ CHECKS = {
         LEADERSHIP,
         "kept_since_is_no_orphan",
     ),
+    "what a record frees is dropped behind it": Check(
+        "cluster/log_writer.py",
+        "            for name, data in write.puts:\n",
+        "            self._freed.extend(write.drops)\n            self._has_freed.set()\n"
+        "            await asyncio.sleep(0.01)\n            for name, data in write.puts:\n",
+        FLEETS,
+        "was_safe_is_there",
+    ),
     "only what is older than a base is forgotten": Check(
         "cluster/log_writer.py",
         "self._engine.log.forget(self._base_begins)",
