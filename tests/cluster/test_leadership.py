@@ -144,7 +144,8 @@ async def test_nobody_leads_before_having_read_all(stage: Stage) -> None:
         await first.journal.synced()
     await first.journal.end()
     stage.broker.faults = BrokerFaults(stale=0.7, silent=0.3)
-    second = await stage.leader("second")
+    async with asyncio.timeout(600.0):
+        second = await stage.leader("second")
     stage.broker.faults = BrokerFaults()
     assert len(second.journal.load(A).entries) == 100
 
@@ -193,10 +194,11 @@ async def test_a_log_that_has_lost_its_beginning_is_refused(stage: Stage) -> Non
     first.write()
     await first.journal.end()
     stage.broker.forget(2)
-    with pytest.raises(DamagedLog, match="begins no base"):
-        await lead(SimEngine(stage.broker), "second", standby="warm")
-    with pytest.raises(DamagedLog, match="begins no base"):
-        await lead(SimEngine(stage.broker), "second", standby="cold")
+    async with asyncio.timeout(10.0):
+        with pytest.raises(DamagedLog, match="begins no base"):
+            await lead(SimEngine(stage.broker), "second", standby="warm")
+        with pytest.raises(DamagedLog, match="begins no base"):
+            await lead(SimEngine(stage.broker), "second", standby="cold")
 
 
 async def test_what_an_engine_was_not_to_raise_is_told(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
