@@ -119,7 +119,8 @@ async def test_who_is_held_back_goes_on_when_the_other_never_leads(stage: Stage)
     await SimEngine(stage.broker).lease.acquire("second")
     await asyncio.sleep(1.2)
     first.write()
-    await first.journal.synced()
+    async with asyncio.timeout(60.0):
+        await first.journal.synced()
     assert stage.broker.held_by() == "first"
     assert not first.lost
 
