@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias
 
 from ..actors.errors import HoldfastError
+from .engine_thread import end_tasks
 from .log_records import (
     EPOCH,
     FORMAT,
@@ -228,8 +229,7 @@ async def lead(
         while True:
             keeper = await _take_lease(engine, me, standby, waits, following)
             if following is not None:
-                following.cancel()
-                await asyncio.wait([following])
+                await end_tasks(following)
                 if not following.cancelled():
                     following.result()
                 await follower.begin_anew()
@@ -249,7 +249,7 @@ async def lead(
                 following = asyncio.ensure_future(follower.follow())
     finally:
         if following is not None:
-            following.cancel()
+            await end_tasks(following)
         await follower.begin_anew()
 
 

@@ -24,7 +24,7 @@ from ..checkpoint.compression import LibraryMissing, compressor, decompress
 from ..checkpoint.entry_codec import check_entry, is_plain
 from ..checkpoint.journal import DamagedStore, Entry, SafeAt, Saved, StaleEpoch, StoreFailed
 from ..checkpoint.snapshot.shared_blocks import Segment
-from .engine_thread import EngineLoop
+from .engine_thread import EngineLoop, end_tasks
 from .leadership import Leading
 from .log_writer import Deposed, LogWriter, Write
 from .ports import Engine, Unanswered
@@ -459,8 +459,7 @@ class ReplicatedJournal:
                 done.set_result(None)  # Nothing more will be written.
         await asyncio.wait([done], timeout=CLOSE_SECONDS)
         left = submitted - self._written if self._failure is None else 0
-        self._leading.cancel()
-        await asyncio.wait([self._leading])
+        await end_tasks(self._leading)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_SECONDS):
                 await self._keeper.release()

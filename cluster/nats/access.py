@@ -7,7 +7,7 @@ import re
 import ssl
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final, TypedDict
+from typing import Any, Final, TypedDict
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 import msgspec
@@ -51,6 +51,12 @@ class NatsAccess(msgspec.Struct, frozen=True, kw_only=True):
     insecure: bool = False
 
     @property
+    def name(self) -> str:
+        """What errors call the store: its servers and its system, without the files of secrets."""
+        scheme = self.servers[0].partition("://")[0]
+        return f"{scheme}://{','.join(one.partition('://')[2] for one in self.servers)}/{self.system}"
+
+    @property
     def is_encrypted(self) -> bool:
         """Whether what is sent to the servers is."""
         return self.ca is not None or any(one.startswith("tls:") for one in self.servers)
@@ -63,8 +69,8 @@ class ConnectOptions(TypedDict, total=False):
     name: str
     allow_reconnect: bool
     max_reconnect_attempts: int
-    reconnect_time_wait: float
-    connect_timeout: float
+    reconnect_time_wait: Any  # nats-py says int, and sleeps for it: a fraction of a second is right
+    connect_timeout: int
     ping_interval: int
     max_outstanding_pings: int
     inbox_prefix: str
@@ -127,7 +133,7 @@ def connect_options(access: NatsAccess) -> ConnectOptions:
         allow_reconnect=True,
         max_reconnect_attempts=-1,
         reconnect_time_wait=0.1,
-        connect_timeout=2.0,
+        connect_timeout=2,
         ping_interval=2,
         max_outstanding_pings=2,
     )

@@ -22,6 +22,7 @@ from ..log_records import PART
 from ..ports import LogReader, OutOfTurn, Record, Unanswered
 from .access import NatsAccess, connect_options
 from .server_check import refuse_unsafe
+from .streams import Names, stream_settings
 
 ANSWER_SECONDS: Final = 2.0
 """How long one request waits for its answer."""
@@ -37,38 +38,6 @@ IDLE_SECONDS: Final = 60.0
 """After so long without a request the server forgets a reader."""
 _WRONG_PREDECESSOR: Final = (10071, 10164)
 """What the server says if the last record is another one, or may be: a majority has not come so far."""
-
-
-class Names:
-    """What a system's subjects and streams are called.
-
-    Args:
-        system: its name on the servers: letters, digits, hyphens and underscores.
-    """
-
-    def __init__(self, system: str) -> None:
-        self.log = f"hf.{system}.root.log"
-        self.lease = f"hf.{system}.root.lease"
-        self.blobs = f"hf.{system}.blob"
-        self.log_stream = f"hf-{system}-log"
-        self.lease_stream = f"hf-{system}-lease"
-        self.blob_stream = f"hf-{system}-blob"
-
-
-def stream_settings(names: Names, replicas: int) -> list[api.StreamConfig]:
-    """The streams of a system, as they have to be."""
-    common: dict[str, Any] = {
-        "storage": api.StorageType.FILE,
-        "num_replicas": replicas,
-        "allow_direct": False,
-        "discard": api.DiscardPolicy.NEW,
-    }
-    newest: dict[str, Any] = {**common, "max_msgs_per_subject": 1}
-    return [
-        api.StreamConfig(name=names.log_stream, subjects=[names.log], **common),
-        api.StreamConfig(name=names.blob_stream, subjects=[f"{names.blobs}.>"], **newest),
-        api.StreamConfig(name=names.lease_stream, subjects=[names.lease], allow_msg_ttl=True, **newest),
-    ]
 
 
 class NatsEngine:
@@ -114,7 +83,7 @@ async def open_engine(access: NatsAccess) -> NatsEngine:
         UnsafeServer: the servers or streams are not set as they have to be.
         Unanswered: no server can be reached, or they have no leader now.
     """
-    name = f"{','.join(access.servers)}/{access.system}"
+    name = access.name
     client = Client()
     options: dict[str, Any] = {**connect_options(access)}
     with answering(name):

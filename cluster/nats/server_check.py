@@ -6,6 +6,7 @@ a warning; `holdfast nats check` prints them all.
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Sequence
 from time import monotonic
@@ -15,8 +16,8 @@ import msgspec
 
 from ...actors.errors import HoldfastError, SpecError
 from ..ports import Unanswered
-from .access import NatsAccess
-from .server_file import MOST_BYTES, VARZ
+from .access import NatsAccess, access_of, connect_options
+from .server_file import MOST_BYTES, NEEDS, VARZ
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -30,6 +31,26 @@ LEAST_BYTES: Final = 1024 * 1024
 _ENGINE: Final = "NATS"
 _NOT_ENABLED: Final = (10039, 10076)
 """Answers of the API where JetStream is off, for the account or for the server."""
+
+
+LOSES: Final = {
+    "subjects": "records go to none",
+    "retention": "records go although nobody has dropped them",
+    "storage": "a restart loses all",
+    "discard": "a full stream does what it should not",
+    "num_replicas": "the loss of a server loses records, or stops all",
+    "max_age": "records go with time",
+    "max_msgs": "there is room for so many records only",
+    "max_msgs_per_subject": "another number of records stays",
+    "max_bytes": "there is room for so many bytes only",
+    "max_msg_size": "larger records are refused",
+    "no_ack": "nobody knows what is kept",
+    "sealed": "nothing can be appended",
+    "allow_direct": "reads may miss the last records",
+    "mirror_direct": "reads may miss the last records",
+    "persist_mode": "what was acknowledged may not be on the disk",
+}
+"""Settings of a stream on which it depends whether something is lost, and what another one leads to."""
 
 
 class UnsafeServer(HoldfastError, text="{servers} may lose what was acknowledged: {problems:; }"):
@@ -96,7 +117,9 @@ class StreamSetting(msgspec.Struct, frozen=True):
     discard: str = "old"
     num_replicas: int = 1
     max_age: int = 0
+    max_msgs: int = -1
     max_msgs_per_subject: int = -1
+    max_bytes: int = -1
     max_msg_size: int = -1
     no_ack: bool = False
     sealed: bool = False
@@ -172,6 +195,42 @@ async def refuse_unsafe(client: Client, access: NatsAccess, *, seconds: float = 
     return found
 
 
+async def check_store(store: str, *, seconds: float = 5.0) -> list[Problem]:
+    """What is wrong with the servers and streams that a store names: connect, look, and go.
+
+    Args:
+        store: `nats://host,host/system?...`, see `access_of`.
+        seconds: how long it may take to connect, and each answer.
+
+    Raises:
+        SpecError: the store cannot be read, or the library for it is missing.
+        Unanswered: no server lets us in, or one has not answered in time.
+    """
+    access = access_of(store)
+    options = connect_options(access)
+    options["max_reconnect_attempts"] = 2
+    try:
+        from nats.aio.client import Client
+        from nats.errors import Error
+    except ImportError as error:
+        raise SpecError("store", NEEDS) from error
+    told: list[str] = []
+
+    async def note(error: Exception) -> None:
+        told.append(str(error) or type(error).__name__)
+
+    client = Client()
+    try:
+        async with asyncio.timeout(seconds):
+            await client.connect(**options, error_cb=note)
+        return await check_server(client, access, seconds=seconds)
+    except (Error, OSError) as error:  # TimeoutError is one of these
+        last = told[-1] if told else str(error) or type(error).__name__
+        raise Unanswered(access.name, f"no server lets us in: {last}") from error
+    finally:
+        await client.close()
+
+
 async def look_at(client: Client, access: NatsAccess, *, seconds: float = 5.0) -> Seen:
     """Ask the servers how they are set up. Nothing is changed there.
 
@@ -211,10 +270,10 @@ def problems_of(seen: Seen, access: NatsAccess) -> list[Problem]:
     for server in seen.servers:
         found += _of_jetstream(server)
     found += _of_cluster(seen.servers, access)
-    own = f"hf.{access.system}."
+    wanted = wanted_streams(access)
     for stream in seen.streams:
-        if any(subject.startswith(own) or subject == ">" for subject in stream.subjects):
-            found += _of_stream(stream, access)
+        if stream.name in wanted:
+            found += _of_stream(stream, wanted[stream.name])
     return found
 
 
@@ -256,46 +315,39 @@ def _cluster_size(servers: Sequence[ServerSeen]) -> int:
     return max((one.jetstream.meta.cluster_size for one in servers if one.jetstream.meta is not None), default=0)
 
 
-def _of_stream(stream: StreamSetting, access: NatsAccess) -> list[Problem]:
-    """One problem for each setting that is wrong."""
-    name = stream.name
-    edit = f"nats stream edit {name}"
-    anew = "its storage cannot be changed: copy what is kept to a stream on files"
-    wrong: list[tuple[bool, str, str]] = [
-        (
-            stream.num_replicas % 2 == 0,
-            f"it has {stream.num_replicas} replicas",
-            f"{edit} --replicas {access.replicas}",
-        ),
-        (
-            stream.num_replicas % 2 == 1 and stream.num_replicas < access.replicas,
-            f"it has {stream.num_replicas} replica, and {access.replicas} are wanted",
-            f"{edit} --replicas {access.replicas}",
-        ),
-        (stream.storage != "file", "it is in memory", anew),
-        (stream.retention != "limits", f"records go by the rule {stream.retention!r}", "its retention must be limits"),
-        (stream.discard != "new", "when it is full, the oldest records go", f"{edit} --discard new"),
-        (stream.max_age > 0, f"records go after {stream.max_age / 1e9:.0f} s", f"{edit} --max-age 0"),
-        (
-            stream.max_msgs_per_subject > 0 and any(one.endswith(".log") for one in stream.subjects),
-            f"only {stream.max_msgs_per_subject} records of a log stay",
-            f"{edit} --max-msgs-per-subject=-1",
-        ),
-        (
-            0 < stream.max_msg_size < LEAST_BYTES,
-            f"it takes records of at most {stream.max_msg_size} bytes",
-            f"{edit} --max-msg-size=-1",
-        ),
-        (stream.allow_direct or stream.mirror_direct, "reads may miss the last records", f"{edit} --no-allow-direct"),
-        (stream.no_ack, "it acknowledges nothing", f"{edit} --ack"),
-        (stream.sealed, "it is sealed: nothing can be appended", "copy what is kept to another stream"),
-        (
-            stream.persist_mode == "async",
-            "it acknowledges records before they are on the disk",
-            "its persist mode must be the default one",
-        ),
-    ]
-    return [Problem(f"the stream {name}", problem, remedy) for is_wrong, problem, remedy in wrong if is_wrong]
+def _of_stream(stream: StreamSetting, wanted: StreamSetting) -> list[Problem]:
+    """One problem for each setting of a stream that is not as the system makes it."""
+    where, found = f"the stream {stream.name}", list[Problem]()
+    for setting in LOSES:
+        now, right = getattr(stream, setting), getattr(wanted, setting)
+        if now != right and not (setting == "num_replicas" and now % 2 and now > right):
+            problem = f"{setting} is {_shown(now)}, and {LOSES[setting]}"
+            found.append(Problem(where, problem, f"set it to {_shown(right)} (`nats stream edit {stream.name}`)"))
+    return found
+
+
+def _shown(value: object) -> str:
+    """A value as the server's own tools write it.
+
+    >>> _shown(("a", "b")), _shown(False), _shown("file"), _shown(-1)
+    ('a b', 'false', 'file', '-1')
+    """
+    match value:
+        case bool():
+            return str(value).lower()
+        case tuple():
+            return " ".join(map(str, value))
+        case _:
+            return str(value)
+
+
+def wanted_streams(access: NatsAccess) -> dict[str, StreamSetting]:
+    """How the streams of a system have to be set, by name."""
+    from .streams import Names, stream_settings
+
+    settings = [one.as_dict() for one in stream_settings(Names(access.system), access.replicas)]
+    as_listed = msgspec.json.decode(msgspec.json.encode(settings), type=list[StreamSetting])
+    return {one.name: one for one in as_listed}
 
 
 def _version(text: str) -> tuple[int, ...]:

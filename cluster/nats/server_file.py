@@ -27,6 +27,7 @@ MOST_BYTES: Final = 8 * 1024 * 1024
 """The largest message that a server takes: parts of records and blobs are smaller."""
 VARZ: Final = "$SYS.REQ.SERVER.PING.VARZ"
 """Where each server answers how it is set up. The system account exports it, so that nodes can check the servers."""
+NEEDS: Final = "a store on NATS needs the library nats-py: pip install 'holdfast[nats]'"
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _LOOPBACK_NAMES: Final = ("localhost", "ip6-localhost")
 
@@ -224,8 +225,9 @@ def write_server_files(
         for name in names
     ]
     secret = _kept(folder / "routes.secret", lambda: secrets.token_hex(24)) if len(servers) > 1 else ""
-    for server, file in zip(servers, files, strict=True):
-        _write(file, server_text(server, servers, accounts, secret))
+    texts = [server_text(server, servers, accounts, secret) for server in servers]
+    for file, text in zip(files, texts, strict=True):
+        _write(file, text)
     return [*files, *seeds.values()]
 
 
@@ -264,7 +266,7 @@ def _library() -> ModuleType:
     try:
         return importlib.import_module("nkeys")
     except ImportError as error:
-        raise SpecError("store", "a store on NATS needs the library nats-py: pip install 'holdfast[nats]'") from error
+        raise SpecError("store", NEEDS) from error
 
 
 def _kept(file: Path, make: Callable[[], str]) -> str:

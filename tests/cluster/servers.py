@@ -24,7 +24,7 @@ import nats
 from nats.aio.client import Client
 
 from holdfast.cluster.nats.access import NatsAccess, access_of, connect_options
-from holdfast.cluster.nats.server_file import Role, ServerPlan, seed_file, write_server_files
+from holdfast.cluster.nats.server_file import Role, ServerPlan, TlsFiles, seed_file, write_server_files
 
 PATIENCE = 60.0
 """Seconds for servers to answer, on a machine that is busy with other things; usually it takes a fraction of one."""
@@ -47,10 +47,10 @@ def server_binary() -> str:
 
 
 class NatsServers:
-    """One or three servers; they are numbered from 0."""
+    """One or three servers; they are numbered from 0. With a certificate they, and who uses them, show it."""
 
-    def __init__(self, folder: Path, count: int = 1) -> None:
-        self.folder, self.count = folder, count
+    def __init__(self, folder: Path, count: int = 1, tls: TlsFiles | None = None) -> None:
+        self.folder, self.count, self.tls = folder, count, tls
         self.plans: list[ServerPlan] = []
         self._systems: Iterator[str] = iter(())
         self._processes: dict[int, subprocess.Popen[bytes]] = {}
@@ -67,7 +67,11 @@ class NatsServers:
     def store(self, system: str, role: Role = Role.NODE) -> str:
         """What `store=` is for a system on these servers, with the key of that role."""
         hosts = ",".join(f"{plan.host}:{plan.port}" for plan in self.plans)
-        return f"nats://{hosts}/{system}?nkey={seed_file(self.folder, system, role)}"
+        nkey = f"nkey={seed_file(self.folder, system, role)}"
+        if self.tls is None:
+            return f"nats://{hosts}/{system}?{nkey}"
+        files = f"ca={self.tls.ca}&certificate={self.tls.certificate}&key={self.tls.key}"
+        return f"tls://{hosts}/{system}?{nkey}&{files}"
 
     def access(self, system: str, role: Role = Role.NODE) -> NatsAccess:
         """What a program with the key of that role may use the servers by."""
@@ -147,6 +151,7 @@ class NatsServers:
                 port=next(ports),
                 cluster_port=next(ports),
                 monitor_port=next(ports),
+                tls=self.tls,
             )
             for number in range(self.count)
         ]

@@ -21,7 +21,8 @@ def seed(tmp_path: Path) -> Path:
 
 
 def test_an_address_names_servers_and_a_system() -> None:
-    access = access_of("nats://127.0.0.1:5222,localhost,[::1]:7/app")
+    access = access_of("nats://127.0.0.1:5222,localhost,[::1]:7/app?insecure=no")
+    assert access.name == "nats://127.0.0.1:5222,localhost:4222,[::1]:7/app"
     assert access.servers == ("nats://127.0.0.1:5222", "nats://localhost:4222", "nats://[::1]:7")
     assert (access.system, access.replicas) == ("app", 3)
 

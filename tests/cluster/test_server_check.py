@@ -8,11 +8,12 @@ from typing import Any
 import msgspec
 import nats
 import pytest
-from nats.js.api import DiscardPolicy, StorageType, StreamConfig
+from nats.js.api import StorageType, StreamConfig
 
 from holdfast.cluster.nats import server_check
 from holdfast.cluster.nats.access import NatsAccess
 from holdfast.cluster.nats.server_check import (
+    LOSES,
     JetStreamConfig,
     JetStreamSeen,
     MetaGroup,
@@ -24,8 +25,10 @@ from holdfast.cluster.nats.server_check import (
     look_at,
     problems_of,
     refuse_unsafe,
+    wanted_streams,
 )
 from holdfast.cluster.nats.server_file import MOST_BYTES, Role
+from holdfast.cluster.nats.streams import Names, stream_settings
 from holdfast.cluster.ports import Unanswered
 from tests.cluster.servers import NatsServers
 
@@ -43,19 +46,20 @@ def seen(*servers: ServerSeen, **more: Any) -> Seen:
     return Seen(servers=servers or (server(),), **told)
 
 
-def stream(**more: Any) -> StreamSetting:
-    return StreamSetting("s0", ("hf.app.*.log",), discard="new", **more)
+def stream(replicas: int = 1, **more: Any) -> StreamSetting:
+    access = msgspec.structs.replace(ACCESS, replicas=replicas)
+    return msgspec.structs.replace(wanted_streams(access)["hf-app-log"], **more)
 
 
 async def test_a_server_of_our_own_configuration_has_no_problem(nats1: NatsServers) -> None:
     system = nats1.new_system()
     client = await nats1.connect(system)
-    setting = StreamConfig(name="s", subjects=[f"hf.{system}.*.log"], discard=DiscardPolicy.NEW, allow_direct=False)
-    await client.jetstream().add_stream(setting)
+    for setting in stream_settings(Names(system), 1):
+        await client.jetstream().add_stream(setting)
     assert await refuse_unsafe(client, nats1.access(system)) == []
     found = await look_at(client, nats1.access(system))
     assert [one.jetstream.config for one in found.servers] == [JetStreamConfig(sync_always=True)]
-    assert [one.name for one in found.streams] == ["s"]
+    assert {one.name: one for one in found.streams} == wanted_streams(nats1.access(system))
     await client.close()
 
 
@@ -124,17 +128,18 @@ async def test_who_may_not_ask_is_told(nats1: NatsServers) -> None:
     await client.close()
 
 
-async def test_the_streams_of_a_system_are_all_looked_at(nats1: NatsServers, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_streams_of_a_system_are_all_looked_at(nats1: NatsServers) -> None:
     system = nats1.new_system()
     client = await nats1.connect(system)
-    for number in range(3):
-        storage = StorageType.MEMORY if number == 2 else StorageType.FILE
-        setting = StreamConfig(name=f"s{number}", subjects=[f"hf.{system}.{number}.log"], storage=storage)
+    for setting in stream_settings(Names(system), 1):
+        setting.storage = StorageType.MEMORY
         await client.jetstream().add_stream(setting)
     await client.jetstream().add_stream(StreamConfig(name="other", subjects=["other"], storage=StorageType.MEMORY))
     found = await check_server(client, nats1.access(system))
-    assert sorted({one.where for one in found}) == ["the stream s0", "the stream s1", "the stream s2"]
-    assert [one.where for one in found if "memory" in one.problem] == ["the stream s2"]
+    assert sorted((one.where, one.problem) for one in found) == [
+        (f"the stream hf-{system}-{kind}", "storage is memory, and a restart loses all")
+        for kind in ("blob", "lease", "log")
+    ]
     await client.close()
 
 
@@ -145,19 +150,22 @@ async def test_the_streams_of_a_system_are_all_looked_at(nats1: NatsServers, mon
         (seen(has_jetstream=False), ACCESS, "JetStream is off", "jetstream: enabled"),
         (seen(server(size=2), server("n1", size=2)), ACCESS, "two servers", "add a third"),
         (seen(), THREE, "3 replicas are wanted", "?replicas=1"),
-        (seen(streams=(stream(num_replicas=2),)), ACCESS, "2 replicas", "--replicas 1"),
-        (seen(server(size=3), streams=(stream(),)), THREE, "1 replica, and 3", "--replicas 3"),
-        (seen(streams=(stream(storage="memory"),)), ACCESS, "in memory", "on files"),
-        (seen(streams=(stream(retention="interest"),)), ACCESS, "'interest'", "limits"),
-        (seen(streams=(StreamSetting("s0", ("hf.app.>",)),)), ACCESS, "the oldest records go", "--discard new"),
-        (seen(streams=(stream(max_age=5 * 10**9),)), ACCESS, "after 5 s", "--max-age 0"),
-        (seen(streams=(stream(max_msgs_per_subject=1),)), ACCESS, "only 1 records", "--max-msgs-per-subject"),
-        (seen(streams=(stream(max_msg_size=1000),)), ACCESS, "at most 1000 bytes", "--max-msg-size"),
-        (seen(streams=(stream(allow_direct=True),)), ACCESS, "reads may miss", "--no-allow-direct"),
-        (seen(streams=(stream(mirror_direct=True),)), ACCESS, "reads may miss", "--no-allow-direct"),
-        (seen(streams=(stream(no_ack=True),)), ACCESS, "acknowledges nothing", "--ack"),
-        (seen(streams=(stream(sealed=True),)), ACCESS, "sealed", "another stream"),
-        (seen(streams=(stream(persist_mode="async"),)), ACCESS, "before they are on the disk", "persist mode"),
+        (seen(streams=(stream(num_replicas=2),)), ACCESS, "num_replicas is 2", "set it to 1"),
+        (seen(server(size=3), streams=(stream(),)), THREE, "num_replicas is 1", "set it to 3"),
+        (seen(streams=(stream(subjects=("other",)),)), ACCESS, "subjects is other", "hf.app.root.log"),
+        (seen(streams=(stream(storage="memory"),)), ACCESS, "storage is memory", "file"),
+        (seen(streams=(stream(retention="interest"),)), ACCESS, "retention is interest", "limits"),
+        (seen(streams=(stream(discard="old"),)), ACCESS, "discard is old", "new"),
+        (seen(streams=(stream(max_age=5 * 10**9),)), ACCESS, "max_age is 5", "set it to 0"),
+        (seen(streams=(stream(max_msgs=1),)), ACCESS, "max_msgs is 1", "-1"),
+        (seen(streams=(stream(max_msgs_per_subject=1),)), ACCESS, "max_msgs_per_subject is 1", "-1"),
+        (seen(streams=(stream(max_bytes=9),)), ACCESS, "max_bytes is 9", "-1"),
+        (seen(streams=(stream(max_msg_size=1000),)), ACCESS, "max_msg_size is 1000", "-1"),
+        (seen(streams=(stream(allow_direct=True),)), ACCESS, "reads may miss", "false"),
+        (seen(streams=(stream(mirror_direct=True),)), ACCESS, "reads may miss", "false"),
+        (seen(streams=(stream(no_ack=True),)), ACCESS, "no_ack is true", "false"),
+        (seen(streams=(stream(sealed=True),)), ACCESS, "sealed is true", "false"),
+        (seen(streams=(stream(persist_mode="async"),)), ACCESS, "may not be on the disk", "default"),
     ],
 )
 def test_each_wrong_setting_is_one_problem_that_says_what_to_change(
@@ -170,10 +178,15 @@ def test_each_wrong_setting_is_one_problem_that_says_what_to_change(
 
 
 def test_what_is_as_it_should_be_is_no_problem() -> None:
-    assert problems_of(seen(streams=(stream(),)), ACCESS) == []
+    assert problems_of(seen(streams=(*wanted_streams(ACCESS).values(),)), ACCESS) == []
+    assert problems_of(seen(streams=(stream(num_replicas=3),)), ACCESS) == []
     three = tuple(server(f"n{number}", size=3) for number in range(3))
-    assert problems_of(seen(*three, streams=(stream(num_replicas=3),)), THREE) == []
+    assert problems_of(seen(*three, streams=(stream(3),)), THREE) == []
     assert problems_of(seen(streams=(StreamSetting("other", ("other",), storage="memory"),)), ACCESS) == []
+
+
+def test_each_setting_that_is_looked_at_says_what_it_leads_to() -> None:
+    assert {*LOSES} == {*StreamSetting.__struct_fields__} - {"name"}
 
 
 def test_a_server_that_takes_small_messages_only_is_a_warning() -> None:
