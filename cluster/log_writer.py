@@ -79,6 +79,8 @@ class LogWriter:
         self._work = asyncio.Event()
         self._may_write = asyncio.Event()
         self._may_write.set()
+        self._freed: deque[str] = deque()
+        self._has_freed = asyncio.Event()
         self._done = 0
         self._grown, self._base_size = grown, 0
         self._base: Iterator[bytes] | None = None  # its further parts
@@ -155,7 +157,8 @@ class LogWriter:
         self._done += len(taken)
         self._written(self._done)
         for write in taken:
-            await self._drop(write.drops)
+            self._freed.extend(write.drops)
+        self._has_freed.set()
         if self._grown > max(LEAST_BASE, 2 * self._base_size) and not self._is_base_wanted:
             self._is_base_wanted = True
             self._want_base()
@@ -179,10 +182,14 @@ class LogWriter:
             with contextlib.suppress(Unanswered):  # The next base does it.
                 await self._engine.log.forget(self._base_begins)
 
-    async def _drop(self, names: Sequence[str]) -> None:
-        for name in names:
-            with contextlib.suppress(Unanswered):  # The next leader drops what nothing refers to.
-                await self._engine.blobs.drop(name)
+    async def drop_freed(self) -> None:
+        """Drop the blobs to which nothing refers behind what is written, for ever; no write waits for that."""
+        while True:
+            await self._has_freed.wait()
+            self._has_freed.clear()
+            while self._freed:
+                with contextlib.suppress(Unanswered):  # The next leader drops what nothing refers to.
+                    await self._engine.blobs.drop(self._freed.popleft())
 
     # -- appending --------------------------------------------------------------------------------------------------
 

@@ -71,7 +71,7 @@ class ReplicatedJournal:
         loop: EngineLoop,
         leading: Leading,
         *,
-        lost: Callable[[Exception], None] = lambda error: None,
+        lost: Callable[[HoldfastError], None] = lambda error: None,
     ) -> None:
         self.path = engine.name
         self.epoch = leading.maker.epoch
@@ -107,15 +107,17 @@ class ReplicatedJournal:
         """Write, keep the lease and tidy up, until the journal is closed or another leads."""
         try:
             async with asyncio.TaskGroup() as group:
-                for work in (self._writer.run(), self._keep_lease(), self._drop_orphans()):
+                for work in (self._writer.run(), self._writer.drop_freed(), self._keep_lease(), self._drop_orphans()):
                     group.create_task(work)
         except ExceptionGroup as errors:
             cause = _first(errors)
+            failure: StaleEpoch | StoreFailed
             if isinstance(cause, Deposed):
-                self._fail(StaleEpoch(self.path, cause.epoch, cause.current))
+                failure = StaleEpoch(self.path, cause.epoch, cause.current)
             else:  # Also what nobody expects of an engine: no sync may wait for a dead writer.
-                self._fail(StoreFailed(self.path, f"{cause}" or type(cause).__name__))
-            self._lost(cause)
+                failure = StoreFailed(self.path, f"{cause}" or type(cause).__name__)
+            self._fail(failure)
+            self._lost(cause if isinstance(cause, HoldfastError) else failure)
         await self._keeper.release()  # Whoever leads next need not wait for its end.
 
     async def _keep_lease(self) -> None:
@@ -433,7 +435,9 @@ class ReplicatedJournal:
         if not self._is_open:
             return
         try:
-            self._loop.wait(self.end())
+            self._loop.wait(self.end(), 3 * CLOSE_SECONDS)
+        except TimeoutError as error:
+            raise StoreFailed(self.path, "its work for the engine does not end") from error
         finally:
             self._loop.close()
 

@@ -7,6 +7,7 @@ import contextlib
 import contextvars
 import random
 from collections.abc import Callable, Coroutine, Generator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -73,6 +74,10 @@ def names_in(contents: StoreContents) -> set[str]:
     return {name for name in contents.kept() if isinstance(name, str)}
 
 
+def _set(event: asyncio.Event, _: object) -> None:
+    event.set()
+
+
 class Judge:
     """Reads every record that there ever was, from the first one on."""
 
@@ -124,7 +129,8 @@ class Program:
     """
 
     def __init__(self, fleet: Fleet, name: str, standby: Standby) -> None:
-        self.fleet, self.name, self._standby = fleet, name, standby
+        self.fleet, self.name = fleet, name
+        self._standby: Standby = standby
         self.engine = SimEngine(fleet.broker)
         self.journal: ReplicatedJournal | None = None
         self.tasks: list[asyncio.Task[Any]] = []
@@ -149,9 +155,7 @@ class Program:
             tag = f"{self.name} in {leading.maker.epoch}"
             self.fleet.begins(leading.contents, leading.maker.after, tag)
             lost = asyncio.Event()
-            self.journal = journal = ReplicatedJournal(
-                self.engine, SameLoop(), leading, lost=lambda error, lost=lost: lost.set()
-            )
+            self.journal = journal = ReplicatedJournal(self.engine, SameLoop(), leading, lost=partial(_set, lost))
             self.is_to_close.clear()
             writing = asyncio.ensure_future(self._write(journal, tag))
             ends = [asyncio.ensure_future(one.wait()) for one in (lost, self.is_to_close)]
@@ -173,14 +177,14 @@ class Program:
                 for _ in range(draw.randint(1, 4)):
                     written = self._write_something(journal, tag, written)
                 safe = journal.synced()
-                safe.add_done_callback(lambda done, count=written: self._acknowledge(done, tag, count))
+                safe.add_done_callback(partial(self._acknowledge, tag, written))
                 if draw.random() < 0.5:
                     await safe
                 else:
                     waiting.append(safe)
                 await asyncio.sleep(draw.choice([0.0, 0.05, 0.3]))
 
-    def _acknowledge(self, done: asyncio.Future[None], tag: str, count: int) -> None:
+    def _acknowledge(self, tag: str, count: int, done: asyncio.Future[None]) -> None:
         if not done.cancelled() and done.exception() is None:
             self.fleet.acknowledged[tag] = max(count, self.fleet.acknowledged.get(tag, 0))
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
+
 import pytest
 
+from holdfast.cluster.ports import Engine
 from holdfast.testing.fleet.broker import SimBroker
 from holdfast.testing.fleet.sim_engine import SimEngine
 from tests.cluster.engines import PROMISES, Connect
@@ -11,11 +14,10 @@ from tests.cluster.engines import PROMISES, Connect
 
 @pytest.mark.asyncio(loop_factories=["virtual"])
 @pytest.mark.parametrize("promise", PROMISES, ids=lambda promise: promise.__name__)
-async def test_simulated_servers_keep_it(promise) -> None:  # type: ignore[no-untyped-def]  # see PROMISES
+async def test_simulated_servers_keep_it(promise: Callable[[Connect], Awaitable[None]]) -> None:
     broker = SimBroker()
 
-    async def connect() -> SimEngine:
+    async def connect() -> Engine:
         return SimEngine(broker)
 
-    made: Connect = connect
-    await promise(made)
+    await promise(connect)

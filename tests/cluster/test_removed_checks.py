@@ -134,7 +134,7 @@ CHECKS = {
     ),
     "whoever holds the lease again looks, and writes": Check(
         "cluster/leadership.py",
-        "                    self._go_on()\n",
+        "                    go_on()\n",
         "                    pass\n",
         LEADERSHIP,
         "the_other_never_leads",
@@ -180,6 +180,14 @@ CHECKS = {
         "for name, data in write.puts[:0]:",
         LEADERSHIP,
         "kept_since_is_no_orphan",
+    ),
+    "what a record frees is dropped behind it": Check(
+        "cluster/log_writer.py",
+        "            for name, data in write.puts:\n",
+        "            self._freed.extend(write.drops)\n            self._has_freed.set()\n"
+        "            await asyncio.sleep(0.01)\n            for name, data in write.puts:\n",
+        FLEETS,
+        "was_safe_is_there",
     ),
     "only what is older than a base is forgotten": Check(
         "cluster/log_writer.py",
@@ -232,8 +240,8 @@ CHECKS = {
     ),
     "what an engine was not to raise is told": Check(
         "cluster/replicated_journal.py",
-        'self._fail(StoreFailed(self.path, f"{cause}" or type(cause).__name__))',
-        "pass",
+        "        except ExceptionGroup as errors:\n",
+        "        except* HoldfastError as errors:\n",
         LEADERSHIP,
         "was_not_to_raise",
     ),
