@@ -2,6 +2,7 @@
 
 from .actors.events import (
     ActorCrashed,
+    ActorKilled,
     ActorStarted,
     AutoShutdown,
     ChildRestarted,
@@ -103,6 +104,7 @@ __all__ = [
     "DeadLetter",
     "Diverged",
     "EffectRepeated",
+    "ActorKilled",
     "EndedByLink",
     "Event",
     "EventStream",

@@ -170,7 +170,7 @@ async def test_the_commands_in_json(system: hf.ActorSystem, path: Path) -> None:
     assert (message["address"], message["attempts"]) == ("/app/poisoned", 1)
     assert message["payload"] == "Do(what='kill')"
     _, said, _ = await command(path, "quarantine")
-    assert "/app/poisoned tests.history.players.Do, 1 deaths: Do(what='kill')" in said
+    assert "/app/poisoned tests.history.players.Do, number 1, 1 deaths: Do(what='kill')" in said
 
 
 async def test_events_that_are_followed_come_as_they_are_told(system: hf.ActorSystem, path: Path) -> None:
