@@ -23,7 +23,7 @@ async def main(system: hf.ActorSystem) -> None:
     orders = await system.start(hf.child("orders", hf.start(OrderBook), recovery=hf.hybrid()))
     while True:
         try:
-            await orders.ask(Order("x" * 20_000), timeout=1.0)
+            await orders.ask(Order("x" * 1_000), timeout=1.0)
         except hf.HoldfastError as error:
             print(f"an order was not taken: {error}", flush=True)
         await asyncio.sleep(0.02)

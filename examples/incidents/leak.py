@@ -22,8 +22,8 @@ class Sessions(hf.Actor):
 
 
 async def main(system: hf.ActorSystem) -> None:
-    limits = hf.Limits(memory_bytes=300_000_000)
+    limits = hf.Limits(memory_bytes=120_000_000)
     sessions = await system.start(hf.child("sessions", hf.start(Sessions), isolation="process", limits=limits))
     for visitor in itertools.count():
         sessions.tell(Visit(f"visitor-{visitor}", b"x" * 100_000))
-        await asyncio.sleep(0.02)
+        await asyncio.sleep(0.005 if visitor < 450 else 0.5)  # The night begins busily.

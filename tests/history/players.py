@@ -67,17 +67,17 @@ class Caller(hf.Actor):
 
 
 class Strike(hf.Message):
-    """Kill this one."""
-
-    whom: hf.ActorRef[Worker]
+    """Kill whom you are bound to."""
 
 
 class Killer(hf.Actor):
-    """Kills others."""
+    """Kills another one."""
+
+    whom: hf.Binding[Worker]
 
     @hf.on(Strike)
     def strike(self, message: Strike) -> None:
-        message.whom.kill()
+        self.whom.kill()
 
 
 class SlowStarter(Worker):

@@ -238,7 +238,7 @@ async def test_whoever_kills_is_named(system: hf.ActorSystem, killer_in: Any, ki
     ref = await system.start(worker(isolation=killed_in))
     spec = hf.child("killer", hf.start(Killer), isolation=killer_in, bindings={"whom": ref.path})
     killer = await system.start(spec)
-    killer.tell(Strike(ref))
+    killer.tell(Strike())
     await until(lambda: len(system.lives(ref)) > 1)
     assert (await said(system, ref)).startswith("/app/worker was ended by /app/killer ")
     await ref.ask(Do("well"))
