@@ -93,6 +93,7 @@ from .system.transaction.events import (
 
 __all__ = [
     "ActorCrashed",
+    "ActorKilled",
     "ActorStarted",
     "AdaptationUndone",
     "AutoShutdown",
@@ -104,7 +105,6 @@ __all__ = [
     "DeadLetter",
     "Diverged",
     "EffectRepeated",
-    "ActorKilled",
     "EndedByLink",
     "Event",
     "EventStream",

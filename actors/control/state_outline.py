@@ -37,8 +37,8 @@ def outline(value: Any) -> str:
 
     >>> outline({"a": 1})
     "{'a': 1}"
-    >>> outline(["x" * 951] * 5000)[:40]
-    'list of 5000 entries, about 5.0 MB: ["xx'
+    >>> outline(["x" * 951] * 5000)[:34]
+    'list of 5000 entries, about 5.0 MB'
     """
     shown = portable(SHORT.repr(value))[:MOST_TEXT]
     if isinstance(value, (dict, list, tuple, set, frozenset, deque)) and len(value) > FEW:

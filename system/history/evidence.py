@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-import psutil
 
 from ...actors.control.orders import Status, status_of
 from ...actors.kernel.cell import GONE
@@ -280,6 +279,8 @@ def _memory(cell: Cell) -> Memory | None:
     process = cell.host.place.process(cell)
     if process is None or limits is None or limits.memory_bytes is None:
         return None
+    import psutil  # only now: a system that runs no process does without it
+
     try:
         return Memory(psutil.Process(process.pid).memory_info().rss, limits.memory_bytes)
     except psutil.Error:
