@@ -2,6 +2,7 @@
 
 from .actors.events import (
     ActorCrashed,
+    ActorKilled,
     ActorStarted,
     AutoShutdown,
     ChildRestarted,
@@ -94,6 +95,7 @@ from .system.transaction.events import (
 
 __all__ = [
     "ActorCrashed",
+    "ActorKilled",
     "ActorStarted",
     "AdaptationUndone",
     "AutoShutdown",

@@ -103,6 +103,12 @@ class EndedByLink(Event, frozen=True, eq=False):
     reason: ExitReason
 
 
+class ActorKilled(Event, frozen=True, eq=False):
+    """Somebody has called `ref.kill()`, and the life ends; `by` is the actor whose turn has, "" if no actor has."""
+
+    by: str
+
+
 class ChildStartFailed(Event, frozen=True, eq=False):
     """A supervisor could not start a child; `reason` is its exit reason in words."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import linecache
+import sys
 from collections.abc import Coroutine, Iterator
 from types import CodeType, FrameType
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,9 @@ from .kernel.envelope import message_in
 
 if TYPE_CHECKING:
     from .kernel.cell import Cell
+
+OURS = __name__.partition(".")[0]
+"""The package whose frames are not the user's."""
 
 
 def blocked_below(top: Cell) -> str:
@@ -41,6 +45,34 @@ def _of(cell: Cell) -> Iterator[str]:
 
 def stack_of(work: Coroutine[Any, Any, Any]) -> Iterator[str]:
     """Where a coroutine waits, outermost first, as in a traceback; behind the last one, for what."""
+    for at, code, frame in _awaited(work):
+        if code is None:
+            yield f"    waits for {at!r}"
+        elif frame is not None:
+            yield f'  File "{code.co_filename}", line {frame.f_lineno}, in {code.co_qualname}'
+            source = linecache.getline(code.co_filename, frame.f_lineno).strip()
+            if source:
+                yield f"    {source}"
+
+
+def waits_at(work: Coroutine[Any, Any, Any]) -> str:
+    """The line of the user's code at which a coroutine waits, `shop.py:41, receipt = await reader.readline()`.
+
+    It is the innermost that is neither of this package nor of Python's library; "" if there is none.
+    """
+    found = ""
+    for _, code, frame in _awaited(work):
+        if code is None or frame is None:
+            continue
+        package = str(frame.f_globals.get("__name__", "")).partition(".")[0]
+        if package != OURS and package not in sys.stdlib_module_names:
+            source = linecache.getline(code.co_filename, frame.f_lineno).strip()
+            found = f"{code.co_filename.rpartition('/')[2]}:{frame.f_lineno}" + (f", {source}" if source else "")
+    return found
+
+
+def _awaited(work: Coroutine[Any, Any, Any]) -> Iterator[tuple[Any, CodeType | None, FrameType | None]]:
+    """A coroutine and what it awaits, outermost first, each with its code and frame; last what has no code."""
     at: Any = work
     while at is not None:
         frame: FrameType | None
@@ -51,11 +83,7 @@ def stack_of(work: Coroutine[Any, Any, Any]) -> Iterator[str]:
             case object(gi_frame=frame, gi_code=code, gi_yieldfrom=inner):
                 pass
             case _:
-                yield f"    waits for {at!r}"
+                yield at, None, None
                 return
-        if frame is not None:
-            yield f'  File "{code.co_filename}", line {frame.f_lineno}, in {code.co_qualname}'
-            source = linecache.getline(code.co_filename, frame.f_lineno).strip()
-            if source:
-                yield f"    {source}"
+        yield at, code, frame
         at = inner

@@ -13,6 +13,7 @@ import msgspec
 from ..actors.errors import HoldfastError, SpecError, type_name
 from ..actors.events import Event, EventStream, MessageIn, MessageOut, TurnBegan, TurnEnded
 from ..actors.kernel.actor import Actor
+from ..checkpoint.home.quarantine import NotQuarantined
 from ..system.transaction.change import Change
 from .declare.tree_plan import declare
 from .inspection import inspected
@@ -35,6 +36,7 @@ from .wire import (
     NextEvents,
     Overview,
     RestartActor,
+    SettleQuarantined,
     Transact,
     Tree,
     Whereis,
@@ -87,7 +89,7 @@ class ClientSession:
             case InspectActor():
                 return await inspected(system, request.path, min(request.timeout, LONGEST))
             case RestartActor():
-                return await restart_actor(system, request.path, min(request.timeout, LONGEST))
+                return await restart_actor(system, request.path, min(request.timeout, LONGEST), at_once=request.at_once)
             case ControlActor():
                 return await self._control(request)
             case Transact():
@@ -110,6 +112,8 @@ class ClientSession:
                 return await system.why(request.path, timeout=min(request.timeout, LONGEST))
             case AskQuarantined():
                 return msgspec.to_builtins(system.put_aside(request.path))
+            case SettleQuarantined():
+                return self._settle(request)
             case _:
                 assert_never(request)
 
@@ -123,6 +127,15 @@ class ClientSession:
             return page
         after, wait = page.next, min(request.wait, LONGEST)
         return await self._system.follow_history(asked.path, kinds=asked.kinds, after=after, timeout=wait)
+
+    def _settle(self, request: SettleQuarantined) -> None:
+        message = next((one for one in self._system.quarantined(request.path) if one.id == request.id), None)
+        if message is None:
+            raise NotQuarantined(request.path, request.id)
+        if request.verb == "retry":
+            self._system.retry(message)
+        else:
+            self._system.drop(message)
 
     async def _control(self, request: ControlActor) -> Any:
         system, timeout = self._system, min(request.timeout, LONGEST)

@@ -94,6 +94,8 @@ for command in (
     remembering.events,
     remembering.dead_letters,
     remembering.quarantine,
+    remembering.retry,
+    remembering.drop,
     declaring.plan,
     declaring.apply,
     service_run.run,

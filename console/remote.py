@@ -46,6 +46,7 @@ from .wire import (
     NextEvents,
     Overview,
     RestartActor,
+    SettleQuarantined,
     Transact,
     Tree,
     Whereis,
@@ -66,7 +67,7 @@ GRACE = 35.0
 
 SHORT_GRACE = 5.0
 """The same of one that changes nothing."""
-CHANGES = (ControlActor, DeclareTree, RestartActor, Transact)
+CHANGES = (ControlActor, DeclareTree, RestartActor, SettleQuarantined, Transact)
 
 
 class NotReached(
@@ -213,6 +214,10 @@ class RemoteSystem:
             self._client.call(ControlActor("get_state", text_of(ref), [], timeout), timeout, describe_value)
         )
 
+    async def outline(self, ref: RemoteTarget, *, timeout: float = 5.0) -> dict[str, str]:
+        """An actor's state in short texts, one for each variable; see `ActorSystem.outline`."""
+        return msgspec.convert(await self._control("outline", ref, timeout), dict[str, str])
+
     def follow(self, ref: RemoteTarget) -> None:
         """Follow what an actor does, for as long as this connection lasts: `next_events` tells."""
         self._client.call(FollowActor(text_of(ref)), 10.0)
@@ -327,10 +332,21 @@ class RemoteSystem:
         """Have a recorded actor's state saved."""
         await self._control("checkpoint", ref, timeout, changes=True)
 
-    async def restart(self, ref: RemoteTarget, *, timeout: float = 5.0) -> str:
-        """End a life in good order, so that the supervisor begins the next one. Returns how it ended, in words."""
-        ended: str = await self.call(RestartActor(text_of(ref), timeout), timeout)
+    async def restart(self, ref: RemoteTarget, *, timeout: float = 5.0, at_once: bool = False) -> str:
+        """End a life in good order, so that the supervisor begins the next one. Returns how it ended, in words.
+
+        With `at_once` it is killed, also in the middle of a turn that hangs.
+        """
+        ended: str = await self.call(RestartActor(text_of(ref), timeout, at_once), timeout)
         return ended
+
+    def retry(self, message: PutAside) -> None:
+        """Have a message in quarantine handled as if it had come now. Raises NotQuarantined: it is there no more."""
+        self._client.call(SettleQuarantined("retry", message.address, message.id), 10.0)
+
+    def drop(self, message: PutAside) -> None:
+        """Forget a message in quarantine; it becomes a dead letter. Raises NotQuarantined: it is not there any more."""
+        self._client.call(SettleQuarantined("drop", message.address, message.id), 10.0)
 
     async def terminate(self, ref: RemoteTarget, *, timeout: float = 5.0) -> str:
         """End a life in good order; its supervisor then does as its spec says. Returns its exit reason in words."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ..actors.control.orders import Ready
 from ..actors.control.orders_lane import order
 from ..actors.errors import SpecError
-from ..actors.exit_reasons import SHUTDOWN, Crash, ExitReason
+from ..actors.exit_reasons import KILLED, SHUTDOWN, Crash, ExitReason
 from ..actors.kernel.cell import Cell
 from ..supervision.intensity import recent_restarts
 from ..supervision.spec import ChildSpec
@@ -20,10 +20,11 @@ ASKED = Crash("holdfast.Restart", "an operator has asked for it")
 """The reason of a life that would not be followed by another one if it ended as when it is stopped."""
 
 
-async def restart_actor(system: ActorSystem, path: str, timeout: float) -> str:
+async def restart_actor(system: ActorSystem, path: str, timeout: float, *, at_once: bool = False) -> str:
     """End a life in good order, and wait until the next one is up; returns how it ended, in words.
 
-    What waits at the address waits for the next life.
+    What waits at the address waits for the next life. With `at_once` the life is killed, in the middle of
+    its turn, and the next one is not waited for.
 
     Raises:
         SpecError: nobody would start it again, or its supervisor would give up over it.
@@ -35,14 +36,15 @@ async def restart_actor(system: ActorSystem, path: str, timeout: float) -> str:
         raise SpecError(path, "the root is not restarted: end the program, and start it again")
     if cell.spec is None and cell.parent.actor is not None:
         raise SpecError(path, "no supervisor looks after it, so that it would not come back")
-    reason: ExitReason = SHUTDOWN
+    reason: ExitReason = KILLED if at_once else SHUTDOWN
     if isinstance(cell.spec, ChildSpec):
-        reason = SHUTDOWN if cell.spec.restarts(SHUTDOWN) else ASKED
+        reason = KILLED if at_once else SHUTDOWN if cell.spec.restarts(SHUTDOWN) else ASKED
         if not cell.spec.restarts(reason):
             raise SpecError(path, f"its spec ({cell.spec.restart}) does not let it come back: stop it, and start it")
     check_allowed(cell.parent, path)
     ended = await system.terminate(ref, reason, timeout=timeout)
-    await order(ref._cell.living, Ready(), timeout)
+    if not at_once:  # The next life of one that is killed may hang as this one did: it is not asked.
+        await order(ref._cell.living, Ready(), timeout)
     return str(ended)
 
 

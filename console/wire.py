@@ -170,10 +170,11 @@ class InspectActor(ControlRequest, tag="inspect", frozen=True):
 
 
 class RestartActor(ControlRequest, tag="restart", frozen=True):
-    """End a life in good order, so that its supervisor begins the next one."""
+    """End a life in good order, or `at_once`, so that its supervisor begins the next one."""
 
     path: str
     timeout: float = 5.0
+    at_once: bool = False
 
 
 class FollowActor(ControlRequest, tag="follow", frozen=True):
@@ -211,6 +212,7 @@ class ControlActor(ControlRequest, tag="control", frozen=True):
         "suspend",
         "resume",
         "get_state",
+        "outline",
         "get_status",
         "protection",
         "statistics",
@@ -260,6 +262,14 @@ class AskQuarantined(ControlRequest, tag="quarantined", frozen=True):
     path: str | None
 
 
+class SettleQuarantined(ControlRequest, tag="settle quarantined", frozen=True):
+    """Have a message in quarantine tried again, or dropped, by its number at its address."""
+
+    verb: Literal["retry", "drop"]
+    path: str
+    id: int
+
+
 class DeclareTree(ControlRequest, tag="declare", frozen=True):
     """Have the tree be as a file says; `name` is what it is called in errors."""
 
@@ -282,6 +292,7 @@ AnyRequest = (
     | AskLives
     | AskWhy
     | AskQuarantined
+    | SettleQuarantined
     | Tree
     | Whereis
     | ControlActor

@@ -57,7 +57,8 @@ class Child:
     def overview(self) -> dict[str, Any]:
         """Describe the child as `get_state` of its supervisor shows it; restarts count at its present address."""
         kind, lives = type_name(self.spec.start.kind), 0 if self.cell is None else self.cell.life
-        return {"kind": kind, "state": self.state, "restart": self.spec.restart, "restarts": max(0, lives - 1)}
+        said = {"kind": kind, "state": self.state, "restart": self.spec.restart, "restarts": max(0, lives - 1)}
+        return said | ({"awaited": self.awaited} if self.awaited else {})
 
 
 def complete(own: Cell, spec: ChildSpec) -> ChildSpec:

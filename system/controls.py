@@ -11,6 +11,7 @@ from ..actors.control.orders import (
     GetState,
     ObserveTurns,
     Order,
+    OutlineState,
     ReplaceCode,
     ReplaceState,
     Resume,
@@ -23,7 +24,7 @@ from ..actors.control.orders_lane import ask_status, order
 from ..actors.control.tracing import Statistics, tap_of
 from ..actors.errors import ActorStopped, AskTimeout, CannotMove, ControlFailed, HoldfastError, SpecError
 from ..actors.events import EventStream
-from ..actors.exit_reasons import SHUTDOWN, ExitReason
+from ..actors.exit_reasons import KILLED, SHUTDOWN, ExitReason
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import cell_kind
@@ -90,6 +91,14 @@ class Controls:
         within the period, and each child's class, state, restart type and restarts, beside what its class adds.
         """
         return await self._order(ref, GetState(), timeout)
+
+    async def outline(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> dict[str, str]:
+        """Tell an actor's state in short texts, one for each variable; of a large one how large it is, and its start.
+
+        Nothing is copied, so it also answers for a state that is too large to be sent. A state that is no dict has the
+        name "".
+        """
+        return cast("dict[str, str]", await self._order(ref, OutlineState(), timeout))
 
     async def replace_state(self, ref: ActorRef[Any], change: Change, *, timeout: float = DEFAULT_TIMEOUT) -> Any:
         """Put `change(state)` in the place of an actor's state; returns the new one.
@@ -263,14 +272,19 @@ class Controls:
     ) -> ExitReason:
         """Have a life end in good order, for `reason`; its supervisor then does as its spec says.
 
+        For the reason `KILLED` it ends at once, also in the middle of a turn that hangs, as by `ref.kill()`.
+
         Returns:
             The reason with which it ended.
         """
         check_seconds(ref.path, "timeout", timeout)
         cell = self._living(ref)
         gone = cell.ended()
-        expect_end(self._history, cell.path, "it was terminated")
-        cell.request_stop(reason)
+        if reason == KILLED:
+            cell.ref.kill()
+        else:
+            expect_end(self._history, cell.path, "it was terminated")
+            cell.request_stop(reason)
         done, _ = await asyncio.wait((gone,), timeout=timeout)
         if not done:
             gone.cancel()

@@ -18,8 +18,10 @@ from ..kernel.envelope import message_in
 from ..kernel.message import message_name
 from ..process.wire.start_codec import imported, pack_recipe, unpack_recipe
 from ..state_hooks import migrated
+from ..turn_stacks import waits_at
 from ..values import UnsavableValue
 from .live_state import change_state, keeping_variables, state_to_show, tried_state
+from .state_outline import outline_of
 from .tracing import Statistics, tap_of
 
 if TYPE_CHECKING:
@@ -74,6 +76,15 @@ class GetState(Order):
 
     def run(self, cell: Cell, actor: Actor) -> Any:
         return state_to_show(actor)
+
+
+class OutlineState(Order):
+    """A short text of each variable of the state, however large it is."""
+
+    verb = "outline"
+
+    def run(self, cell: Cell, actor: Actor) -> dict[str, str]:
+        return outline_of(actor)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -386,6 +397,7 @@ ORDERS: dict[str, type[Order]] = {
         Suspend,
         Resume,
         GetState,
+        OutlineState,
         ReplaceState,
         ReplaceCode,
         Prepare,
@@ -428,6 +440,8 @@ class Status:
     """The OS process; 0 if there is none now."""
     bindings: dict[str, str] = dataclasses.field(default_factory=dict)
     """Who is bound to its ports: port to address."""
+    turn_at: str = ""
+    """The line of the user's code at which that turn waits, `shop.py:41, await reader.readline()`; "" if none does."""
 
 
 def status_of(cell: Cell) -> Status:
@@ -450,6 +464,7 @@ def status_of(cell: Cell) -> Status:
         0 if more is None else len(more.ties.monitors),
         os.getpid(),
         {} if more is None else {port: target.path for port, target in more.bindings.items()},
+        "" if turn is None else waits_at(turn.coroutine),
     )
 
 

@@ -12,6 +12,7 @@ import types
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
+from ..errors import type_name
 from ..events import EventHub, EventStream, MessageIn, MessageOut, TurnBegan, TurnEnded
 from ..kernel import mailbox
 from ..kernel.codec import Parcel
@@ -63,6 +64,7 @@ class TurnTap:
         self._since, self._life = self.cell.node.clock.wall(), self.cell.life
         self._in = self._out = self._turns = 0
         self._seconds = self._longest = 0.0
+        self._slowest, self._slowest_life = ("", 0.0), 0
 
     # -- on and off -------------------------------------------------------------------------------------------------
 
@@ -109,6 +111,11 @@ class TurnTap:
         """The counts since statistics were switched on."""
         restarts = self.cell.life - self._life
         return Statistics(self._since, self._in, self._out, self._turns, self._seconds, self._longest, restarts)
+
+    @property
+    def slowest(self) -> tuple[str, float]:
+        """The message type of the longest turn of the present or last life that was counted, and its seconds."""
+        return self._slowest if self._slowest_life == self.cell.life else ("", 0.0)
 
     # -- where it is put in -----------------------------------------------------------------------------------------
 
@@ -182,6 +189,8 @@ class TurnTap:
         self._turns += 1
         self._seconds += seconds
         self._longest = max(self._longest, seconds)
+        if self._slowest_life != self.cell.life or seconds > self._slowest[1]:
+            self._slowest, self._slowest_life = (type_name(type(message)), seconds), self.cell.life
         self._tell(TurnEnded(self.cell.path, message, seconds, outcome))
 
 

@@ -10,6 +10,9 @@ import asyncio
 from collections.abc import Awaitable, Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
+from ..events import ActorKilled
+from .cell import RUNNING
+
 if TYPE_CHECKING:
     from ..control.orders_lane import QueuedOrder as QueuedOrder
     from ..exit_reasons import ExitReason
@@ -57,8 +60,13 @@ class Home:
         """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
         return True
 
-    def faulted(self, cell: Cell) -> None:
-        """The life is killed, and no supervisor has ordered that: a turn in hand counts it as any death."""
+    def faulted(self, cell: Cell, by: str) -> None:
+        """The life is killed, and no supervisor has ordered that: a turn in hand counts it as any death.
+
+        `by` is the address of the actor whose turn has called for it; "" if that was no actor.
+        """
+        if cell.state == RUNNING and cell.node.events.has_listeners:
+            cell.node.emit(ActorKilled(cell.path, by))
 
     def handed_to(self, parent: Parent) -> None:
         """Another supervisor has the address from now on."""

@@ -357,10 +357,10 @@ class Cell(_Hot):
         """Ask for an end in good order; on a cell that is down or ending it changes nothing."""
         self.host.stop(self, reason)
 
-    def kill(self, *, is_fault: bool = False) -> None:
-        """End the life at once, without hooks. `is_fault`: no supervisor has ordered that."""
-        if is_fault:
-            self.host.home.faulted(self)
+    def kill(self, *, by: str | None = None) -> None:
+        """End the life at once, without hooks. `by`: no supervisor has ordered that, but this actor ("": nobody's)."""
+        if by is not None:
+            self.host.home.faulted(self, by)
         self.host.kill(self)
 
     def ended(self) -> asyncio.Future[ExitReason]:

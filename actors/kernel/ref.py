@@ -139,7 +139,8 @@ class ActorRef(Generic[A_co]):
         If the actor is recorded, the message in its turn counts it against `max_deliveries`, as any death.
         """
         self._cell.node.check_thread(self.path)
-        self._cell.living.kill(is_fault=True)
+        caller = current.get(None)
+        self._cell.living.kill(by="" if caller is None else caller.path)
 
     def __repr__(self) -> str:
         return f"<ActorRef {self.path}>"

@@ -198,7 +198,8 @@ class JournalHome(RecordedHome):
         """Whether an end for this reason is followed by a recovery."""
         return not reason.is_clean
 
-    def faulted(self, cell: Cell) -> None:
+    def faulted(self, cell: Cell, by: str) -> None:
+        super().faulted(cell, by)
         switch = self.switch
         rests = switch is not None and switch.rests_in(cell.host.place.running(cell))
         self.is_faulted = cell.state is RUNNING and not rests

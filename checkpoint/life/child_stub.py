@@ -112,9 +112,9 @@ class RootHome(Home):
     def recovers(self, reason: ExitReason) -> bool:
         return not reason.is_clean
 
-    def faulted(self, cell: Cell) -> None:
+    def faulted(self, cell: Cell, by: str) -> None:
         if cell.state is RUNNING:
-            self.guest.command(cell, "faulted", {})
+            self.guest.command(cell, "faulted", {"by": by})
 
     def retired(self, cell: Cell) -> None:
         if cell.queue:

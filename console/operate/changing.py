@@ -75,21 +75,28 @@ def restart(
     system: System = None,
     socket: Socket = None,
     yes: Yes = False,
+    at_once: Annotated[
+        bool, typer.Option("--kill", help="Kill them, in the middle of a turn that hangs; no hook is called.")
+    ] = False,
     timeout: Timeout = 10.0,
     as_json: Json = False,
 ) -> None:
     """End the lives of actors in good order, one after another; their supervisors begin the next ones.
 
-    Messages wait for the next life. The state of an actor without recovery is lost, and asked about. A restart counts
-    for the supervisor as any other does: one that would make it give up is refused.
+    Messages wait for the next life; with --kill whoever asked for the turn in hand hears that it was killed. The state
+    of an actor without recovery is lost, and asked about. A restart counts for the supervisor as any other does: one
+    that would make it give up is refused.
 
-    Exit status 0: all of them are up again. 1: one is not, and those behind it were left alone. 2: no system answers.
+    Exit status 0: all of them are up again; with --kill, have ended. 1: one is not, and those behind it were left
+    alone. 2: no system answers.
     """
     with reached("restart", system, socket) as remote:
         all_rows = remote.look().rows
         rows = select(all_rows, paths)
         confirm("restart", _lost_states(rows, all_rows), yes=yes)
-        done = [asyncio.run(remote.restart(row.path, timeout=timeout)) for row in _announced(rows, as_json)]
+        done = [
+            asyncio.run(remote.restart(row.path, timeout=timeout, at_once=at_once)) for row in _announced(rows, as_json)
+        ]
     if as_json:
         show_json({"restarted": done})
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import sys
 import time
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ import msgspec
 import typer
 
 from ...actors.errors import HoldfastError
-from ..overview import ActorRow, SystemLook
+from ..overview import ActorRow, ProcessUse, SystemLook
 from ..remote import RemoteSystem
 from ..runtime_folder import found_sockets, sweep
 from .patterns import select
@@ -102,7 +103,7 @@ def tree(
     elif paths:
         typer.echo("\n".join(printable(row.path) for row in rows))
     else:
-        typer.echo("\n".join(tree_lines(with_ancestors(look.rows, rows))))
+        typer.echo("\n".join(tree_lines(with_ancestors(look.rows, rows), look.processes)))
 
 
 def as_plain_look(look: SystemLook, rows: list[ActorRow]) -> dict[str, Any]:
@@ -128,26 +129,28 @@ def with_ancestors(rows: list[ActorRow], wanted: list[ActorRow]) -> list[ActorRo
     return [row for row in rows if row.path in paths]
 
 
-def tree_lines(rows: list[ActorRow]) -> Iterator[str]:
+def tree_lines(rows: list[ActorRow], processes: list[ProcessUse]) -> Iterator[str]:
     """The rows as lines, each below the one above it."""
+    memory = {use.pid: use.memory_bytes for use in processes}
     below: dict[str, list[ActorRow]] = {}
     for row in rows:
         below.setdefault(row.path.rpartition("/")[0], []).append(row)
     waiting = [(rows[0], "", "")] if rows else []
     while waiting:
         row, guide, indent = waiting.pop()
-        yield f"{guide}{row_line(row, is_top=not guide)}"
+        yield f"{guide}{row_line(row, memory.get(row.pid), is_top=not guide)}"
         children = below.get(row.path, [])
         for number, child in enumerate(reversed(children)):
             branch, further = ("└── ", "    ") if number == 0 else ("├── ", "│   ")
             waiting.append((child, indent + branch, indent + further))
 
 
-def row_line(row: ActorRow, *, is_top: bool) -> str:
+def row_line(row: ActorRow, memory_bytes: int | None, *, is_top: bool) -> str:
     """One actor in a line: name, class, state, and what is not as usual."""
     name = row.path if is_top else row.path.rpartition("/")[2]
     said = [typer.style(row.state, fg=COLOURS.get(row.state, "magenta"))]
-    said += [f"{row.place} {row.pid or '-'}"] if row.place != "task" or is_top else []
+    if row.place != "task" or is_top:
+        said += [f"{row.place} {row.pid or '-'}"] + ([f"{memory_bytes / 1e6:.0f} MB"] if memory_bytes else [])
     said += [typer.style(f"restarts {row.restarts}", fg="yellow")] if row.restarts else []
     said += [f"queued {row.queued}"] if row.queued else []
     said += [f"in {printable(_short(row.turn))} for {row.turn_seconds:.1f} s"] if row.turn else []
@@ -190,7 +193,9 @@ def inspect(
     paths: Paths,
     system: System = None,
     socket: Socket = None,
-    with_state: Annotated[bool, typer.Option("--state", help="Show the state, too.")] = False,
+    with_state: Annotated[
+        bool, typer.Option("--state", help="Show the state, too: in outline, or in full with --json.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Show all there is to say of actors: status, place, mailbox, turn, ties, bindings, protection, memory, processor.
@@ -204,7 +209,8 @@ def inspect(
         found = [_measured(remote.inspect(path), one, time.monotonic() - begun) for path, one in before.items()]
         for one in found:
             if with_state and one["actor"]["pid"]:
-                one["state"] = remote.state(one["actor"]["path"])
+                path = one["actor"]["path"]
+                one["state"] = remote.state(path) if as_json else asyncio.run(remote.outline(path))
     if as_json:
         show_json(found)
         return
@@ -249,9 +255,8 @@ def inspection_lines(one: dict[str, Any]) -> Iterator[str]:
         yield f"memory: {process['memory_bytes'] / 1e6:.1f} MB, of its process"
         yield f"processor: {process['cpu_seconds']:.1f} s{percent}, of its process"
     if "state" in one:
-        state = one["state"]
-        for name, value in state.items() if isinstance(state, dict) else [("", state)]:
-            yield f"state {name}: {value!r}" if name else f"state: {value!r}"
+        for name, text in one["state"].items():
+            yield f"state {name}: {printable(text)}" if name else f"state: {printable(text)}"
 
 
 def protection_text(found: dict[str, Any] | None) -> str:

@@ -1,4 +1,4 @@
-"""The commands that ask a running system about its past: why, history, events, dead-letters, quarantine."""
+"""The commands about the past of a running system: why, history, events, dead-letters, quarantine, retry, drop."""
 
 from __future__ import annotations
 
@@ -12,12 +12,26 @@ import msgspec
 import typer
 
 from ... import events as events_of_all
-from ...system import PastEvent, PastLife
-from .reaching import FAILED, UNUSABLE, Json, OnePath, Socket, System, ended, printable, reached, show_json
+from ...system import PastEvent, PastLife, PutAside
+from ..remote import RemoteSystem
+from .reaching import (
+    FAILED,
+    UNUSABLE,
+    Json,
+    OnePath,
+    Socket,
+    System,
+    Yes,
+    confirm,
+    ended,
+    printable,
+    reached,
+    show_json,
+)
 
 ONE_LOOK = 30.0
 """Seconds that one request of `--follow` waits for the next event."""
-HIDDEN = frozenset({"traceback", "reason_kind"})
+HIDDEN = frozenset({"traceback", "reason_kind", "turns", "longest_turn", "longest_message"})
 """Fields of events that stand in `--json` only: their line would become too long."""
 KINDS = frozenset(events_of_all.__all__) | {"SystemStarted", "SystemStopped", "EventsLeftOut"}
 """The names of the events that there are."""
@@ -105,7 +119,45 @@ def quarantine(
     for one in messages:
         sender = f" from {one.sender}" if one.sender else ""
         payload = f": {one.payload}" if one.payload else ""
-        _print_lines([f"{moment(one.since)} {one.address} {one.message}{sender}, {one.attempts} deaths{payload}"])
+        number = f"number {one.id}, {one.attempts} deaths"
+        _print_lines([f"{moment(one.since)} {one.address} {one.message}{sender}, {number}{payload}"])
+
+
+Messages = Annotated[str, typer.Argument(metavar="PATH", help="The address whose messages in quarantine are meant.")]
+Number = Annotated[int | None, typer.Option("--id", help="Only this one, by the number that `quarantine` shows.")]
+
+
+def retry(path: Messages, system: System = None, socket: Socket = None, number: Number = None) -> None:
+    """Have messages in quarantine handled as if they had come now: once the cause is mended.
+
+    Exit status 0: done. 1: there is no such message. 2: no system answers.
+    """
+    with reached("retry", system, socket) as remote:
+        for one in _set_aside(remote, "retry", path, number):
+            remote.retry(one)
+            _print_lines([f"{one.address} handles {one.message} again"])
+
+
+def drop(path: Messages, system: System = None, socket: Socket = None, number: Number = None, yes: Yes = False) -> None:
+    """Forget messages in quarantine; they become dead letters.
+
+    Exit status 0: done. 1: there is no such message, or the answer was no. 2: no system answers.
+    """
+    with reached("drop", system, socket) as remote:
+        found = _set_aside(remote, "drop", path, number)
+        confirm("drop", [f"{one.message} to {one.address} is not handled" for one in found], yes=yes)
+        for one in found:
+            remote.drop(one)
+            _print_lines([f"dropped {one.message} to {one.address}"])
+
+
+def _set_aside(remote: RemoteSystem, command: str, path: str, number: int | None) -> list[PutAside]:
+    """The messages that are meant; the command ends if there is none."""
+    found = [one for one in remote.put_aside(path) if number in (None, one.id)]
+    if not found:
+        which = "no message" if number is None else f"no message {number}"
+        raise ended(command, f"{which} to {path} is in quarantine", FAILED)
+    return found
 
 
 def _print_lines(lines: Iterable[str]) -> None:
@@ -148,6 +200,8 @@ def life_line(life: PastLife) -> str:
         parts += [f"handling {life.handling}"] if life.handling else []
         parts += [f"by {life.by} ({life.because})"] if life.by else []
         parts += [f"restart {life.restarts} of {life.allowed}"] if life.restarts is not None else []
+    parts += [f"{life.turns} turns"] if life.turns is not None else []
+    parts += [f"the longest {life.longest_turn:.1f} s with {life.longest_message}"] if life.longest_message else []
     parts += [f"recovered in {sum(life.phases.values()):.3f} s, {life.replayed} replayed"] if life.phases else []
     return ", ".join(parts)
 

@@ -27,6 +27,8 @@ LEAST_FILES: Final = 4096
 """Descriptors: some for each process actor, and one for each connection."""
 LEAST_ROOM: Final = 1_000_000_000
 """Bytes that should be free beside a store."""
+NO_ROOM: Final = 1_000_000
+"""Bytes beside a store below which it takes nothing, or soon will not."""
 NETWORK: Final = {"nfs", "nfs4", "cifs", "smb3", "fuse.sshfs", "9p", "ceph", "glusterfs"}
 """File systems over a network, whose locks and fsync are not those that a store relies on."""
 UNSYNCHRONISED: Final = 5
@@ -154,7 +156,9 @@ def store(path: Path) -> Iterator[MachineFinding]:
     if kind in NETWORK:
         yield fail(about, f"on {kind}", "put it on a local disk: locks and fsync of a network are not to be relied on")
     free = shutil.disk_usage(path.parent).free
-    if free < LEAST_ROOM:
+    if free < NO_ROOM:
+        yield fail(about, f"{free / 1e9:.2f} GB free", "make room: nothing is accepted any more")
+    elif free < LEAST_ROOM:
         yield warn(about, f"{free / 1e9:.2f} GB free", "make room: when there is none nothing is accepted any more")
     if not os.access(path, os.R_OK | os.W_OK) or not os.access(path.parent, os.W_OK):
         yield fail(about, "this user may not write it, or its folder", "chown it to the user of the program")

@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.control.orders import Status
 from ...actors.errors import HoldfastError, SpecError
+from ...actors.kernel.node import cell_kind
 from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
 from ...actors.seconds import check_seconds
-from .evidence import PutAside, collect, literal, put_aside
-from .lives import PastLife
+from ...supervision.supervisor import Supervisor
+from .counted_work import count_work
+from .evidence import PutAside, Told, collect, literal, put_aside
+from .lives import PastLife, done
 from .pages import MOST_ON_PAGE, HistoryPage, HistoryQuestion, answer, question
 from .recorder import HistoryRecorder
 from .why import why
@@ -38,6 +41,10 @@ class HistoryCalls:
 
     async def get_status(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Status:
         """Say how an actor is now; see `Controls`."""
+        raise NotImplementedError
+
+    async def get_state(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Any:
+        """Copy an actor's state; see `Controls`."""
         raise NotImplementedError
 
     def quarantined(self, actor: ActorRef[Any] | str | None = None) -> list[QuarantinedMessage]:
@@ -97,7 +104,11 @@ class HistoryCalls:
         Raises:
             SpecError: the system was made with `history=False`.
         """
-        return self._recorder.lives.at(_path(target))
+        path = _path(target)
+        lives = self._recorder.lives.at(path)
+        if lives and not lives[-1].is_over:
+            done(lives[-1], count_work(self._node, path))
+        return lives
 
     async def why(self, target: ActorRef[Any] | str, *, timeout: float = DEFAULT_TIMEOUT) -> list[str]:
         """Say in a few sentences why an actor restarts, has ended, or does not get on.
@@ -111,8 +122,7 @@ class HistoryCalls:
         """
         check_seconds("why", "timeout", timeout)
         path, node, recorder = _path(target), self._node, self._recorder
-        status, before = await self._look(path, timeout)
-        return why(collect(node, recorder, path, status, before, self.quarantined(path)))
+        return why(collect(node, recorder, path, await self._ask_itself(path, timeout), self.quarantined(path)))
 
     def put_aside(self, target: ActorRef[Any] | str | None = None) -> list[PutAside]:
         """The messages in quarantine as plain data, oldest first; what is in them only with `log_payloads`.
@@ -122,19 +132,27 @@ class HistoryCalls:
         payloads = self._history is not None and self._history.keeps_payloads
         return [put_aside(one, payloads=payloads) for one in self.quarantined(target)]
 
-    async def _look(self, path: str, timeout: float) -> tuple[Status | None, int | None]:
-        """The status of an actor, and how many messages waited a moment before, if there are several."""
+    async def _ask_itself(self, path: str, timeout: float) -> Told:
+        """What an actor says of itself; if several messages wait, what it said a moment before, too."""
         cell = self._node.find(path)
         if cell is None:
-            return None, None
+            return Told()
         try:
-            status = await self.get_status(ActorRef(cell), timeout=timeout)
-            if status.queued < SEVERAL:
-                return status, None
-            await asyncio.sleep(BETWEEN)
-            return await self.get_status(ActorRef(cell), timeout=timeout), status.queued
+            status = await self.get_status(cell.ref, timeout=timeout)
+            before = None
+            if status.queued >= SEVERAL:
+                before = status.queued
+                await asyncio.sleep(BETWEEN)
+                status = await self.get_status(cell.ref, timeout=timeout)
         except HoldfastError:
-            return None, None  # It has ended meanwhile, or does not answer: the rest is known all the same.
+            return Told()  # It has ended meanwhile, or does not answer: the rest is known all the same.
+        kind = cell_kind(cell)
+        if kind is None or not issubclass(kind, Supervisor):
+            return Told(status, before)
+        try:
+            return Told(status, before, await self.get_state(cell.ref, timeout=timeout))
+        except HoldfastError:
+            return Told(status, before)  # It has a turn in hand that does not end: its status says so.
 
     @property
     def _recorder(self) -> HistoryRecorder:

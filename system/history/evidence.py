@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import itertools
+import time
+from collections import Counter
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ...actors.control.orders import Status
+from ...actors.control.orders import Status, status_of
 from ...actors.kernel.cell import GONE
-from ...actors.kernel.envelope import Ask, message_in
+from ...actors.kernel.envelope import Ask, Item, message_in
 from ...actors.process.process_host import Outlet
+from ...ftm.group.protected import protection_of
+from ...supervision.children import STOPPED
 from ...supervision.intensity import recent_restarts
+from ...supervision.spec import ChildSpec
 from ...supervision.supervisor import Supervisor
-from .lives import PastLife
+from .lives import WITH_THE_ROOT, PastLife
 from .pages import answer, question
 from .past_event import PastEvent, content, message_type, shortened
 
@@ -32,6 +37,12 @@ MOST_LOOKED_AT = 50_000
 """Actors and messages in mailboxes that are looked at for asks of one actor."""
 MOST = 200
 """Events of the address that are looked at, the newest."""
+MOST_TEXT = 300
+"""Characters of an error that a sentence quotes."""
+LONG_TURN = 1.0
+"""Seconds from which on a turn is worth a sentence."""
+CHILD_KINDS = ("ChildRestarted", "JournalFull", "MessageQuarantined", "RecoveryFailed", "ReplicaLost", "StopOverdue")
+"""Events of children that their supervisor is asked about, too."""
 
 
 class Outstanding(msgspec.Struct, frozen=True):
@@ -72,6 +83,41 @@ class PutAside(msgspec.Struct, frozen=True):
     payload: str = ""
 
 
+class ChildNow(msgspec.Struct, frozen=True):
+    """A child as its supervisor sees it at this moment.
+
+    Attributes:
+        name: the last part of its address.
+        state: "running", "suspended", "starting", "restarting", "recovering", "stopping" or "stopped".
+        turn: the message whose turn waits, by type; "" if none does, or the child lives in another process.
+        turn_seconds: how long that turn has taken so far.
+        turn_at: the line of the user's code at which it waits.
+        awaited: the address for which its start waits, because it is bound to it.
+    """
+
+    name: str
+    state: str
+    turn: str = ""
+    turn_seconds: float = 0.0
+    turn_at: str = ""
+    awaited: str = ""
+
+
+class Memory(msgspec.Struct, frozen=True):
+    """The resident memory of an actor's own process, and what its limits allow; both in bytes."""
+
+    resident_bytes: int
+    allowed_bytes: int
+
+
+class Waiting(msgspec.Struct, frozen=True):
+    """The commonest message type in a mailbox: its name, how many there are, and one of their senders or ""."""
+
+    message: str
+    count: int
+    sender: str = ""
+
+
 class Evidence(msgspec.Struct, frozen=True):
     """All that is known about an address at one moment.
 
@@ -89,6 +135,14 @@ class Evidence(msgspec.Struct, frozen=True):
         allowance: what its supervisor allows, if that is in this process.
         quarantined: its messages in quarantine.
         suspects_gap: whether events were left out lately because there were too many.
+        below: the newest events about what weighs much at its children, oldest first.
+        children: if it is a supervisor that answers, its children.
+        ended_below: the last lives of its children that are not there now, by address.
+        own_allowance: what it allows itself, if it is a supervisor that answers.
+        replica_states: its replicas by name ("leads", "follows", "joining", "silent", "down"), if it is protected.
+        epoch: of its replicas.
+        memory: of its own process, if its limits bound that.
+        waiting: what waits most in its mailbox.
     """
 
     address: str
@@ -104,15 +158,54 @@ class Evidence(msgspec.Struct, frozen=True):
     allowance: Allowance | None = None
     quarantined: list[PutAside] = []
     suspects_gap: bool = False
+    below: list[PastEvent] = []
+    children: list[ChildNow] = []
+    ended_below: dict[str, PastLife] = {}
+    own_allowance: Allowance | None = None
+    replica_states: dict[str, str] = {}
+    epoch: int = 0
+    memory: Memory | None = None
+    waiting: Waiting | None = None
+
+    @property
+    def is_whole(self) -> bool:
+        """Say whether one replica leads, and all others could."""
+        states = sorted(self.replica_states.values())
+        return states.count("leads") == 1 and states.count("follows") == len(states) - 1
+
+    def ago(self, at: float) -> str:
+        """A moment as people say it: how long ago, or the time of day if that is long."""
+        seconds = self.now - at
+        if seconds < 120.0:
+            return f"{seconds_text(max(0.0, seconds))} ago"
+        return f"at {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(at))}"
+
+
+def seconds_text(seconds: float) -> str:
+    """Seconds as people say them.
+
+    >>> seconds_text(12.3), seconds_text(1.23)
+    ('12 s', '1.2 s')
+    """
+    return f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.1f} s"
+
+
+class Told(msgspec.Struct, frozen=True):
+    """What an actor itself has said a moment ago.
+
+    Attributes:
+        status: how it is; None if nobody lives there, or it does not say.
+        queued_before: how many messages waited a moment before; None: nobody has looked.
+        overview: of a supervisor, its state.
+    """
+
+    status: Status | None = None
+    queued_before: int | None = None
+    overview: dict[str, Any] = {}
 
 
 def collect(
-    node: Node,
-    recorder: HistoryRecorder,
-    address: str,
-    status: Status | None,
-    queued_before: int | None,
-    quarantined: list[QuarantinedMessage],
+    node: Node, recorder: HistoryRecorder, address: str, told: Told, quarantined: list[QuarantinedMessage]
 ) -> Evidence:
     """All that is known about an address now."""
     cell = node.find(address)
@@ -121,6 +214,8 @@ def collect(
     while above:
         ancestors += answer(recorder, question(literal(above), kinds=GAVE_UP_KINDS, limit=5)).events
         above = above.rpartition("/")[0]
+    children = _children(node, address, told.overview)
+    protection = None if cell is None else protection_of(cell)
     return Evidence(
         address,
         node.clock.wall(),
@@ -129,13 +224,81 @@ def collect(
         answer(recorder, question(literal(address), limit=MOST)).events,
         sorted(ancestors, key=lambda event: event.number),
         answer(recorder, question(kinds=STORE_KINDS, limit=20)).events,
-        status,
-        queued_before,
+        told.status,
+        told.queued_before,
         outstanding(node, address),
         None if cell is None else _allowance(cell),
         [put_aside(one) for one in quarantined],
         recorder.is_in_storm,
+        answer(recorder, question(f"{literal(address)}/*", kinds=CHILD_KINDS, limit=MOST)).events,
+        children,
+        _ended_below(recorder, address, children),
+        _own_allowance(told.overview),
+        {} if protection is None else protection.replicas,
+        0 if protection is None else protection.epoch,
+        None if cell is None else _memory(cell),
+        None if cell is None else _waiting(cell),
     )
+
+
+def _children(node: Node, address: str, overview: dict[str, Any]) -> list[ChildNow]:
+    """A supervisor's children, each with its turn if that can be seen from here."""
+    return [
+        _child_now(node.find(f"{address}/{name}"), name, about) for name, about in overview.get("children", {}).items()
+    ]
+
+
+def _child_now(cell: Cell | None, name: str, about: dict[str, Any]) -> ChildNow:
+    state, awaited = str(about["state"]), str(about.get("awaited", ""))
+    if cell is None or cell.is_dead:
+        return ChildNow(name, state, awaited=awaited)
+    status = status_of(cell)
+    state = status.state if (state, status.state) == ("running", "suspended") else state
+    return ChildNow(name, state, status.turn or "", status.turn_seconds, status.turn_at, awaited)
+
+
+def _ended_below(recorder: HistoryRecorder, address: str, children: list[ChildNow]) -> dict[str, PastLife]:
+    """The last lives of those that lived directly below, and do not now; unless they ended with the whole system."""
+    there = {f"{address}/{one.name}" for one in children if one.state != STOPPED}
+    return {
+        path: life
+        for path, life in recorder.lives.last_below(address)
+        if life.is_over and path not in there and life.reason_kind not in WITH_THE_ROOT
+    }
+
+
+def _own_allowance(overview: dict[str, Any]) -> Allowance | None:
+    if "intensity" not in overview:
+        return None
+    return Allowance(overview["intensity"], overview["period"], overview["restarts"])
+
+
+def _memory(cell: Cell) -> Memory | None:
+    """The memory of the actor's own process; None if it has none, or nothing bounds it."""
+    limits = cell.spec.limits if isinstance(cell.spec, ChildSpec) else None
+    process = cell.host.place.process(cell)
+    if process is None or limits is None or limits.memory_bytes is None:
+        return None
+    import psutil  # only now: a system that runs no process does without it
+
+    try:
+        return Memory(psutil.Process(process.pid).memory_info().rss, limits.memory_bytes)
+    except psutil.Error:
+        return None  # It has ended meanwhile.
+
+
+def _waiting(cell: Cell) -> Waiting | None:
+    """What waits most in the mailbox, as far as that is in this process."""
+    counts: Counter[str] = Counter()
+    senders: dict[str, str] = {}
+    for item in _items(cell, MOST_LOOKED_AT):
+        name = message_type(message_in(item))
+        counts[name] += 1
+        if isinstance(item, Item) and item.sender is not None:
+            senders[name] = item.sender.path
+    for name, count in counts.most_common(1):
+        return Waiting(name, count, senders.get(name, ""))
+    return None
 
 
 def put_aside(one: QuarantinedMessage, *, payloads: bool = False) -> PutAside:
@@ -164,11 +327,16 @@ def _in_mailboxes(node: Node) -> Iterator[tuple[str, Ask]]:
     while cells and left > 0:
         cell = cells.pop()
         cells.extend((cell.children or {}).values())
-        outlet = cell.more.outlet if cell.more is not None else None
-        sent = [item for _, item in outlet.flight] if isinstance(outlet, Outlet) else []
-        items = [cell.item, *itertools.islice(itertools.chain(sent, cell.queue or ()), left)]
+        items = [cell.item, *_items(cell, left)]
         left -= len(items)
         yield from ((cell.path, item) for item in items if isinstance(item, Ask) and not item.is_done)
+
+
+def _items(cell: Cell, most: int) -> list[Any]:
+    """What waits at an actor in this process, or was handed to its own and has no answer yet."""
+    outlet = cell.more.outlet if cell.more is not None else None
+    sent = [item for _, item in outlet.flight] if isinstance(outlet, Outlet) else []
+    return list(itertools.islice(itertools.chain(sent, cell.queue or ()), most))
 
 
 def _allowance(cell: Cell) -> Allowance | None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import OrderedDict, deque
+from collections.abc import Iterator
 from typing import TypeAlias
 
 import msgspec
 
-from .past_event import PastEvent
+from .past_event import PastEvent, Plain
 
 MOST_LIVES = 16
 """Lives that are kept of one address, the newest."""
@@ -35,6 +36,10 @@ class PastLife(msgspec.Struct):
         pid: the OS process that it had for itself; 0 if it had none.
         phases: seconds that each phase of its recovery took (detect, isolate, restart, restore, replay, release).
         replayed: turns that were handled again before it was there.
+        turns: turns that it did, replayed ones not among them; None if nobody has counted them.
+        turns_before: turns that were counted at the address before it; None if nobody has.
+        longest_turn: seconds of the longest turn that was told by `watch_turns`, or measured while statistics are on.
+        longest_message: the type of the message of that turn; "" if none is known.
     """
 
     number: int
@@ -51,6 +56,10 @@ class PastLife(msgspec.Struct):
     pid: int = 0
     phases: dict[str, float] = {}
     replayed: int = 0
+    turns: int | None = None
+    turns_before: int | None = None
+    longest_turn: float = 0.0
+    longest_message: str = ""
 
     @property
     def is_over(self) -> bool:
@@ -76,6 +85,12 @@ class LivesByAddress:
     def at(self, address: str) -> list[PastLife]:
         """The lives of an address, oldest first; copies."""
         return [msgspec.structs.replace(life) for life in self._known.get(address, ())]
+
+    def last_below(self, address: str) -> Iterator[tuple[str, PastLife]]:
+        """The newest life of each address directly below this one, with that address."""
+        for path, known in self._known.items():
+            if path.rpartition("/")[0] == address:
+                yield path, known[-1]
 
     def __len__(self) -> int:
         return len(self._known)
@@ -125,9 +140,25 @@ def _end(life: PastLife, event: PastEvent) -> None:
     """The life is over; the first that is told of its end says the most."""
     if life.ended is None:
         life.ended = event.at
+        done(life, event.fields)
     if not life.reason:
         life.reason, life.reason_kind = _text(event, "reason"), _text(event, "reason_kind")
         life.traceback = _text(event, "traceback")
+
+
+def done(life: PastLife, fields: dict[str, Plain]) -> None:
+    """What is counted at the address when something is told of the life; see `count_work`."""
+    turns, seconds, message = fields.get("turns"), fields.get("longest_turn"), fields.get("longest_message")
+    if isinstance(turns, int) and life.turns_before is not None and turns >= life.turns_before:
+        life.turns = turns - life.turns_before
+    if isinstance(seconds, float) and isinstance(message, str) and seconds > life.longest_turn:
+        life.longest_turn, life.longest_message = seconds, message
+
+
+def _slow(lives: Lives, event: PastEvent) -> None:
+    """A turn that `watch_turns` has seen: told when it is over, which may be after the life."""
+    seconds = event.fields.get("seconds")
+    done(_last(lives), {"longest_turn": seconds, "longest_message": _text(event, "message")})
 
 
 def _started(lives: Lives, event: PastEvent) -> None:
@@ -135,12 +166,12 @@ def _started(lives: Lives, event: PastEvent) -> None:
     if lives and not lives[-1].is_over:
         life = lives[-1]
         if life.started is None:
-            life.number, life.started = number, event.at
+            life.number, life.started, life.turns_before = number, event.at, _number(event, "turns")
             return
         if life.number == number:
             return  # A replica of the same life.
         life.ended, life.reason = event.at, life.reason or "its end was not recorded"
-    lives.append(PastLife(number, event.at))
+    lives.append(PastLife(number, event.at, turns_before=_number(event, "turns")))
 
 
 def _process_started(lives: Lives, event: PastEvent) -> None:
@@ -192,6 +223,12 @@ def _linked_end(lives: Lives, event: PastEvent) -> None:
     _end(life, event)
 
 
+def _killed(lives: Lives, event: PastEvent) -> None:
+    """Its end is told by another event, which comes when it has ended."""
+    life = _now(lives)
+    life.by, life.because = _text(event, "by"), "it was killed by `ref.kill()`"
+
+
 def _restarted(lives: Lives, event: PastEvent) -> None:
     life = _last(lives)
     _end(life, event)
@@ -217,8 +254,9 @@ def _recovered(lives: Lives, event: PastEvent) -> None:
 def _failed_over(lives: Lives, event: PastEvent) -> None:
     life = _now(lives)
     life.ended, life.reason, life.reason_kind = event.at, _text(event, "why"), "FailedOver"
+    done(life, event.fields)
     life.by, life.because = "failover", f"{_text(event, 'replica')} leads now"
-    lives.append(PastLife(life.number, event.at))
+    lives.append(PastLife(life.number, event.at, turns_before=_number(event, "turns")))
 
 
 def _quarantined(lives: Lives, event: PastEvent) -> None:
@@ -239,6 +277,8 @@ def _root_ended(lives: Lives, event: PastEvent) -> None:
         life.by = "the program"
 
 
+WITH_THE_ROOT = frozenset({"SystemStopped", "RootKilled"})
+"""How lives end that end with the process of the root."""
 ROOT = ("SystemStarted", "SystemStopped")
 DEATHS = frozenset({"Signal", "Exited", "OutOfMemory", "Hung"})
 """Exit reasons of a process that says nothing itself of what it had in hand."""
@@ -250,11 +290,13 @@ LEARN = {
     "ChildTerminated": _terminated,
     "ChildStopped": _stopped,
     "EndedByLink": _linked_end,
+    "ActorKilled": _killed,
     "ChildRestarted": _restarted,
     "ChildStartFailed": _not_started,
     "Recovered": _recovered,
     "FailedOver": _failed_over,
     "MessageQuarantined": _quarantined,
+    "TurnSlow": _slow,
     "SystemStarted": _root_ended,
     "SystemStopped": _root_ended,
 }

@@ -50,7 +50,8 @@ class PastEvent(msgspec.Struct, frozen=True):
             "SystemStopped".
         address: whom it is about.
         fields: the other fields of the event as plain values. An exit reason is text, and `reason_kind` is its class;
-            of a message there is the type, and its content only with `log_payloads`.
+            of a message there is the type, and its content only with `log_payloads`. Where a life begins or ends there
+            are the `turns` of its address so far, and the longest turn, if somebody counts them.
     """
 
     number: int

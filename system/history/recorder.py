@@ -7,8 +7,9 @@ from collections.abc import Callable
 from heapq import merge
 from typing import TYPE_CHECKING
 
-from ...actors.events import ActorStarted, ChildStopped, ChildTerminated, Event, Restful
+from ...actors.events import ActorKilled, ActorStarted, ChildStopped, ChildTerminated, Event, Restful
 from .authors import author
+from .counted_work import COUNTED, count_work
 from .lives import LivesByAddress
 from .past_event import UNKEPT, PastEvent, Plain, plain_fields, shortened
 from .tracks import BOUNDS, EventTrack, TrackName, track_of
@@ -77,6 +78,10 @@ class HistoryRecorder:
             by, because = self._expected.pop(event.address)
             fields["by"] = fields.get("by") or by
             fields["because"] = fields.get("because") or because
+        if kind is ActorKilled:
+            fields["by"] = fields["by"] or author()
+        if kind.__name__ in COUNTED:
+            fields |= count_work(self._node, event.address)
         self._add(kind.__name__, event.address, fields)
 
     def _admits(self, event: Event, kind: type[Event]) -> bool:

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 
-from .evidence import Evidence, PutAside
+from .evidence import LONG_TURN, MOST_TEXT, Evidence, PutAside, seconds_text
 from .lives import PastLife
 from .past_event import PastEvent
 from .raised import raised_at
+from .why_children import (
+    ended_children,
+    moving_children,
+    overdue_children,
+    restarts_of_children,
+    troubled_children,
+    waiting_children,
+)
 
 LATELY = 60.0
 """Seconds within which ends belong to one crash loop, if the supervisor's period is not known to be longer."""
-LONG_TURN = 1.0
-"""Seconds from which on a turn is worth a sentence."""
 MANY = 100
 """Messages in a mailbox that are worth a sentence."""
-MOST_TEXT = 300
-"""Characters of an error that a sentence quotes."""
+MUCH = 0.6
+"""The part of the memory that a process may have from which on it is worth a sentence."""
 
 Rule = Callable[[Evidence], list[str]]
 
@@ -83,7 +88,7 @@ def _within(evidence: Evidence, loop: list[PastLife]) -> str:
     first, last = loop[0].ended or evidence.now, loop[-1].ended or evidence.now
     if evidence.now - last < LATELY:
         return f"in the last {max(1, math.ceil(evidence.now - first))} s"
-    return f"within {max(1, math.ceil(last - first))} s, the last time {_since(evidence, last)}"
+    return f"within {max(1, math.ceil(last - first))} s, the last time {evidence.ago(last)}"
 
 
 def _last_ended(evidence: Evidence) -> PastLife | None:
@@ -131,7 +136,7 @@ def _fault(life: PastLife) -> str:
         case "Hung":
             return f"its process {reason}: a loop without await, a blocking call or a lock"
         case "Killed":
-            return "it was killed, by `ref.kill()` or by a time limit"
+            return "it was killed, by a time limit or over a link"
         case "TrustBreach":
             return f"its process was ended for a {reason}"
         case _:
@@ -166,7 +171,7 @@ def _ended_by_others(evidence: Evidence) -> list[str]:
     if life.by == evidence.address:
         return [f"{evidence.address} ended by itself {_ago(evidence, life)}: {life.because}."]
     because = f": {life.because}" if life.because else ""
-    fault = "" if life.reason_kind in CLEAN else f" ({_fault(life)})"
+    fault = "" if life.reason_kind in CLEAN or life.reason_kind == "Killed" else f" ({_fault(life)})"
     return [f"{evidence.address} was ended by {life.by} {_ago(evidence, life)}{because}{fault}."]
 
 
@@ -177,12 +182,12 @@ def _given_up_above(evidence: Evidence) -> list[str]:
         child, reason = event.fields.get("child"), event.fields.get("reason")
         if event.kind == "SupervisorGaveUp":
             said.append(
-                f"{event.address} gave up {_since(evidence, event.at)}, and all below it ended: "
+                f"{event.address} gave up {evidence.ago(event.at)}, and all below it ended: "
                 f"{event.address}/{child} had failed too often, the last time with {str(reason)[:MOST_TEXT]}."
             )
         else:
             said.append(
-                f"{event.address} ended {_since(evidence, event.at)}: its significant child {child} did ({reason})."
+                f"{event.address} ended {evidence.ago(event.at)}: its significant child {child} did ({reason})."
             )
     return said
 
@@ -193,9 +198,7 @@ def _gave_up(evidence: Evidence) -> list[str]:
     if event is None:
         return []
     child, reason = event.fields.get("child"), str(event.fields.get("reason"))[:MOST_TEXT]
-    return [
-        f"{evidence.address} gave up {_since(evidence, event.at)}: its child {child} had failed too often ({reason})."
-    ]
+    return [f"{evidence.address} gave up {evidence.ago(event.at)}: its child {child} had failed too often ({reason})."]
 
 
 def _root_ended(evidence: Evidence) -> list[str]:
@@ -215,12 +218,12 @@ def _quarantine(evidence: Evidence) -> list[str]:
     event = _newest(evidence, "MessageQuarantined")
     if event is None:
         return []
-    put = f"The message {event.fields.get('message')} was put into quarantine {_since(evidence, event.at)}"
+    put = f"The message {event.fields.get('message')} was put into quarantine {evidence.ago(event.at)}"
     return [f"{put}, after {event.fields.get('deliveries')} deaths of the process, and is not there any more."]
 
 
 def _is_put_aside(evidence: Evidence, one: PutAside) -> str:
-    put = f"The message {one.message} was put into quarantine {_since(evidence, one.since)}"
+    put = f"The message {one.message} was put into quarantine {evidence.ago(one.since)}"
     deaths = f"it had ended the process {one.attempts} times in a row"
     return f"{put}: {deaths}. The actor goes on without it; retry or drop it once the cause is mended."
 
@@ -234,7 +237,7 @@ def _recovery_fails(evidence: Evidence) -> list[str]:
     reason = str(event.fields.get("reason", ""))[: 2 * MOST_TEXT]
     if "diverged" in reason:
         return [f"{evidence.address} cannot be recovered, for its turns do not go as they went before: {reason}."]
-    return [f"{evidence.address} could not be recovered {_since(evidence, event.at)}: {reason}."]
+    return [f"{evidence.address} could not be recovered {evidence.ago(event.at)}: {reason}."]
 
 
 # -- how it is now ----------------------------------------------------------------------------------------------------
@@ -259,36 +262,59 @@ def _waits(evidence: Evidence) -> list[str]:
     status = evidence.status
     if status is None or status.turn is None or status.turn_seconds < LONG_TURN:
         return []
-    said = f"{evidence.address} has been in the turn of {status.turn} for {_seconds(status.turn_seconds)}"
+    said = f"{evidence.address} has been in the turn of {status.turn} for {seconds_text(status.turn_seconds)}"
+    at = f", at {status.turn_at}" if status.turn_at else ""
     if not evidence.asks:
-        return [f"{said}; it waits for something that is no ask of this process."]
+        return [f"{said}{at}; it waits for something that is no ask of this process."]
     first = evidence.asks[0]
     more = f", and {len(evidence.asks) - 1} more asks" if len(evidence.asks) > 1 else ""
-    return [f"{said}: it waits for {first.to} to answer {first.message}, asked {_seconds(first.seconds)} ago{more}."]
+    asked = f"it waits for {first.to} to answer {first.message}, asked {seconds_text(first.seconds)} ago"
+    return [f"{said}{at}: {asked}{more}."]
 
 
 def _mailbox(evidence: Evidence) -> list[str]:
     status = evidence.status
     if status is None or status.queued < MANY or status.state == "suspended":
         return []
-    before = evidence.queued_before
-    if before is None or before == status.queued:
-        return [f"{status.queued} messages wait in its mailbox."]
-    way = "and they become more" if status.queued > before else "and they become fewer"
-    return [f"{status.queued} messages wait in its mailbox, {way}."]
+    before, most = evidence.queued_before, evidence.waiting
+    said = f"{status.queued} messages wait in its mailbox"
+    if before is not None and before != status.queued:
+        said += ", and they become more" if status.queued > before else ", and they become fewer"
+    if most is not None:
+        sender = f" from {most.sender}" if most.sender else ""
+        said += f"; most of them are {most.message}{sender}"
+    return [f"{said}."]
+
+
+def _memory(evidence: Evidence) -> list[str]:
+    """Its process has nearly as much memory as it may."""
+    memory = evidence.memory
+    if memory is None or memory.resident_bytes < MUCH * memory.allowed_bytes:
+        return []
+    has, may = memory.resident_bytes / 1e6, memory.allowed_bytes / 1e6
+    said = f"Its process has {has:.0f} MB of memory, and is ended at {may:.0f} MB"
+    return [f"{said}: if that goes on growing, look at what its state holds (`holdfast inspect --state`)."]
 
 
 def _replicas(evidence: Evidence) -> list[str]:
-    """What has happened to its replicas, unless all of them are back since."""
+    """Which replica was lost, when and by what; who leads since, and whether all of them are there again."""
     lost, over = _newest(evidence, "ReplicaLost"), _newest(evidence, "FailedOver")
     gone, back = _newest(evidence, "ProtectionLost"), _newest(evidence, "ReplicaJoined")
+    is_back = lost is not None and back is not None and back.number > lost.number
     said: list[str] = []
+    if lost is not None:
+        still = "" if is_back else " and is not back"
+        ago = evidence.ago(lost.at)
+        said.append(f"Replica {lost.fields.get('replica')} was lost {ago}{still}: {lost.fields.get('why')}.")
     if over is not None:
-        replica, cause = over.fields.get("replica"), over.fields.get("why")
-        said.append(f"Replica {replica} took over {_since(evidence, over.at)}: {cause}.")
-    if lost is not None and (back is None or back.number < lost.number):
-        replica, cause = lost.fields.get("replica"), lost.fields.get("why")
-        said.append(f"Replica {replica} was lost {_since(evidence, lost.at)} and is not back: {cause}.")
+        took = f"Replica {over.fields.get('replica')} took over {evidence.ago(over.at)}"
+        said.append(f"{took}, in epoch {over.fields.get('epoch')}: {over.fields.get('why')}.")
+    if said and evidence.replica_states:
+        states = ", ".join(f"{name} {state}" for name, state in evidence.replica_states.items())
+        whole = "It is whole again" if evidence.is_whole else "It is not whole"
+        if back is not None and is_back:
+            whole += f", for {back.fields.get('replica')} came back {evidence.ago(back.at)}"
+        said.append(f"{whole}: {states}, epoch {evidence.epoch}.")
     if gone is not None and (back is None or back.number < gone.number):
         said.append("It is not protected at the moment: no replica may die.")
     return said
@@ -303,12 +329,12 @@ def _store(evidence: Evidence) -> list[str]:
             case "JournalGoesOn":
                 said.pop("JournalBlocked", None)
             case "JournalBlocked":
-                said[event.kind] = f"The store stopped taking anything {_since(evidence, event.at)}: {reason}."
+                said[event.kind] = f"The store stopped taking anything {evidence.ago(event.at)}: {reason}."
             case "JournalStopped":
-                said[event.kind] = f"The store failed {_since(evidence, event.at)}, and nothing is accepted: {reason}."
+                said[event.kind] = f"The store failed {evidence.ago(event.at)}, and nothing is accepted: {reason}."
             case "JournalFull" if event.address == evidence.address:
                 said[event.kind] = (
-                    f"Its journal became full {_since(evidence, event.at)}, and it accepts nothing: "
+                    f"Its journal became full {evidence.ago(event.at)}, and it accepts nothing: "
                     f"{event.fields.get('way_out')}."
                 )
             case _:
@@ -332,8 +358,15 @@ RULES: dict[str, Rule] = {
     "restarting": _restarting,
     "its turn waits": _waits,
     "mailbox": _mailbox,
+    "memory": _memory,
     "replicas": _replicas,
     "store": _store,
+    "restarts of children": restarts_of_children,
+    "children that are not there": ended_children,
+    "children that start or stop": moving_children,
+    "children in trouble": troubled_children,
+    "children that had to be killed": overdue_children,
+    "children that wait": waiting_children,
     "events left out": _gap,
 }
 """The causes, in the order in which they are told."""
@@ -347,16 +380,4 @@ def _newest(evidence: Evidence, kind: str) -> PastEvent | None:
 
 
 def _ago(evidence: Evidence, life: PastLife) -> str:
-    return _since(evidence, life.ended or evidence.now)
-
-
-def _since(evidence: Evidence, at: float) -> str:
-    """A moment as people say it: how long ago, or the time of day if that is long."""
-    seconds = evidence.now - at
-    if seconds < 120.0:
-        return f"{_seconds(max(0.0, seconds))} ago"
-    return f"at {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(at))}"
-
-
-def _seconds(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.1f} s"
+    return evidence.ago(life.ended or evidence.now)

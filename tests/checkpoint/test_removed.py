@@ -66,14 +66,14 @@ CHECKS = {
     ),
     "a supervisor's process says who was killed there from outside": Check(
         "checkpoint/life/child_stub.py",
-        '            self.guest.command(cell, "faulted", {})\n',
+        '            self.guest.command(cell, "faulted", {"by": by})\n',
         "            pass\n",
         KILLS,
         "put_aside and subtree-sibling",
     ),
     "another process says whom it kills": Check(
         "actors/process/wire/peer.py",
-        'connection.send(frames.Command(connection.names.to_wire(cell.path), "faulted", {}))',
+        'connection.send(frames.Command(connection.names.to_wire(cell.path), "faulted", {"by": by}))',
         "connection.flush()",
         KILLS,
         "put_aside and process-process",

@@ -1,7 +1,6 @@
 """Every command that docs/command-line.md shows does what it says there."""
 
 import asyncio
-import doctest
 import re
 import shlex
 import sys
@@ -13,14 +12,10 @@ import pytest
 
 from holdfast.console.commands import commands
 from holdfast.console.service.project import write_project
+from tests.console.shown import is_shown, sections, steps
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "command-line.md").read_text("utf-8")
-CONSOLE = re.compile(r"^```console\n(?P<body>.*?)^```$", re.M | re.S)
-SECTIONS = {
-    title: CONSOLE.findall(body)
-    for title, body in re.findall(r"^### ([^\n]+)\n(.*?)(?=^##|\Z)", PAGE, re.M | re.S)
-    if CONSOLE.search(body)
-}
+SECTIONS = sections(PAGE, "###")
 TREE = re.search(r"^```toml\n(.*?)^```$", PAGE, re.M | re.S)
 
 
@@ -54,13 +49,6 @@ async def said(line: str) -> str:
     return output.decode() + (f"[exit {process.returncode}]\n" if process.returncode else "")
 
 
-def steps(body: str) -> Iterator[tuple[str, str]]:
-    """The commands of a block, each with what is shown of its output."""
-    for part in re.split(r"^\$ ", body, flags=re.M)[1:]:
-        line, _, shown = part.partition("\n")
-        yield line, shown
-
-
 @pytest.mark.parametrize("title", SECTIONS)
 async def test_the_page_is_true(project: Path, title: str) -> None:
     service = await asyncio.create_subprocess_exec(
@@ -74,10 +62,7 @@ async def test_the_page_is_true(project: Path, title: str) -> None:
         for body in SECTIONS[title]:
             for line, shown in steps(body):
                 output = await said(line)
-                is_shown = doctest.OutputChecker().check_output(
-                    shown, output, doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-                )
-                assert is_shown, f"$ {line}\n{output}"
+                assert is_shown(shown, output), f"$ {line}\n{output}"
     finally:
         service.terminate()
         await service.communicate()

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -110,7 +111,7 @@ async def test_the_tree_shows_what_runs_and_what_is_stopped(named: hf.ActorSyste
     status, output, _ = await holdfast("tree")
     assert status == DONE
     lines = output.splitlines()
-    assert lines[0] == f"/app  Supervisor  running, task {os.getpid()}"
+    assert re.fullmatch(rf"/app  Supervisor  running, task {os.getpid()}, \d+ MB", lines[0])
     assert "├── left  Supervisor  running" in lines
     assert "│   ├── a  Counter  suspended, named first" in lines
     assert "│   ├── e  Counter  stopped" in lines

@@ -57,6 +57,15 @@ async def test_a_suspended_actor_handles_what_came_meanwhile_in_order(
     assert (await system.get_state(one))["seen"] == [0, 1, 2, 3, 4, 5]
 
 
+async def test_a_state_in_outline_is_told_whatever_its_size(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    for n in range(12):
+        await one.ask(Add(n))
+    told = await system.outline(one)
+    assert told["total"] == "66"
+    assert told["seen"].startswith("list of 12 entries, about 0.0 MB: [0, 1, 2")
+
+
 async def test_messages_that_were_queued_before_the_suspension_wait_too(
     system: hf.ActorSystem, start_one: Starter, tmp_path: Path
 ) -> None:

@@ -40,6 +40,8 @@ class Worker(hf.Actor):
             case "clock":
                 self.seen = time.time()
                 return int(self.seen * 1e6)
+            case "block":
+                time.sleep(0.3)
             case "stop":
                 self.ctx.stop()
             case "wait":
@@ -62,6 +64,32 @@ class Caller(hf.Actor):
     @hf.on(Pass)
     async def on_pass(self, message: Pass) -> int:
         return await message.to.ask(Do(message.what), 60.0)
+
+
+class Strike(hf.Message):
+    """Kill whom you are bound to."""
+
+
+class Killer(hf.Actor):
+    """Kills another one."""
+
+    whom: hf.Binding[Worker]
+
+    @hf.on(Strike)
+    def strike(self, message: Strike) -> None:
+        self.whom.kill()
+
+
+class SlowStarter(Worker):
+    """Waits in its start for as long as a file is not there."""
+
+    def __init__(self, file: str) -> None:
+        super().__init__()
+        self.file = file
+
+    async def on_start(self, restored: bool) -> None:
+        while not os.path.exists(self.file):
+            await asyncio.sleep(0.01)
 
 
 class Stubborn(hf.Actor):

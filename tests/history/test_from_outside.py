@@ -170,7 +170,18 @@ async def test_the_commands_in_json(system: hf.ActorSystem, path: Path) -> None:
     assert (message["address"], message["attempts"]) == ("/app/poisoned", 1)
     assert message["payload"] == "Do(what='kill')"
     _, said, _ = await command(path, "quarantine")
-    assert "/app/poisoned tests.history.players.Do, 1 deaths: Do(what='kill')" in said
+    assert "/app/poisoned tests.history.players.Do, number 1, 1 deaths: Do(what='kill')" in said
+    code, said, errors = await command(path, "drop", "/app/poisoned")
+    assert (code, said) == (1, "")
+    assert "Do to /app/poisoned is not handled" in errors
+    code, said, _ = await command(path, "retry", "/app/poisoned", "--id", "1")
+    assert (code, said) == (0, "/app/poisoned handles tests.history.players.Do again\n")
+    await until(lambda: system.put_aside("/app/poisoned") and system.put_aside("/app/poisoned")[0].id != 1)
+    code, said, _ = await command(path, "drop", "/app/poisoned", "--yes")  # It has killed once more.
+    assert (code, said) == (0, "dropped tests.history.players.Do to /app/poisoned\n")
+    assert system.put_aside() == []
+    code, _, errors = await command(path, "retry", "/app/poisoned")
+    assert (code, errors) == (1, "holdfast retry: no message to /app/poisoned is in quarantine\n")
 
 
 async def test_events_that_are_followed_come_as_they_are_told(system: hf.ActorSystem, path: Path) -> None:

@@ -12,6 +12,7 @@ BOUNDS = "tests/history/test_bounds.py"
 LIVES = "tests/history/test_lives.py"
 KILLED = "tests/history/test_root_killed.py"
 LIVE = "tests/history/test_why_live.py"
+WHY = "tests/history/test_why.py"
 OUTSIDE = "tests/history/test_from_outside.py"
 
 CHECKS = {
@@ -196,6 +197,55 @@ CHECKS = {
         "            pass\n",
         LIVE,
         "test_a_link",
+    ),
+    "whoever kills is named": Check(
+        "actors/kernel/address_host.py",
+        "            cell.node.emit(ActorKilled(cell.path, by))\n",
+        "            pass\n",
+        LIVE,
+        "test_whoever_kills_is_named",
+    ),
+    "whoever kills from another process is named": Check(
+        "actors/process/wire/peer.py",
+        '            cell.host.home.faulted(cell, by if isinstance(by, str) else "")\n',
+        '            cell.host.home.faulted(cell, "")\n',
+        LIVE,
+        "test_whoever_kills_is_named",
+    ),
+    "turns before the life are not its own": Check(
+        "system/history/lives.py",
+        "        life.turns = turns - life.turns_before\n",
+        "        life.turns = turns\n",
+        LIVE,
+        "test_the_turns_of_a_life",
+    ),
+    "a life that began before anybody counted has no count": Check(
+        "system/history/lives.py",
+        "isinstance(turns, int) and life.turns_before is not None and turns >= life.turns_before",
+        "isinstance(turns, int)",
+        LIVE,
+        "test_the_turns_of_a_life",
+    ),
+    "a replica that is back was lost all the same": Check(
+        "system/history/why.py",
+        "    if lost is not None:\n",
+        "    if lost is not None and not is_back:\n",
+        WHY,
+        "test_a_replica_that_was_lost_is_told_of_also_when_it_is_back",
+    ),
+    "of many children some are named": Check(
+        "system/history/why_children.py",
+        "    return [*said[:MOST_NAMED], ",
+        "    return [*said, ",
+        WHY,
+        "test_of_many_children_some_are_named",
+    ),
+    "a turn that hangs is killed for KILLED": Check(
+        "system/controls.py",
+        "        if reason == KILLED:\n",
+        "        if False:\n",
+        LIVE,
+        "test_an_actor_that_is_terminated_at_once_does_not_end_its_turn",
     ),
     "a sibling's end is told": Check(
         "supervision/supervisor.py",

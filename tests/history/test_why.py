@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.system.history.evidence import Allowance, Evidence, Outstanding, PutAside
+from holdfast.system.history.evidence import Allowance, ChildNow, Evidence, Memory, Outstanding, PutAside, Waiting
 from holdfast.system.history.why import RULES, why
 
 AT = "/app/shop/till"
@@ -85,7 +85,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "killed by the program": (
         {"lives": [life(1, 998.0, "killed", "Killed")]},
-        f"{AT} ended 2.0 s ago: it was killed, by `ref.kill()` or by a time limit.",
+        f"{AT} ended 2.0 s ago: it was killed, by a time limit or over a link.",
     ),
     "breach": (
         {"lives": [life(1, 998.0, "breach of trust: it lies", "TrustBreach")]},
@@ -191,8 +191,8 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         "Replica b was lost 10 s ago and is not back: SIGKILL.",
     ),
     "failed over": (
-        {"events": [told("FailedOver", replica="b", why="SIGKILL")]},
-        "Replica b took over 10 s ago: SIGKILL.",
+        {"events": [told("FailedOver", replica="b", epoch=2, why="SIGKILL")]},
+        "Replica b took over 10 s ago, in epoch 2: SIGKILL.",
     ),
     "not protected": (
         {"events": [told("ProtectionLost", number=2)]},
@@ -214,6 +214,91 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         {"store": [told("JournalFull", way_out="take a snapshot"), told("JournalFull", "/app/other", way_out="no")]},
         "Its journal became full 10 s ago, and it accepts nothing: take a snapshot.",
     ),
+    "a child restarted": (
+        {
+            "below": [
+                told("ChildRestarted", f"{AT}/a", 985.0, reason="KeyError: 7", allowed=3),
+                told("ChildRestarted", f"{AT}/b", 990.0, reason="SIGKILL", allowed=3),
+                told("ChildRestarted", f"{AT}/a", 995.0, reason="KeyError: 8", allowed=3),
+                told("ChildRestarted", f"{AT}/old", 100.0, reason="long ago", allowed=3),
+            ],
+            "own_allowance": Allowance(3, 5.0, 3),
+        },
+        (
+            "Within the last 15 s it restarted a 2 times (KeyError: 8), b once (SIGKILL); it allows 3 in 5 s, "
+            "and gives up at the next."
+        ),
+    ),
+    "a child restarted, and the supervisor is silent": (
+        {"below": [told("ChildRestarted", f"{AT}/a", reason="KeyError: 7", allowed=3)]},
+        "Within the last 10 s it restarted a once (KeyError: 7); it allows 3 within its period.",
+    ),
+    "a child that has ended": (
+        {
+            "ended_below": {
+                f"{AT}/a": life(1, 998.0, "shutdown", "Shutdown", by="an operator", because="it was stopped by order")
+            }
+        },
+        "Its child a ended 2.0 s ago and is not there: shutdown, by an operator (it was stopped by order).",
+    ),
+    "a child that could not be started": (
+        {"ended_below": {f"{AT}/a": life(1, 998.0, "no file", "StartFailed")}},
+        "Its child a could not be started 2.0 s ago: no file.",
+    ),
+    "a child that is stopped": (
+        {"children": [ChildNow("a", "stopping", "shop.Pay", 12.0, "shop.py:41, await answer")]},
+        "Its child a is being stopped: it has been in the turn of shop.Pay for 12 s at shop.py:41, await answer.",
+    ),
+    "a child that starts": (
+        {"children": [ChildNow("a", "starting", awaited="/app/b"), ChildNow("c", "running")]},
+        "Its child a is starting, and waits for /app/b to be there.",
+    ),
+    "a child in trouble": (
+        {"below": [told("ReplicaLost", f"{AT}/a"), told("ReplicaLost", f"{AT}/a", 100.0)]},
+        f"Of its child a, a replica was lost 10 s ago: ask why of {AT}/a.",
+    ),
+    "a child that was killed": (
+        {
+            "below": [
+                told("StopOverdue", f"{AT}/a", seconds=5.0, stacks=f"{AT}/a (ending) has been in the turn of Pay:")
+            ]
+        },
+        (
+            "Its child a had not ended within 5.0 s when it was told to, and was killed 10 s ago: "
+            f"{AT}/a (ending) has been in the turn of Pay."
+        ),
+    ),
+    "a child that waits": (
+        {"children": [ChildNow("a", "running", "shop.Pay", 3.0), ChildNow("b", "running", "shop.Pay", 0.5)]},
+        "Its child a does not get on: it has been in the turn of shop.Pay for 3.0 s.",
+    ),
+    "a child that is suspended": ({"children": [ChildNow("a", "suspended")]}, "Its child a is suspended."),
+    "little memory is left": (
+        {"memory": Memory(250_000_000, 300_000_000)},
+        (
+            "Its process has 250 MB of memory, and is ended at 300 MB: if that goes on growing, look at what its "
+            "state holds (`holdfast inspect --state`)."
+        ),
+    ),
+    "much memory is left": (
+        {"memory": Memory(100_000_000, 300_000_000), "is_there": True, "lives": [life(1)], "status": status()},
+        f"{AT} is running, in life 2, and nothing is wrong as far as is known.",
+    ),
+    "what waits": (
+        {"status": status(queued=150), "waiting": Waiting("shop.Pay", 140, "/app/till")},
+        "150 messages wait in its mailbox; most of them are shop.Pay from /app/till.",
+    ),
+    "where it waits": (
+        {"status": status(turn="shop.Pay", turn_seconds=1.5, turn_at="shop.py:41, await answer")},
+        (
+            f"{AT} has been in the turn of shop.Pay for 1.5 s, at shop.py:41, await answer; it waits for something "
+            "that is no ask of this process."
+        ),
+    ),
+    "killed by somebody": (
+        {"lives": [life(1, 998.0, "killed", "Killed", by="/app/b", because="it was killed by `ref.kill()`"), life(2)]},
+        f"{AT} was ended by /app/b 2.0 s ago: it was killed by `ref.kill()`.",
+    ),
     "events left out": ({"suspects_gap": True}, "Events are left out at the moment, because there are too many."),
 }
 
@@ -231,6 +316,34 @@ def test_each_rule_is_met() -> None:
     for known, _ in CASES.values():
         met |= {name for name, rule in RULES.items() if rule(evidence(known))}
     assert met == set(RULES)
+
+
+LOST = [
+    told("ReplicaLost", number=1, replica="a", why="its process has ended (SIGKILL)"),
+    told("FailedOver", number=2, replica="b", epoch=2, why="its process has ended (SIGKILL)"),
+]
+JOINED = told("ReplicaJoined", number=3, at=995.0, replica="a")
+
+
+def test_a_replica_that_was_lost_is_told_of_also_when_it_is_back() -> None:
+    said = why(Evidence(AT, NOW, events=LOST, replica_states={"a": "joining", "b": "leads"}, epoch=2))
+    assert said == [
+        "Replica a was lost 10 s ago and is not back: its process has ended (SIGKILL).",
+        "Replica b took over 10 s ago, in epoch 2: its process has ended (SIGKILL).",
+        "It is not whole: a joining, b leads, epoch 2.",
+    ]
+    said = why(Evidence(AT, NOW, events=[*LOST, JOINED], replica_states={"a": "follows", "b": "leads"}, epoch=2))
+    assert said[0] == "Replica a was lost 10 s ago: its process has ended (SIGKILL)."
+    assert said[2] == "It is whole again, for a came back 5.0 s ago: a follows, b leads, epoch 2."
+
+
+def test_of_many_children_some_are_named() -> None:
+    said = why(Evidence(AT, NOW, children=[ChildNow(f"c{n}", "suspended") for n in range(9)]))
+    assert said == [*(f"Its child c{n} is suspended." for n in range(3)), "The same is true of 6 more."]
+    ended = {f"{AT}/c{n}": life(1, 900.0 + n, "killed", "Killed") for n in range(5)}
+    assert why(Evidence(AT, NOW, ended_below=ended))[-1] == "2 more of its children are not there."
+    below = [told("ChildRestarted", f"{AT}/c{n}", reason="SIGKILL", allowed=9) for n in range(5)]
+    assert "c2 once (SIGKILL), 2 others; it allows 9" in why(Evidence(AT, NOW, below=below))[0]
 
 
 def test_several_causes_are_told_together() -> None:

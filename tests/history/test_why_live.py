@@ -4,13 +4,28 @@ import asyncio
 import os
 import signal
 from collections.abc import AsyncIterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 import holdfast as hf
 from holdfast.actors.kernel import links
-from tests.history.players import Caller, Do, Fickle, Pass, Stubborn, Worker, failed, until
+from holdfast.system.history.evidence import Told, collect
+from holdfast.system.history.why import why
+from tests.history.players import (
+    Caller,
+    Do,
+    Fickle,
+    Killer,
+    Pass,
+    SlowStarter,
+    Strike,
+    Stubborn,
+    Worker,
+    failed,
+    until,
+)
 
 
 @pytest.fixture
@@ -26,6 +41,13 @@ def worker(name: str = "worker", **options: object) -> hf.ChildSpec[Worker]:
 
 async def said(system: hf.ActorSystem, target: hf.ActorRef[hf.Actor] | str) -> str:
     return " ".join(await system.why(target))
+
+
+def heard(system: hf.ActorSystem, target: hf.ActorRef[Any]) -> str:
+    """What `why` would say of the children, without a wait: for `until`."""
+    assert system._history is not None
+    overview = target._cell.actor._overview()  # type: ignore[union-attr]  # it is up
+    return " ".join(why(collect(system._node, system._history, target.path, Told(None, None, overview), [])))
 
 
 async def test_nobody_and_nothing(system: hf.ActorSystem) -> None:
@@ -147,6 +169,134 @@ async def test_a_supervisor_that_gives_up(system: hf.ActorSystem) -> None:
     assert "its child two had failed too often (ZeroDivisionError: nothing to divide)" in text
 
 
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_supervisor_tells_of_its_children(system: hf.ActorSystem, isolation: Any) -> None:
+    children = [worker("one"), worker("two", restart="temporary"), worker("three")]
+    spec = hf.supervisor("family", intensity=5, period=60.0, children=children, isolation=isolation)
+    family = await system.start(spec)
+    one, two, three = (system.ref(f"/app/family/{name}", Worker) for name in ("one", "two", "three"))
+    for _ in range(2):
+        await failed(one, "crash")
+    await failed(three, "crash")
+    await failed(two, "crash")
+    await three.ask(Do("well"))
+    text = await said(system, family)
+    assert "it restarted one 2 times (ZeroDivisionError: nothing to divide), three once (Zero" in text
+    assert "it allows 5 in 60 s, of which it has counted 3." in text
+    assert "Its child two ended " in text
+    assert "and is not there: ZeroDivisionError: nothing to divide." in text
+    assert "one ended" not in text
+
+
+async def test_a_supervisor_tells_who_made_it_give_up(system: hf.ActorSystem) -> None:
+    await system.start(hf.supervisor("family", intensity=1, children=[worker("one"), worker("two")]))
+    two = system.ref("/app/family/two", Worker)
+    for _ in range(2):
+        await failed(two, "crash")
+    await until(lambda: len(system.lives("/app/family")) > 1)
+    text = await said(system, "/app/family")
+    assert "/app/family gave up " in text
+    assert "its child two had failed too often (ZeroDivisionError: nothing to divide)" in text
+    assert "it restarted two once (ZeroDivisionError: nothing to divide)" in text
+
+
+async def test_a_supervisor_tells_who_starts_and_who_hangs_in_a_stop(system: hf.ActorSystem, tmp_path: Path) -> None:
+    family = await system.start(hf.supervisor("family", children=[worker("one", shutdown=30.0)]))
+    one, file = system.ref("/app/family/one", Worker), tmp_path / "up"
+    asked = one.ask(Do("wait"), 60.0)
+    slow = family.ask(hf.StartChild(hf.child("slow", hf.start(SlowStarter, str(file)))), 60.0)
+    await asyncio.sleep(1.1)  # A turn is long from one second on.
+    text = await said(system, family)
+    assert "Its child one does not get on: it has been in the turn of tests.history.players.Do for 1." in text
+    assert " at players.py:" in text
+    assert "await asyncio.sleep(60.0)" in text
+    assert "Its child slow is starting" in text
+    file.touch()
+    await slow
+    stopping = family.ask(hf.TerminateChild("one"), 60.0)
+    await until(lambda: "Its child one is being stopped: it has been in the turn of" in heard(system, family))
+    one.kill()
+    await stopping
+    with pytest.raises(hf.HoldfastError):
+        await asked
+
+
+async def test_a_supervisor_says_who_is_suspended_and_who_was_stopped(system: hf.ActorSystem) -> None:
+    family = await system.start(hf.supervisor("family", children=[worker("one"), worker("two")]))
+    await system.suspend(system.ref("/app/family/one"))
+    async with system.transaction() as change:
+        change.stop("/app/family/two")
+    text = await said(system, family)
+    assert "Its child one is suspended." in text
+    assert "Its child two ended " in text
+    assert "by a transaction of the program" in text
+
+
+@pytest.mark.parametrize("killed_in", ["task", "process"])
+@pytest.mark.parametrize("killer_in", ["task", "process"])
+async def test_whoever_kills_is_named(system: hf.ActorSystem, killer_in: Any, killed_in: Any) -> None:
+    ref = await system.start(worker(isolation=killed_in))
+    spec = hf.child("killer", hf.start(Killer), isolation=killer_in, bindings={"whom": ref.path})
+    killer = await system.start(spec)
+    killer.tell(Strike())
+    await until(lambda: len(system.lives(ref)) > 1)
+    assert (await said(system, ref)).startswith("/app/worker was ended by /app/killer ")
+    await ref.ask(Do("well"))
+    ref.kill()
+    await until(lambda: len(system.lives(ref)) > 2)
+    life = system.lives(ref)[1]
+    assert (life.by, life.because) == ("the program", "it was killed by `ref.kill()`")
+    await ref.ask(Do("well"))
+
+
+async def test_an_actor_that_is_terminated_at_once_does_not_end_its_turn(system: hf.ActorSystem) -> None:
+    ref = await system.start(worker(shutdown="infinity"))
+    asked = ref.ask(Do("wait"), 60.0)
+    await until(lambda: ref._cell.more is not None and ref._cell.more.turn is not None)
+    assert await system.terminate(ref, hf.KILLED) == hf.KILLED
+    with pytest.raises(hf.AskFailed):
+        await asked
+    await ref.ask(Do("well"))
+
+
+async def test_memory_that_is_nearly_used_up(system: hf.ActorSystem) -> None:
+    ref = await system.start(
+        worker(isolation="process", limits=hf.Limits(memory_bytes=10_000_000, watch_interval=60.0))
+    )
+    assert "MB of memory, and is ended at 10 MB" in await said(system, ref)
+
+
+async def test_the_turns_of_a_life(system: hf.ActorSystem) -> None:
+    recorded = await system.start(worker("recorded", recovery=hf.hybrid()))
+    plain, counted = await system.start(worker("plain")), await system.start(worker("counted"))
+    await system.statistics(counted, True)
+    for ref in (recorded, plain, counted):
+        for n in (3, 2):
+            for _ in range(n):
+                await ref.ask(Do("well"))
+            await failed(ref, "crash")
+        await ref.ask(Do("well"))
+    assert [life.turns for life in system.lives(recorded)] == [4, 3, 1]
+    assert [life.turns for life in system.lives(plain)] == [None, None, None]
+    assert [life.turns for life in system.lives(counted)] == [
+        None,
+        3,
+        1,
+    ]  # The first began before anybody counted.
+    assert {life.longest_message for life in system.lives(counted)} == {"tests.history.players.Do"}
+    assert all(life.longest_turn > 0.0 for life in system.lives(counted))
+
+
+async def test_the_longest_turn_is_known_when_turns_are_watched() -> None:
+    async with hf.ActorSystem("app", log=False, watch_turns=0.05) as system:
+        ref = await system.start(worker())
+        await ref.ask(Do("block"))
+        await until(lambda: system.lives(ref)[-1].longest_message)
+        life = system.lives(ref)[-1]
+        assert life.longest_message == "tests.history.players.Do"
+        assert life.longest_turn >= 0.05
+
+
 async def test_a_link(system: hf.ActorSystem) -> None:
     one = await system.start(worker("one"))
     two = await system.start(worker("two"))
@@ -224,5 +374,13 @@ async def test_replicas(system: hf.ActorSystem) -> None:
     os.kill(system.pid_of(ref), signal.SIGKILL)
     await ref.ask(Do("well"), 30.0)
     text = await said(system, ref)
-    assert " took over " in text
+    assert "Replica r1 was lost " in text
+    assert "Replica r2 took over " in text
+    assert ", in epoch 2: its process has ended (SIGKILL)." in text
+    assert "Of its child worker, a replica was lost " in await said(system, "/app")
+    await until(lambda: len([one for one in system.history(ref).events if one.kind == "ReplicaJoined"]) > 1, 30.0)
+    text = await said(system, ref)  # It is back, and what has happened is told all the same.
+    assert "Replica r1 was lost " in text
+    assert "It is whole again, for r1 came back " in text
+    assert text.endswith("r1 follows, r2 leads, epoch 2.")
     assert any(life.by == "failover" for life in system.lives(ref))

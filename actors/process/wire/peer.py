@@ -432,10 +432,10 @@ class RemoteHome(Home):
     def load(self, cell: Cell) -> int:
         return 0
 
-    def faulted(self, cell: Cell) -> None:
+    def faulted(self, cell: Cell, by: str) -> None:
         self.peer.require_granted(cell.path, "kill")
         connection = self.peer.connection
-        connection.send(frames.Command(connection.names.to_wire(cell.path), "faulted", {}))
+        connection.send(frames.Command(connection.names.to_wire(cell.path), "faulted", {"by": by}))
 
     def admit(self, cell: Cell, item: Any) -> None:
         """Stands in `cell.admit` of the stand-ins."""
@@ -520,7 +520,8 @@ def obey(node: Node, cell: Cell, name: str, frame: frames.Command, *, by_root: b
         case "kill":
             cell.kill()
         case "faulted":
-            cell.host.home.faulted(cell)
+            by = data.get("by")
+            cell.host.home.faulted(cell, by if isinstance(by, str) else "")
         case "exit":
             source, reason = named(node, frame, "source"), unpack_exit(data.get("reason"))
             known = cell.more.ties.links.get(source) if cell.more is not None else None

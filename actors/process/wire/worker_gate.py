@@ -402,6 +402,8 @@ def _order(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     gate.require_granted(to, repr(frame.verb))
     if frame.verb == "stop":
         unpack_exit(frame.data.get("reason"))
+    if frame.verb == "faulted" and (by := text(frame, "by")):
+        gate.require_own(by, "a kill in the name")
 
 
 def _tie(key: str, *, both: bool) -> Callable[[WorkerGate, str, frames.Command], None]:

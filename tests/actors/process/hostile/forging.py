@@ -95,6 +95,8 @@ BREACHES: dict[str, Callable[[], bytes]] = {
     "kill another": lambda: command(VICTIM, "kill"),
     "stop another": lambda: command(VICTIM, "stop", reason=NORMAL),
     "kill the supervisor": lambda: command(SUP, "kill"),
+    "a kill in the name of another": lambda: command(EVIL, "faulted", by=OTHER),
+    "a kill in no name": lambda: command(EVIL, "faulted"),
     "kill the root": lambda: command("/app", "kill"),
     "start a child": lambda: tell([], START_CHILD, SUP),
     "ask to terminate a child": lambda: frame(f.Ask(1, SUP, TERMINATE, raw(["victim"]), 1e18)),

@@ -53,6 +53,13 @@ CHECKS = {
         "tests/actors/process/hostile/test_hostile.py",
         "test_a_signal_that_says_it_was_carried",
     ),
+    "a process kills in the name of its own actors": Check(
+        GATE,
+        '        gate.require_own(by, "a kill in the name")\n',
+        "        pass\n",
+        "tests/actors/process/hostile/test_hostile.py",
+        "test_a_breach_ends_the_worker_and_nobody_else",
+    ),
     "a life's bindings, too": Check(
         GATE,
         '    gate.claims(frame.data.get("bindings", {}))\n',
