@@ -9,11 +9,12 @@ from __future__ import annotations
 import asyncio
 import contextvars
 import functools
+import math
 import random
 import types
 from collections.abc import Callable
 from contextvars import Token
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from opentelemetry import context as otel
 from opentelemetry import trace
@@ -35,6 +36,7 @@ from ..kernel.context import Piped
 from ..kernel.envelope import Ask, Envelope, Item, chain_of
 from ..kernel.ref import current
 from ..kernel.timers import Tick
+from .late_spans import LateSpan, LateSpans
 from .trace_tail import TracedEnvelope, follow, tail_of, with_tail
 
 if TYPE_CHECKING:
@@ -50,7 +52,6 @@ PACKAGE = f"{__name__.partition('.')[0]}."
 MOST_LAST = 1000
 """Addresses of which it is known what was asked there last."""
 _BAGGAGE = W3CBaggagePropagator()
-_random = random.random
 
 
 class _Current(NamedTuple):
@@ -92,7 +93,8 @@ class Spans:
         self.share = share
         self._base = node.base_context.run(otel.get_current)  # of whoever entered the system: of no turn
         self.sink: Callable[[Event], None] = lambda event: None  # who makes spans of events, if anybody does
-        self.last: dict[str, SpanContext] = {}  # by address: the last turn there that is in a trace
+        self.last: dict[str, Span] = {}  # by address: of the last turn there that is in a trace
+        self.late = LateSpans(node.loop, report)
 
     def around(self, ctx: ActorContext | None) -> otel.Context | None:
         """In which context of OpenTelemetry a message is sent that belongs to a trace; None if it does to none.
@@ -124,23 +126,24 @@ class Spans:
 
     def remember(self, address: str, span: Span) -> None:
         """A turn there is in a trace: what happens to the actor next may have to do with it."""
-        self.last[address] = span.get_span_context()
+        self.last[address] = span
         if len(self.last) > MOST_LAST:
             self.last.pop(next(iter(self.last)))
 
-    def begin(self, verb: str, kind: SpanKind, cell: Cell, message: str, parent: otel.Context) -> Span:
-        """A span about one message, of which the type is given, to one address."""
+    def begin(
+        self, verb: str, kind: SpanKind, cell: Cell, message: str, parent: otel.Context, begun: int | None = None
+    ) -> Span:
+        """A span about one message, of which the type is given, to one address; it began then, or begins now."""
         try:
-            return self.tracer.start_span(_title(verb, message), parent, kind, {ADDRESS: cell.path})
+            return self.tracer.start_span(_title(verb, message), parent, kind, {ADDRESS: cell.path}, start_time=begun)
         except Exception as error:
             report(error)
             return trace.INVALID_SPAN
 
     def tail(self, at: SpanContext, around: otel.Context) -> str:
         """What goes along with a message whose parent is this span."""
-        written = f"00-{at.trace_id:032x}-{at.span_id:016x}-01" if _is_sampled(at) else NO_TRACE
         held = _held(around) if self.baggage else ""
-        return f"{written} {held}" if held else written
+        return f"{_written(at)} {held}" if held else _written(at)
 
     def ask(self, ask: Ask, around: otel.Context) -> None:
         """An ask is about to be made: give it its trace, and perhaps a span up to its outcome."""
@@ -164,8 +167,11 @@ class Spans:
             around = self.around(None if item.sender is None else current.get(None))
             if around is not None:
                 self.ask(item, around)
+            elif tail_of(item.chain) == BEGIN:
+                item.chain = with_tail(item.chain, NO_TRACE)  # The trace of the turn that asks has begun.
             return item
         if kind is not Envelope and isinstance(item, Item):
+            goes_on(item)
             return item
         message, sender = (item.message, item.sender) if kind is Envelope else (item, None)
         around = self.around(current.get(None))
@@ -189,10 +195,10 @@ class Spans:
         What comes again and again does not, for that trace would have no end.
         """
         here = otel.get_current()  # It was kept with the timer, and with the task.
-        goes_on = not (isinstance(item, Tick) and item.timer.is_repeated)
+        is_once = not (isinstance(item, Tick) and item.timer.is_repeated)
         if item.message is None:
             return
-        if goes_on and here is not self._base and self._decides(here):
+        if is_once and here is not self._base and self._decides(here):
             around = self._continued(here)
         else:
             around = self._begun()
@@ -204,10 +210,14 @@ class Spans:
     def methods(self) -> dict[str, Callable[..., Any]]:
         """What is put before the methods of the node's cells."""
         outgoing, ask, share = self.outgoing, self.ask, self.share
+        left = _next_one(share)
 
         def take_in(cell: Cell, _: Cell, item: Any) -> None:
+            nonlocal left
             if type(item) is Ask and item.sender is None and not _here():  # From outside of any trace: the hot path.
-                if _random() < share:
+                left -= 1
+                if left <= 0:
+                    left = _next_one(share)
                     ask(item, otel.Context())
                 cell.admit(cell, item)
             else:
@@ -226,6 +236,28 @@ class Spans:
 
 BEGIN, NO_TRACE = "+", "-"
 """Stand for the trace of a message: its turn begins one; there is only baggage."""
+
+
+def _next_one(share: float) -> float:
+    """How many messages on the next one is that begins a trace, if each of them does with this probability.
+
+    One number is drawn for all of them: those in between cost a subtraction.
+    """
+    if share <= 0.0:
+        return math.inf
+    return 1 if share >= 1.0 else int(math.log(1.0 - random.random()) / math.log1p(-share)) + 1
+
+
+def _written(at: SpanContext) -> str:
+    """A span, as W3C Trace Context writes it."""
+    return f"00-{at.trace_id:032x}-{at.span_id:016x}-01" if _is_sampled(at) else NO_TRACE
+
+
+def goes_on(item: Item) -> None:
+    """Have what handles an item next, which leaves its turn, go on with the trace that this turn has begun."""
+    if tail_of(item.chain) == BEGIN:
+        at = trace.get_current_span().get_span_context()
+        cast("Any", item).chain = with_tail(item.chain, _written(at))
 
 
 @functools.lru_cache(4096)
@@ -286,7 +318,10 @@ def trace_node(node: Node, tracer: Tracer, share: float, *, baggage: bool) -> Sp
 
 
 def leave_node(node: Node) -> None:
-    """Make no more spans of what a node sends and runs."""
+    """Make no more spans of what a node sends and runs, but for those that wait to be made."""
+    spans = spans_of(node)
+    if spans is not None:
+        spans.late.flush()
     node.cell_kinds.take_out()
 
 
@@ -318,18 +353,18 @@ def in_span(run: Callable[[Any, Any], object], actor: Any, item: Any) -> object:
     if spans is None:
         spans = trace_node(node, trace.get_tracer(NAME), 0.0, baggage=True)
     around = context_of(tail)
-    span = None
+    span: Span | None = None
     if not tail.startswith(NO_TRACE):
-        kind = SpanKind.SERVER if item.is_ask else SpanKind.CONSUMER
-        span = spans.begin("handle", kind, cell, item.brings(), around)
+        kind, brings = SpanKind.SERVER if item.is_ask else SpanKind.CONSUMER, item.brings()
+        if tail == BEGIN:
+            span = LateSpan(functools.partial(spans.begin, "handle", kind, cell, brings, around))
+        else:
+            span = spans.begin("handle", kind, cell, brings, around)
         spans.remember(cell.path, span)
         around = trace.set_span_in_context(span, around)
-        if tail == BEGIN or ctx._may_rest:  # What comes of this turn goes on with it, and so does a forwarded ask.
-            tail = spans.tail(span.get_span_context(), around)
-            item.chain = with_tail(item.chain, tail)
     if ctx._may_rest:
-        ctx._continue_trace(tail)
-    turn = _Turn(ctx, span, _attach(around))
+        ctx._continue_trace(tail if span is None else spans.tail(span.get_span_context(), around))
+    turn = _Turn(ctx, spans, span, _attach(around))
     try:
         result = run(actor, item)
     except BaseException as error:
@@ -345,6 +380,7 @@ class _Turn(NamedTuple):
     """A turn that is in a trace."""
 
     ctx: ActorContext
+    spans: Spans
     span: Span | None
     token: Token[otel.Context]
 
@@ -372,6 +408,8 @@ class _Turn(NamedTuple):
                 span.record_exception(error)
             span.set_status(Status(StatusCode.ERROR, type(error).__name__))
         end(span)
+        if isinstance(span, LateSpan) and not span.is_made:
+            self.spans.late.add(span)
 
 
 def _outcome(span: Span, done: Any) -> None:

@@ -194,7 +194,7 @@ class ActorContext:
             cell: Cell = to._cell
             cell.require(item.message)
             self._cell.item = Stashed.of(item)
-            cell.admit(cell, item)
+            cell.take_in(cell, item)
         elif isinstance(item, Envelope):
             to._cell.take_in(to._cell, Envelope(item.message, item.sender))
         else:

@@ -4,6 +4,7 @@ import asyncio
 import inspect
 import math
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ from opentelemetry.sdk.trace.sampling import ALWAYS_OFF
 from opentelemetry.trace import SpanKind, StatusCode, Tracer
 
 import holdfast as hf
-from holdfast.actors.control.trace_tail import tail_of
+from holdfast.actors.control.late_spans import LATEST, MOST
 from holdfast.actors.kernel.cell import Cell
 from holdfast.actors.kernel.context import ActorContext
 from holdfast.actors.kernel.ref import ActorRef
@@ -42,6 +43,7 @@ from tests.telemetry.traced_shop import (
     Piped,
     Published,
     Sent,
+    Stasher,
     Stored,
     Through,
     TooLate,
@@ -376,11 +378,45 @@ async def test_whoever_waits_for_a_turn_has_decided(traced: Traced) -> None:
 async def test_a_trace_is_begun_once(traced: Traced) -> None:
     off = TracerProvider(sampler=ALWAYS_OFF).get_tracer("off")
     async with hf.ActorSystem("app", log=False) as system:
-        alice = await system.start(hf.child("alice", hf.start(Clerk), isolation="process"))
+        alice = await system.start(hf.child("alice", hf.start(Clerk)))
         dave = await system.start(hf.child("dave", hf.start(Through), bindings={"next_one": alice.path}))
         system.trace_with(off, one_in=1)  # The turn of dave begins a trace, which is not sampled.
         assert await dave.ask(Pass()) == "none"
-        assert tail_of(dave._cell.item.chain) == "-"
+
+
+async def test_a_span_that_nobody_looks_at_is_made_later(traced: Traced) -> None:
+    """After a while, or when many wait, or when the system is traced no more: with the times of its turn."""
+    async with hf.ActorSystem("app", log=False) as system:
+        alice = await system.start(hf.child("alice", hf.start(Clerk)))
+        system.trace_with(traced.tracer, one_in=1)
+        before = time.time_ns()
+        await alice.ask(Count())
+        after = time.time_ns()
+        assert traced.spans() == []
+        await asyncio.sleep(2 * LATEST)
+        made = traced.one("handle Count")
+        assert made.start_time is not None
+        assert made.end_time is not None
+        assert before <= made.start_time <= made.end_time <= after
+        assert made.parent is None
+        for _ in range(MOST):
+            await alice.ask(Count())
+        assert len(traced.spans("handle Count")) == 1 + MOST
+        await alice.ask(Count())
+        system.trace_with(None)
+        assert len(traced.spans("handle Count")) == 2 + MOST
+        system.trace_with(traced.tracer, one_in=1)
+        await alice.ask(Count())
+    assert len(traced.spans("handle Count")) == 3 + MOST
+
+
+async def test_a_stashed_ask_goes_on_in_its_trace(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        keeper = await system.start(hf.child("keeper", hf.start(Stasher)))
+        system.trace_with(traced.tracer, one_in=1)
+        assert await keeper.ask(Pass()) == "again"
+    first, second = sorted(traced.spans("handle Pass"), key=lambda one: one.start_time or 0)
+    assert parent_of(second) == id_of(first)
 
 
 async def test_a_forwarded_ask_goes_on_in_its_trace(traced: Traced) -> None:

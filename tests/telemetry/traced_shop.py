@@ -185,6 +185,22 @@ class Stored(Clerk):
         return "here"
 
 
+class Stasher(hf.Actor):
+    """Puts the first message aside, and answers it when it comes again."""
+
+    def __init__(self) -> None:
+        self.has_stashed = False
+
+    @hf.on(Pass)
+    def passed(self, message: Pass) -> str:
+        if self.has_stashed:
+            return "again"
+        self.has_stashed = True
+        self.ctx.stash()
+        self.ctx.unstash()
+        return ""
+
+
 class Through(hf.Actor):
     """Hands on what it is asked."""
 
