@@ -335,6 +335,7 @@ async def test_a_system_beside_a_traced_one_is_not_traced(traced: Traced) -> Non
         with traced.tracer.start_as_current_span("request"):
             alice.tell(Note())
             assert await alice.ask(Noted()) == ["none"]
+    assert [one.name for one in traced.spans()] == ["request"]
 
 
 async def test_statistics_count_what_a_traced_turn_tells(traced: Traced) -> None:
@@ -378,10 +379,11 @@ async def test_whoever_waits_for_a_turn_has_decided(traced: Traced) -> None:
 async def test_a_trace_is_begun_once(traced: Traced) -> None:
     off = TracerProvider(sampler=ALWAYS_OFF).get_tracer("off")
     async with hf.ActorSystem("app", log=False) as system:
-        alice = await system.start(hf.child("alice", hf.start(Clerk)))
+        alice = await system.start(hf.child("alice", hf.start(Clerk, provides=True), isolation="process"))
         dave = await system.start(hf.child("dave", hf.start(Through), bindings={"next_one": alice.path}))
         system.trace_with(off, one_in=1)  # The turn of dave begins a trace, which is not sampled.
         assert await dave.ask(Pass()) == "none"
+        assert await alice.ask(Made()) == []
 
 
 async def test_a_span_that_nobody_looks_at_is_made_later(traced: Traced) -> None:
@@ -670,6 +672,7 @@ async def test_a_tracer_that_raises_hurts_no_actor(where: str) -> None:
         kept = await system.start(hf.child("kept", hf.start(Clerk), isolation="process", recovery=hf.hybrid()))
         system.trace_with(provider.get_tracer("test"), one_in=1)
         with system.events() as events:
+            assert await one.ask(Where(), timeout=30.0)  # It looks at its span, which is made at once.
             for ref in (one, kept):
                 assert await ref.ask(Count(), timeout=30.0) == 1
                 ref.kill()
