@@ -34,7 +34,7 @@ SINCE_THEN = "since then"
 
 
 class Out(msgspec.Struct, array_like=True, gc=False):
-    """One output of a turn; `k` counts them in program order from 1."""
+    """One output of a turn; `k` counts them in program order from 1. `trace` is that of its turn, and no part of it."""
 
     k: int
     verb: str
@@ -43,6 +43,7 @@ class Out(msgspec.Struct, array_like=True, gc=False):
     body: bytes = b""
     seconds: float = 0.0
     interval: float = 0.0
+    trace: str = ""
 
     def digest(self) -> int:
         """A checksum by which a replayed output is compared with the one released before."""

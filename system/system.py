@@ -18,7 +18,6 @@ from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.address_host import AddressHost
 from ..actors.kernel.cell import GONE, Cell, Host
-from ..actors.kernel.deadlines import Deadlines
 from ..actors.kernel.lifecycle import LOCAL, NEAR
 from ..actors.kernel.mailbox import Bounded
 from ..actors.kernel.message import Message
@@ -301,7 +300,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         while node.remains:
             await asyncio.wait(set(node.remains))
         self._watch.close()
-        if type(node.deadlines) is not Deadlines:
+        if node.cell_kinds.watcher is not None:
             self.trace_with(None)
         await self._workers.close()
         await node.close()

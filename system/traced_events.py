@@ -74,7 +74,7 @@ def _ago(seconds: float) -> int:
 
 def _begin(spans: Spans, name: str, event: Event, begun: int, below: otel.Context | None = None) -> Span:
     last = spans.last.get(event.address) if below is None else None
-    links = () if last is None else (Link(last),)
+    links = () if last is None else (Link(last.get_span_context()),)
     about = {"holdfast.address": event.address} if below is None else {}
     try:
         return spans.tracer.start_span(name, below or otel.Context(), attributes=about, links=links, start_time=begun)

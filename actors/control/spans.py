@@ -1,7 +1,7 @@
 """Spans of asks, tells and turns, in the traces of OpenTelemetry. Imported only when somebody wants them.
 
-Nothing is tested for while nobody does: asks get their deadlines from an object of another class, refs have other
-methods, and what stands in a mailbox has another `run`, for as long as a system is traced.
+Nothing is tested for while nobody does: what is sent passes other methods of the cells of its node, and what stands in
+a mailbox has another `run`, for as long as a system is traced. Other nodes of the process have other classes of cells.
 """
 
 from __future__ import annotations
@@ -9,11 +9,12 @@ from __future__ import annotations
 import asyncio
 import contextvars
 import functools
+import math
 import random
 import types
 from collections.abc import Callable
 from contextvars import Token
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from opentelemetry import context as otel
 from opentelemetry import trace
@@ -30,16 +31,16 @@ from opentelemetry.trace import (
 )
 
 from ..errors import type_name
-from ..kernel.deadlines import Deadlines
-from ..kernel.envelope import Ask, chain_of
-from ..kernel.message import Message
-from ..kernel.ref import ActorRef, current
+from ..kernel.cell import Cell
+from ..kernel.context import Piped
+from ..kernel.envelope import Ask, Envelope, Item, chain_of
+from ..kernel.ref import current
+from ..kernel.timers import Tick
+from .late_spans import LateSpan, LateSpans
 from .trace_tail import TracedEnvelope, follow, tail_of, with_tail
-from .tracing import TappedContext, tap_of
 
 if TYPE_CHECKING:
     from ..events import Event
-    from ..kernel.cell import Cell
     from ..kernel.context import ActorContext
     from ..kernel.node import Node
 
@@ -51,7 +52,6 @@ PACKAGE = f"{__name__.partition('.')[0]}."
 MOST_LAST = 1000
 """Addresses of which it is known what was asked there last."""
 _BAGGAGE = W3CBaggagePropagator()
-_add, _random = Deadlines.add, random.random
 
 
 class _Current(NamedTuple):
@@ -93,7 +93,8 @@ class Spans:
         self.share = share
         self._base = node.base_context.run(otel.get_current)  # of whoever entered the system: of no turn
         self.sink: Callable[[Event], None] = lambda event: None  # who makes spans of events, if anybody does
-        self.last: dict[str, SpanContext] = {}  # by address: the last turn there that is in a trace
+        self.last: dict[str, Span] = {}  # by address: of the last turn there that is in a trace
+        self.late = LateSpans(node.loop, report)
 
     def around(self, ctx: ActorContext | None) -> otel.Context | None:
         """In which context of OpenTelemetry a message is sent that belongs to a trace; None if it does to none.
@@ -102,38 +103,50 @@ class Spans:
             ctx: of the actor that sends it; None if none does.
         """
         here = otel.get_current()
-        if here and (ctx is None or here is not self._base):
-            found = trace.get_current_span(here).get_span_context()
-            if found.is_valid or (self.baggage and _held(here)):
-                return here if _is_sampled(found) or (self.baggage and _held(here)) else None
+        if (ctx is None or here is not self._base) and self._decides(here):
+            return self._continued(here)
         if ctx is not None and chain_of(ctx._item):
             return None  # Whoever waits for this turn has decided.
+        return self._begun()
+
+    def _decides(self, here: otel.Context) -> bool:
+        """Whether a context of OpenTelemetry says of what is sent in it whether it is in a trace."""
+        if not here:
+            return False
+        return trace.get_current_span(here).get_span_context().is_valid or (self.baggage and bool(_held(here)))
+
+    def _continued(self, here: otel.Context) -> otel.Context | None:
+        """That context, if there is something in it that has to go along."""
+        sampled = _is_sampled(trace.get_current_span(here).get_span_context())
+        return here if sampled or (self.baggage and _held(here)) else None
+
+    def _begun(self) -> otel.Context | None:
+        """An empty context, if a trace begins with what is sent."""
         return otel.Context() if random.random() < self.share else None
 
     def remember(self, address: str, span: Span) -> None:
         """A turn there is in a trace: what happens to the actor next may have to do with it."""
-        self.last[address] = span.get_span_context()
+        self.last[address] = span
         if len(self.last) > MOST_LAST:
             self.last.pop(next(iter(self.last)))
 
-    def begin(self, verb: str, kind: SpanKind, cell: Cell, message: str, parent: otel.Context) -> Span:
-        """A span about one message, of which the type is given, to one address."""
+    def begin(
+        self, verb: str, kind: SpanKind, cell: Cell, message: str, parent: otel.Context, begun: int | None = None
+    ) -> Span:
+        """A span about one message, of which the type is given, to one address; it began then, or begins now."""
         try:
-            return self.tracer.start_span(_title(verb, message), parent, kind, {ADDRESS: cell.path})
+            return self.tracer.start_span(_title(verb, message), parent, kind, {ADDRESS: cell.path}, start_time=begun)
         except Exception as error:
             report(error)
             return trace.INVALID_SPAN
 
     def tail(self, at: SpanContext, around: otel.Context) -> str:
         """What goes along with a message whose parent is this span."""
-        written = f"00-{at.trace_id:032x}-{at.span_id:016x}-01" if _is_sampled(at) else NO_TRACE
         held = _held(around) if self.baggage else ""
-        return f"{written} {held}" if held else written
+        return f"{_written(at)} {held}" if held else _written(at)
 
     def ask(self, ask: Ask, around: otel.Context) -> None:
         """An ask is about to be made: give it its trace, and perhaps a span up to its outcome."""
-        if type(ask) is not Ask:  # It is handed on for a recorded turn, and has the trace of that turn's asker.
-            return
         if not around and _is_ours(ask.message):
             return
         if not around and _runs_here(ask.to):
@@ -147,10 +160,23 @@ class Spans:
         ask.chain = with_tail(ask.chain, tail) if ask.chain else ((tail, 0),)
         follow(ask)
 
-    def tell(self, cell: Cell, message: Message[Any], ctx: ActorContext | None, around: otel.Context) -> None:
-        """Tell a message that belongs to a trace, or begins one."""
-        if ctx is not None:
-            ctx._alive()
+    def outgoing(self, cell: Cell, item: Any) -> Any:
+        """What is sent in place of an ask, a message or an envelope: one that has its trace, if it belongs to one."""
+        kind = type(item)
+        if kind is Ask:
+            around = self.around(None if item.sender is None else current.get(None))
+            if around is not None:
+                self.ask(item, around)
+            elif tail_of(item.chain) == BEGIN:
+                item.chain = with_tail(item.chain, NO_TRACE)  # The trace of the turn that asks has begun.
+            return item
+        if kind is not Envelope and isinstance(item, Item):
+            goes_on(item)
+            return item
+        message, sender = (item.message, item.sender) if kind is Envelope else (item, None)
+        around = self.around(current.get(None))
+        if around is None or (not around and _is_ours(message)):
+            return item
         if type(message) not in cell.table:
             cell.require(message)
         if around:
@@ -161,14 +187,77 @@ class Spans:
             span = self.begin("tell", SpanKind.PRODUCER, cell, type_name(type(message)), around)
             end(span)
             tail = self.tail(span.get_span_context(), around)
-        sender = None if ctx is None else ctx._cell
-        cell.admit(cell, TracedEnvelope(message, sender, ((tail, 0),)))
-        if ctx is not None and isinstance(ctx, TappedContext):
-            tap_of(ctx._cell).sent(cell.path, message)
+        return TracedEnvelope(message, sender, ((tail, 0),))
+
+    def coming_back(self, item: Tick | Piped) -> None:
+        """An actor's own timer or background work brings a message: it goes on in the trace of the turn that began it.
+
+        What comes again and again does not, for that trace would have no end.
+        """
+        here = otel.get_current()  # It was kept with the timer, and with the task.
+        is_once = not (isinstance(item, Tick) and item.timer.is_repeated)
+        if item.message is None:
+            return
+        if is_once and here is not self._base and self._decides(here):
+            around = self._continued(here)
+        else:
+            around = self._begun()
+        if around is not None and (around or not _is_ours(item.message)):
+            at = trace.get_current_span(around).get_span_context()
+            item.chain = ((self.tail(at, around) if around else BEGIN, 0),)
+            follow(item)
+
+    def methods(self) -> dict[str, Callable[..., Any]]:
+        """What is put before the methods of the node's cells."""
+        outgoing, ask, share = self.outgoing, self.ask, self.share
+        left = _next_one(share)
+
+        def take_in(cell: Cell, _: Cell, item: Any) -> None:
+            nonlocal left
+            if type(item) is Ask and item.sender is None and not _here():  # From outside of any trace: the hot path.
+                left -= 1
+                if left <= 0:
+                    left = _next_one(share)
+                    ask(item, otel.Context())
+                cell.admit(cell, item)
+            else:
+                cell.admit(cell, outgoing(cell, item))
+
+        def push(cell: Cell, item: Item) -> None:
+            if isinstance(item, Tick | Piped):
+                self.coming_back(item)
+            Cell.push(cell, item)
+
+        def sent(cell: Cell, item: Any) -> Any:
+            return outgoing(cell, item)
+
+        return {"take_in": take_in, "push": push, "outgoing": sent}
 
 
 BEGIN, NO_TRACE = "+", "-"
 """Stand for the trace of a message: its turn begins one; there is only baggage."""
+
+
+def _next_one(share: float) -> float:
+    """How many messages on the next one is that begins a trace, if each of them does with this probability.
+
+    One number is drawn for all of them: those in between cost a subtraction.
+    """
+    if share <= 0.0:
+        return math.inf
+    return 1 if share >= 1.0 else int(math.log(1.0 - random.random()) / math.log1p(-share)) + 1
+
+
+def _written(at: SpanContext) -> str:
+    """A span, as W3C Trace Context writes it."""
+    return f"00-{at.trace_id:032x}-{at.span_id:016x}-01" if _is_sampled(at) else NO_TRACE
+
+
+def goes_on(item: Item) -> None:
+    """Have what handles an item next, which leaves its turn, go on with the trace that this turn has begun."""
+    if tail_of(item.chain) == BEGIN:
+        at = trace.get_current_span().get_span_context()
+        cast("Any", item).chain = with_tail(item.chain, _written(at))
 
 
 @functools.lru_cache(4096)
@@ -215,87 +304,25 @@ def context_of(tail: str) -> otel.Context:
     return _BAGGAGE.extract({BAGGAGE: held}, found) if held else found
 
 
-class TracedDeadlines(Deadlines):
-    """What every ask comes to, while the node is traced."""
-
-    spans: Spans
-
-    def add(self, ask: Ask) -> None:
-        """Set its deadline, and begin its span if it belongs to a trace."""
-        _add(self, ask)
-        spans, here = self.spans, _here()
-        if not here and ask.sender is None:  # From outside of any trace: the hot path.
-            if _random() >= spans.share:
-                return
-            spans.ask(ask, here)
-            return
-        around = spans.around(None if ask.sender is None else current.get(None))
-        if around is not None:
-            spans.ask(ask, around)
-
-    def close(self) -> list[Ask]:
-        """Forget all timers; whoever ends so is traced no more, however it ends."""
-        left = Deadlines.close(self)
-        self._leave()
-        return left
-
-    def _leave(self) -> None:
-        del self.spans
-        cast("Any", self).__class__ = Deadlines
-        TracedSends.take_out()
-
-
-class TracedSends:
-    """The methods that refs have while any node of this process is traced."""
-
-    nodes: ClassVar[int] = 0
-    tell_plainly: ClassVar[Callable[[ActorRef[Any], Message[Any]], None]] = ActorRef.tell
-
-    @classmethod
-    def put_in(cls) -> None:
-        """One more node is traced."""
-        cls.nodes += 1
-        cast("Any", ActorRef).tell = _tell
-
-    @classmethod
-    def take_out(cls) -> None:
-        """One node less is traced; behind the last one nobody pays."""
-        cls.nodes -= 1
-        if not cls.nodes:
-            cast("Any", ActorRef).tell = cls.tell_plainly
-
-
-def _tell(ref: ActorRef[Any], message: Message[Any]) -> None:
-    """Tell as `ActorRef.tell` does, with the trace of whoever tells."""
-    ctx, cell = current.get(None), ref._cell
-    spans = spans_of(cell.node)
-    around = None if spans is None or (ctx is not None and ctx._may_rest) else spans.around(ctx)
-    if spans is None or around is None or (not around and _is_ours(message)):
-        TracedSends.tell_plainly(ref, message)
-    else:
-        spans.tell(cell, message, ctx, around)
-
-
 def spans_of(node: Node) -> Spans | None:
     """What makes the spans of a node; None if nobody traces it."""
-    deadlines = node.deadlines
-    return deadlines.spans if isinstance(deadlines, TracedDeadlines) else None
+    watcher = node.cell_kinds.watcher
+    return watcher if isinstance(watcher, Spans) else None
 
 
 def trace_node(node: Node, tracer: Tracer, share: float, *, baggage: bool) -> Spans:
     """Trace a node from now on, by this tracer."""
-    deadlines: Any = node.deadlines
-    if not isinstance(deadlines, TracedDeadlines):
-        deadlines.__class__ = TracedDeadlines
-        TracedSends.put_in()
-    spans = deadlines.spans = Spans(node, tracer, share, baggage=baggage)
+    spans = Spans(node, tracer, share, baggage=baggage)
+    node.cell_kinds.put_in(spans, spans.methods())
     return spans
 
 
 def leave_node(node: Node) -> None:
-    """Make no more spans of what a node sends and runs."""
-    if isinstance(node.deadlines, TracedDeadlines):
-        node.deadlines._leave()
+    """Make no more spans of what a node sends and runs, but for those that wait to be made."""
+    spans = spans_of(node)
+    if spans is not None:
+        spans.late.flush()
+    node.cell_kinds.take_out()
 
 
 # -- a turn -----------------------------------------------------------------------------------------------------------
@@ -317,54 +344,72 @@ def report(error: Exception) -> None:
 
 def in_span(run: Callable[[Any, Any], object], actor: Any, item: Any) -> object:
     """Run the turn of an item whose chain ends with a trace: it is a span, and so is current in the handler."""
-    cell: Cell = actor.ctx._cell
+    ctx: ActorContext = actor.ctx
+    cell = ctx._cell
     tail, node = tail_of(item.chain), cell.node
     spans = spans_of(node)
+    if item.is_cancelled or (spans is None and node.ports.uplink is None):
+        return run(actor, item)  # There is nothing to do, or nobody traces any more what was sent in a trace.
     if spans is None:
-        if node.ports.uplink is None:
-            return run(actor, item)  # It was traced when this was sent.
         spans = trace_node(node, trace.get_tracer(NAME), 0.0, baggage=True)
     around = context_of(tail)
-    span = None
+    span: Span | None = None
     if not tail.startswith(NO_TRACE):
-        kind = SpanKind.SERVER if item.is_ask else SpanKind.CONSUMER
-        span = spans.begin("handle", kind, cell, item.brings(), around)
+        kind, brings = SpanKind.SERVER if item.is_ask else SpanKind.CONSUMER, item.brings()
+        if tail == BEGIN:
+            span = LateSpan(functools.partial(spans.begin, "handle", kind, cell, brings, around))
+        else:
+            span = spans.begin("handle", kind, cell, brings, around)
         spans.remember(cell.path, span)
         around = trace.set_span_in_context(span, around)
-        if tail == BEGIN:  # It has begun: what comes of this turn, and whoever the ask is forwarded to, go on with it.
-            item.chain = (*item.chain[:-1], (spans.tail(span.get_span_context(), around), 0))
-    token = _attach(around)
+    if ctx._may_rest:
+        ctx._continue_trace(tail if span is None else spans.tail(span.get_span_context(), around))
+    turn = _Turn(ctx, spans, span, _attach(around))
     try:
         result = run(actor, item)
     except BaseException as error:
-        _over(span, token, error)
+        turn.over(error)
         raise
     if type(result) is Coroutine_:
-        return _followed(result, span, token)
-    _over(span, token, None)
+        return turn.followed(result)
+    turn.over(None)
     return result
 
 
-async def _followed(turn: Any, span: Span | None, token: Token[otel.Context]) -> object:
-    try:
-        result = await turn
-    except BaseException as error:
-        _over(span, token, error)
-        raise
-    _over(span, token, None)
-    return result
+class _Turn(NamedTuple):
+    """A turn that is in a trace."""
 
+    ctx: ActorContext
+    spans: Spans
+    span: Span | None
+    token: Token[otel.Context]
 
-def _over(span: Span | None, token: Token[otel.Context], error: BaseException | None) -> None:
-    if not isinstance(error, GeneratorExit):  # Else the life is over, and its context with it.
-        _detach(token)
-    if span is None:
-        return
-    if error is not None:
-        if isinstance(error, Exception):
-            span.record_exception(error)
-        span.set_status(Status(StatusCode.ERROR, type(error).__name__))
-    end(span)
+    async def followed(self, turn: Any) -> object:
+        """Await the rest of the turn."""
+        try:
+            result = await turn
+        except BaseException as error:
+            self.over(error)
+            raise
+        self.over(None)
+        return result
+
+    def over(self, error: BaseException | None) -> None:
+        """The turn has ended: by this error, if there is one."""
+        if not isinstance(error, GeneratorExit):  # Else the life is over, and its context with it.
+            _detach(self.token)
+        if self.ctx._may_rest:
+            self.ctx._continue_trace("")
+        span = self.span
+        if span is None:
+            return
+        if error is not None:
+            if isinstance(error, Exception):
+                span.record_exception(error)
+            span.set_status(Status(StatusCode.ERROR, type(error).__name__))
+        end(span)
+        if isinstance(span, LateSpan) and not span.is_made:
+            self.spans.late.add(span)
 
 
 def _outcome(span: Span, done: Any) -> None:

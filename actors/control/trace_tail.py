@@ -33,16 +33,27 @@ def with_tail(chain: Chain, tail: str) -> Chain:
 class TracedEnvelope(Envelope, eq=False):
     """A message that nobody waits for, and that belongs to a trace."""
 
+    is_followed = True
     chain: Chain = ()
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         return _in_span()(Envelope.run, actor, item)
 
+    def stashed(self) -> None:
+        _goes_on()(self)
+
+
+def enveloped(message: Any, sender: Any, chain: Chain) -> Any:
+    """What stands in a mailbox for a message nobody waits for: itself, if it has neither a sender nor a trace."""
+    if chain:
+        return TracedEnvelope(message, sender, chain)
+    return message if sender is None else Envelope(message, sender)
+
 
 def follow(item: Item) -> None:
     """Have the turn of an item be a span, if its chain ends with a trace: it gets another class, with another `run`."""
-    if tail_of(item.chain):
+    if tail_of(item.chain) and not item.is_followed:
         cast("Any", item).__class__ = _traced_class(cast("Any", type(item)))
 
 
@@ -53,12 +64,27 @@ def _traced_class(kind: type[Item]) -> Any:
     def run(actor: Any, item: Any) -> object:
         return _in_span()(kind.run, actor, item)
 
-    space, options = {"run": staticmethod(run), "__module__": kind.__module__}, dict[str, Any]()
+    def stashed(item: Any) -> None:
+        kind.stashed(item)
+        _goes_on()(item)
+
+    space, options = (
+        {"run": staticmethod(run), "stashed": stashed, "__module__": kind.__module__, "is_followed": True},
+        dict[str, Any](),
+    )
     if issubclass(kind, msgspec.Struct):
         options["eq"] = False
     else:
         space["__slots__"] = cast("Any", ())
     return types.new_class(f"Traced{kind.__name__}", (kind,), options, lambda made: made.update(space))
+
+
+@functools.cache
+def _goes_on() -> Callable[[Any], None]:
+    """What has an item go on with the trace that its turn has begun."""
+    from .spans import goes_on
+
+    return goes_on
 
 
 @functools.cache

@@ -6,7 +6,7 @@ import asyncio
 import contextvars
 from collections import deque
 from collections.abc import Awaitable, Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from ..errors import ActorStopped, UnknownMessage, type_name
 from ..exit_reasons import SHUTDOWN, ExitReason
@@ -221,7 +221,11 @@ class Cell(_Hot):
 
     __slots__ = ("__weakref__", "children", "ctx", "host", "life", "more", "name", "parent", "spec", "state")
 
+    take_in: Admit
+    """What senders call: the function in `admit`, by another name, before which a node may put one of its own."""
+
     def __init__(self, node: Node, parent: Cell | None, name: str, host: Host) -> None:
+        cast("Any", self).__class__ = node.cell_kinds[type(self)]
         self.node = node
         self.parent = parent
         self.name = name
@@ -283,6 +287,14 @@ class Cell(_Hot):
         if not self.table.knows(type(message)):
             require_message(self.path, message)
             raise UnknownMessage(self.path, type_name(type(message)))
+
+    def outgoing(self, item: Any) -> Any:
+        """What is sent to this address in place of a message or an envelope: that itself, unless the node is traced."""
+        return item
+
+    def offer(self, item: Any) -> Awaitable[None] | None:
+        """Admit a message for a sender that waits until it is accepted. None: it is."""
+        return self.host.offer(self, self.outgoing(item))
 
     def push(self, item: Item) -> None:
         """Put an item of the runtime's own at the end of the queue: no bound, no type check."""
@@ -395,6 +407,45 @@ class Cell(_Hot):
 
     def __repr__(self) -> str:
         return f"<Cell {self.path} {self.state} life {self.life}>"
+
+
+Cell.take_in = vars(_Hot)["admit"]  # The same slot, so that it is read as fast.
+
+
+class CellKinds(dict[type[Cell], type[Cell]]):
+    """The classes of the cells of one node, each derived from the one that it stands for.
+
+    What is put into them is passed by all that is sent from this node, and from no other one of the process. They have
+    nothing of their own while nobody looks, so that nothing is tested for then.
+
+    Attributes:
+        watcher: who has put something in; None if nobody has.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.watcher: Any = None
+        self._methods: dict[str, Callable[..., Any]] = {}
+
+    def __missing__(self, kind: type[Cell]) -> type[Cell]:
+        made = type(kind.__name__, (kind,), {"__slots__": (), "__module__": kind.__module__, **self._methods})
+        self[kind] = made
+        return made
+
+    def put_in(self, watcher: Any, methods: dict[str, Callable[..., Any]]) -> None:
+        """Put methods before those of the cells, in the place of what was put in before."""
+        self.take_out()
+        self.watcher, self._methods = watcher, methods
+        for kind in self.values():
+            for name, method in methods.items():
+                setattr(kind, name, method)
+
+    def take_out(self) -> None:
+        """Take out what was put in: it costs nothing from then on."""
+        for kind in self.values():
+            for name in self._methods:
+                delattr(kind, name)
+        self.watcher, self._methods = None, {}
 
 
 class _NextUrgent(Item):

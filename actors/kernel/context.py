@@ -68,6 +68,9 @@ class ActorContext:
         self._owes: list[Ask] | None = None  # asks that may be answered later
         self._token = 0  # of its effects; it gets one with the first
 
+    def _continue_trace(self, tail: str) -> None:
+        """The turn that begins now is in this trace, if what it sends is not sent at once; "": the turn is over."""
+
     # -- who, when --------------------------------------------------------------------------------------------------
 
     @property
@@ -119,7 +122,7 @@ class ActorContext:
         self._alive()
         if type(message) not in cell.table:
             cell.require(message)
-        cell.admit(cell, Envelope(message, self._cell))
+        cell.take_in(cell, Envelope(message, self._cell))
 
     async def _send(self, cell: Cell, message: Message[Any]) -> None:
         """Send and wait until it is accepted. Nobody waits for room at itself: that raises MailboxFull, as a tell."""
@@ -129,7 +132,7 @@ class ActorContext:
             self._alive()
         if type(message) not in cell.table:
             cell.require(message)
-        accepted = cell.host.offer(cell, Envelope(message, self._cell))
+        accepted = cell.offer(Envelope(message, self._cell))
         if accepted is not None:
             await accepted
 
@@ -147,7 +150,7 @@ class ActorContext:
         ask = Ask(message, self._cell, chain, timeout, NO_DEADLINE, future, cell)
         node.deadlines.add(ask)
         try:
-            cell.admit(cell, ask)
+            cell.take_in(cell, ask)
         except BaseException:
             future.cancel()
             raise
@@ -191,11 +194,11 @@ class ActorContext:
             cell: Cell = to._cell
             cell.require(item.message)
             self._cell.item = Stashed.of(item)
-            cell.admit(cell, item)
+            cell.take_in(cell, item)
         elif isinstance(item, Envelope):
-            to._cell.admit(to._cell, Envelope(item.message, item.sender))
+            to._cell.take_in(to._cell, Envelope(item.message, item.sender))
         else:
-            to._cell.admit(to._cell, message_in(item))  # The item of a timer or a pipe is of this life.
+            to._cell.take_in(to._cell, message_in(item))  # The item of a timer or a pipe is of this life.
 
     def reply_handle(self) -> ReplyHandle[Any]:
         """Return the right to answer the ask in hand later: `return self.ctx.reply_handle()`, keep it, call `reply`."""
@@ -239,7 +242,7 @@ class ActorContext:
         if uplink is not None:  # The subscribers are known to the root only.
             self._alive()
             require_message(topic, message)
-            await uplink.publish(topic, message, self._cell)
+            await uplink.publish(topic, self._cell.outgoing(Envelope(message, self._cell)))
             return
 
         async def send(cell: Cell) -> None:
@@ -683,10 +686,11 @@ class Stashed(Envelope, eq=False):
 class Piped(Item):
     """The result of background work."""
 
-    __slots__ = ("error", "message")
+    __slots__ = ("chain", "error", "message")
 
     def __init__(self, message: Message[Any] | None, error: BaseException | None) -> None:
         self.message, self.error = message, error
+        self.chain: Chain = ()
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:

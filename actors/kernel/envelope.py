@@ -47,6 +47,10 @@ class Item:
     """The turns that wait for its turn."""
     is_ask: bool = False
     """Whether somebody waits for an answer to it."""
+    is_followed: ClassVar[bool] = False
+    """Whether its turn is a span of a trace."""
+    is_cancelled: bool = False
+    """Whether it has come to nothing while it waited, so that its turn does nothing."""
     stops: ExitReason | None = None
     """Why the life has to end in good order, if that is what it commands."""
 

@@ -28,7 +28,7 @@ from ..exit_reasons import KILLED, ExitReason
 from ..persistence import Keeper, NothingKept
 from . import lifecycle
 from .blocking_handlers import HandlerThreads
-from .cell import DOWN, GONE, RUNNING, Cell, Host
+from .cell import DOWN, GONE, RUNNING, Cell, CellKinds, Host
 from .codec import Codec
 from .deadlines import Deadlines
 from .envelope import Item
@@ -170,6 +170,7 @@ class Node(RunLoop):
         if not name or "/" in name:
             raise SpecError("ActorSystem", f"the name must be text without '/', not {name!r}")
         self.name = name
+        self.cell_kinds = CellKinds()
         self.deadlines = Deadlines(loop)
         self.codec = Codec(self.cell_at)
         self.clock = Clock(loop)

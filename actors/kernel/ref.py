@@ -60,7 +60,7 @@ class ActorRef(Generic[A_co]):
         cell = self._cell
         sender = current.get(None)
         if sender is None:
-            cell.admit(cell, message)
+            cell.take_in(cell, message)
         else:
             sender._tell(cell, message)
 
@@ -81,7 +81,7 @@ class ActorRef(Generic[A_co]):
             await room
         if type(message) not in cell.table:
             cell.require(message)
-        accepted = cell.host.offer(cell, message)
+        accepted = cell.offer(message)
         if accepted is not None:
             await accepted
 
@@ -122,7 +122,7 @@ class ActorRef(Generic[A_co]):
         ask = Ask(message, None, (), timeout, NO_DEADLINE, future, cell)
         node.deadlines.add(ask)
         try:
-            cell.admit(cell, ask)
+            cell.take_in(cell, ask)
         except BaseException:
             future.cancel()  # Refused at the call: nobody holds the future.
             raise

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-from .envelope import Item
+from .envelope import Chain, Item
 from .message import Message
 
 if TYPE_CHECKING:
@@ -32,6 +32,16 @@ class Timer:
     def is_active(self) -> bool:
         """Say whether the message of the timer may still come."""
         return self._handle is not None or self._queued
+
+    @property
+    def is_queued(self) -> bool:
+        """Say whether a tick of the timer is in the mailbox, and counts."""
+        return self._queued
+
+    @property
+    def is_repeated(self) -> bool:
+        """Say whether the message of the timer comes again and again."""
+        return self._interval is not None
 
     def cancel(self) -> None:
         """Cancel the timer: its message does not come any more, not even if it is queued already."""
@@ -106,10 +116,16 @@ class Timer:
 class Tick(Item):
     """A timer's message in the mailbox."""
 
-    __slots__ = ("timer",)
+    __slots__ = ("chain", "timer")
 
     def __init__(self, timer: Timer) -> None:
         self.timer = timer
+        self.chain: Chain = ()
+
+    @property
+    def is_cancelled(self) -> bool:  # type: ignore[override]  # as with the message
+        """Whether its timer was cancelled while it was queued."""
+        return not self.timer.is_queued
 
     @property
     def message(self) -> Message[Any]:

@@ -24,7 +24,7 @@ from ..kernel import lifecycle, links
 from ..kernel.actor import Start
 from ..kernel.address_host import AddressHost
 from ..kernel.cell import RUNNING, Cell
-from ..kernel.envelope import AnyTable
+from ..kernel.envelope import AnyTable, Envelope
 from ..kernel.lifecycle import HERE, MAILBOX
 from ..kernel.message import Message, RuntimeOrder, message_name
 from ..kernel.node import TOKENS, Node, Ports
@@ -246,13 +246,13 @@ class Guest(Peer):
             sender = current.get(None)
             raise NotGranted(path, order, root.path if sender is None else sender.path)
 
-    def publish(self, topic: str, message: Any, sender: Cell | None) -> asyncio.Future[None]:
+    def publish(self, topic: str, item: Envelope) -> asyncio.Future[None]:
         """Publish through the root; the future ends when every subscriber has accepted."""
         connection = self.connection
-        name, body = self._payload(message)
-        source = None if sender is None else connection.names.to_wire(sender.path)
+        name, body = self._payload(item.message)
+        source = None if item.sender is None else connection.names.to_wire(item.sender.path)
         key, accepted = self.acceptance()
-        connection.send(frames.Publish(key, topic, name, body, source), topic)
+        connection.send(frames.Publish(key, topic, name, body, source, item.chain), topic)
         return accepted
 
     def command(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:

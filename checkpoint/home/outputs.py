@@ -8,10 +8,11 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
+from ...actors.control.trace_tail import enveloped, follow, with_tail
 from ...actors.errors import AskDeadlock, HoldfastError, MailboxFull
 from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.codec import Parcel
-from ...actors.kernel.envelope import Envelope, waiters
+from ...actors.kernel.envelope import Chain, waiters
 from ..durable_links import UNDONE_BY, connect
 from ..inputs import Batch
 from ..life.recorded_inbox import STARTED
@@ -166,6 +167,7 @@ class Outputs:
                 bound = switch.intake.bound
                 if bound is None or bound.makes_room(None, out.name, out.body, cell.path):
                     source = switch.record(MESSAGE, out.name, out.body, cell.path, batch)
+                    source.chain = trace_of(out)
                     batch.after.append(lambda: switch.admitted(source))
             except MailboxFull as error:  # Its turn has gone on: there is nobody to raise this to.
                 home.node.dead_letter(target, Parcel(out.name, out.body), str(error), cell)
@@ -176,7 +178,8 @@ class Outputs:
         def send() -> None:
             there = target.living
             try:
-                there.admit(there, Envelope(home.node.codec.message_in(there, out.name, out.body), cell))
+                message = home.node.codec.message_in(there, out.name, out.body)
+                there.admit(there, enveloped(message, cell, trace_of(out)))
             except HoldfastError as error:
                 home.node.dead_letter(there, Parcel(out.name, out.body), str(error), cell)
 
@@ -232,6 +235,7 @@ class Outputs:
             if bound is None or not target.has_room or bound.makes_room(None, out.name, out.body, home.path):
                 # Even if there is no room: what is journaled in this append cannot be lost, and the sender waits.
                 source = switch.record(MESSAGE, out.name, out.body, home.path, batch)
+                source.chain = trace_of(out)
                 batch.after.append(lambda: switch.admitted(source))
         except MailboxFull as full:
             error = full
@@ -277,7 +281,7 @@ class Outputs:
                     room.add_done_callback(lambda _: self._room_came(target))
                     return False
                 message = home.node.codec.message_in(target, out.name, out.body)
-                taken = target.host.offer(target, Envelope(message, home.cell))
+                taken = target.host.offer(target, enveloped(message, home.cell, trace_of(out)))
         except HoldfastError as error:
             over(error)
             return True
@@ -295,6 +299,8 @@ class Outputs:
             return
         source = home.ledger.open.get(key)
         chain = ((home.path, key), *(source.chain if source is not None else ()))
+        if out.trace:
+            chain = with_tail(chain, out.trace)
         ask = SwitchAsk.made(home, turn, out, chain, target)
         home.calls.asks[turn, out.k] = ask
         home.node.deadlines.add(ask)
@@ -323,6 +329,7 @@ class Outputs:
             if ctx is not None and ctx._turn_in(ask.chain):
                 raise AskDeadlock(target.path, waiters(ask.chain))
             ask.message = home.node.codec.message_in(target, parcel.name, parcel.body)
+            follow(ask)
             target.admit(target, ask)
         except HoldfastError as error:
             ask.fail(error)
@@ -340,6 +347,9 @@ class Outputs:
             self._deliver(target, out, batch, origin_kept(home, turn, key, out), sender)
             return
         source.ask = None  # From now on it is the receiver's to answer.
+        if out.trace:
+            ask.chain = with_tail(ask.chain, out.trace)
+            follow(ask)
 
         def send() -> None:
             there = target.living
@@ -366,6 +376,11 @@ class Outputs:
             home.topics.pop(out.to, None)
             if home.cell is not None:
                 home.node.topics.unsubscribe(out.to, inlet(home, out.to))
+
+
+def trace_of(out: Out) -> Chain:
+    """The chain of what a turn sends and does not wait for: its trace, if the turn is in one."""
+    return ((out.trace, 0),) if out.trace else ()
 
 
 def _failure(done: asyncio.Future[None]) -> HoldfastError | None:

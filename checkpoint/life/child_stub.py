@@ -16,7 +16,7 @@ from ...actors.exit_reasons import ExitReason, pack_exit
 from ...actors.kernel import links
 from ...actors.kernel.address_host import AddressHost, Home, Place
 from ...actors.kernel.cell import DOWN, RUNNING, Cell
-from ...actors.kernel.envelope import Envelope, Item
+from ...actors.kernel.envelope import Item
 from ...actors.kernel.lifecycle import MAILBOX, NEAR
 from ...actors.kernel.mailbox import Bounded, Senders
 from ...actors.kernel.message import message_name
@@ -91,8 +91,7 @@ class RootHome(Home):
             MAILBOX.push(cell, item)
 
     def offer(self, cell: Cell, item: Any) -> asyncio.Future[None]:
-        message, sender = (item.message, item.sender) if isinstance(item, Envelope) else (item, None)
-        accepted = self.guest.offer(cell.path, message, sender)
+        accepted = self.guest.offer(cell.path, item)
         if self._homeward is not None:
             self._homeward.left(accepted)
         return accepted

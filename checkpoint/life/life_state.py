@@ -159,6 +159,7 @@ class LifeStage:
         ignored_why: why the actor does not want to be started.
         is_over: whether it has ended.
         is_adrift: whether a turn of it was left in the middle, so that its state is that of no turn.
+        trace: the trace in which the turn in hand sends; "" if it is in none.
     """
 
     has_replayed: bool = False
@@ -172,6 +173,7 @@ class LifeStage:
     ignored_why: str | None = None
     is_over: bool = False
     is_adrift: bool = False
+    trace: str = ""
 
     def judge(self, go: Go) -> None:
         """All was handled again: whether the life is to end now is for the home to say, which knows what was done."""

@@ -116,6 +116,9 @@ class RecordedContext(ActorContext):
     recorded: Life
     _drawn: int  # the turn that `_random` belongs to
 
+    def _continue_trace(self, tail: str) -> None:
+        self.recorded.stage.trace = tail
+
     def _in_turn(self) -> bool:
         """Whether this code runs in the turn in hand, not in a background task."""
         return self.recorded.feed is not None and not _in_background()

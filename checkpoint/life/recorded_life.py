@@ -423,7 +423,7 @@ class Life:
         What a hook does takes effect at once: a hook runs at each life, and is not replayed.
         """
         self.last_k = k = self.last_k + 1
-        out = Out(k, verb, to, name, body, seconds, interval)
+        out = Out(k, verb, to, name, body, seconds, interval, self.stage.trace)
         if self.feed is None:
             self.port.to_home(Hooked(self.hook, out))
         else:

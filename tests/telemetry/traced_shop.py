@@ -1,5 +1,6 @@
 """Actors that say which span they are in, and, in a process of their own, which spans were made there."""
 
+import asyncio
 from collections.abc import Iterable
 
 from opentelemetry import baggage, trace
@@ -42,6 +43,30 @@ class Onward(hf.Message[str]):
 
 class Onto(hf.Message[None]):
     """Tells the next one a note."""
+
+
+class Sent(hf.Message[None]):
+    """Sends the next one a note."""
+
+
+class Published(hf.Message[None]):
+    """Publishes a note."""
+
+
+class Later(hf.Message[None]):
+    """Has a note come to the actor itself, at once."""
+
+
+class Again(hf.Message[None]):
+    """Has notes come to the actor itself, every 10 ms."""
+
+
+class TooLate(hf.Message[None]):
+    """Has a note come to the actor itself, and cancels that when it is queued."""
+
+
+class Piped(hf.Message[None]):
+    """Has a note come from background work."""
 
 
 def here() -> str:
@@ -116,9 +141,64 @@ class Clerk(hf.Actor):
     def onto(self, message: Onto) -> None:
         self.next_one.tell(Note())
 
+    @hf.on(Sent)
+    async def sent(self, message: Sent) -> None:
+        await self.next_one.send(Note())
+
+    @hf.on(Published)
+    async def published(self, message: Published) -> None:
+        await self.ctx.publish("/notes", Note())
+
+    @hf.on(Later)
+    def later(self, message: Later) -> None:
+        self.ctx.tell_after(0.0, Note())
+
+    @hf.on(Again)
+    def again(self, message: Again) -> None:
+        self.ctx.every(0.01, Note())
+
+    @hf.on(TooLate)
+    async def too_late(self, message: TooLate) -> None:
+        timer = self.ctx.tell_after(0.0, Note())
+        while not timer.is_queued:
+            await asyncio.sleep(0)
+        timer.cancel()
+
+    @hf.on(Piped)
+    def piped(self, message: Piped) -> None:
+        self.ctx.pipe_to_self(asyncio.sleep(0), lambda _: Note())
+
     @hf.on(Pass)
     def passed(self, message: Pass) -> str:
         return here()
+
+
+class Stored(Clerk):
+    """One whose state says nothing of spans."""
+
+    @hf.on(Note)
+    def note(self, message: Note) -> None:
+        self.count += 1
+
+    @hf.on(Where)
+    async def where(self, message: Where) -> str:
+        return "here"
+
+
+class Stasher(hf.Actor):
+    """Puts the first message aside, and answers it when it comes again."""
+
+    def __init__(self) -> None:
+        self.has_stashed = False
+
+    @hf.on(Pass)
+    def passed(self, message: Pass) -> str:
+        if self.has_stashed:
+            return "again"
+        self.has_stashed = True
+        self.ctx.stash()
+        self.ctx.unstash()
+        return ""
 
 
 class Through(hf.Actor):

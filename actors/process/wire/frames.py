@@ -119,6 +119,7 @@ class Publish(Frame, tag=9):
     name: Name
     body: Raw
     sender: Name | None = None
+    chain: Chain = ()
 
 
 class Beat(Frame, tag=10):
@@ -153,13 +154,14 @@ TakeRecord = Callable[[Record], None]
 
 
 class Offer(Frame, tag=13):
-    """A message whose acceptance is awaited under `id`, its handling is not."""
+    """A message whose acceptance is awaited under `id`, its handling is not: its `chain` has at most a trace."""
 
     id: int
     to: Name
     name: Name
     body: Raw
     sender: Name | None = None
+    chain: Chain = ()
 
 
 class PageChanged(Frame, tag=14):

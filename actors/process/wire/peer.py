@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from ...control.trace_tail import TracedEnvelope, follow
+from ...control.trace_tail import enveloped, follow
 from ...errors import AskDeadlock, BadMessage, BadReply, HoldfastError, type_name
 from ...exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...kernel import links
 from ...kernel.address_host import AddressHost, Home, Place
 from ...kernel.cell import Cell
 from ...kernel.codec import Codec, Parcel, Raw
-from ...kernel.envelope import Ask, Chain, Envelope, Item, waiters
+from ...kernel.envelope import Ask, Chain, Envelope, Item, chain_of, message_in, waiters
 from ...kernel.lifecycle import NEAR
 from ...kernel.message import Message, message_name
 from . import frames
@@ -96,18 +96,19 @@ class Peer:
             # Asks that expired are dropped: their replies, if any come, are late.
             self.pending = {key: ask for key, ask in self.pending.items() if not ask.is_done}
 
-    def offer(self, path: str, message: Any, sender: Cell | None) -> asyncio.Future[None]:
-        """Send a message to `path`; the future ends when it is accepted there.
+    def offer(self, path: str, item: Any) -> asyncio.Future[None]:
+        """Send a message, or an envelope, to `path`; the future ends when it is accepted there.
 
         Raises:
             BadMessage: it cannot be coded.
         """
         connection = self.connection
         to = connection.names.to_wire(path)
-        name, body = self._payload(message)
+        name, body = self._payload(message_in(item))
+        sender = item.sender if isinstance(item, Item) else None
         source = None if sender is None else connection.names.to_wire(sender.path)
         key, accepted = self.acceptance()
-        connection.send(frames.Offer(key, to, name, body, source), path)
+        connection.send(frames.Offer(key, to, name, body, source, chain_of(item)), path)
         return accepted
 
     def acceptance(self) -> tuple[int, asyncio.Future[None]]:
@@ -234,9 +235,8 @@ class Peer:
                 follow(arrived)
             cell.admit(cell, arrived)
         else:
-            item = message if sender is None else Envelope(message, sender)
             try:
-                cell.admit(cell, TracedEnvelope(message, sender, frame.chain) if frame.chain else item)
+                cell.admit(cell, enveloped(message, sender, frame.chain))
             except HoldfastError as error:
                 self.node.dead_letter(cell, message, str(error), sender)
 
@@ -246,7 +246,7 @@ class Peer:
         name = connection.names.from_wire(frame.name)
         sender = None if frame.sender is None else self.node.cell_at(connection.names.from_wire(frame.sender))
         parcel = Parcel(name, bytes(frame.body))
-        Offered(self, frame.id, parcel, sender, topic).begin(cells)
+        Offered(self, frame.id, parcel, (sender, frame.chain), topic).begin(cells)
 
     def on_ask(self, cell: Cell, frame: frames.Ask, page: memoryview | None) -> None:
         """Take in an ask; its outcome goes back over this connection."""
@@ -422,9 +422,7 @@ class RemoteHome(Home):
         send_signal(self.peer, cell.path, item)
 
     def offer(self, cell: Cell, item: Any) -> asyncio.Future[None]:
-        if isinstance(item, Envelope):
-            return self.peer.offer(cell.path, item.message, item.sender)
-        return self.peer.offer(cell.path, item, None)
+        return self.peer.offer(cell.path, item)
 
     def backlog(self, cell: Cell, running: int) -> int:
         return 0

@@ -7,9 +7,10 @@ import functools
 from collections.abc import Awaitable, Iterable
 from typing import TYPE_CHECKING
 
+from ...control.trace_tail import enveloped
 from ...errors import HoldfastError
 from ...kernel.codec import Parcel
-from ...kernel.envelope import Envelope
+from ...kernel.envelope import Chain
 
 if TYPE_CHECKING:
     from ...kernel.cell import Cell
@@ -23,10 +24,13 @@ class Offered:
     has come, and one's trouble is not another's; of any other message it fails the sender.
     """
 
-    __slots__ = ("_id", "_left", "_parcel", "_peer", "_sender", "_topic")
+    __slots__ = ("_chain", "_id", "_left", "_parcel", "_peer", "_sender", "_topic")
 
-    def __init__(self, peer: Peer, key: int, parcel: Parcel, sender: Cell | None, topic: str | None) -> None:
-        self._peer, self._id, self._parcel, self._sender, self._topic = peer, key, parcel, sender, topic
+    def __init__(
+        self, peer: Peer, key: int, parcel: Parcel, origin: tuple[Cell | None, Chain], topic: str | None
+    ) -> None:
+        self._peer, self._id, self._parcel, self._topic = peer, key, parcel, topic
+        self._sender, self._chain = origin
         self._left = 1  # receivers that have not accepted it, and we ourselves while we begin
 
     def begin(self, cells: Iterable[Cell]) -> None:
@@ -49,7 +53,7 @@ class Offered:
                     room.add_done_callback(functools.partial(self._hand_to, cell))
                     return
                 message = peer.codec.message_in(cell, parcel.name, parcel.body)
-                taken = cell.host.offer(cell, message if self._sender is None else Envelope(message, self._sender))
+                taken = cell.host.offer(cell, enveloped(message, self._sender, self._chain))
         except HoldfastError as error:
             self._over(cell, error)
             return
