@@ -224,6 +224,7 @@ async def test_a_brick_that_does_not_return_is_told_in_whatever_role(
     system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, below: Mechanism, whose: str, part: str
 ) -> None:
     monkeypatch.setattr(probation, "MOST_SECONDS", 8.0)
+    monkeypatch.setattr(probation, "STUCK_AFTER", 1.0)  # Found too soon it would be, on a busy machine, found as well.
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=below))
     load = Load(ref)
     await load.reached(20)
