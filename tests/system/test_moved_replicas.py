@@ -704,7 +704,6 @@ async def test_what_a_replica_says_before_it_has_heard_of_its_address_is_meant_s
         assert pids(one) == before
 
 
-@pytest.mark.pairs
 @KIND
 @pytest.mark.parametrize("whom", ["leader", "follower", "all"])
 @pytest.mark.parametrize("when", ["prepare", "commit", "finish"])
