@@ -38,6 +38,8 @@ campaign: $(VENV)/.dev
 	HOLDFAST_SIGNALS=100 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=900 tests/system/test_signals.py
 	HOLDFAST_SYSCALLS=500 HOLDFAST_FUZZ=5000 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=900 \
 	    tests/faults tests/actors/process/hostile/test_fuzz.py
+	HOLDFAST_FLEETS=2000 HOLDFAST_CROSSED=1 HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s \
+	    tests/cluster/test_takeover.py tests/cluster/test_removed_checks.py
 	HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s tests/system/test_removed_checks.py \
 	    tests/actors/process/hostile/test_removed_claims.py tests/telemetry/test_removed_checks.py
 	HOLDFAST_BUILDS=1 $(BIN)/python -m pytest -q -s tests/packaging

@@ -25,7 +25,9 @@ def open_journal(store: str | Journal | None, *, takeover: bool = False, key: St
         return store if isinstance(store, MemoryJournal) else Called(store)
     kind, _, path = store.partition(":")
     if kind != "sqlite" or not path:
-        raise SpecError("store", f"must be None, 'memory', 'sqlite:PATH', 'nats://HOST/NAME' or an engine, not {store!r}")
+        raise SpecError(
+            "store", f"must be None, 'memory', 'sqlite:PATH', 'nats://HOST/NAME' or an engine, not {store!r}"
+        )
     if not Path(path).parent.is_dir() or Path(path).is_dir():
         raise SpecError("store", f"{store!r} must name a file in a folder that is there")
     from .sqlite import SqliteJournal  # only now: sqlite3 takes a while to import, and most tests need no store

@@ -11,6 +11,19 @@ from typing import Any, Protocol, TypeVar
 T = TypeVar("T")
 
 
+async def end_tasks(*tasks: asyncio.Future[Any]) -> None:
+    """Cancel tasks, and wait until they have ended.
+
+    One that waits by `asyncio.wait_for` may miss a cancellation that comes just when it gets what it waits for (until
+    Python 3.12): it is cancelled again.
+    """
+    left = {task for task in tasks if not task.done()}
+    while left:
+        for task in left:
+            task.cancel()
+        _, left = await asyncio.wait(left, timeout=0.05)
+
+
 class EngineLoop(Protocol):
     """The event loop on which an engine's coroutines run, as others see it."""
 

@@ -54,24 +54,25 @@ async def join(
         DamagedStore: what the log holds cannot be used.
     """
     if find_spec("nats") is None:
-        raise SpecError(
-            "store", f"{store.partition(':')[0]}:// needs the library nats-py: pip install 'holdfast[nats]'"
-        )
+        kind = store.partition(":")[0]
+        raise SpecError("store", f"{kind}:// needs the library nats-py: pip install 'holdfast[nats]'")
+    from .nats.access import access_of
     from .nats.nats_engine import open_engine  # only now: it imports that library
 
+    access = access_of(store)
     loop = asyncio.get_running_loop()
     me = leader_name()
     thread = EngineThread(f"holdfast {system}")
     engine: Engine | None = None
     try:
-        engine = await thread.run(_connected(lambda: open_engine(store, system), insists=standby is not None))
+        engine = await thread.run(_connected(lambda: open_engine(access), insists=standby is not None))
         leading = await thread.run(lead(engine, me, standby=standby, waits=lambda leader: _tell(loop, waits, leader)))
 
         def lost(error: HoldfastError) -> None:
             if isinstance(error, Deposed):
                 _tell(loop, deposed, error)
 
-        return ReplicatedJournal(engine, thread, leading, me, lost=lost)
+        return ReplicatedJournal(engine, thread, leading, lost=lost)
     except BaseException as error:
         if engine is not None:
             with contextlib.suppress(asyncio.CancelledError, TimeoutError):

@@ -22,9 +22,11 @@ from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias
 
 from ..actors.errors import HoldfastError
+from .engine_thread import end_tasks
 from .log_records import (
     EPOCH,
     FORMAT,
+    DamagedLog,
     EpochBegun,
     GapInLog,
     RecordMaker,
@@ -42,6 +44,8 @@ LOOK_SECONDS: Final = 0.2
 """How often a candidate looks whether the lease is free."""
 QUIET_SECONDS: Final = 2.0
 """Without a record for so long, a follower asks the log whether it has missed any."""
+MOST_READERS: Final = 5
+"""Readers that have to begin a log with a record that begins nothing, before it is the log that is damaged."""
 RENEWALS: Final = 6
 """How often a leader renews its lease in the time that it lasts."""
 TRUSTED: Final = 0.75
@@ -72,8 +76,8 @@ class LeadershipLost(
 
 
 def leader_name() -> str:
-    """What this process calls itself, for people: the machine and the process."""
-    return f"{socket.gethostname()}, process {os.getpid()}"
+    """What a candidate calls itself: machine and process, for people, and what tells it from all others there."""
+    return f"{socket.gethostname()}, process {os.getpid()} ({uuid.uuid4().hex[:8]})"
 
 
 class Follower:
@@ -89,6 +93,7 @@ class Follower:
         self._engine = engine
         self._stream: LogReader | None = None
         self._is_new = True
+        self._wrong_beginnings = 0
         self.contents = StoreContents()
         self.reader = RecordReader()
         self.leader = ""
@@ -112,7 +117,7 @@ class Follower:
                 self._take(record)
             except GapInLog:
                 if self._is_new:  # What this follower has not read yet is gone: all of it stands in a base.
-                    self.contents, self.reader, self.leader = StoreContents(), RecordReader(), ""
+                    self._begin_again(record)
                 await self.begin_anew()
                 break
             self._is_new = False
@@ -157,6 +162,20 @@ class Follower:
             with contextlib.suppress(Unanswered):
                 await stream.close()
 
+    def _begin_again(self, record: Record) -> None:
+        """Read the log from its beginning, which is not this record.
+
+        Raises:
+            DamagedLog: again and again it is, whichever reader is asked.
+        """
+        if self.reader.at == 0:
+            self._wrong_beginnings += 1
+            if self._wrong_beginnings == MOST_READERS:
+                raise DamagedLog(record.sequence, "what stood before it is gone, and it begins no base")
+        else:
+            self._wrong_beginnings = 0
+        self.contents, self.reader, self.leader = StoreContents(), RecordReader(), ""
+
     def _take(self, record: Record) -> None:
         if record.sequence <= self.reader.at:
             return
@@ -164,8 +183,11 @@ class Follower:
             if said.kind == EPOCH:
                 self.leader = decode_epoch(said.data).leader
                 continue
-            for change in decode_changes(said.data):
-                self.contents.make(change)
+            try:
+                for change in decode_changes(said.data):
+                    self.contents.make(change)
+            except ValueError as error:
+                raise DamagedLog(said.sequence, str(error)) from error
 
 
 @dataclass(slots=True)
@@ -176,15 +198,13 @@ class Leading:
         contents: all that its predecessors have written.
         maker: of its own records.
         grown: bytes that the log has beside the newest base.
-        token: of the lease.
-        deadline: until when it relies on the lease, on the clock of the loop.
+        keeper: of its lease.
     """
 
     contents: StoreContents
     maker: RecordMaker
     grown: int
-    token: int
-    deadline: float
+    keeper: LeaseKeeper
 
 
 async def lead(
@@ -207,27 +227,29 @@ async def lead(
     following = asyncio.ensure_future(follower.follow()) if standby == "warm" else None
     try:
         while True:
-            taken, asked = await _take_lease(engine, me, standby, waits, following)
+            keeper = await _take_lease(engine, me, standby, waits, following)
             if following is not None:
-                following.cancel()
-                await asyncio.wait([following])
+                await end_tasks(following)
                 if not following.cancelled():
                     following.result()
                 await follower.begin_anew()
+            renewing = asyncio.ensure_future(keeper.renew_while_reading(follower))
             try:
-                maker = await _begin_epoch(engine, me, follower, asked + engine.lease.seconds)
+                maker = await _begin_epoch(engine, me, follower, keeper)
             except Unanswered:
                 if standby is None:
                     raise
                 maker = None
+            finally:
+                renewing.cancel()
+                await asyncio.wait([renewing])
             if maker is not None:
-                deadline = asked + TRUSTED * engine.lease.seconds
-                return Leading(follower.contents, maker, follower.reader.grown, taken, deadline)
+                return Leading(follower.contents, maker, follower.reader.grown, keeper)
             if standby == "warm":
                 following = asyncio.ensure_future(follower.follow())
     finally:
         if following is not None:
-            following.cancel()
+            await end_tasks(following)
         await follower.begin_anew()
 
 
@@ -237,8 +259,8 @@ async def _take_lease(
     standby: Standby | None,
     waits: Callable[[str], None],
     following: asyncio.Future[None] | None,
-) -> tuple[int, float]:
-    """Wait for the lease; return its token, and when it was asked for."""
+) -> LeaseKeeper:
+    """Wait for the lease, and return what keeps it."""
     loop = asyncio.get_running_loop()
     known = ""
     has_failed = False
@@ -250,7 +272,7 @@ async def _take_lease(
             token = await engine.lease.acquire(me)
             if token is not None:
                 if not has_failed:
-                    return token, asked
+                    return LeaseKeeper(engine, me, token, asked)
                 # After an outage that this process has seen, too, whoever led goes first: with its state in memory.
                 await engine.lease.release(token)
                 await asyncio.sleep(engine.lease.seconds)
@@ -273,7 +295,7 @@ async def _take_lease(
         await asyncio.sleep(LOOK_SECONDS * random.uniform(0.5, 1.0))
 
 
-async def _begin_epoch(engine: Engine, me: str, follower: Follower, until: float) -> RecordMaker | None:
+async def _begin_epoch(engine: Engine, me: str, follower: Follower, keeper: LeaseKeeper) -> RecordMaker | None:
     """Append the beginning of an epoch behind all that stands in the log; `None` if the lease is over before that."""
     loop = asyncio.get_running_loop()
     attempt = uuid.uuid4().hex
@@ -284,44 +306,56 @@ async def _begin_epoch(engine: Engine, me: str, follower: Follower, until: float
         record = maker.beginning(EpochBegun(me, attempt, FORMAT, time.time()))
         stands = await append_behind(engine, record, reader.at)
         if isinstance(stands, int):
+            reader.check_whole()
             maker.after = stands
             return maker
-        if loop.time() > until:
+        if loop.time() > keeper.deadline:
             return None
 
 
 class LeaseKeeper:
-    """Keeps a leader's lease. All methods are for the loop of the engine.
+    """Keeps a lease that was taken. All methods are for the loop of the engine.
 
     Attributes:
-        deadline: until when the leader relies on it, on the clock of the loop.
+        deadline: until when its holder relies on it, on the clock of the loop.
 
     Args:
         engine: keeps the lease.
         me: what the holder calls itself.
-        leading: what it began with.
-        hold: called when another has the lease: nothing more is to be written.
-        go_on: called when it is ours again.
-        look: called when it was lost: the leader is to look whether it still leads.
+        token: of the lease.
+        asked: when it was asked for, on the clock of the loop.
     """
 
-    def __init__(
-        self,
-        engine: Engine,
-        me: str,
-        leading: Leading,
-        *,
-        hold: Callable[[], None],
-        go_on: Callable[[], None],
-        look: Callable[[], None],
-    ) -> None:
+    def __init__(self, engine: Engine, me: str, token: int, asked: float) -> None:
         self._lease, self._me = engine.lease, me
-        self._token: int | None = leading.token
-        self._hold, self._go_on, self._look = hold, go_on, look
-        self.deadline = leading.deadline
+        self._token: int | None = token
+        self._is_held = False
+        self.deadline = asked + TRUSTED * engine.lease.seconds
 
-    async def run(self) -> None:
-        """Renew the lease, for ever."""
+    async def renew_while_reading(self, follower: Follower) -> None:
+        """Renew the lease for as long as a candidate that has it gets on with reading the log, which may be long.
+
+        One that does not lets the lease expire: others may be able to.
+        """
+        loop = asyncio.get_running_loop()
+        at = follower.reader.at
+        while self._token is not None:
+            await asyncio.sleep(self._lease.seconds / RENEWALS)
+            if follower.reader.at == at:
+                continue
+            at, asked = follower.reader.at, loop.time()
+            with contextlib.suppress(Unanswered):
+                self._token = await self._lease.renew(self._me, self._token)
+                self.deadline = asked + TRUSTED * self._lease.seconds if self._token is not None else self.deadline
+
+    async def run(self, *, hold: Callable[[], None], go_on: Callable[[], None], look: Callable[[], None]) -> None:
+        """Renew the lease of a leader, for ever.
+
+        Args:
+            hold: called when another has the lease: nothing more is to be written, until `go_on`.
+            go_on: called when it is ours again.
+            look: called when it was lost, and when another has it: the leader is to look whether it still leads.
+        """
         loop = asyncio.get_running_loop()
         lease = self._lease
         while True:
@@ -331,15 +365,19 @@ class LeaseKeeper:
                 if self._token is None:
                     self._token = await lease.acquire(self._me)
                     if self._token is None:
-                        if await lease.holder():
-                            self._hold()
+                        if not self._is_held and await lease.holder():
+                            self._is_held = True
+                            hold()
+                            look()
                         continue
-                    self._go_on()
-                else:
-                    self._token = await lease.renew(self._me, self._token)
-                    if self._token is None:
-                        self._look()
-                        continue
+                    self._is_held = False
+                    go_on()
+                    look()  # Another may have led meanwhile: nothing is relied on before the next renewal.
+                    continue
+                self._token = await lease.renew(self._me, self._token)
+                if self._token is None:
+                    look()
+                    continue
             except Unanswered:
                 continue
             self.deadline = asked + TRUSTED * lease.seconds

@@ -134,11 +134,13 @@ class RecordMaker:
         for one in data:
             pieces.append(one)
             size += len(one)
-            while size > PART:
-                joined = b"".join(pieces)
-                pieces, size = [joined[PART:]], len(joined) - PART
-                yield self._record(kind, part, joined[:PART], is_last=False)
-                part += 1
+            if size <= PART:
+                continue
+            joined, at = b"".join(pieces), 0
+            while size - at > PART:
+                yield self._record(kind, part, joined[at : at + PART], is_last=False)
+                part, at = part + 1, at + PART
+            pieces, size = [joined[at:]], size - at
         yield self._record(kind, part, b"".join(pieces), is_last=True)
 
     def _record(self, kind: str, part: int, data: bytes, *, is_last: bool) -> bytes:
@@ -185,6 +187,7 @@ class RecordReader:
 
     def __init__(self) -> None:
         self.at = self.epoch = self.grown = 0
+        self._grown_before = 0  # beside the base before the one of which parts were taken in
         self._parts: dict[str, list[tuple[int, LogPart]]] = {}
         self._held: list[Said] | None = None  # behind the first part of a base that this reader began with
 
@@ -200,6 +203,9 @@ class RecordReader:
         sequence = record.sequence
         part = self._checked(record)
         if part.kind == EPOCH:
+            self.check_whole()
+            if self._parts.get(BASE):
+                self.grown += self._grown_before + sum(len(one.data) for _, one in self._parts[BASE])
             self._parts.clear()  # What was not finished never was.
         elif self.at == 0:
             self._held = []  # What is older than this base was removed.
@@ -210,7 +216,7 @@ class RecordReader:
         if part.kind != BASE:
             self.grown += len(record.data)
         elif part.part == 0:
-            self.grown = 0
+            self._grown_before, self.grown = self.grown, 0
         parts.append((sequence, part))
         if not part.is_last:
             return []
@@ -224,14 +230,21 @@ class RecordReader:
         held, self._held = self._held, None
         return [] if held is None else [said, *held]
 
+    def check_whole(self) -> None:
+        """See to it that the base that this reader began with is complete: it was, before what is older was removed.
+
+        Raises:
+            DamagedLog: the base that the log begins with has no end.
+        """
+        if self._held is not None:
+            raise DamagedLog(self.at, "the log begins with a base that was never finished")
+
     def _checked(self, record: Record) -> LogPart:
         part = read_part(record)
         begins = self.at == 0 and part.kind == BASE and part.part == 0
         if part.previous != self.at and not begins:
-            if self.at == 0:
-                raise DamagedLog(record.sequence, "what stood before it is gone, and it begins no base")
             raise GapInLog(part.previous, self.at)
-        if part.epoch < self.epoch or (part.epoch > self.epoch and part.kind != EPOCH and not begins):
+        if not (begins or (part.epoch > self.epoch if part.kind == EPOCH else part.epoch == self.epoch)):
             raise DamagedLog(record.sequence, f"it is of epoch {part.epoch}, and stands behind epoch {self.epoch}")
         if part.kind == EPOCH and decode_epoch(part.data).format > FORMAT:
             raise DamagedLog(record.sequence, "a newer version of holdfast wrote what follows: update this one")

@@ -96,7 +96,7 @@ class LogWriter:
         self._work.set()
 
     def hold(self) -> None:
-        """Write nothing more for now: somebody else may be about to lead."""
+        """Write nothing more for now, and only look: somebody else may be about to lead, or does so already."""
         self._may_write.clear()
 
     def go_on(self) -> None:
@@ -116,11 +116,23 @@ class LogWriter:
             if not self._queue and self._base is None:
                 await self._work.wait()
                 self._work.clear()
-            await self._may_write.wait()
+            if not self._may_write.is_set():
+                await self._look()
+                continue
             if self._queue:
                 await self._write_some()
             if self._base is not None:
                 await self._write_base_part()
+
+    async def _look(self) -> None:
+        """See without an append whether another leads: whoever is held back would learn of it from nobody else.
+
+        Raises:
+            Deposed: another leads.
+        """
+        found = await behind(self._engine, self._maker.after)
+        if found is not None:
+            raise _deposed(found, self._maker.epoch)
 
     async def _write_some(self) -> None:
         """Write what has gathered, as one; a base on its own."""

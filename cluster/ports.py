@@ -99,7 +99,9 @@ class Lease(Protocol):
         ...
 
     async def acquire(self, holder: str) -> int | None:
-        """Take the lease if nobody has it, and return its token; `None` if somebody has.
+        """Take the lease if nobody has it, and return its token; `None` if somebody else has.
+
+        Whoever has it by this name takes it again, with a new token and all of its time: an answer may have been lost.
 
         Raises:
             Unanswered: it may be taken or not.

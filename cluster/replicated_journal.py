@@ -24,8 +24,8 @@ from ..checkpoint.compression import LibraryMissing, compressor, decompress
 from ..checkpoint.entry_codec import check_entry, is_plain
 from ..checkpoint.journal import DamagedStore, Entry, SafeAt, Saved, StaleEpoch, StoreFailed
 from ..checkpoint.snapshot.shared_blocks import Segment
-from .engine_thread import EngineLoop
-from .leadership import Leading, LeaseKeeper
+from .engine_thread import EngineLoop, end_tasks
+from .leadership import Leading
 from .log_writer import Deposed, LogWriter, Write
 from .ports import Engine, Unanswered
 from .store_contents import Change
@@ -58,7 +58,6 @@ class ReplicatedJournal:
         engine: keeps the log.
         loop: on which the engine's work runs.
         leading: what this leader begins with.
-        me: what it calls itself.
         lost: told, on the engine's loop, why nothing can be written any more: another leads, or the log is damaged.
     """
 
@@ -71,63 +70,72 @@ class ReplicatedJournal:
         engine: Engine,
         loop: EngineLoop,
         leading: Leading,
-        me: str,
         *,
-        lost: Callable[[HoldfastError], None] = lambda error: None,
+        lost: Callable[[Exception], None] = lambda error: None,
     ) -> None:
         self.path = engine.name
         self.epoch = leading.maker.epoch
         self._engine, self._loop, self._lost = engine, loop, lost
         self._contents = leading.contents
-        self._lock = threading.RLock()
+        self._lock = threading.RLock()  # of the contents; the engine's loop, which keeps the lease, never waits for it
         self._joint: list[Write] | None = None
+        self._is_base_due = False
+        self._count_lock = threading.Lock()  # of what follows
         self._submitted = self._written = 0
         self._waiting: deque[tuple[int, Callable[[HoldfastError | None], None]]] = deque()
         self._unsent: dict[str, bytes] = {}
         self._sending: deque[tuple[int, str]] = deque()
         self._unsent_bytes = 0
+        self._known: set[str] | None = {name for name in leading.contents.kept() if isinstance(name, str)}  # no orphans
         self._failure: HoldfastError | None = None
         self._is_open = True
         self._is_awake = False
-        loop.wait(self._begin(leading, me))
+        self._keeper = leading.keeper
+        loop.wait(self._begin(leading))
 
-    async def _begin(self, leading: Leading, me: str) -> None:
-        self._writer = writer = LogWriter(
+    async def _begin(self, leading: Leading) -> None:
+        self._writer = LogWriter(
             self._engine,
             leading.maker,
             grown=leading.grown,
             written=self._take_written,
-            want_base=self._submit_base,
+            want_base=self._want_base,
         )
-        self._keeper = LeaseKeeper(
-            self._engine, me, leading, hold=writer.hold, go_on=writer.go_on, look=lambda: self._submit(Write())
-        )
-        self._tasks = [asyncio.ensure_future(one) for one in (self._write(), self._keeper.run(), self._drop_orphans())]
+        self._leading = asyncio.ensure_future(self._lead())
 
-    async def _write(self) -> None:
+    async def _lead(self) -> None:
+        """Write, keep the lease and tidy up, until the journal is closed or another leads."""
         try:
-            await self._writer.run()
-        except Deposed as error:
-            self._fail(StaleEpoch(self.path, error.epoch, error.current), error)
-        except HoldfastError as error:
-            self._fail(StoreFailed(self.path, str(error)), error)
+            async with asyncio.TaskGroup() as group:
+                for work in (self._writer.run(), self._keep_lease(), self._drop_orphans()):
+                    group.create_task(work)
+        except ExceptionGroup as errors:
+            cause = _first(errors)
+            if isinstance(cause, Deposed):
+                self._fail(StaleEpoch(self.path, cause.epoch, cause.current))
+            else:  # Also what nobody expects of an engine: no sync may wait for a dead writer.
+                self._fail(StoreFailed(self.path, f"{cause}" or type(cause).__name__))
+            self._lost(cause)
+        await self._keeper.release()  # Whoever leads next need not wait for its end.
+
+    async def _keep_lease(self) -> None:
+        await self._keeper.run(hold=self._writer.hold, go_on=self._writer.go_on, look=lambda: self._queue(Write()))
 
     async def _drop_orphans(self) -> None:
         """Remove what earlier leaders have kept beside the log and nothing in it refers to."""
-        with self._lock:
-            known = {name for name in self._contents.kept() if isinstance(name, str)}
+        names: set[str] = set()
         with contextlib.suppress(Unanswered):  # The next leader does it.
-            orphans = await self._engine.blobs.names() - known
-            if orphans:  # Once a look is written, nobody led before it who could have kept any of these since.
-                with self._lock:
-                    orphans -= self._unsent.keys()
-                    self._submit(Write(drops=sorted(orphans)))
+            names = await self._engine.blobs.names()
+        with self._count_lock:
+            orphans, self._known = names - (self._known or set()), None
+        if orphans:  # Once a look is written, nobody led before it who could have kept any of these since.
+            self._queue(Write(drops=sorted(orphans)))
 
     # -- from the engine's loop -------------------------------------------------------------------------------------
 
     def _take_written(self, count: int) -> None:
         """So many of the writes that were submitted stand in the log."""
-        with self._lock:
+        with self._count_lock:
             self._written = count
             while self._sending and self._sending[0][0] <= count:
                 self._unsent_bytes -= len(self._unsent.pop(self._sending.popleft()[1]))
@@ -137,18 +145,17 @@ class ReplicatedJournal:
         for tell in ready:
             tell(None)
 
-    def _fail(self, failure: HoldfastError, cause: HoldfastError) -> None:
-        with self._lock:
+    def _fail(self, failure: HoldfastError) -> None:
+        """Refuse everything from now on, and tell whoever waits."""
+        with self._count_lock:
             self._failure = failure
             waiting = [tell for _, tell in self._waiting]
             self._waiting.clear()
         for tell in waiting:
             tell(failure)
-        self._lost(cause)
 
-    def _submit_base(self) -> None:
-        with self._lock:
-            self._submit(Write(base=self._contents.copy()))
+    def _want_base(self) -> None:
+        self._is_base_due = True  # Whoever writes next has the lock, and copies what there is.
 
     # -- writing ----------------------------------------------------------------------------------------------------
 
@@ -169,14 +176,23 @@ class ReplicatedJournal:
         if self._joint is not None:
             self._joint.append(write)
             return
-        self._submitted += 1
-        for name, data in write.puts:
-            self._unsent[name] = data
-            self._unsent_bytes += len(data)
-            self._sending.append((self._submitted, name))
-        self._writer.submit(write)
-        if not self._is_awake:
-            self._is_awake = True
+        self._queue(write)
+        if self._is_base_due:
+            self._is_base_due = False
+            self._queue(Write(base=self._contents.copy()))
+
+    def _queue(self, write: Write) -> None:
+        with self._count_lock:
+            self._submitted += 1
+            for name, data in write.puts:
+                self._unsent[name] = data
+                self._unsent_bytes += len(data)
+                self._sending.append((self._submitted, name))
+                if self._known is not None:
+                    self._known.add(name)
+            self._writer.submit(write)
+            is_awake, self._is_awake = self._is_awake, True
+        if not is_awake:
             self._loop.soon(self._wake)
 
     def _wake(self) -> None:
@@ -207,9 +223,9 @@ class ReplicatedJournal:
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """Keep a snapshot, and forget what it contains; see `Journal`."""
         data = bytes(snapshot)
+        gone = drop if isinstance(drop, range) else frozenset(drop)
         with self._lock:
-            last = self._contents.last
-            dropped = tuple(sorted({position for position in drop if position <= last}))
+            dropped = tuple(position for position in self._contents.entries.get(address, ()) if position in gone)
             if len(data) < LARGE:
                 self._change(("cut", (address, data, dropped, turn, keep)), len(data) + 9 * len(dropped))
             else:
@@ -267,7 +283,7 @@ class ReplicatedJournal:
 
     def _tell_written(self, tell: Callable[[HoldfastError | None], None]) -> None:
         """Have it called, on any thread, when all that was submitted is in the log, or never will be."""
-        with self._lock:
+        with self._count_lock:
             self._refuse_failed()
             if self._written < self._submitted:
                 self._waiting.append((self._submitted, tell))
@@ -341,6 +357,7 @@ class ReplicatedJournal:
     def read_blocks(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
         """Blocks of a pack, verified; see `Journal`."""
         with self._lock:
+            self._refuse_failed()
             name = self._contents.packs.get(address, {}).get(number)
         data = None if name is None else self._blob(name)
         if data is None:
@@ -369,8 +386,9 @@ class ReplicatedJournal:
         Raises:
             StoreFailed: the engine does not answer.
         """
-        with self._lock:
+        with self._count_lock:
             unsent = self._unsent.get(name)
+        with self._lock:
             if unsent is None and self._joint is not None:
                 unsent = next((data for write in self._joint for known, data in write.puts if known == name), None)
         if unsent is not None:
@@ -412,29 +430,45 @@ class ReplicatedJournal:
         Raises:
             StoreFailed: the engine has not answered in time: what was not acknowledged may be lost.
         """
-        with self._lock:
-            if not self._is_open:
+        if not self._is_open:
+            return
+        try:
+            self._loop.wait(self.end())
+        finally:
+            self._loop.close()
+
+    async def end(self) -> None:
+        """Do what `close` does before it ends the engine's loop; for somebody on that loop.
+
+        Raises:
+            StoreFailed: the engine has not answered in time: what was not acknowledged may be lost.
+        """
+        with self._count_lock:
+            if not self._is_open and self._leading.done():
                 return
+            self._is_open = False
             submitted = self._submitted
-            done: Future[None] = Future()
-            if self._failure is None:
-                self._tell_written(lambda error: done.set_result(None))
+            done = asyncio.get_running_loop().create_future()
+            if self._failure is None and self._written < submitted:
+                self._waiting.append((submitted, lambda error: done.set_result(None)))
             else:
                 done.set_result(None)  # Nothing more will be written.
-            self._is_open = False
-        with contextlib.suppress(TimeoutError):
-            done.result(CLOSE_SECONDS)
+        await asyncio.wait([done], timeout=CLOSE_SECONDS)
         left = submitted - self._written if self._failure is None else 0
+        await end_tasks(self._leading)
         with contextlib.suppress(TimeoutError):
-            self._loop.wait(self._end(), CLOSE_SECONDS)
-        self._loop.close()
+            async with asyncio.timeout(CLOSE_SECONDS):
+                await self._keeper.release()
+                await self._engine.close()
         if left > 0:
-            raise StoreFailed(self.path, f"it has not answered for {CLOSE_SECONDS:g} s: {left} writes may be lost")
+            problem = f"it has not answered for {CLOSE_SECONDS:g} s: {left} writes may be lost"
+            self._fail(StoreFailed(self.path, problem))
+            raise StoreFailed(self.path, problem)
 
-    async def _end(self) -> None:
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.wait(self._tasks)
-        if self._failure is None:
-            await self._keeper.release()
-        await self._engine.close()
+
+def _first(errors: ExceptionGroup[Exception]) -> Exception:
+    """One error of a group, in whatever groups it stands."""
+    error: Exception = errors
+    while isinstance(error, ExceptionGroup):
+        error = error.exceptions[0]
+    return error

@@ -9,6 +9,10 @@ from ..checkpoint.journal import Entry
 
 Change = tuple[str, tuple[Any, ...]]
 """A method of `StoreContents`, and its arguments."""
+CHANGES = frozenset((
+    "append", "cut", "erase", "keep_pack", "forget_packs", "note", "hand_out", "put_entries", "put_snapshot",
+))  # fmt: skip
+"""The methods that are changes."""
 MOST_ENTRIES = 1000
 """Entries of one address in one change of `as_changes`."""
 
@@ -50,8 +54,14 @@ class StoreContents:
     # -- changes ----------------------------------------------------------------------------------------------------
 
     def make(self, change: Change) -> list[Any]:
-        """Make a change; return what it has freed."""
+        """Make a change; return what it has freed.
+
+        Raises:
+            ValueError: there is no such change.
+        """
         name, args = change
+        if name not in CHANGES:
+            raise ValueError(f"no store can make the change {name!r}")
         freed: list[Any] | None = getattr(self, name)(*args)
         return freed or []
 
@@ -69,6 +79,7 @@ class StoreContents:
     def cut(self, address: str, snapshot: Any, drop: Collection[int], turn: int, keep: int) -> list[Any]:
         """Add a snapshot, and forget what the oldest one that is kept contains."""
         kept, entries = self.snapshots.setdefault(address, []), self.entries.get(address, {})
+        drop = drop if isinstance(drop, range) else frozenset(drop)
         before = kept[-1].contains if kept else frozenset[int]()
         kept.append(KeptSnapshot(snapshot, turn, frozenset(p for p in entries if p in before or p in drop)))
         freed = [one.data for one in kept[:-keep]]

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from .. import HoldfastError, run
 from . import upgrade_commands
+from .nats_commands import nats
 from .operate import changing, declaring, following, looking, remembering
 from .service import doctor, project, service_run
 from .store_commands import store
@@ -103,3 +104,4 @@ for command in (
 commands.command("check-upgrade")(upgrade_commands.check)
 commands.command("replay")(upgrade_commands.replay)
 commands.add_typer(store)
+commands.add_typer(nats)

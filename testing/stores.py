@@ -40,7 +40,8 @@ def conformance(factory: Factory, *, crash: Crash | None = None, fail: Fail = fu
         factory: opens the engine in a folder.
         crash: given an engine and its folder, makes another folder as a kill of the process would leave it at this
             moment, which may be in the middle of a call or of an opening (then the engine is that of the opening
-            before). For an engine on plain files it copies the folder. Left out, nothing is tested of kills.
+            before). For an engine on plain files it copies the folder. An engine whose `safe_at` is "sync" need not
+            have kept what was not synced. Left out, nothing is tested of kills.
         fail: given the folder, a context in which it takes no more bytes. Left out, no file of the process can grow
             meanwhile; give one if the engine keeps its data elsewhere.
     """

@@ -59,7 +59,7 @@ def test_pytest_holds_one_copy_of_the_package() -> None:
         "nats",
         "nkeys",
         "numpy",
-        "holdfast.cluster",
+        "holdfast.cluster.nats",
         "holdfast.console",
         "holdfast.diagnosis",
         "holdfast.testing",

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Generator, Mapping, Sequence
-from typing import Any, Final, TypeVar
-from urllib.parse import quote
+from collections.abc import Generator, Sequence
+from typing import Any, Final
 
 import nats.errors
 from nats.aio.client import Client
@@ -21,11 +20,14 @@ from nats.js.errors import Error as JetStreamError
 
 from ..log_records import PART
 from ..ports import LogReader, OutOfTurn, Record, Unanswered
-from .access import access_of, connect_options
+from .access import NatsAccess, connect_options
+from .server_check import refuse_unsafe
+from .streams import Names, stream_settings
 
-T = TypeVar("T")
 ANSWER_SECONDS: Final = 2.0
 """How long one request waits for its answer."""
+CONNECT_SECONDS: Final = 5.0
+"""How long it may take until the first server answers."""
 LEASE_SECONDS: Final = 3
 """How long a lease lasts after each renewal, in whole seconds, as the server counts them."""
 BATCH: Final = 256
@@ -36,50 +38,6 @@ IDLE_SECONDS: Final = 60.0
 """After so long without a request the server forgets a reader."""
 _WRONG_PREDECESSOR: Final = (10071, 10164)
 """What the server says if the last record is another one, or may be: a majority has not come so far."""
-
-
-def token_of(name: str) -> str:
-    """A name as a part of a subject or of a stream's name: no dots, blanks, stars or slashes.
-
-    >>> token_of("shop.eu 1")
-    'shop%2Eeu%201'
-    """
-    return quote(name, safe="-_").replace(".", "%2E").replace("~", "%7E")
-
-
-class Names:
-    """What a system's subjects and streams are called.
-
-    Args:
-        system: its name.
-    """
-
-    def __init__(self, system: str) -> None:
-        token = token_of(system)
-        self.log = f"hf.{token}.root.log"
-        self.lease = f"hf.{token}.root.lease"
-        self.blobs = f"hf.{token}.blob"
-        self.log_stream = f"HF-{token}-LOG"
-        self.lease_stream = f"HF-{token}-LEASE"
-        self.blob_stream = f"HF-{token}-BLOB"
-
-
-def stream_settings(names: Names, replicas: int) -> list[api.StreamConfig]:
-    """The streams of a system, as they have to be."""
-    common: dict[str, Any] = {"storage": api.StorageType.FILE, "num_replicas": replicas, "allow_direct": False}
-    keeps: dict[str, Any] = {**common, "discard": api.DiscardPolicy.NEW}
-    return [
-        api.StreamConfig(name=names.log_stream, subjects=[names.log], **keeps),
-        api.StreamConfig(name=names.blob_stream, subjects=[f"{names.blobs}.>"], max_msgs_per_subject=1, **keeps),
-        api.StreamConfig(
-            name=names.lease_stream,
-            subjects=[names.lease],
-            max_msgs_per_subject=1,
-            allow_msg_ttl=True,
-            discard=api.DiscardPolicy.OLD,
-            **common,
-        ),
-    ]
 
 
 class NatsEngine:
@@ -100,30 +58,6 @@ class NatsEngine:
         self.lease = NatsLease(stream, names, name)
         self.blobs = NatsBlobs(stream, names, name)
 
-    @staticmethod
-    async def connect(options: Mapping[str, Any], name: str, system: str, *, replicas: int) -> NatsEngine:
-        """Connect, and make the streams of the system if they are not there.
-
-        Args:
-            options: of `nats.connect`.
-            name: what errors call the engine, without secrets.
-            system: the name of the system.
-            replicas: on how many servers everything is kept: 1 or 3.
-
-        Raises:
-            Unanswered: no server can be reached, or they do not make the streams.
-        """
-        client = Client()
-        with answering(name):
-            await client.connect(**options)
-        engine = NatsEngine(client, name, system)
-        try:
-            await engine._make_streams(replicas)
-        except BaseException:
-            await engine.close()
-            raise
-        return engine
-
     async def _make_streams(self, replicas: int) -> None:
         stream = self._client.jetstream(timeout=5 * ANSWER_SECONDS)
         with answering(self.name):
@@ -141,20 +75,32 @@ class NatsEngine:
             await self._client.close()
 
 
-async def open_engine(store: str, system: str) -> NatsEngine:
-    """Connect to the servers that a store names, and refuse those that may lose what they have acknowledged.
-
-    Args:
-        store: "nats://HOST,HOST/NAME", see `access_of`.
-        system: the name of the system.
+async def open_engine(access: NatsAccess) -> NatsEngine:
+    """Connect, make the streams of the system if they are not there, and refuse servers that may lose something.
 
     Raises:
-        SpecError: the store cannot be read, or its files must not be used.
-        UnsafeServer: its servers or streams are not set as they have to be.
-        Unanswered: no server can be reached.
+        SpecError: a file of secrets or certificates must not be used.
+        UnsafeServer: the servers or streams are not set as they have to be.
+        Unanswered: no server can be reached, or they have no leader now.
     """
-    access = access_of(store)
-    return await NatsEngine.connect(connect_options(access), access.name, system, replicas=access.replicas)
+    name = access.name
+    client = Client()
+    options: dict[str, Any] = {**connect_options(access)}
+    with answering(name):
+        try:
+            async with asyncio.timeout(CONNECT_SECONDS):
+                await client.connect(**options)
+        except BaseException:
+            await client.close()
+            raise
+    engine = NatsEngine(client, name, access.system)
+    try:
+        await engine._make_streams(access.replicas)
+        await refuse_unsafe(client, access)
+    except BaseException:
+        await engine.close()
+        raise
+    return engine
 
 
 @contextlib.contextmanager

@@ -7,12 +7,13 @@ import random
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import partial
 from typing import Any, Final
 
 from ...actors.errors import StoreError
 from ...checkpoint.journal import Entry, Journal
 from ..threads import NewThreads
-from .bench import Bench, OpenEngine
+from .bench import Bench, OpenEngine, acknowledged
 from .comparing import PromiseBroken, refused
 from .contents import check_twice
 from .model import StoreModel, settle
@@ -45,6 +46,25 @@ def what_was_acknowledged_outlives_a_kill(bench: Bench) -> None:
     opened.kill()
     fill(opened.journal, model)
     check_twice(opened, model)
+
+
+def a_kill_leaves_all_writes_up_to_some_one(bench: Bench) -> None:
+    """Where only a sync makes safe, what was not synced may be gone, but only from some write on, and whole writes."""
+    for count in range(1, len(all_writes()) + 1):
+        opened, model = bench.open(), StoreModel()
+        fill(opened.journal, model)
+        opened.kill()
+        states = [model.copy()]
+        for write in all_writes()[:count]:
+            write.do(opened.journal, model)
+            if write.kind == "sync" or opened.safe_at == "append":
+                states.clear()
+            states.append(model.copy())
+        opened.kill(synced=False)
+        model = settle(opened.journal, states[::-1])
+        append(opened.journal, model, (A, ("in", "later")))
+        check_twice(opened, model)
+        bench.close()
 
 
 def a_kill_before_the_first_write_is_survived(bench: Bench) -> None:
@@ -190,7 +210,7 @@ def of_two_openings_one_acknowledges(bench: Bench) -> None:
         blocks = make_small_blocks(random.Random(1))
         if second.epoch <= first.epoch:
             raise PromiseBroken(f"the second opening has epoch {second.epoch} after epoch {first.epoch}")
-        append(second, model, (A, ("in", "second")))
+        acknowledged(second, lambda: append(second, model, (A, ("in", "second"))))
         for what, write in (
             ("append", lambda: first.append([(A, ("in", "first"))])),
             ("cut", lambda: first.cut(A, b"first", [], turn=99)),
@@ -198,7 +218,7 @@ def of_two_openings_one_acknowledges(bench: Bench) -> None:
             ("erase", lambda: first.erase(A)),
             ("keep_blocks", lambda: first.keep_blocks(A, 99, blocks, False)),
         ):
-            refused(write, f"{what} by the first of two openings")
+            refused(partial(acknowledged, first, write), f"{what} by the first of two openings")
         first.close()
         append(second, model, (A, ("in", "second, when the first was closed")))
         model.check(second)
@@ -307,6 +327,7 @@ def what_is_written_together_is_kept_together(bench: Bench) -> None:
 KILLS: Final = (
     a_kill_before_the_first_write_is_survived,
     what_was_acknowledged_outlives_a_kill,
+    a_kill_leaves_all_writes_up_to_some_one,
     a_kill_inside_a_write_leaves_all_of_it_or_nothing,
     a_kill_inside_an_opening_or_a_closing_is_survived,
     what_is_written_together_is_kept_together,

@@ -10,13 +10,26 @@ from pathlib import Path
 from typing import Any
 
 from ...actors.errors import StoreError
-from ...checkpoint.journal import Journal
+from ...checkpoint.journal import Journal, SafeAt
 from .comparing import PromiseBroken
 from .watching import full_disk, grown, signature, watched
 
 Factory = Callable[[Path], Journal]
 Crash = Callable[[Journal, Path], Path]
 Fail = Callable[[Path], AbstractContextManager[None]]
+
+
+def safe_at(journal: Journal) -> SafeAt:
+    """When what was appended outlives a kill; engines that do not say so keep it at once."""
+    said: SafeAt = getattr(journal, "safe_at", "append")
+    return said
+
+
+def acknowledged(journal: Journal, write: Callable[[], object]) -> None:
+    """Write, and wait until it is as safe as it has to be before anybody may be told of it."""
+    write()
+    if safe_at(journal) == "sync":
+        journal.sync()
 
 
 class Bench:
@@ -101,8 +114,19 @@ class OpenEngine:
         self.journal.close()
         self.journal = self._open(self.folder)
 
-    def kill(self) -> None:
-        """Go on with what a kill leaves; what was open before is closed, in its own folder, as if it were not there."""
+    @property
+    def safe_at(self) -> SafeAt:
+        """When what was written outlives a kill: at once, or only when a `sync` has come back."""
+        return safe_at(self.journal)
+
+    def kill(self, *, synced: bool = True) -> None:
+        """Go on with what a kill leaves; what was open before is closed, in its own folder, as if it were not there.
+
+        Args:
+            synced: have an engine sync before, if what it was given is not safe without that.
+        """
+        if synced and self.safe_at == "sync":
+            self.journal.sync()
         folder = self.bench.copy(self.journal, self.folder)
         self.journal.close()
         self.folder = folder

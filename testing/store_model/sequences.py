@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 from ...actors.errors import StoreError
 from ...checkpoint.journal import Entry, Journal
-from .bench import Bench
+from .bench import Bench, acknowledged
 from .comparing import PromiseBroken
 from .model import StoreModel
 from .samples import make_entry, make_small_blocks
@@ -185,7 +185,7 @@ class SequenceRun:
             raise PromiseBroken(f"a second opening has epoch {second.epoch} after epoch {first.epoch}")
         self._opened.journal, self._opened.epoch = second, second.epoch
         try:
-            first.append([(PLACES[0], ("in", "by the first"))])
+            acknowledged(first, lambda: first.append([(PLACES[0], ("in", "by the first"))]))
         except StoreError:
             first.close()
             return

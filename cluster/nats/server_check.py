@@ -1,0 +1,434 @@
+"""Are the servers, and the streams of a system on them, such that nothing is lost that was acknowledged?
+
+`look_at` asks the servers, `problems_of` judges what they say. A start refuses servers with a problem that is more than
+a warning; `holdfast nats check` prints them all.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Sequence
+from time import monotonic
+from typing import TYPE_CHECKING, Final, TypeVar
+
+import msgspec
+
+from ...actors.errors import HoldfastError, SpecError
+from ..ports import Unanswered
+from .access import NatsAccess, access_of, connect_options
+from .server_file import MOST_BYTES, NEEDS, VARZ
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
+
+T = TypeVar("T")
+
+OLDEST: Final = (2, 12)
+"""The first version that loses no acknowledged write when a server is killed."""
+LEAST_BYTES: Final = 1024 * 1024
+"""Messages of this size must be taken: parts of records are smaller, with some room."""
+_ENGINE: Final = "NATS"
+_NOT_ENABLED: Final = (10039, 10076)
+"""Answers of the API where JetStream is off, for the account or for the server."""
+
+
+LOSES: Final = {
+    "subjects": "records go to none",
+    "retention": "records go although nobody has dropped them",
+    "storage": "a restart loses all",
+    "discard": "a full stream does what it should not",
+    "num_replicas": "the loss of a server loses records, or stops all",
+    "max_age": "records go with time",
+    "max_msgs": "there is room for so many records only",
+    "max_msgs_per_subject": "another number of records stays",
+    "max_bytes": "there is room for so many bytes only",
+    "max_msg_size": "larger records are refused",
+    "no_ack": "nobody knows what is kept",
+    "sealed": "nothing can be appended",
+    "allow_direct": "reads may miss the last records",
+    "mirror_direct": "reads may miss the last records",
+    "persist_mode": "what was acknowledged may not be on the disk",
+}
+"""Settings of a stream on which it depends whether something is lost, and what another one leads to."""
+
+
+class UnsafeServer(HoldfastError, text="{servers} may lose what was acknowledged: {problems:; }"):
+    """A server, or a stream on it, is not set up such that a system may rely on it."""
+
+    servers: str
+    problems: tuple[str, ...]
+
+
+class Problem(msgspec.Struct, frozen=True):
+    """Something about a server or a stream that is not as it should be.
+
+    Attributes:
+        where: the server, or the stream.
+        problem: what is wrong, and what it may lead to.
+        remedy: what to change.
+        is_warning: a system can be started all the same.
+    """
+
+    where: str
+    problem: str
+    remedy: str
+    is_warning: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.problem}; {self.remedy}"
+
+
+class MetaGroup(msgspec.Struct, frozen=True):
+    """The servers of a cluster that vote about streams."""
+
+    cluster_size: int = 0
+
+
+class JetStreamConfig(msgspec.Struct, frozen=True):
+    """How JetStream of a server is set up; `sync_always` is left out by the server where it is false."""
+
+    sync_always: bool = False
+
+
+class JetStreamSeen(msgspec.Struct, frozen=True):
+    """What a server says of its JetStream; no configuration where it is off."""
+
+    config: JetStreamConfig | None = None
+    meta: MetaGroup | None = None
+
+
+class ServerSeen(msgspec.Struct, frozen=True):
+    """What a server says of itself."""
+
+    server_name: str
+    version: str
+    max_payload: int = LEAST_BYTES
+    jetstream: JetStreamSeen = JetStreamSeen()
+
+
+class StreamSetting(msgspec.Struct, frozen=True):
+    """The configuration of a stream, as far as what was acknowledged depends on it; times in nanoseconds."""
+
+    name: str
+    subjects: tuple[str, ...] = ()
+    retention: str = "limits"
+    storage: str = "file"
+    discard: str = "old"
+    num_replicas: int = 1
+    max_age: int = 0
+    max_msgs: int = -1
+    max_msgs_per_subject: int = -1
+    max_bytes: int = -1
+    max_msg_size: int = -1
+    no_ack: bool = False
+    sealed: bool = False
+    allow_direct: bool = False
+    mirror_direct: bool = False
+    persist_mode: str = "default"
+
+
+class Seen(msgspec.Struct, frozen=True):
+    """What can be seen of the servers from the account of a system.
+
+    Attributes:
+        version: of the server that the client is connected to.
+        max_payload: of that server, in bytes.
+        has_jetstream: whether the account has JetStream.
+        servers: those that have said how they are set up; none where the account does not import that.
+        streams: all in the account.
+    """
+
+    version: str
+    max_payload: int
+    has_jetstream: bool
+    servers: tuple[ServerSeen, ...] = ()
+    streams: tuple[StreamSetting, ...] = ()
+
+
+class _Varz(msgspec.Struct):
+    data: ServerSeen
+
+
+class _ApiError(msgspec.Struct):
+    code: int = 0
+    err_code: int = 0
+    description: str = ""
+
+
+class _Info(msgspec.Struct):
+    error: _ApiError | None = None
+
+
+class _ListedStream(msgspec.Struct):
+    config: StreamSetting
+
+
+class _Streams(_Info):
+    total: int = 0
+    streams: list[_ListedStream] | None = None
+
+
+async def check_server(client: Client, access: NatsAccess, *, seconds: float = 5.0) -> list[Problem]:
+    """What is wrong with the servers that a client is connected to, and with the streams of its system.
+
+    Args:
+        seconds: how long each answer may take.
+
+    Raises:
+        Unanswered: a server has not answered in time, or has no leader now.
+    """
+    return problems_of(await look_at(client, access, seconds=seconds), access)
+
+
+async def refuse_unsafe(client: Client, access: NatsAccess, *, seconds: float = 5.0) -> list[Problem]:
+    """Check the servers, and return what is only a warning.
+
+    Raises:
+        UnsafeServer: something that was acknowledged may be lost there; the text has each problem and its remedy.
+        Unanswered: a server has not answered in time, or has no leader now.
+    """
+    found = await check_server(client, access, seconds=seconds)
+    fatal = tuple(str(one) for one in found if not one.is_warning)
+    if fatal:
+        raise UnsafeServer(", ".join(access.servers), fatal)
+    return found
+
+
+async def check_store(store: str, *, seconds: float = 5.0) -> list[Problem]:
+    """What is wrong with the servers and streams that a store names: connect, look, and go.
+
+    Args:
+        store: `nats://host,host/system?...`, see `access_of`.
+        seconds: how long it may take to connect, and each answer.
+
+    Raises:
+        SpecError: the store cannot be read, or the library for it is missing.
+        Unanswered: no server lets us in, or one has not answered in time.
+    """
+    access = access_of(store)
+    options = connect_options(access)
+    options["max_reconnect_attempts"] = 2
+    try:
+        from nats.aio.client import Client
+        from nats.errors import Error
+    except ImportError as error:
+        raise SpecError("store", NEEDS) from error
+    told: list[str] = []
+
+    async def note(error: Exception) -> None:
+        told.append(str(error) or type(error).__name__)
+
+    client = Client()
+    try:
+        async with asyncio.timeout(seconds):
+            await client.connect(**options, error_cb=note)
+        return await check_server(client, access, seconds=seconds)
+    except (Error, OSError) as error:  # TimeoutError is one of these
+        last = told[-1] if told else str(error) or type(error).__name__
+        raise Unanswered(access.name, f"no server lets us in: {last}") from error
+    finally:
+        await client.close()
+
+
+async def look_at(client: Client, access: NatsAccess, *, seconds: float = 5.0) -> Seen:
+    """Ask the servers how they are set up. Nothing is changed there.
+
+    Raises:
+        Unanswered: a server has not answered in time, or has no leader now.
+    """
+    from nats.errors import NoRespondersError
+
+    try:
+        info = await _asked(client, "INFO", _Info, {}, seconds)
+        has_jetstream = _refusal(info) is None
+    except NoRespondersError:
+        has_jetstream = False
+    return Seen(
+        version=str(client.connected_server_version),
+        max_payload=client.max_payload,
+        has_jetstream=has_jetstream,
+        servers=await _servers(client, access),
+        streams=await _streams(client, seconds) if has_jetstream else (),
+    )
+
+
+def problems_of(seen: Seen, access: NatsAccess) -> list[Problem]:
+    """Judge what was seen of the servers; each problem says what to change."""
+    told = seen.servers or (ServerSeen("the server", seen.version, seen.max_payload),)
+    found = [problem for server in told for problem in _of_version(server)]
+    if not seen.has_jetstream:
+        remedy = "give the account `jetstream: enabled` and the server a block `jetstream { ... }`"
+        return [*found, Problem(f"the account of {access.system}", "JetStream is off, so nothing can be kept", remedy)]
+    if not seen.servers:
+        problem = "nobody can see from here whether each record is on the disk before it is acknowledged"
+        remedy = (
+            "look for `sync_interval: always` in the file of each server, or use what `holdfast nats config` writes, "
+            f"which lets the account import {VARZ}"
+        )
+        found.append(Problem("the servers", problem, remedy, is_warning=True))
+    for server in seen.servers:
+        found += _of_jetstream(server)
+    found += _of_cluster(seen.servers, access)
+    wanted = wanted_streams(access)
+    for stream in seen.streams:
+        if stream.name in wanted:
+            found += _of_stream(stream, wanted[stream.name])
+    return found
+
+
+def _of_version(server: ServerSeen) -> list[Problem]:
+    where, found = server.server_name, list[Problem]()
+    if _version(server.version) < OLDEST:
+        problem = f"its version is {server.version}, which may lose acknowledged records when it is killed"
+        found.append(Problem(where, problem, f"install {'.'.join(map(str, OLDEST))} or later"))
+    if server.max_payload < MOST_BYTES:
+        problem = f"it takes messages of at most {server.max_payload} bytes, and a message may have {MOST_BYTES}"
+        is_warning = server.max_payload >= LEAST_BYTES
+        found.append(Problem(where, problem, f"set `max_payload: {MOST_BYTES}`", is_warning=is_warning))
+    return found
+
+
+def _of_jetstream(server: ServerSeen) -> list[Problem]:
+    if server.jetstream.config is None:
+        problem = "JetStream is off there, so it keeps no copies of what the others have"
+        return [Problem(server.server_name, problem, "add a block `jetstream { ... }`", is_warning=True)]
+    if not server.jetstream.config.sync_always:
+        problem = "it acknowledges records before they are on the disk, and a power cut loses them"
+        return [Problem(server.server_name, problem, "set `jetstream { sync_interval: always }`")]
+    return []
+
+
+def _of_cluster(servers: Sequence[ServerSeen], access: NatsAccess) -> list[Problem]:
+    size = _cluster_size(servers)
+    if size == 2:
+        problem = "the cluster has two servers, and the loss of either stops both"
+        return [Problem("the cluster", problem, "add a third server, or use one alone")]
+    if servers and access.replicas > max(size, 1):
+        problem = f"{access.replicas} replicas are wanted, and there is one server"
+        return [Problem("the cluster", problem, f"add servers until there are {access.replicas}, or write ?replicas=1")]
+    return []
+
+
+def _cluster_size(servers: Sequence[ServerSeen]) -> int:
+    """How many servers vote about streams; 0 for one that is alone."""
+    return max((one.jetstream.meta.cluster_size for one in servers if one.jetstream.meta is not None), default=0)
+
+
+def _of_stream(stream: StreamSetting, wanted: StreamSetting) -> list[Problem]:
+    """One problem for each setting of a stream that is not as the system makes it."""
+    where, found = f"the stream {stream.name}", list[Problem]()
+    for setting in LOSES:
+        now, right = getattr(stream, setting), getattr(wanted, setting)
+        if now != right and not (setting == "num_replicas" and now % 2 and now > right):
+            problem = f"{setting} is {_shown(now)}, and {LOSES[setting]}"
+            found.append(Problem(where, problem, f"set it to {_shown(right)} (`nats stream edit {stream.name}`)"))
+    return found
+
+
+def _shown(value: object) -> str:
+    """A value as the server's own tools write it.
+
+    >>> _shown(("a", "b")), _shown(False), _shown("file"), _shown(-1)
+    ('a b', 'false', 'file', '-1')
+    """
+    match value:
+        case bool():
+            return str(value).lower()
+        case tuple():
+            return " ".join(map(str, value))
+        case _:
+            return str(value)
+
+
+def wanted_streams(access: NatsAccess) -> dict[str, StreamSetting]:
+    """How the streams of a system have to be set, by name."""
+    from .streams import Names, stream_settings
+
+    settings = [one.as_dict() for one in stream_settings(Names(access.system), access.replicas)]
+    as_listed = msgspec.json.decode(msgspec.json.encode(settings), type=list[StreamSetting])
+    return {one.name: one for one in as_listed}
+
+
+def _version(text: str) -> tuple[int, ...]:
+    """The numbers of a version.
+
+    >>> _version("2.12.0-RC.1"), _version("<nats server v2.15.1>")
+    ((2, 12, 0), (2, 15, 1))
+    """
+    plain = text.strip("<>").rpartition(" ")[2].lstrip("v").partition("-")[0]
+    return tuple(int(part) for part in plain.split(".") if part.isdigit())
+
+
+async def _servers(client: Client, access: NatsAccess) -> tuple[ServerSeen, ...]:
+    """What each server says of itself, as far as the account may ask; those that are down say nothing."""
+    inbox = client.new_inbox()
+    asked = await client.subscribe(inbox)
+    found: dict[str, ServerSeen] = {}
+    try:
+        await client.publish(VARZ, b"", reply=inbox)
+        until, expected = monotonic() + 1.0, len(access.servers)
+        while len(found) < expected:
+            try:
+                answer = await asked.next_msg(max(0.001, until - monotonic()))
+            except TimeoutError:  # of nats-py, too
+                break
+            if not answer.data:  # Nobody listens: the account does not import it.
+                break
+            seen = _read(answer.data, _Varz).data
+            found[seen.server_name] = seen
+            expected = max(expected, _cluster_size([seen]))
+    finally:
+        await asked.unsubscribe()
+    return tuple(found[name] for name in sorted(found))
+
+
+async def _streams(client: Client, seconds: float) -> tuple[StreamSetting, ...]:
+    found: list[StreamSetting] = []
+    while True:
+        page = await _asked(client, "STREAM.LIST", _Streams, {"offset": len(found)}, seconds)
+        if refused := _refusal(page):
+            raise Unanswered(_ENGINE, refused)
+        found += (one.config for one in page.streams or ())
+        if not page.streams or len(found) >= page.total:
+            return tuple(found)
+
+
+def _refusal(info: _Info) -> str | None:
+    """Why the API refuses to answer since JetStream is off; None if it answers.
+
+    Raises:
+        Unanswered: it cannot answer now.
+    """
+    if info.error is None:
+        return None
+    if info.error.err_code in _NOT_ENABLED:
+        return info.error.description
+    raise Unanswered(_ENGINE, f"{info.error.description} ({info.error.err_code})")
+
+
+async def _asked(client: Client, what: str, kind: type[T], wanted: dict[str, int], seconds: float) -> T:
+    """The answer of the JetStream API.
+
+    Raises:
+        Unanswered: it does not come in time.
+        NoRespondersError: nobody answers there.
+    """
+    from nats.errors import Error, NoRespondersError
+
+    try:
+        answer = await client.request(f"$JS.API.{what}", json.dumps(wanted).encode(), timeout=seconds)
+    except NoRespondersError:
+        raise
+    except TimeoutError as error:
+        raise Unanswered(_ENGINE, f"no answer to {what} in {seconds} s; may this user ask?") from error
+    except Error as error:
+        raise Unanswered(_ENGINE, f"{what}: {error}") from error
+    return _read(answer.data, kind)
+
+
+def _read(data: bytes, kind: type[T]) -> T:
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except msgspec.MsgspecError as error:
+        raise SpecError("nats check", f"the server answers in a way that is not known: {error}") from error

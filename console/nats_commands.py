@@ -1,0 +1,108 @@
+"""The `holdfast nats` commands: write the files of servers on which systems may rely, and check servers that run."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from ..actors.errors import HoldfastError, SpecError
+from ..cluster.nats.server_check import check_store
+from ..cluster.nats.server_file import ServerPlan, TlsFiles, write_server_files
+from .operate.reaching import FAILED, UNUSABLE, Json, printable, show_json
+
+nats = typer.Typer(
+    name="nats", help="Set up NATS servers for systems on several machines, and check them.", no_args_is_help=True
+)
+
+
+@nats.command()
+def config(
+    folder: Annotated[Path, typer.Argument(help="Where the files go; it is made, for its owner alone.")],
+    system: Annotated[list[str], typer.Option(help="A system that is kept there; give it again for more.")],
+    host: Annotated[
+        list[str] | None, typer.Option(help="A server, by the name that others reach it by: one, or three.")
+    ] = None,
+    port: Annotated[int, typer.Option(min=1, max=65000, help="For clients; counted up on one host.")] = 4222,
+    cluster_port: Annotated[int, typer.Option(min=1, max=65000, help="For the servers among each other.")] = 6222,
+    monitor_port: Annotated[int, typer.Option(min=0, max=65000, help="For health checks, on the machine.")] = 8222,
+    store_dir: Annotated[str, typer.Option(help="Where JetStream keeps its files, on each machine.")] = "/var/lib/nats",
+    certificate: Annotated[str | None, typer.Option(help="The certificate of a server, on its machine.")] = None,
+    key: Annotated[str | None, typer.Option(help="The private key of that certificate, on its machine.")] = None,
+    ca: Annotated[str | None, typer.Option(help="Who has signed the certificates, on each machine.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Write files of servers anew. Keys are kept always.")] = False,
+) -> None:
+    """Write the configuration of one NATS server, or of each of three, and a key for each role in each system.
+
+    Servers on other hosts than 127.0.0.1 need --certificate, --key and --ca.
+
+    Exit status 0: the files are there. 2: they could not be written.
+    """
+    try:
+        tls = _tls(certificate, key, ca)
+        plans = _plans(host or ["127.0.0.1"], (port, cluster_port, monitor_port), store_dir, tls)
+        files = write_server_files(folder, plans, system, force=force)
+    except (HoldfastError, OSError) as error:
+        typer.echo(f"holdfast nats config: {error}", err=True)
+        raise typer.Exit(UNUSABLE) from error
+    for file in files:
+        typer.echo(printable(str(file)))
+
+
+@nats.command()
+def check(
+    store: Annotated[str, typer.Argument(help="As in ActorSystem(store=...): nats://HOST,HOST/SYSTEM?nkey=FILE")],
+    seconds: Annotated[float, typer.Option(min=0.1, max=600.0, help="How long each answer may take.")] = 5.0,
+    as_json: Json = False,
+) -> None:
+    """Look whether servers, and the streams of a system there, may lose something that was acknowledged.
+
+    Exit status 0: they do not, though there may be warnings. 1: they may. 2: no server answers, or STORE is not valid.
+    """
+    try:
+        found = asyncio.run(check_store(store, seconds=seconds))
+    except HoldfastError as error:
+        typer.echo(f"holdfast nats check: {error}", err=True)
+        raise typer.Exit(UNUSABLE) from error
+    if as_json:
+        show_json(msgspec.to_builtins(found))
+    else:
+        for one in found:
+            typer.echo(printable(f"{'warning' if one.is_warning else 'PROBLEM'}: {one}"))
+        if not found:
+            typer.echo("ok: what is acknowledged there stays")
+    if not all(one.is_warning for one in found):
+        raise typer.Exit(FAILED)
+
+
+def _tls(certificate: str | None, key: str | None, ca: str | None) -> TlsFiles | None:
+    match certificate, key, ca:
+        case None, None, None:
+            return None
+        case str(), str(), str():
+            return TlsFiles(certificate, key, ca)
+        case _:
+            raise SpecError("nats config", "--certificate, --key and --ca belong together: give all or none")
+
+
+def _plans(hosts: list[str], ports: tuple[int, int, int], store_dir: str, tls: TlsFiles | None) -> list[ServerPlan]:
+    """A plan for each host; servers that share one have ports that follow each other."""
+    port, cluster_port, monitor_port = ports
+    plans: list[ServerPlan] = []
+    for number, host in enumerate(hosts):
+        earlier = hosts[:number].count(host)
+        plans.append(
+            ServerPlan(
+                name=f"nats-{number + 1}",
+                host=host,
+                store_dir=f"{store_dir.rstrip('/')}/nats-{number + 1}",
+                port=port + earlier,
+                cluster_port=cluster_port + earlier,
+                monitor_port=monitor_port and monitor_port + earlier,
+                tls=tls,
+            )
+        )
+    return plans

@@ -1,0 +1,139 @@
+"""Programs that stand by and lead, as processes that tests kill and stop, and a client that asks whoever leads."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+
+from tests.cluster.servers import PATIENCE
+
+ATTEMPT_SECONDS = 1.0
+"""How long a client waits for an answer before it asks again, perhaps somebody else."""
+
+
+class Programs:
+    """Processes of `tests.cluster.bank` on one store."""
+
+    def __init__(self, store: str, folder: Path, isolation: str = "task") -> None:
+        self.store, self.socket, self.isolation = store, folder / "bank.sock", isolation
+        self.folder = folder
+        self.processes: list[asyncio.subprocess.Process] = []
+
+    async def start(self) -> asyncio.subprocess.Process:
+        """Start another program; it stands by, or leads."""
+        command = ["-m", "tests.cluster.bank", self.store, str(self.socket), self.isolation]
+        errors = (self.folder / f"program-{len(self.processes)}.err").open("wb")
+        with errors:
+            process = await asyncio.create_subprocess_exec(
+                sys.executable, *command, stdout=asyncio.subprocess.PIPE, stderr=errors
+            )
+        self.processes.append(process)
+        return process
+
+    async def leads(self, process: asyncio.subprocess.Process) -> None:
+        """Wait until a program has begun to lead."""
+        assert process.stdout is not None
+        async with asyncio.timeout(PATIENCE):
+            assert await process.stdout.readline() == b"leads\n", self.errors()
+
+    def errors(self) -> str:
+        """What the programs have written about what went wrong."""
+        return "\n".join(file.read_text() for file in sorted(self.folder.glob("program-*.err")))
+
+    def of(self, pid: int) -> asyncio.subprocess.Process:
+        """The program with that pid."""
+        return next(one for one in self.processes if one.pid == pid)
+
+    async def end(self, process: asyncio.subprocess.Process, number: signal.Signals = signal.SIGKILL) -> None:
+        """Send a program that signal, and wait until it has ended."""
+        process.send_signal(number)
+        async with asyncio.timeout(PATIENCE):
+            await process.wait()
+        self.processes.remove(process)
+
+    async def close(self) -> None:
+        """End all programs."""
+        for process in [*self.processes]:
+            with contextlib.suppress(ProcessLookupError):
+                await self.end(process)
+
+
+class Client:
+    """Deposits 1, 2, 3, ...: each is asked for until it is answered, and then the next one follows.
+
+    Attributes:
+        leader: the pid of the program that has answered last.
+        count: how many deposits were answered.
+        balance: their sum, which each answer is compared with: it is as if there were one account, which never failed.
+    """
+
+    def __init__(self, socket: Path) -> None:
+        self._socket = socket
+        self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
+        self.leader = 0
+        self.count = self.balance = 0
+
+    async def deposit(self) -> None:
+        """One more deposit."""
+        number = self.count + 1
+        answer = await self._answered({"id": number, "amount": number})
+        self.balance += number
+        self.count = number
+        assert answer == self.balance, f"deposit {number} was answered with {answer}, not {self.balance}"
+
+    async def deposit_for(self, until: asyncio.Event) -> None:
+        """Deposits, until the event is set."""
+        while not until.is_set():
+            await self.deposit()
+
+    async def check(self) -> None:
+        """Compare what the account says of itself."""
+        answer = await self._answered({})
+        assert answer == {"balance": self.balance, "count": self.count}, answer
+
+    async def _answered(self, request: dict[str, int]) -> object:
+        async with asyncio.timeout(PATIENCE):
+            while True:
+                try:
+                    async with asyncio.timeout(ATTEMPT_SECONDS):
+                        return await self._ask(request)
+                except (OSError, TimeoutError, asyncio.IncompleteReadError):
+                    await self.close()
+                    await asyncio.sleep(0.02)  # Nobody tells a client that somebody else leads.
+
+    async def _ask(self, request: dict[str, int]) -> object:
+        if self._streams is None:
+            self._streams = await asyncio.open_unix_connection(str(self._socket))
+        reader, writer = self._streams
+        writer.write(json.dumps(request).encode() + b"\n")
+        answer = json.loads(await reader.readuntil())
+        self.leader = answer["pid"]
+        return answer["answer"]
+
+    async def close(self) -> None:
+        """Let go of the connection."""
+        streams, self._streams = self._streams, None
+        if streams is not None:
+            streams[1].close()
+            with contextlib.suppress(OSError):
+                await streams[1].wait_closed()
+
+
+def paused(process: asyncio.subprocess.Process) -> contextlib.AbstractContextManager[None]:
+    """Have a process stand still meanwhile, with all its connections."""
+
+    @contextlib.contextmanager
+    def standing() -> object:
+        os.kill(process.pid, signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process.pid, signal.SIGCONT)
+
+    return standing()

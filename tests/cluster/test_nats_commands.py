@@ -1,0 +1,87 @@
+"""`holdfast nats config` and `holdfast nats check`, as a user runs them."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+from nats.js.api import StorageType
+from typer.testing import CliRunner, Result
+
+from holdfast.cluster.nats.server_file import Role
+from holdfast.cluster.nats.streams import Names, stream_settings
+from holdfast.console.commands import commands
+from tests.cluster.servers import NatsServers, free_ports, server_binary
+
+
+def nats(*arguments: str) -> Result:
+    return CliRunner().invoke(commands, ["nats", *arguments])
+
+
+def test_the_files_are_such_that_a_server_takes_them(tmp_path: Path) -> None:
+    folder = tmp_path / "servers"
+    done = nats("config", str(folder), "--system", "app", *3 * ("--host", "127.0.0.1"), "--store-dir", str(tmp_path))
+    assert done.exit_code == 0
+    assert [Path(line).name for line in done.output.split()] == [
+        *("nats-1.conf", "nats-2.conf", "nats-3.conf"),
+        *("app-node.nk", "app-client.nk", "app-observer.nk"),
+    ]
+    for number in range(3):
+        file = folder / f"nats-{number + 1}.conf"
+        subprocess.run([server_binary(), "-t", "-c", str(file)], check=True, capture_output=True, timeout=60)
+        assert f'listen: "127.0.0.1:{4222 + number}"' in file.read_text()
+    again = nats("config", str(folder), "--system", "app")
+    assert again.exit_code == 2
+    assert "is there already" in again.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (["--host", "10.0.0.1"], "give it a certificate"),
+        (["--host", "10.0.0.1", "--certificate", "/c.pem"], "belong together"),
+        (["--host", "127.0.0.1", "--host", "127.0.0.1"], "there are 2 servers"),
+    ],
+)
+def test_a_plan_that_does_not_work_is_refused(tmp_path: Path, arguments: list[str], problem: str) -> None:
+    done = nats("config", str(tmp_path), "--system", "app", *arguments)
+    assert done.exit_code == 2
+    assert problem in done.output
+
+
+def test_servers_are_checked(nats1: NatsServers) -> None:
+    good = nats("check", nats1.store(nats1.new_system()))
+    assert (good.exit_code, good.output) == (0, "ok: what is acknowledged there stays\n")
+    system = nats1.new_system()
+    asyncio.run(_in_memory(nats1, system))
+    bad = nats("check", nats1.store(system))
+    assert bad.exit_code == 1
+    assert f"PROBLEM: the stream hf-{system}-log: storage is memory" in bad.output
+    told = json.loads(nats("check", nats1.store(system), "--json").output)
+    assert {one["is_warning"] for one in told} == {False}
+
+
+async def _in_memory(servers: NatsServers, system: str) -> None:
+    client = await servers.connect(system)
+    setting = stream_settings(Names(system), 1)[0]
+    setting.storage = StorageType.MEMORY
+    await client.jetstream().add_stream(setting)
+    await client.close()
+
+
+def test_who_is_not_let_in_is_told(nats1: NatsServers) -> None:
+    stranger = nats("check", nats1.store(nats1.new_system()).partition("?")[0])
+    assert stranger.exit_code == 2
+    assert "authorization violation" in stranger.output.lower()
+    client = nats("check", nats1.store(nats1.new_system(), Role.CLIENT), "--seconds", "0.3")
+    assert client.exit_code == 2
+    assert "may this user ask?" in client.output
+
+
+def test_servers_that_are_not_there_are_told(tmp_path: Path) -> None:
+    done = nats("check", f"nats://127.0.0.1:{free_ports(1)[0]}/app", "--seconds", "1")
+    assert done.exit_code == 2
+    assert "no server lets us in" in done.output
