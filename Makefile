@@ -12,9 +12,10 @@ BESIDE := $(patsubst %/,%,$(sort $(dir $(wildcard tests/*.py benchmarks/*.py exa
 demo: $(VENV)/.demo
 	$(BIN)/python examples/programs/demo.py
 
-# The tests of one file stay in one process.
+# The tests of one file stay in one process. There is one process more than processors: many tests wait for a time limit.
+WORKERS ?= 3
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
 
 # Hours of it: every kind of end, again and again, every safety check removed once, every test under both event loops
 # with other random examples each time, all combinations of its parameters and fork servers started by exec, all tests on

@@ -17,6 +17,7 @@ What Hypothesis draws depends on the test alone, so a run today finds what it fo
 import asyncio
 import os
 import random
+import signal
 import sys
 import tempfile
 import time
@@ -68,7 +69,10 @@ MARK = "HOLDFAST_TEST_RUN"
 
 @pytest.hookimpl(tryfirst=True)  # Before Hypothesis looks at its option.
 def pytest_configure(config: pytest.Config) -> None:
-    """Choose the seed of a random run; the other processes of the run inherit it."""
+    """Have programs hear Ctrl+C, and choose the seed of a random run; the other processes of the run inherit both."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        # A shell that started us with & has it ignored, and so would have each program that a test interrupts.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     config.addinivalue_line("markers", "pairs: each pair of values of two parameters is enough (tests/pairs.py)")
     if RANDOM == "1":
         os.environ["HOLDFAST_RANDOM"] = str(random.SystemRandom().randrange(2, 2**32))

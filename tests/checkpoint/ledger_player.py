@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import holdfast as hf
 from holdfast.actors.values import encode_value, state_digest
 
-MANY = 12_000
+MANY = 9_000
 """Orders: enough for an image."""
 FORKED = 17 << 20
 """Bytes beside them with which a copy of the process writes it."""

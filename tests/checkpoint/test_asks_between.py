@@ -79,6 +79,7 @@ OUTCOMES = {
 }
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("recorded", ["the asker", "the giver", "both"])
 @pytest.mark.parametrize("giver", ["task", "process"])
 @pytest.mark.parametrize("asker", ["task", "process"])

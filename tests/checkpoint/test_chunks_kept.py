@@ -14,13 +14,15 @@ import pytest
 
 import holdfast
 import holdfast as hf
-from holdfast.checkpoint.snapshot.image_writer import MOST_SEGMENTS
+from holdfast.checkpoint.snapshot import image_writer
 from holdfast.checkpoint.store_tools import compact_store, export_store, verify_store
 from tests.checkpoint.ledger_player import FORKED, MANY, Book, Change, Ledger, Told, Turns, told
 from tests.checkpoint.players import start
 from tests.checkpoint.strikes import NEVER, strike
 
 SEED = 20_261_127
+FEW = 8
+"""Segments that an image may be spread over, so that little has to be saved until they are gathered."""
 SCRIPT = Path(__file__).with_name("ledger_root.py")
 PATHS = os.pathsep.join(
     filter(None, (str(Path(holdfast.__file__).parents[1]), str(SCRIPT.parents[2]), os.environ.get("PYTHONPATH")))
@@ -48,6 +50,7 @@ def running(store: str | None) -> hf.ActorSystem:
     return hf.ActorSystem("app", store=store, log=False, intensity=10_000)
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("room", [0, FORKED])
 async def test_what_little_has_changed_is_written_and_all_comes_back(
     store: str | None, isolation: str, room: int
@@ -82,7 +85,7 @@ async def test_a_life_ends_in_the_middle_of_a_snapshot(store: str | None, where:
     dice, want = random.Random(SEED), Book(MANY)
     async with running(store) as system:
         ref = await ledger(system, where, FORKED if where == "process" else 0)
-        for number in range(6):
+        for number in range(4):
             await changed(ref, want, dice)
             wish = asyncio.ensure_future(system.checkpoint(ref, timeout=25.0))
             await asyncio.sleep(dice.choice((0.0, dice.uniform(0.0, 0.2))))
@@ -118,16 +121,19 @@ async def test_an_image_that_could_not_be_kept_is_made_again(tmp_path: Path, mon
         assert await ref.ask(Told(), timeout=25.0) == told(want)
 
 
-async def test_a_state_that_is_saved_often_is_never_written_as_a_whole_again(store: str | None) -> None:
+async def test_a_state_that_is_saved_often_is_never_written_as_a_whole_again(
+    store: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is scattered over many snapshots is gathered; what most of the state is in stays where it is."""
-    want = Book(4 * MANY)
+    monkeypatch.setattr(image_writer, "MOST_SEGMENTS", FEW)
+    want = Book(2 * MANY)
     async with running(store) as system:
-        ref = await ledger(system, "task", count=4 * MANY)
+        ref = await ledger(system, "task", count=2 * MANY)
         for _ in range(2):
             want.change(0, "append")
             await ref.ask(Change(0, "append"), timeout=25.0)
             await taken(system, ref)
-        for seed in range(3 * MOST_SEGMENTS):
+        for seed in range(3 * FEW):
             want.change(seed, "replace")
             await ref.ask(Change(seed, "replace"), timeout=25.0)
             one = await taken(system, ref)

@@ -87,6 +87,7 @@ def memory_files(pid: int | str = "self") -> list[str]:
 # -- it comes back --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("cells", [CELLS, MANY])
 async def test_what_a_life_does_to_its_state_does_not_reach_its_snapshot(
     store: str | None, isolation: str, cells: int

@@ -44,6 +44,7 @@ def running(store: str | None) -> hf.ActorSystem:
     return hf.ActorSystem("app", store=store, log=False, intensity=1000)
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("cells", [600_000, MANY])
 async def test_what_has_not_changed_is_not_written_again_and_all_of_it_comes_back(
     store: str | None, isolation: str, cells: int

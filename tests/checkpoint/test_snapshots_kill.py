@@ -41,6 +41,7 @@ async def canvas(system: hf.ActorSystem, isolation: str, cells: int) -> hf.Actor
     return await start(system, isolation, "canvas", hf.start(Canvas, cells), recovery=recovery, shutdown=8.0)
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("where", ["process", "subtree"])
 @pytest.mark.parametrize("cells", [CELLS, MANY])
 async def test_the_process_dies_in_the_middle_of_a_snapshot(store: str | None, where: str, cells: int) -> None:

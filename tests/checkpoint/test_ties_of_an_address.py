@@ -58,6 +58,7 @@ class Watcher(hf.Actor):
         self.told.append(f"EXIT {source.path}")
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("hook", ["none", "on_start", "on_recovered"])
 @pytest.mark.parametrize("end", ["crash", "terminated and restarted", "its supervisor is restarted"])
 @pytest.mark.parametrize("isolation", ["task", "process"])

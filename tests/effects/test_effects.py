@@ -442,6 +442,7 @@ class Exploding(Clerk):
         return f"{len(value)} bytes"
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("is_async", [True, False])
 @pytest.mark.parametrize("isolation", ["task", "process"])
 @pytest.mark.parametrize("name", RAISED)

@@ -37,6 +37,7 @@ async def settled(driver: Any, name: str, turn: int) -> None:
             await asyncio.sleep(0.001)
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("below", [PBR(), LFR()])
 @pytest.mark.parametrize("always", [False, True])
 @pytest.mark.parametrize("what", ["answer", "state", "message"])

@@ -14,6 +14,7 @@ import holdfast as hf
 from holdfast.ftm.bricks.brick_messages import Done
 from holdfast.ftm.bricks.bricks import After
 from holdfast.ftm.events import MechanismChanged
+from holdfast.ftm.group import adaptation_engine
 from holdfast.ftm.group.reconfiguration import CannotAdapt
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpointing
@@ -226,7 +227,9 @@ async def test_a_dry_run_shows_steps_and_bricks(system: hf.ActorSystem) -> None:
     assert stack(ref) == ("pbr",)
 
 
-async def test_a_turn_that_does_not_end_rolls_it_back(system: hf.ActorSystem, tmp_path: Path) -> None:
+async def test_a_turn_that_does_not_end_rolls_it_back(
+    system: hf.ActorSystem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A83, T36: within a time limit; requests that waited meanwhile are handled."""
     file = tmp_path / "slow"
     file.touch()
@@ -234,7 +237,8 @@ async def test_a_turn_that_does_not_end_rolls_it_back(system: hf.ActorSystem, tm
     slow = asyncio.ensure_future(ref.ask(Total(), timeout=30))
     await asyncio.sleep(0.05)  # It has begun, or will: either way it does not end.
     waiting = asyncio.ensure_future(ref.ask(Add(0), timeout=30))
-    with pytest.raises(hf.TransactionFailed, match="has not ended"):
+    with pytest.raises(hf.TransactionFailed, match="has not ended"), monkeypatch.context() as patch:
+        patch.setattr(adaptation_engine, "REST_WITHIN", 1.0)
         await transition(system, ref, LFR())
     assert stack(ref) == ("pbr",)
     file.unlink()

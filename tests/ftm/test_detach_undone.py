@@ -121,6 +121,7 @@ WAITED = [
 ]
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("place", ["here", "below a process"])
 @pytest.mark.parametrize(("recovery", "what", "why"), WAITED)
 async def test_the_stack_is_in_force_as_before(

@@ -213,6 +213,7 @@ class Greeting(Returning):
             self.returns += 100
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("kind", [Returning, Greeting])
 @pytest.mark.parametrize("recovery", [None, hf.hybrid(interval=3600.0)], ids=["plain", "hybrid"])
 @pytest.mark.parametrize("name", [*sorted(who_compares()), "pbr"])

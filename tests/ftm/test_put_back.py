@@ -178,6 +178,7 @@ def numbers(messages: list[Any]) -> list[int]:
     return sorted(one.tag for one in messages if isinstance(one, Meet) and one.kind == "asks")
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("method", ["without recovery", "hybrid"])
 @pytest.mark.parametrize("mechanism", MECHANISMS)
@@ -432,6 +433,7 @@ DECIDING: dict[str, Any] = {
 }
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("method", ["without recovery", "hybrid"])
 @pytest.mark.parametrize("mechanism", DECIDING)

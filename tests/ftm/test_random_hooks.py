@@ -223,6 +223,7 @@ async def test_a_task_is_not_begun_again_by_a_turn_that_was_handed_over(name: st
         assert list(tmp_path.iterdir())
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("seed", range(SEED, SEED + PROGRAMS))
 @pytest.mark.parametrize("falls", [False, True], ids=["stays up", "falls"])
 @pytest.mark.parametrize("name", sorted(mechanisms()))

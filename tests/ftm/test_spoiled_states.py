@@ -70,6 +70,7 @@ async def told(events: hf.events.EventStream) -> None:
                 return
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("kind", [Locking, Silent])
 @pytest.mark.parametrize(
     ("name", "how"),

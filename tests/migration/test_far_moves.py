@@ -55,6 +55,7 @@ async def system() -> Any:
         yield running
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("way", list(WAYS))
 @pytest.mark.parametrize("kind", list(KINDS))
 @pytest.mark.parametrize("isolation", PLACES)

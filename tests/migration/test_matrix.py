@@ -51,6 +51,7 @@ async def system() -> Any:
         yield running
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize(("place", "kind", "step"), cells())
 async def test_an_actor_is_taken_there_with_all_it_has(
     system: hf.ActorSystem, place: str, kind: str, step: str

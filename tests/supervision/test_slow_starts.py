@@ -185,6 +185,7 @@ async def test_a_sibling_that_crashes_meanwhile_is_restarted(strategy: Any) -> N
 # -- it can be stopped ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("kind", [Hangs, Swallows])
 @pytest.mark.parametrize("isolation", ["task", "process"])
 @pytest.mark.parametrize("what", ["the child", "its supervisor", "the system"])

@@ -296,6 +296,7 @@ async def test_an_authority_that_dies_at_the_commit_revokes_in_its_next_life(tmp
         assert await one.ask(Me(), IN_TIME) == THERE
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("whom", ["leader", "follower", "all"])
 @pytest.mark.parametrize("when", ["prepare", "commit", "finish"])
 @pytest.mark.parametrize("there", ["task", "process"])

@@ -282,6 +282,7 @@ def changes(at: list[str]) -> list[str]:
     return [one for index, one in enumerate(at) if index == 0 or at[index - 1] != one]
 
 
+@pytest.mark.pairs
 @STACK
 @KIND
 @THERE_IN
@@ -509,6 +510,7 @@ async def test_a_supervisor_is_moved_with_those_that_are_protected_below_it(stac
             assert (await ref.ask(Told(), IN_TIME))["at"] == [ref.path]
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("kind", ["plain", "recorded"])
 @pytest.mark.parametrize("verb", ["monitor", "link"])
 @pytest.mark.parametrize("who", ["watcher", "target", "both"])
@@ -624,6 +626,7 @@ async def test_the_next_root_has_the_mechanism_that_it_was_given_at_its_new_addr
 # -- killed meanwhile -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("whom", ["leader", "follower"])
 @pytest.mark.parametrize("stack", ["PBR", "LFR", "SEC+PBR"])
 @pytest.mark.parametrize("seed", range(6))

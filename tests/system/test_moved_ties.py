@@ -62,6 +62,7 @@ PLACES: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("verb", ["monitor", "watch", "link"])
 @pytest.mark.parametrize("when", ["before", "after", "its own move", "the move of both"])
 @pytest.mark.parametrize("target", list(PLACES))
@@ -98,6 +99,7 @@ async def test_it_hears_of_the_end_once(watcher: str, target: str, when: str, ve
         await hears_once(one, "exit" if verb == "link" else "down")
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("verb", ["monitor", "watch", "link"])
 @pytest.mark.parametrize("target", list(PLACES))
 @pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["plain", "recorded"])
@@ -254,6 +256,7 @@ async def test_who_goes_from_process_to_process_hears_of_ends_behind_it(
         await hears_once(one, "exit" if verb == "link" else "down")
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("target", list(PLACES))
 @pytest.mark.parametrize("client", ["near", "far", "other"])
 @pytest.mark.parametrize("way", ["near far", "far near", "far other"])

@@ -47,7 +47,7 @@ async def test_it(system):
 """
 
 
-def ran(folder: Path, program: str, seconds: int = 2) -> subprocess.CompletedProcess[str]:
+def ran(folder: Path, program: str, seconds: int) -> subprocess.CompletedProcess[str]:
     """A run of pytest, in which nothing may take longer."""
     (folder / "test_hangs.py").write_text(program, "utf-8")
     options = [
@@ -62,15 +62,21 @@ def ran(folder: Path, program: str, seconds: int = 2) -> subprocess.CompletedPro
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=SECONDS, check=False)
 
 
+def hung(folder: Path, program: str, what: str) -> tuple[subprocess.CompletedProcess[str], int]:
+    """A run that has told what hangs, and the seconds that a test had; on a busy machine the start takes that long."""
+    for seconds in (2, 10, 30):
+        run = ran(folder, program, seconds)  # One that is ended while it starts may end of the very dump.
+        if f"test_hangs.py::{what} hangs" in run.stderr:
+            break
+    assert f"test_hangs.py::{what} hangs" in run.stderr
+    assert run.returncode == 1
+    return run, seconds
+
+
 @pytest.mark.parametrize("how", ["the test", "the teardown", "a teardown behind a failure"])
 def test_what_hangs_is_told_and_ended(how: str, tmp_path: Path) -> None:
     what = "the test" if how == "the test" else "the teardown"
-    for seconds in (2, 10, 30):  # On a busy machine the start of all takes longer than that.
-        run = ran(tmp_path, f"HOW = {how!r}\n{HANGS}", seconds)
-        assert run.returncode == 1
-        if f"test_hangs.py::test_it: {what} hangs" in run.stderr:
-            break
-    assert f"test_hangs.py::test_it: {what} hangs" in run.stderr
+    run, seconds = hung(tmp_path, f"HOW = {how!r}\n{HANGS}", f"test_it: {what}")
     assert "/app/waits (running) has been in the turn of Wait" in run.stderr
     assert "in Waits.wait_in_turn" in run.stderr
     assert "/ended" not in run.stderr
@@ -91,7 +97,6 @@ async def test_another():
 
 
 def test_a_test_that_hangs_fails_alone(tmp_path: Path) -> None:
-    run = ran(tmp_path, FORGETS, 30)
-    assert "test_hangs.py::test_hangs: the test hangs" in run.stderr
+    run, _ = hung(tmp_path, FORGETS, "test_hangs: the test")
     assert "1 failed, 1 passed" in run.stdout
     assert "CancelledError" in run.stdout
