@@ -370,13 +370,13 @@ class JournalStopped(Event, frozen=True, eq=False):
 
 
 class StandingBy(Event, frozen=True, eq=False):
-    """This program waits: `leader` leads the system. Told each time that another one does."""
+    """Another program, `leader`, leads the system, and this one waits. Told anew whenever the leader changes."""
 
     leader: str
 
 
 class LeadershipTaken(Event, frozen=True, eq=False):
-    """This program leads the system from now on, in this `epoch`; its tree is started next."""
+    """From now on this program leads the system, in this `epoch`; its tree is started next."""
 
     epoch: int
 

@@ -191,7 +191,7 @@ class NatsLease:
         """Take the lease if nobody has it; see `Lease`."""
         last = await self._last()
         if last is not None:
-            return last.sequence if last.data.decode() == holder else None
+            return await self._publish(holder, last.sequence) if last.data.decode() == holder else None
         return await self._publish(holder, 0)
 
     async def renew(self, holder: str, token: int) -> int | None:
