@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from ..actors.control.orders import Ready
 from ..actors.control.orders_lane import order
-from ..actors.errors import SpecError
+from ..actors.errors import AskTimeout, HoldfastError, SpecError
 from ..actors.exit_reasons import SHUTDOWN, Crash, ExitReason
 from ..actors.kernel.cell import Cell
 from ..supervision.intensity import recent_restarts
@@ -20,14 +20,28 @@ ASKED = Crash("holdfast.Restart", "an operator has asked for it")
 """The reason of a life that would not be followed by another one if it ended as when it is stopped."""
 
 
+class NotUpYet(
+    HoldfastError,
+    text="{path} has ended ({reason}), and its next life is not up within {seconds:g} s: it waits for {above}, "
+    "and comes when that gets to it",
+):
+    """A life was ended by order, and its supervisor has not brought up the next one so far."""
+
+    path: str
+    reason: str
+    seconds: float
+    above: str
+
+
 async def restart_actor(system: ActorSystem, path: str, timeout: float) -> str:
     """End a life in good order, and wait until the next one is up; returns how it ended, in words.
 
     What waits at the address waits for the next life.
 
     Raises:
-        SpecError: nobody would start it again, or its supervisor would give up over it.
-        HoldfastError: it has not ended, or is not up again, within `timeout` seconds.
+        SpecError: nobody would start it again, or its supervisor is suspended, or would give up over it.
+        NotUpYet: its life has ended, and the next one is not up within `timeout` seconds.
+        HoldfastError: it has not ended within `timeout` seconds.
     """
     ref = system.ref(path)
     cell = ref._cell.living
@@ -40,9 +54,15 @@ async def restart_actor(system: ActorSystem, path: str, timeout: float) -> str:
         reason = SHUTDOWN if cell.spec.restarts(SHUTDOWN) else ASKED
         if not cell.spec.restarts(reason):
             raise SpecError(path, f"its spec ({cell.spec.restart}) does not let it come back: stop it, and start it")
-    check_allowed(cell.parent, path)
+    above = cell.parent
+    check_allowed(above, path)
+    if (await system.get_status(above.ref, timeout=timeout)).state == "suspended":
+        raise SpecError(path, f"{above.path} is suspended, and starts nobody: resume it first")
     ended = await system.terminate(ref, reason, timeout=timeout)
-    await order(ref._cell.living, Ready(), timeout)
+    try:
+        await order(ref._cell.living, Ready(), timeout)
+    except AskTimeout as late:
+        raise NotUpYet(path, str(ended), timeout, above.path) from late
     return str(ended)
 
 

@@ -260,6 +260,21 @@ class AskQuarantined(ControlRequest, tag="quarantined", frozen=True):
     path: str | None
 
 
+class SettleQuarantined(ControlRequest, tag="settle", frozen=True):
+    """Have messages in quarantine handled again, or dropped: one by its id, or all of an address."""
+
+    verb: Literal["retry", "drop"]
+    path: str
+    id: int | None
+
+
+class AskDiagnosis(ControlRequest, tag="diagnosis", frozen=True):
+    """What diagnosis says now, of all or of what is at an address and below it."""
+
+    path: str | None
+    timeout: float
+
+
 class DeclareTree(ControlRequest, tag="declare", frozen=True):
     """Have the tree be as a file says; `name` is what it is called in errors."""
 
@@ -282,6 +297,8 @@ AnyRequest = (
     | AskLives
     | AskWhy
     | AskQuarantined
+    | SettleQuarantined
+    | AskDiagnosis
     | Tree
     | Whereis
     | ControlActor

@@ -1,4 +1,4 @@
-"""The commands that ask a running system about its past: why, history, events, dead-letters, quarantine."""
+"""The commands that ask a running system about its past: why, history, events, dead-letters."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def why(path: OnePath, system: System = None, socket: Socket = None, as_json: Js
     if as_json:
         show_json({"address": path, "why": sentences})
     else:
-        _print_lines(sentences)
+        print_lines(sentences)
 
 
 def history(path: OnePath, system: System = None, socket: Socket = None, as_json: Json = False) -> None:
@@ -47,7 +47,7 @@ def history(path: OnePath, system: System = None, socket: Socket = None, as_json
     if as_json:
         show_json({"address": path, "lives": msgspec.to_builtins(lives)})
     else:
-        _print_lines(map(life_line, lives))
+        print_lines(map(life_line, lives))
 
 
 def events(
@@ -90,25 +90,7 @@ def dead_letters(
     _print_events(page.events, as_json=as_json)
 
 
-def quarantine(
-    path: Annotated[str | None, typer.Argument(help="An address; without one, of all.")] = None,
-    system: System = None,
-    socket: Socket = None,
-    as_json: Json = False,
-) -> None:
-    """List the messages that were put aside because they have ended their actor's process again and again."""
-    with reached("quarantine", system, socket) as remote:
-        messages = remote.put_aside(path)
-    if as_json:
-        show_json({"quarantine": msgspec.to_builtins(messages)})
-        return
-    for one in messages:
-        sender = f" from {one.sender}" if one.sender else ""
-        payload = f": {one.payload}" if one.payload else ""
-        _print_lines([f"{moment(one.since)} {one.address} {one.message}{sender}, {one.attempts} deaths{payload}"])
-
-
-def _print_lines(lines: Iterable[str]) -> None:
+def print_lines(lines: Iterable[str]) -> None:
     for line in lines:
         typer.echo(printable(line))
 
@@ -118,7 +100,7 @@ def _print_events(found: Iterable[PastEvent], *, as_json: bool) -> None:
         if as_json:
             typer.echo(msgspec.json.encode(event).decode())
         else:
-            _print_lines([event_line(event)])
+            print_lines([event_line(event)])
 
 
 def event_line(event: PastEvent) -> str:
