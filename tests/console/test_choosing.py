@@ -55,10 +55,9 @@ async def test_diagnose_tells_suspects_with_their_addresses(system: hf.ActorSyst
         assert (status, errors, told["diagnoser"]) == (DONE, "", "/app/diagnosis/diagnoser")
         component = next(name for name, where in watching.addresses.items() if where == "/app/left/a")
         await system.suspend(system.ref("/app/left/a"))
-        await system.publish(
-            diagnosis.OBSERVATIONS,
-            Observation(parse(f"not running({component})"), "test", system._node.loop.time(), 60.0),
-        )
+        now = system._node.loop.time()
+        seen = Observation(parse(f"not running({component})"), now, "test", 60.0)
+        await system.publish(diagnosis.OBSERVATIONS, seen)
         assert component in (await watching.diagnosis()).suspects
         status, output, _ = await holdfast("diagnose", "/app/left", "--socket", path)
         assert (status, f"faulty: {component} at /app/left/a" in output) == (DONE, True)

@@ -100,7 +100,7 @@ CHECKS = {
     ),
     "a supervisor does not give up over a restart by order": Check(
         "console/restarting.py",
-        "    check_allowed(cell.parent, path)\n",
+        "    check_allowed(above, path)\n",
         "",
         OPERATE,
         "test_a_restart_that_would_end_the_supervisor_is_refused",
