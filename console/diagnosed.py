@@ -7,21 +7,15 @@ import os
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from ..actors.errors import HoldfastError
 from ..diagnosis.diagnoser import DiagnoserActor
 from ..diagnosis.engine import Diagnosis
 from ..diagnosis.messages import Explained, GetDiagnosis, GetExplanation
 from ..diagnosis.observers import NodeObserver
 from .overview import SLICE, Found, walk
+from .wire import NotDiagnosed
 
 if TYPE_CHECKING:
     from ..system.system import ActorSystem
-
-
-class NotDiagnosed(HoldfastError, text="{problem}"):
-    """No diagnosis of the system runs, or it has no component at the address that was asked about."""
-
-    problem: str
 
 
 async def diagnosed(system: ActorSystem, path: str | None, timeout: float) -> list[dict[str, Any]]:

@@ -6,31 +6,19 @@ from typing import TYPE_CHECKING
 
 from ..actors.control.orders import Ready
 from ..actors.control.orders_lane import order
-from ..actors.errors import AskTimeout, HoldfastError, SpecError
+from ..actors.errors import AskTimeout, SpecError
 from ..actors.exit_reasons import SHUTDOWN, Crash, ExitReason
 from ..actors.kernel.cell import Cell
 from ..supervision.intensity import recent_restarts
 from ..supervision.spec import ChildSpec
 from ..supervision.supervisor import Supervisor
+from .wire import NotUpYet
 
 if TYPE_CHECKING:
     from ..system.system import ActorSystem
 
 ASKED = Crash("holdfast.Restart", "an operator has asked for it")
 """The reason of a life that would not be followed by another one if it ended as when it is stopped."""
-
-
-class NotUpYet(
-    HoldfastError,
-    text="{path} has ended ({reason}), and its next life is not up within {seconds:g} s: it waits for {above}, "
-    "and comes when that gets to it",
-):
-    """A life was ended by order, and its supervisor has not brought up the next one so far."""
-
-    path: str
-    reason: str
-    seconds: float
-    above: str
 
 
 async def restart_actor(system: ActorSystem, path: str, timeout: float) -> str:

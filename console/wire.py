@@ -39,6 +39,25 @@ class NotServed(HoldfastError, text="the system cannot watch another connection 
     why: str
 
 
+class NotDiagnosed(HoldfastError, text="{problem}"):
+    """No diagnosis of the system runs, or it has no component at the address that was asked about."""
+
+    problem: str
+
+
+class NotUpYet(
+    HoldfastError,
+    text="{path} has ended ({reason}), and its next life is not up within {seconds:g} s: it waits for {above}, "
+    "and comes when that gets to it",
+):
+    """A life was ended by order, and its supervisor has not brought up the next one so far."""
+
+    path: str
+    reason: str
+    seconds: float
+    above: str
+
+
 class WrongUser(HoldfastError, text="the other end runs as the user with uid {uid}, and only uid {expected} is served"):
     """The other end of the control endpoint belongs to another user."""
 

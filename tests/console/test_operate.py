@@ -314,7 +314,7 @@ async def test_a_name_that_a_terminal_would_obey_is_refused(named: hf.ActorSyste
         hf.child("one", hf.start(Counter), register=name)
     with pytest.raises(hf.SpecError, match="without control characters"):
         named.register(name, one)
-    with pytest.raises(hf.system.TransactionRefused, match="without control characters"):
+    with pytest.raises(hf.errors.TransactionRefused, match="without control characters"):
         async with named.transaction() as change:
             change.register(name, one)
     assert not [path for path in named.tree() if name in path]
