@@ -17,11 +17,11 @@ from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.lifecycle import GRACE
 from ..actors.kernel.mailbox import Bounded
-from ..actors.path_parts import check_path_part, has_control
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.start_codec import pack_recipe
 from ..actors.seconds import check_seconds, is_seconds
 from ..actors.values import UnsavableValue
+from ..actors.values.path_parts import check_path_part, has_control
 from .decisions import decide, is_as_told
 from .patience import end_within
 from .rules import Rule

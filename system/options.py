@@ -8,7 +8,7 @@ from typing import get_args
 
 from ..actors.errors import SpecError
 from ..actors.loop_watchdog import check_limits
-from ..actors.path_parts import check_path_part
+from ..actors.values.path_parts import check_path_part
 from ..checkpoint.journal import Journal
 from ..checkpoint.method import Durability
 from ..checkpoint.recovery_file import RecoveryFile, load_recovery

@@ -25,8 +25,8 @@ from ..errors import (
 )
 from ..events import DeadLetter, Event, EventHub, SupervisorGaveUp
 from ..exit_reasons import KILLED, ExitReason
-from ..path_parts import check_beside, check_path_part
 from ..persistence import Keeper, NothingKept
+from ..values.path_parts import check_beside, check_path_part
 from . import lifecycle
 from .blocking_handlers import HandlerThreads
 from .cell import DOWN, GONE, RUNNING, Cell, Host

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final
 import typer
 
 from ...actors.errors import HoldfastError
-from ...actors.path_parts import CONTROL
+from ...actors.values.path_parts import CONTROL
 from ...system.script import UntrustedFile
 from ..overview import ActorRow
 from ..remote import NotReached, RemoteSystem

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.errors import ActorStopped, NameTaken, NoSuchActor, type_name
 from ...actors.kernel.cell import RUNNING
-from ...actors.path_parts import check_beside
+from ...actors.values.path_parts import check_beside
 from ...supervision.respec import rebind
 from .draft import Draft, DraftPlace, Target
 from .operation import Operation, text_of, wrong

@@ -43,14 +43,14 @@ CHECKS = {
         "test_a_module_that_raises_anything",
     ),
     "an address is one line": Check(
-        "actors/path_parts.py",
+        "actors/values/path_parts.py",
         """ or "/" in name or has_control(name):""",
         """ or "/" in name:""",
         OPERATE,
         "test_a_name_that_a_terminal_would_obey",
     ),
     "a name beside an address is one line": Check(
-        "actors/path_parts.py",
+        "actors/values/path_parts.py",
         "    if not name or has_control(name):",
         "    if not name:",
         OPERATE,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from .errors import SpecError
+from ..errors import SpecError
 
 CONTROL: Final = (*range(32), *range(127, 160), 0x200E, 0x200F, *range(0x2028, 0x202F), *range(0x2066, 0x206A))
 """Code points that make a terminal do something, end a line, or make a line look like another one."""
