@@ -1,6 +1,7 @@
-"""How long does an operator wait for a running system: for one actor while it is saturated, and for a tree of 10,000?
+"""How long does an operator wait for a running system?
 
-Baseline: the same with the system idle, and for the tree none. The client is a process of its own.
+For one actor while the system is saturated, for a tree of 10,000, and for either while another operator adds 1,000.
+Baseline: the same with the system idle, and for the others none. Each client is a process of its own.
 Command: python benchmarks/bench_console.py [--quick]
 """
 
@@ -11,6 +12,7 @@ import json
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
@@ -25,6 +27,8 @@ from holdfast.console.endpoint import control_endpoint
 from holdfast.console.remote import RemoteSystem
 
 ACTORS = 10_000
+CHANGED = 1_000
+"""Children that are added by one transaction."""
 
 
 class Idle(hf.Actor):
@@ -45,6 +49,35 @@ def client(socket: str, requests: int) -> None:
             remote.look()
             trees.append(time.perf_counter() - began)
     print(json.dumps({"p99": sorted(taken)[int(requests * 0.99)] * 1e3, "tree": min(trees)}))
+
+
+def reader(socket: str) -> None:
+    """Asks for the tree and for one actor in turn, until its input ends: prints when each began and what it took."""
+    found: list[tuple[str, float, float]] = []
+    is_over = threading.Event()
+    threading.Thread(target=lambda: (sys.stdin.read(), is_over.set()), daemon=True).start()
+    with RemoteSystem(socket) as remote:
+        print("ready", flush=True)
+        while not is_over.is_set():
+            for what, ask in (("tree", remote.tree), ("inspect", lambda: remote.inspect("/bench/many"))):
+                began = time.monotonic()
+                ask()
+                found.append((what, began, time.monotonic() - began))
+    print(json.dumps(found))
+
+
+def changer(socket: str, count: int) -> None:
+    """Adds children by one transaction: prints when it was sent, and when it was over."""
+
+    async def change(remote: RemoteSystem) -> list[float]:
+        async with remote.transaction(timeout=60.0) as change:
+            for number in range(count):
+                change.add("/bench/many", hf.child(f"n{number}", hf.start(Idle)))
+            began = time.monotonic()
+        return [began, time.monotonic()]
+
+    with RemoteSystem(socket) as remote:
+        print(json.dumps(asyncio.run(change(remote))))
 
 
 async def asked(socket: Path, requests: int) -> dict[str, float]:
@@ -97,8 +130,35 @@ async def tree(run: Run) -> None:
     await run.added(f"a tree of {ACTORS:,} actors with their statuses", whole, none, unit="s", target=1.0)
 
 
+async def changing(run: Run) -> None:
+    taken: dict[str, list[float]] = {"tree": [], "inspect": []}
+    for _ in range(2 if run.quick else 10):
+        async with served() as (system, socket):
+            await system.start(hf.supervisor("many", children=[]))
+            arguments = (sys.executable, __file__, "reader", str(socket))
+            reads = await asyncio.create_subprocess_exec(*arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            assert reads.stdout is not None
+            await reads.stdout.readline()
+            changes = await asyncio.create_subprocess_exec(
+                *(sys.executable, __file__, "changer", str(socket), str(CHANGED)), stdout=subprocess.PIPE
+            )
+            begun, over = json.loads((await changes.communicate())[0])
+            found: list[tuple[str, float, float]] = json.loads((await reads.communicate(b""))[0])
+            for what, began, seconds in found:
+                if began < over and began + seconds > begun:
+                    taken[what].append(seconds)
+    for what, values in taken.items():
+        p99 = sorted(values)[int(len(values) * 0.99)] * 1e3
+        run.bound(f"p99 of {what} while {CHANGED:,} children are added", p99, unit="ms", target=20.0)
+
+
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["client"]:
-        client(sys.argv[2], int(sys.argv[3]))
-    else:
-        main([saturated, tree])
+    match sys.argv[1:]:
+        case ["client", where, requests]:
+            client(where, int(requests))
+        case ["reader", where]:
+            reader(where)
+        case ["changer", where, count]:
+            changer(where, int(count))
+        case _:
+            main([saturated, tree, changing])

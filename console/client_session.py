@@ -13,7 +13,7 @@ import msgspec
 from ..actors.errors import HoldfastError, SpecError, type_name
 from ..actors.events import Event, EventStream, MessageIn, MessageOut, TurnBegan, TurnEnded
 from ..actors.kernel.actor import Actor
-from ..checkpoint.home.quarantine import NotQuarantined
+from ..system.history.evidence import PutAside, put_aside
 from ..system.transaction.change import Change
 from .declare.tree_plan import declare
 from .inspection import inspected
@@ -23,6 +23,7 @@ from .trust import Needed, trusted_imports
 from .wire import (
     About,
     AnyRequest,
+    AskDiagnosis,
     AskHistory,
     AskLives,
     AskQuarantined,
@@ -51,6 +52,8 @@ LONGEST = 3600.0
 """Seconds that one request may take."""
 MOST_COUNTED = 1000
 """Actors whose turns are counted for one client."""
+OPENED_TOGETHER = 32
+"""Operations of a transaction that are opened in one step of the loop."""
 LONGEST_MESSAGE = 1000
 """Characters that are shown of a message that is followed."""
 _TREE = {"add", "remove", "move", "reorder", "strategy", "intensity", "isolation", "stop", "start"}
@@ -103,7 +106,7 @@ class ClientSession:
             case DeclareTree():
                 timeout = min(request.timeout, LONGEST)
                 change = await declare(system, request.text, request.name, dry_run=request.dry_run, timeout=timeout)
-                return {"steps": [], "difference": []} if change is None else as_told(change)
+                return {"steps": [], "difference": [], "lost": []} if change is None else as_told(change)
             case AskHistory():
                 return msgspec.to_builtins(await self._history(request))
             case AskLives():
@@ -114,6 +117,10 @@ class ClientSession:
                 return msgspec.to_builtins(system.put_aside(request.path))
             case SettleQuarantined():
                 return self._settle(request)
+            case AskDiagnosis():
+                from .diagnosed import diagnosed  # only now: few systems have diagnosis, and all have an endpoint
+
+                return await diagnosed(system, request.path, min(request.timeout, LONGEST))
             case _:
                 assert_never(request)
 
@@ -128,14 +135,22 @@ class ClientSession:
         after, wait = page.next, min(request.wait, LONGEST)
         return await self._system.follow_history(asked.path, kinds=asked.kinds, after=after, timeout=wait)
 
-    def _settle(self, request: SettleQuarantined) -> None:
-        message = next((one for one in self._system.quarantined(request.path) if one.id == request.id), None)
-        if message is None:
-            raise NotQuarantined(request.path, request.id)
-        if request.verb == "retry":
-            self._system.retry(message)
-        else:
-            self._system.drop(message)
+    def _settle(self, request: SettleQuarantined) -> dict[str, Any]:
+        """Retry or drop what is meant, each message by itself; which of them it was, and why others were not."""
+        system = self._system
+        meant = [one for one in system.quarantined(request.path) if request.id in (None, one.id)]
+        if not meant:
+            which = "nothing" if request.id is None else f"no message {request.id}"
+            raise SpecError(request.path, f"{which} of it is in quarantine: `holdfast quarantine` lists what is")
+        done: list[PutAside] = []
+        failed: list[str] = []
+        for one in meant:
+            try:
+                (system.retry if request.verb == "retry" else system.drop)(one)
+                done.append(put_aside(one))
+            except HoldfastError as error:
+                failed.append(f"{one.address} {one.id}: {error}")
+        return {"done": msgspec.to_builtins(done), "failed": failed}
 
     async def _control(self, request: ControlActor) -> Any:
         system, timeout = self._system, min(request.timeout, LONGEST)
@@ -148,8 +163,14 @@ class ClientSession:
     async def _transact(self, request: Transact) -> Any:
         timeout = min(request.timeout, LONGEST)
         everything = [arg for _, args in request.operations for arg in args]
-        with trusted_imports(self._system._node, Needed(request.script, everything)):
-            operations = [(verb, [open_arg(arg) for arg in args]) for verb, args in request.operations]
+        node, operations = self._system._node, list[tuple[str, list[Any]]]()
+        with trusted_imports(node, Needed(request.script, everything)):
+            pass  # The script is loaded, if something of it is needed.
+        for begin in range(0, len(request.operations), OPENED_TOGETHER):
+            with trusted_imports(node, Needed(None, [])):
+                some = request.operations[begin : begin + OPENED_TOGETHER]
+                operations += [(verb, [open_arg(arg) for arg in args]) for verb, args in some]
+            await asyncio.sleep(0)  # Others are answered meanwhile; outside of the block, whose imports are ours alone.
         async with self._system.transaction(dry_run=request.dry_run, timeout=timeout) as change:
             for verb, args in operations:
                 if verb not in OPERATIONS:
@@ -218,7 +239,7 @@ class ClientSession:
 def as_told(change: Change) -> dict[str, Any]:
     """The steps of a transaction, and how the tree changes, as plain data."""
     steps = [(step.number, step.verb, step.target, step.text) for step in change.steps]
-    return {"steps": steps, "difference": list(change.difference)}
+    return {"steps": steps, "difference": list(change.difference), "lost": list(change.lost)}
 
 
 def event_words(event: Event) -> dict[str, Any]:

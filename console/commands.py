@@ -10,9 +10,9 @@ import typer
 from rich.console import Console
 
 from .. import HoldfastError, run
-from . import upgrade_commands
+from . import mechanism_commands, upgrade_commands
 from .nats_commands import nats
-from .operate import changing, declaring, following, looking, remembering
+from .operate import changing, declaring, diagnosing, following, looking, remembering, retrying
 from .service import doctor, project, service_run
 from .store_commands import store
 
@@ -93,9 +93,7 @@ for command in (
     remembering.history,
     remembering.events,
     remembering.dead_letters,
-    remembering.quarantine,
-    remembering.retry,
-    remembering.drop,
+    diagnosing.diagnose,
     declaring.plan,
     declaring.apply,
     service_run.run,
@@ -105,5 +103,8 @@ for command in (
     commands.command()(command)
 commands.command("check-upgrade")(upgrade_commands.check)
 commands.command("replay")(upgrade_commands.replay)
+commands.command("coverage")(mechanism_commands.show_coverage)
+commands.command("select")(mechanism_commands.show_selection)
+commands.add_typer(retrying.quarantine)
 commands.add_typer(store)
 commands.add_typer(nats)

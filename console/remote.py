@@ -11,7 +11,7 @@ import uuid
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -34,6 +34,7 @@ from .wire import (
     RESPONSE,
     About,
     AnyRequest,
+    AskDiagnosis,
     AskHistory,
     AskLives,
     AskQuarantined,
@@ -303,6 +304,38 @@ class RemoteSystem:
         path = None if target is None else text_of(target)
         return msgspec.convert(self._client.call(AskQuarantined(path), 10.0), list[PutAside])
 
+    def settle_put_aside(
+        self, verb: Literal["retry", "drop"], target: RemoteTarget, id: int | None = None
+    ) -> tuple[list[PutAside], list[str]]:
+        """Have messages in quarantine handled as if they had come now, or forget them: they become dead letters.
+
+        Args:
+            verb: "retry" or "drop".
+            target: whose messages.
+            id: of one of them, as `put_aside` tells it; None means all of the address.
+
+        Returns:
+            those for which it was done, and for the others why not, in words.
+
+        Raises:
+            SpecError: none of them is in quarantine, or this is a dry run.
+        """
+        if self._dry_run:
+            raise SpecError(verb, "in a dry run nothing in quarantine is changed")
+        answer = self._client.call(SettleQuarantined(verb, text_of(target), id), 10.0)
+        return msgspec.convert(answer["done"], list[PutAside]), msgspec.convert(answer["failed"], list[str])
+
+    async def diagnosis(self, target: RemoteTarget | None = None, *, timeout: float = 5.0) -> list[dict[str, Any]]:
+        """What each diagnosis that runs says now, as plain data; with a target of the suspects there and below it.
+
+        Raises:
+            NotDiagnosed: none runs, or none has a component there.
+        """
+        check_seconds("diagnosis", "timeout", timeout)
+        path = None if target is None else text_of(target)
+        found: list[dict[str, Any]] = await self.call(AskDiagnosis(path, timeout), timeout)
+        return found
+
     # -- orders to one actor ------------------------------------------------------------------------------------------
 
     async def suspend(self, ref: RemoteTarget, *, timeout: float = 5.0) -> None:
@@ -339,14 +372,6 @@ class RemoteSystem:
         """
         ended: str = await self.call(RestartActor(text_of(ref), timeout, at_once), timeout)
         return ended
-
-    def retry(self, message: PutAside) -> None:
-        """Have a message in quarantine handled as if it had come now. Raises NotQuarantined: it is there no more."""
-        self._client.call(SettleQuarantined("retry", message.address, message.id), 10.0)
-
-    def drop(self, message: PutAside) -> None:
-        """Forget a message in quarantine; it becomes a dead letter. Raises NotQuarantined: it is not there any more."""
-        self._client.call(SettleQuarantined("drop", message.address, message.id), 10.0)
 
     async def terminate(self, ref: RemoteTarget, *, timeout: float = 5.0) -> str:
         """End a life in good order; its supervisor then does as its spec says. Returns its exit reason in words."""
@@ -421,6 +446,7 @@ class RemoteChange:
         self._operations: list[tuple[str, list[Any]]] = []
         self._steps: tuple[Step, ...] | None = None
         self._difference: tuple[str, ...] = ()
+        self._lost: tuple[str, ...] = ()
 
     def add(self, supervisor: RemoteTarget, spec: ChildSpec | Start[Any]) -> str:
         """Start one more child; returns its address."""
@@ -514,6 +540,7 @@ class RemoteChange:
     def _take(self, answer: dict[str, Any]) -> None:
         self._steps = tuple(Step(*step) for step in answer["steps"])
         self._difference = tuple(answer["difference"])
+        self._lost = tuple(answer["lost"])
 
     @property
     def steps(self) -> tuple[Step, ...]:
@@ -527,6 +554,11 @@ class RemoteChange:
     def difference(self) -> tuple[str, ...]:
         """How the tree changes, line by line."""
         return self._difference
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """What of recorded states is left behind, in sentences."""
+        return self._lost
 
     def describe(self) -> str:
         """The steps, and how the tree changes, in words."""

@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING
 
 from ..actors.control.orders import Ready
 from ..actors.control.orders_lane import order
-from ..actors.errors import SpecError
+from ..actors.errors import AskTimeout, SpecError
 from ..actors.exit_reasons import KILLED, SHUTDOWN, Crash, ExitReason
 from ..actors.kernel.cell import Cell
 from ..supervision.intensity import recent_restarts
 from ..supervision.spec import ChildSpec
 from ..supervision.supervisor import Supervisor
+from .wire import NotUpYet
 
 if TYPE_CHECKING:
     from ..system.system import ActorSystem
@@ -27,8 +28,9 @@ async def restart_actor(system: ActorSystem, path: str, timeout: float, *, at_on
     its turn, and the next one is not waited for.
 
     Raises:
-        SpecError: nobody would start it again, or its supervisor would give up over it.
-        HoldfastError: it has not ended, or is not up again, within `timeout` seconds.
+        SpecError: nobody would start it again, or its supervisor is suspended, or would give up over it.
+        NotUpYet: its life has ended, and the next one is not up within `timeout` seconds.
+        HoldfastError: it has not ended within `timeout` seconds.
     """
     ref = system.ref(path)
     cell = ref._cell.living
@@ -41,10 +43,16 @@ async def restart_actor(system: ActorSystem, path: str, timeout: float, *, at_on
         reason = KILLED if at_once else SHUTDOWN if cell.spec.restarts(SHUTDOWN) else ASKED
         if not cell.spec.restarts(reason):
             raise SpecError(path, f"its spec ({cell.spec.restart}) does not let it come back: stop it, and start it")
-    check_allowed(cell.parent, path)
+    above = cell.parent
+    check_allowed(above, path)
+    if (await system.get_status(above.ref, timeout=timeout)).state == "suspended":
+        raise SpecError(path, f"{above.path} is suspended, and starts nobody: resume it first")
     ended = await system.terminate(ref, reason, timeout=timeout)
     if not at_once:  # The next life of one that is killed may hang as this one did: it is not asked.
-        await order(ref._cell.living, Ready(), timeout)
+        try:
+            await order(ref._cell.living, Ready(), timeout)
+        except AskTimeout as late:
+            raise NotUpYet(path, str(ended), timeout, above.path) from late
     return str(ended)
 
 

@@ -39,6 +39,25 @@ class NotServed(HoldfastError, text="the system cannot watch another connection 
     why: str
 
 
+class NotDiagnosed(HoldfastError, text="{problem}"):
+    """No diagnosis of the system runs, or it has no component at the address that was asked about."""
+
+    problem: str
+
+
+class NotUpYet(
+    HoldfastError,
+    text="{path} has ended ({reason}), and its next life is not up within {seconds:g} s: it waits for {above}, "
+    "and comes when that gets to it",
+):
+    """A life was ended by order, and its supervisor has not brought up the next one so far."""
+
+    path: str
+    reason: str
+    seconds: float
+    above: str
+
+
 class WrongUser(HoldfastError, text="the other end runs as the user with uid {uid}, and only uid {expected} is served"):
     """The other end of the control endpoint belongs to another user."""
 
@@ -262,12 +281,19 @@ class AskQuarantined(ControlRequest, tag="quarantined", frozen=True):
     path: str | None
 
 
-class SettleQuarantined(ControlRequest, tag="settle quarantined", frozen=True):
-    """Have a message in quarantine tried again, or dropped, by its number at its address."""
+class SettleQuarantined(ControlRequest, tag="settle", frozen=True):
+    """Have messages in quarantine handled again, or dropped: one by its id, or all of an address."""
 
     verb: Literal["retry", "drop"]
     path: str
-    id: int
+    id: int | None
+
+
+class AskDiagnosis(ControlRequest, tag="diagnosis", frozen=True):
+    """What diagnosis says now, of all or of what is at an address and below it."""
+
+    path: str | None
+    timeout: float
 
 
 class DeclareTree(ControlRequest, tag="declare", frozen=True):
@@ -293,6 +319,7 @@ AnyRequest = (
     | AskWhy
     | AskQuarantined
     | SettleQuarantined
+    | AskDiagnosis
     | Tree
     | Whereis
     | ControlActor

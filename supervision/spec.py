@@ -21,6 +21,7 @@ from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.start_codec import pack_recipe
 from ..actors.seconds import check_seconds, is_seconds
 from ..actors.values import UnsavableValue
+from ..actors.values.path_parts import check_path_part, has_control
 from .decisions import decide, is_as_told
 from .patience import end_within
 from .rules import Rule
@@ -115,8 +116,7 @@ class ChildSpec(Generic[A_co]):
 
     def __post_init__(self) -> None:
         where = f"child {self.id!r}"
-        if not isinstance(self.id, str) or not self.id or "/" in self.id:
-            raise SpecError(where, "the id must be text without '/'")
+        check_path_part(where, "the id", self.id)
         if not isinstance(self.start, Start) or not issubclass(self.start.kind, Actor):
             raise SpecError(where, f"start must come from start(Class, ...), not be {self.start!r}")
         try:
@@ -133,8 +133,9 @@ class ChildSpec(Generic[A_co]):
         if not isinstance(self.autostart, bool):
             raise SpecError(where, f"autostart must be True or False, not {self.autostart!r}")
         name = self.register
-        if name is not None and (not isinstance(name, str) or not name or name.startswith("/")):
-            raise SpecError(where, f"register must be text that does not begin with '/', or left out, not {name!r}")
+        if name is not None and (not isinstance(name, str) or not name or name.startswith("/") or has_control(name)):
+            problem = "must be text without control characters that does not begin with '/', or left out"
+            raise SpecError(where, f"register {problem}, not {name!r}")
         if not isinstance(self.significant, bool):
             raise SpecError(where, f"significant must be True or False, not {self.significant!r}")
         if self.significant and self.restart == "permanent":

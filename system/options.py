@@ -8,6 +8,7 @@ from typing import get_args
 
 from ..actors.errors import SpecError
 from ..actors.loop_watchdog import check_limits
+from ..actors.values.path_parts import check_path_part
 from ..checkpoint.journal import Journal
 from ..checkpoint.method import Durability
 from ..checkpoint.recovery_file import RecoveryFile, load_recovery
@@ -45,8 +46,7 @@ class SystemOptions:
     recovery: str | os.PathLike[str] | RecoveryFile | None
 
     def __post_init__(self) -> None:
-        if not self.name or "/" in self.name:
-            raise SpecError("ActorSystem", f"the name must be text without '/', not {self.name!r}")
+        check_path_part("ActorSystem", "the name", self.name)
         check_durability(self.store, self.durability)
         check_store_key(self.store, self.store_key)
         if self.standby is not None:

@@ -26,6 +26,7 @@ from ..errors import (
 from ..events import DeadLetter, Event, EventHub, SupervisorGaveUp
 from ..exit_reasons import KILLED, ExitReason
 from ..persistence import Keeper, NothingKept
+from ..values.path_parts import check_beside, check_path_part
 from . import lifecycle
 from .blocking_handlers import HandlerThreads
 from .cell import DOWN, GONE, RUNNING, Cell, CellKinds, Host
@@ -167,8 +168,7 @@ class Node(RunLoop):
         topics: Topics | None = None,
     ) -> None:
         super().__init__(loop)
-        if not name or "/" in name:
-            raise SpecError("ActorSystem", f"the name must be text without '/', not {name!r}")
+        check_path_part("ActorSystem", "the name", name)
         self.name = name
         self.cell_kinds = CellKinds()
         self.deadlines = Deadlines(loop)
@@ -253,8 +253,8 @@ class Node(RunLoop):
         """
         if name is None:
             name = self.numbers.next_name()
-        elif parent is not None and (not name or "/" in name):
-            raise SpecError("name", f"an actor's name must be text without '/', not {name!r}")
+        elif parent is not None:
+            check_path_part(parent.path, "the name of an actor below it", name)
         cell = Cell(self, parent, name, self.ports.here if host is None else host)
         if parent is not None:
             if parent.children is None:
@@ -350,8 +350,9 @@ class Node(RunLoop):
             is_starting: a life of it is about to begin, and has the name from its very start.
 
         Raises:
-            NameTaken: another living actor has it.
+            NameTaken: another living actor has it. SpecError: it is empty, or has control characters.
         """
+        check_beside(cell.path, name)
         holder = self.names.get(name)
         if holder is cell:
             return

@@ -66,10 +66,12 @@ async def change_to(
     Raises:
         SpecError: it cannot be so while all runs. TransactionRefused, TransactionFailed: as any transaction.
     """
-    steps = await TreePlan(system, wanted, timeout).steps()
+    plan = TreePlan(system, wanted, timeout)
+    steps = await plan.steps()
     if not steps:
         return None
     async with system.transaction(dry_run=dry_run, timeout=timeout) as change:
+        change.lose(plan.left_behind())
         for step in steps:
             change.step(step)
     return change
@@ -188,6 +190,18 @@ class TreePlan:
                 path = one.path + inner.path[len(place.path) :]
                 if path in self._wanted.actors:
                     self._there.setdefault(path, inner)
+
+    def left_behind(self) -> Iterator[str]:
+        """Recorded states that do not come along: their actor is gone here, and new there as another class."""
+        gone = {place.name: place for place in self._gone if _is_recorded(place.spec)}
+        for one in self._new():
+            place = gone.get(one.id)
+            if place is not None and place.kind is not None and one.spec is not None:
+                old, new = place.kind.__name__, one.spec.start.kind.__name__
+                yield (
+                    f"{one.path} begins anew as {new}, and what is recorded of {place.path} ({old}) is left behind: "
+                    "apply the move and the other class one after the other to keep it"
+                )
 
     # -- the steps ----------------------------------------------------------------------------------------------------
 
@@ -343,6 +357,10 @@ class TreePlan:
 
 def _kind(one: WantedActor) -> type[Actor] | None:
     return one.spec.start.kind if one.spec is not None else None
+
+
+def _is_recorded(spec: ChildSpec | None) -> bool:
+    return spec is not None and spec.recovery is not None and spec.recovery.records
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -32,6 +33,8 @@ from .reaching import (
     show_json,
 )
 
+MANY_CHILDREN = 10
+"""Children from which on it is asked before their supervisor is suspended."""
 MOST_NAMED = 5
 """Actors that are named before something is lost; the others are counted."""
 
@@ -40,16 +43,21 @@ def suspend(
     paths: Paths,
     system: System = None,
     socket: Socket = None,
+    yes: Yes = False,
     dry_run: DryRun = False,
     timeout: Timeout = 10.0,
     as_json: Json = False,
 ) -> None:
     """Have actors handle no message until they are resumed; messages wait. All of them, or none: one transaction.
 
+    The root, and a supervisor of many, is asked about: while it is suspended, none of its children is restarted.
+
     Exit status 0: done. 1: refused, nothing was done. 2: no system answers.
     """
     with reached("suspend", system, socket) as remote:
-        rows = meant_rows(remote, paths)
+        all_rows = remote.look().rows
+        rows = select(all_rows, paths)
+        confirm("suspend", [] if dry_run else held_up_by(rows, all_rows), yes=yes)
         _transact(remote, lambda change: _each(change.suspend, rows), dry_run, timeout, as_json)
 
 
@@ -299,13 +307,16 @@ def _transact(
     show_change(asyncio.run(main()), dry_run=dry_run, as_json=as_json)
 
 
-def show_change(change: RemoteChange, *, dry_run: bool, as_json: bool) -> None:
-    """The steps of a transaction, and how the tree has changed."""
+def show_change(change: RemoteChange, *, dry_run: bool, as_json: bool, lost: list[str] | None = None) -> None:
+    """The steps of a transaction, how the tree has changed, and of a file (`lost`) what is lost by it."""
     if as_json:
         steps = [dataclasses.asdict(step) for step in change.steps]
-        show_json({"dry_run": dry_run, "steps": steps, "difference": list(change.difference)})
+        told = {"dry_run": dry_run, "steps": steps, "difference": list(change.difference)}
+        show_json(told if lost is None else {**told, "lost": lost})
         return
     typer.echo(change.describe())
+    for line in (lost or ()) if dry_run else ():
+        typer.echo(f"! {line}")
     typer.echo("nothing was done: this was a dry run" if dry_run else "done")
 
 
@@ -326,6 +337,17 @@ def _ending(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[ActorRow]:
     """The actors that end: these, and all below them."""
     paths = {row.path for row in rows}
     return [row for row in all_rows if row.path in paths or any(above in paths for above in _above(row.path))]
+
+
+def held_up_by(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[str]:
+    """What waits while these are suspended, in words: of the root, and of supervisors with many children."""
+    children = Counter(row.path.rpartition("/")[0] for row in all_rows)
+    return [
+        f"while {row.path} is suspended it starts, stops and restarts none of its {children[row.path]} children: "
+        f"what ends stays down, and what it is asked for waits, until `holdfast resume {row.path}`"
+        for row in rows
+        if row.is_supervisor and (row.path.count("/") == 1 or children[row.path] >= MANY_CHILDREN)
+    ]
 
 
 def lost_by(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[str]:

@@ -10,8 +10,7 @@ import typer
 
 from ...actors.errors import SpecError
 from ...system.script import read_source
-from ..overview import ActorRow
-from ..remote import RemoteChange
+from ..remote import RemoteChange, RemoteSystem
 from .changing import lost_by, show_change
 from .reaching import UNUSABLE, DryRun, Json, Socket, System, Timeout, Yes, confirm, ended, reached, told
 from .scripts import run_script
@@ -30,7 +29,8 @@ def plan(
     text = _read("plan", tree)
     with reached("plan", system, socket) as remote:
         change = asyncio.run(remote.declare(text, str(tree), dry_run=True))
-    show_change(change, dry_run=True, as_json=as_json)
+        lost = _lost(change, remote)
+    show_change(change, dry_run=True, as_json=as_json, lost=lost)
 
 
 def apply(
@@ -56,10 +56,11 @@ def apply(
     text = _read("apply", file)
     with reached("apply", system, socket) as remote:
         change = asyncio.run(remote.declare(text, str(file), dry_run=True, timeout=timeout))
+        lost = _lost(change, remote)
         if not dry_run and change.steps:
-            confirm("apply", lost_by(_ends(change, remote.look().rows), remote.look().rows), yes=yes)
+            confirm("apply", lost, yes=yes)
             change = asyncio.run(remote.declare(text, str(file), timeout=timeout))
-    show_change(change, dry_run=dry_run, as_json=as_json)
+    show_change(change, dry_run=dry_run, as_json=as_json, lost=lost)
 
 
 def _read(command: str, file: Path) -> str:
@@ -73,7 +74,8 @@ def _read(command: str, file: Path) -> str:
             ) from error
 
 
-def _ends(change: RemoteChange, rows: list[ActorRow]) -> list[ActorRow]:
-    """Those that a change ends."""
+def _lost(change: RemoteChange, remote: RemoteSystem) -> list[str]:
+    """What is lost by a change, in sentences."""
     paths = {step.target for step in change.steps if step.verb in ("remove", "stop")}
-    return [row for row in rows if row.path in paths]
+    rows = remote.look().rows
+    return [*change.lost, *lost_by([row for row in rows if row.path in paths], rows)]

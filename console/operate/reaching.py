@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
 
 from ...actors.errors import HoldfastError
+from ...actors.values.path_parts import CONTROL
 from ...system.script import UntrustedFile
 from ..overview import ActorRow
 from ..remote import NotReached, RemoteSystem
@@ -23,10 +24,8 @@ FAILED: Final = 1
 UNUSABLE: Final = 2
 
 
-UNPRINTED: Final = dict.fromkeys(
-    (*range(32), *range(127, 160), 0x200E, 0x200F, *range(0x2028, 0x202F), *range(0x2066, 0x206A)), "?"
-)
-"""Characters that make a terminal do something, or that make a line look like another one."""
+UNPRINTED: Final = dict.fromkeys(CONTROL, "?")
+"""What stands for characters that no terminal is to obey. Addresses have none, but messages and errors may."""
 
 
 def printable(text: str) -> str:
@@ -54,9 +53,14 @@ def complete_system(incomplete: str) -> list[str]:
 
 def complete_path(ctx: typer.Context, incomplete: str) -> list[str]:
     """The addresses in the system that is meant, for the shell."""
+    return complete(ctx, incomplete, lambda remote: remote.tree())
+
+
+def complete(ctx: typer.Context, incomplete: str, words: Callable[[RemoteSystem], Iterable[str]]) -> list[str]:
+    """Words that the system that is meant knows, those that begin as what was typed; none if it does not answer."""
     try:
         with RemoteSystem(chosen(ctx.params.get("system"), ctx.params.get("socket"))) as remote:
-            return [path for path in remote.tree() if path.startswith(incomplete)]
+            return [word for word in words(remote) if word.startswith(incomplete)]
     except HoldfastError:  # A shell that waits for words has no use for a sentence.
         return []
 

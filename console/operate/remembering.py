@@ -1,4 +1,4 @@
-"""The commands about the past of a running system: why, history, events, dead-letters, quarantine, retry, drop."""
+"""The commands that ask a running system about its past: why, history, events, dead-letters."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import msgspec
 import typer
 
 from ... import events as events_of_all
-from ...system import PastEvent, PastLife, PutAside
-from ..remote import RemoteSystem
+from ...system import PastEvent, PastLife
 from .reaching import (
     FAILED,
     UNUSABLE,
@@ -21,8 +20,6 @@ from .reaching import (
     OnePath,
     Socket,
     System,
-    Yes,
-    confirm,
     ended,
     printable,
     reached,
@@ -49,7 +46,7 @@ def why(path: OnePath, system: System = None, socket: Socket = None, as_json: Js
     if as_json:
         show_json({"address": path, "why": sentences})
     else:
-        _print_lines(sentences)
+        print_lines(sentences)
 
 
 def history(path: OnePath, system: System = None, socket: Socket = None, as_json: Json = False) -> None:
@@ -61,7 +58,7 @@ def history(path: OnePath, system: System = None, socket: Socket = None, as_json
     if as_json:
         show_json({"address": path, "lives": msgspec.to_builtins(lives)})
     else:
-        _print_lines(map(life_line, lives))
+        print_lines(map(life_line, lives))
 
 
 def events(
@@ -104,63 +101,7 @@ def dead_letters(
     _print_events(page.events, as_json=as_json)
 
 
-def quarantine(
-    path: Annotated[str | None, typer.Argument(help="An address; without one, of all.")] = None,
-    system: System = None,
-    socket: Socket = None,
-    as_json: Json = False,
-) -> None:
-    """List the messages that were put aside because they have ended their actor's process again and again."""
-    with reached("quarantine", system, socket) as remote:
-        messages = remote.put_aside(path)
-    if as_json:
-        show_json({"quarantine": msgspec.to_builtins(messages)})
-        return
-    for one in messages:
-        sender = f" from {one.sender}" if one.sender else ""
-        payload = f": {one.payload}" if one.payload else ""
-        number = f"number {one.id}, {one.attempts} deaths"
-        _print_lines([f"{moment(one.since)} {one.address} {one.message}{sender}, {number}{payload}"])
-
-
-Messages = Annotated[str, typer.Argument(metavar="PATH", help="The address whose messages in quarantine are meant.")]
-Number = Annotated[int | None, typer.Option("--id", help="Only this one, by the number that `quarantine` shows.")]
-
-
-def retry(path: Messages, system: System = None, socket: Socket = None, number: Number = None) -> None:
-    """Have messages in quarantine handled as if they had come now: once the cause is mended.
-
-    Exit status 0: done. 1: there is no such message. 2: no system answers.
-    """
-    with reached("retry", system, socket) as remote:
-        for one in _set_aside(remote, "retry", path, number):
-            remote.retry(one)
-            _print_lines([f"{one.address} handles {one.message} again"])
-
-
-def drop(path: Messages, system: System = None, socket: Socket = None, number: Number = None, yes: Yes = False) -> None:
-    """Forget messages in quarantine; they become dead letters.
-
-    Exit status 0: done. 1: there is no such message, or the answer was no. 2: no system answers.
-    """
-    with reached("drop", system, socket) as remote:
-        found = _set_aside(remote, "drop", path, number)
-        confirm("drop", [f"{one.message} to {one.address} is not handled" for one in found], yes=yes)
-        for one in found:
-            remote.drop(one)
-            _print_lines([f"dropped {one.message} to {one.address}"])
-
-
-def _set_aside(remote: RemoteSystem, command: str, path: str, number: int | None) -> list[PutAside]:
-    """The messages that are meant; the command ends if there is none."""
-    found = [one for one in remote.put_aside(path) if number in (None, one.id)]
-    if not found:
-        which = "no message" if number is None else f"no message {number}"
-        raise ended(command, f"{which} to {path} is in quarantine", FAILED)
-    return found
-
-
-def _print_lines(lines: Iterable[str]) -> None:
+def print_lines(lines: Iterable[str]) -> None:
     for line in lines:
         typer.echo(printable(line))
 
@@ -170,7 +111,7 @@ def _print_events(found: Iterable[PastEvent], *, as_json: bool) -> None:
         if as_json:
             typer.echo(msgspec.json.encode(event).decode())
         else:
-            _print_lines([event_line(event)])
+            print_lines([event_line(event)])
 
 
 def event_line(event: PastEvent) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Callable, Coroutine
 from typing import Any, ClassVar
 
 from rich.style import Style
@@ -16,7 +17,7 @@ from textual.widgets import Footer, Input, Static
 from ...actors.errors import HoldfastError
 from ..overview import ActorRow, SystemLook
 from ..remote import NotReached, RemoteSystem
-from .changing import lost_by
+from .changing import held_up_by, lost_by
 from .looking import COLOURS, inspection_lines
 from .patterns import select
 from .row_list import RowList
@@ -199,8 +200,12 @@ class Top(App[str]):
         self.push_screen(Page("\n".join(inspection_lines(found))))
 
     def action_order(self, verb: str) -> None:
-        """Suspend or resume the actor at the cursor."""
-        self._begin(self._order(verb, self._rows().key_at_cursor))
+        """Suspend or resume the actor at the cursor; asks if that holds up many."""
+        path, look = self._rows().key_at_cursor, self._look
+        if look is None or not path:
+            return
+        held = held_up_by([row for row in look.rows if row.path == path], look.rows) if verb == "suspend" else []
+        self._ask(f"{verb} {path}", held, lambda: self._order(verb, path))
 
     async def _order(self, verb: str, path: str) -> None:
         async with self._remote.transaction() as change:
@@ -214,13 +219,17 @@ class Top(App[str]):
         if look is None or not path:
             return
         lost = lost_by([row for row in look.rows if row.path == path], look.rows)
+        self._ask(f"restart {path}", lost, lambda: self._restart(path))
+
+    def _ask(self, what: str, lost: list[str], work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Do something at once if nothing speaks against it, else when the answer is yes."""
 
         def answered(yes: bool | None) -> None:
             if yes:
-                self._begin(self._restart(path))
+                self._begin(work())
 
         if lost:
-            self.push_screen(Question(f"restart {path}: {'; '.join(lost)}"), answered)
+            self.push_screen(Question(f"{what}: {'; '.join(lost)}"), answered)
         else:
             answered(True)
 

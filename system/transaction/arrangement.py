@@ -239,7 +239,9 @@ def planned_spec(place: DraftPlace, *, in_force: bool) -> ChildSpec:
     assert spec is not None
     bound = {port: to for port, to in place.bindings.items() if port in spec.bindings}
     paths = {port: to.path if in_force or to.cell is None else to.cell.path for port, to in bound.items()}
-    changes: dict[str, Any] = {"bindings": {**spec.bindings, **paths}}
+    changes: dict[str, Any] = {}
+    if any(spec.bindings[port] != path for port, path in paths.items()):
+        changes["bindings"] = {**spec.bindings, **paths}
     if place.was.start is not None:  # It takes the place of another one.
         start, begins_with = place.was.start, None
         if not in_force and place.is_supervisor:
@@ -255,7 +257,8 @@ def planned_spec(place: DraftPlace, *, in_force: bool) -> ChildSpec:
         changes["start"] = Start(spec.start.kind, (place.flags, below), spec.start.kwargs)
     elif place.flags is not None and len(spec.start.args) == 2:
         changes["start"] = Start(spec.start.kind, (place.flags, spec.start.args[1]), spec.start.kwargs)
-    return dataclasses.replace(spec, **changes)
+    # A copy is checked anew, and a commit makes one for each child that is added, with no pause in between.
+    return dataclasses.replace(spec, **changes) if changes else spec
 
 
 def _start_before(place: DraftPlace) -> Start[Any]:

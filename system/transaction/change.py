@@ -33,6 +33,7 @@ class Change:
         self._added: set[str] = set()
         self._before: list[str] | None = None
         self._difference: list[str] | None = None
+        self._lost: tuple[str, ...] = ()
 
     # -- the shape of the tree ----------------------------------------------------------------------------------------
 
@@ -178,6 +179,15 @@ class Change:
     def difference(self) -> tuple[str, ...]:
         """List how the tree changes: lines with `-` go, lines with `+` come. Known after the checks."""
         return tuple(self._difference or ())
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """Name what of recorded states is left behind, in sentences, as whoever planned the steps has found."""
+        return self._lost
+
+    def lose(self, what: Iterable[str]) -> None:
+        """Note what is left behind by the steps, in sentences, for those who are asked before."""
+        self._lost = (*self._lost, *what)
 
     def describe(self) -> str:
         """Say in words which steps there are, and how the tree changes (known after the checks)."""

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 RELEASE_TIMEOUT = 30.0
 """Seconds that letting go of what one step has prepared may take before it is given up, and told as such."""
+CHECKED_TOGETHER = 16
+"""Steps that are checked in one step of the loop."""
 LOOK_AGAIN = 0.02
 """Seconds between two looks at whether nothing is in the way of a commit any more."""
 
@@ -105,7 +107,9 @@ class Transaction:
         change, system = self._change, self._system
         draft = self._draft = Draft(system._node, self._arrangement, self._timeout)
         before = draft.lines()
-        for operation in change.operations:
+        for number, operation in enumerate(change.operations, 1):
+            if number % CHECKED_TOGETHER == 0:
+                await asyncio.sleep(0)  # What else the system does, and who asks how it is, goes on meanwhile.
             await self._in_time(operation.text, deadline, lambda one=operation: one.check(system, draft))  # type: ignore[misc]
             refuse_self(operation)
         try:

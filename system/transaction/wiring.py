@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.errors import ActorStopped, NameTaken, NoSuchActor, type_name
 from ...actors.kernel.cell import RUNNING
+from ...actors.values.path_parts import check_beside
 from ...supervision.respec import rebind
 from .draft import Draft, DraftPlace, Target
 from .operation import Operation, text_of, wrong
@@ -117,6 +118,7 @@ class RegisterName(Operation):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = draft.find(self._at)
         self.target = place.path
+        check_beside(place.path, self._name)
         place.check_lived_in(system._node)
         holder = holder_of(self._name, draft)
         if holder is not None and holder is not place:

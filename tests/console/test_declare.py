@@ -235,7 +235,7 @@ async def test_plan_shows_and_apply_does(app: hf.ActorSystem, path: Path, tmp_pa
     assert "/app/left/b" in app.tree()
     status, output, _ = await holdfast("plan", file, "--socket", path, "--json")
     told: Any = json.loads(output)
-    assert (status, told) == (DONE, {"dry_run": True, "steps": [], "difference": []})
+    assert (status, told) == (DONE, {"dry_run": True, "steps": [], "difference": [], "lost": []})
 
 
 async def test_apply_asks_before_something_is_lost(app: hf.ActorSystem, path: Path, tmp_path: Path) -> None:
@@ -248,6 +248,28 @@ async def test_apply_asks_before_something_is_lost(app: hf.ActorSystem, path: Pa
     assert "/app/left/b" in app.tree()
     assert (await holdfast("apply", file, "--socket", path, "--yes"))[0] == DONE
     assert "/app/left/b" not in app.tree()
+
+
+async def test_what_is_recorded_of_one_that_moves_and_is_another_is_told_as_lost(
+    app: hf.ActorSystem, path: Path, tmp_path: Path
+) -> None:
+    recorded = SHOP.replace("args = [5]", 'args = [5]\nrecovery = "hybrid"')
+    await steps(app, without(recorded, "/app/left/b"))
+    await ref(app, "/app/left/a").ask(Add(1))
+    other = without(without(recorded, "/app/left/b"), "/app/left/a")
+    file = tmp_path / "shop.toml"
+    file.write_text(f'{other}\n["/app/a"]\nclass = "tests.system.trees:Double"\nrecovery = "hybrid"\n')
+    file.chmod(0o600)
+    lost = "/app/a begins anew as Double, and what is recorded of /app/left/a (Counter) is left behind"
+    status, output, _ = await holdfast("plan", file, "--socket", path)
+    assert (status, f"! {lost}" in output) == (DONE, True)
+    _, output, _ = await holdfast("plan", file, "--socket", path, "--json")
+    assert json.loads(output)["lost"][0].startswith(lost)
+    status, _, errors = await holdfast("apply", file, "--socket", path)
+    assert (status, errors.startswith(lost), "say --yes" in errors) == (FAILED, True, True)
+    assert "/app/left/a" in app.tree()
+    assert (await holdfast("apply", file, "--socket", path, "--yes"))[0] == DONE
+    assert "/app/a" in app.tree()
 
 
 async def test_a_file_that_others_may_write_or_that_is_not_there_is_not_used(path: Path, tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ VARIES = [
     (r"\.py:\d+", ".py:N"),
 ]
 """What is another one each time: moments and numbers of events, seconds, sizes, processes, lines of the programs."""
-CHANGES = re.compile(r"(holdfast (restart|drop|retry)|kill|dd|rm) ")
+CHANGES = re.compile(r"(holdfast (restart|quarantine (drop|retry))|kill|dd|rm) ")
 """Commands that change something; the others are given again until they say what is shown."""
 PATIENCE = 30.0
 

@@ -301,13 +301,41 @@ async def test_a_module_that_raises_anything_ends_nobody(
     assert (await holdfast("tree", "--paths"))[0] == DONE
 
 
-async def test_an_address_is_one_line_whatever_is_in_it(named: hf.ActorSystem) -> None:
+@pytest.mark.parametrize("name", ["e\x1b[31m", "two\nlines", "\u202eback", "c1\x9b"])
+async def test_a_name_that_a_terminal_would_obey_is_refused(named: hf.ActorSystem, name: str) -> None:
     """Else a child could pass for another in a script, or make a terminal do something."""
-    await named.start(hf.child("e\x1b[31m\n\u202ex", hf.start(Counter)))
-    status, output, _ = await holdfast("tree", "--paths")
-    assert (status, "/app/e?[31m??x" in output.split("\n")) == (DONE, True)
-    status, output, _ = await holdfast("tree")
-    assert (status, "\x1b" in output, sum("e?[31m??x" in line for line in output.split("\n"))) == (DONE, False, 1)
+    one = ref(named, "/app/left/a")
+    with pytest.raises(hf.SpecError, match="without '/' and control characters"):
+        hf.child(name, hf.start(Counter))
+    with pytest.raises(hf.SpecError, match="without '/' and control characters"):
+        named.spawn(hf.start(Counter), name)
+    with pytest.raises(hf.SpecError, match="without '/' and control characters"):
+        hf.ActorSystem(name)
+    with pytest.raises(hf.SpecError, match="without control characters"):
+        hf.child("one", hf.start(Counter), register=name)
+    with pytest.raises(hf.SpecError, match="without control characters"):
+        named.register(name, one)
+    with pytest.raises(hf.errors.TransactionRefused, match="without control characters"):
+        async with named.transaction() as change:
+            change.register(name, one)
+    assert not [path for path in named.tree() if name in path]
+
+
+async def test_who_suspends_the_root_or_a_supervisor_of_many_is_asked(named: hf.ActorSystem) -> None:
+    status, _, errors = await holdfast("suspend", "/app")
+    assert status == FAILED
+    assert "while /app is suspended it starts, stops and restarts none of its" in errors
+    assert errors.endswith("holdfast suspend: this needs a yes: say --yes\n")
+    await named.start(hf.supervisor("many", children=[hf.child(f"n{n}", hf.start(Counter)) for n in range(10)]))
+    many = ref(named, "/app/many")
+    assert (await holdfast("suspend", "/app/many"))[0] == FAILED
+    assert (await named.get_status(many)).state == "running"
+    assert (await holdfast("suspend", "/app/many", "--yes"))[0] == DONE
+    status, _, errors = await holdfast("restart", "/app/many/n1", "--yes")
+    assert (status, "/app/many is suspended, and starts nobody: resume it first" in errors) == (FAILED, True)
+    assert "/app/many/n1" in named.tree()
+    assert (await holdfast("resume", "/app/many"))[0] == DONE
+    assert (await holdfast("suspend", "/app/left"))[0] == DONE  # It has a few.
 
 
 async def test_top_needs_a_terminal(named: hf.ActorSystem) -> None:

@@ -204,7 +204,7 @@ async def test_sighup_has_another_tree_planted(project: Path) -> None:
         ("clock.py", ACTORS + "\nraise SystemExit(3)\n", "SystemExit"),
         ("clock.py", ACTORS + "\nraise KeyboardInterrupt\n", "KeyboardInterrupt"),
         ("words.py", WORDS + "\n\nclass Tock(hf.Message): ...\n", "words: it defines messages"),
-        ("tree.py", TREE.replace('"clock", hf', '"/", hf'), "the id must be text without '/'"),
+        ("tree.py", TREE.replace('"clock", hf', '"/", hf'), "the id must be text without '/' and control characters"),
         ("tree.py", TREE.replace("Clock)", "Clock, 7)"), "too many positional arguments"),
         ("tree.py", TREE.replace("    return [", "    raise SystemExit(3)\n    return ["), "SystemExit"),
     ],

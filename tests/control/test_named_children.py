@@ -196,5 +196,5 @@ async def test_below_a_supervisor_in_a_process_it_is_refused(system: hf.ActorSys
 
 @pytest.mark.parametrize("wrong", ["", "/app/bank", 5])
 def test_what_is_no_name_is_refused(wrong: Any) -> None:
-    with pytest.raises(hf.SpecError, match="child 'one': register must be text that does not begin with '/'"):
+    with pytest.raises(hf.SpecError, match="child 'one': register must be text without control characters"):
         hf.child("one", hf.start(Account), register=wrong)

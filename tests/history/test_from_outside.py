@@ -170,18 +170,26 @@ async def test_the_commands_in_json(system: hf.ActorSystem, path: Path) -> None:
     assert (message["address"], message["attempts"]) == ("/app/poisoned", 1)
     assert message["payload"] == "Do(what='kill')"
     _, said, _ = await command(path, "quarantine")
-    assert "/app/poisoned tests.history.players.Do, number 1, 1 deaths: Do(what='kill')" in said
-    code, said, errors = await command(path, "drop", "/app/poisoned")
-    assert (code, said) == (1, "")
-    assert "Do to /app/poisoned is not handled" in errors
-    code, said, _ = await command(path, "retry", "/app/poisoned", "--id", "1")
-    assert (code, said) == (0, "/app/poisoned handles tests.history.players.Do again\n")
-    await until(lambda: system.put_aside("/app/poisoned") and system.put_aside("/app/poisoned")[0].id != 1)
-    code, said, _ = await command(path, "drop", "/app/poisoned", "--yes")  # It has killed once more.
-    assert (code, said) == (0, "dropped tests.history.players.Do to /app/poisoned\n")
-    assert system.put_aside() == []
-    code, _, errors = await command(path, "retry", "/app/poisoned")
-    assert (code, errors) == (1, "holdfast retry: no message to /app/poisoned is in quarantine\n")
+    assert f"/app/poisoned {message['id']} tests.history.players.Do, 1 deaths: Do(what='kill')" in said
+
+
+async def test_what_is_in_quarantine_is_retried_and_dropped(system: hf.ActorSystem, path: Path) -> None:
+    spec = hf.child("poisoned", hf.start(Worker), isolation="process", recovery=hf.hybrid(max_deliveries=1))
+    await failed(await system.start(spec), "kill")
+    [first] = system.quarantined()
+    code, _, said = await command(path, "quarantine", "retry", "/app/worker")
+    assert (code, "/app/worker: nothing of it is in quarantine" in said) == (1, True)
+    code, _, said = await command(path, "quarantine", "retry", "/app/poisoned", str(first.id + 99))
+    assert (code, f"no message {first.id + 99} of it is in quarantine" in said) == (1, True)
+    code, said, _ = await command(path, "quarantine", "retry", "/app/poisoned", str(first.id))
+    assert (code, said.startswith("handled again: ")) == (0, True)
+    await until(lambda: [one.id for one in system.quarantined() if one.id != first.id])  # It has killed again.
+    code, _, said = await command(path, "quarantine", "drop", "/app/poisoned")
+    assert (code, "this needs a yes: say --yes" in said) == (1, True)
+    code, said, _ = await command(path, "quarantine", "drop", "/app/poisoned", "--yes", "--json")
+    told = json.loads(said)
+    assert (code, [one["address"] for one in told["done"]], told["failed"]) == (0, ["/app/poisoned"], [])
+    assert system.quarantined() == []
 
 
 async def test_events_that_are_followed_come_as_they_are_told(system: hf.ActorSystem, path: Path) -> None:

@@ -25,9 +25,12 @@ def top(**options: Any) -> hf.ChildSpec:
 
 
 WRONG: list[tuple[Callable[[], object], str, str]] = [
-    (lambda: kid(""), "child ''", "the id must be text without '/'"),
-    (lambda: kid("a/b"), "child 'a/b'", "the id must be text without '/'"),
-    (lambda: kid(7), "child 7", "the id must be text without '/'"),
+    (lambda: kid(""), "child ''", "the id must be text without '/' and control characters"),
+    (lambda: kid("a/b"), "child 'a/b'", "the id must be text without '/' and control characters"),
+    (lambda: kid("a\nb"), "child 'a\\nb'", "the id must be text without '/' and control characters"),
+    (lambda: kid("a\x1b[31m"), "child 'a\\x1b[31m'", "the id must be text without '/' and control characters"),
+    (lambda: hf.ActorSystem("a\u202e"), "ActorSystem", "the name must be text without '/' and control characters"),
+    (lambda: kid(7), "child 7", "the id must be text without '/' and control characters"),
     (lambda: hf.child("kid", Idle), "child 'kid'", "start must come from start(Class, ...)"),  # type: ignore[arg-type]
     (lambda: hf.child("kid", hf.start(Idle, 1, 2)), "child 'kid'", "Idle, ...): too many positional arguments"),  # type: ignore[call-arg]
     (lambda: hf.child("kid", hf.start(Idle, last=1)), "child 'kid'", "unexpected keyword argument 'last'"),  # type: ignore[call-arg]
@@ -67,7 +70,11 @@ WRONG: list[tuple[Callable[[], object], str, str]] = [
         "restart must be one of permanent, transient, temporary, not 'never'",
     ),
     (lambda: top(shutdown=-2.0), "child 'top'", "shutdown must be seconds >= 0"),
-    (lambda: hf.ActorSystem("a/b"), "ActorSystem", "the name must be text without '/', not 'a/b'"),
+    (
+        lambda: hf.ActorSystem("a/b"),
+        "ActorSystem",
+        "the name must be text without '/' and control characters, not 'a/b'",
+    ),
     (lambda: hf.ActorSystem(intensity=-1), "supervisor", "intensity must be a whole number >= 0, not -1"),
     (lambda: hf.bounded(0), "bounded", "capacity must be a whole number of messages >= 1, not 0"),
     (lambda: hf.bounded(1, overflow="wait"), "bounded", "overflow must be one of block, reject, drop_newest"),  # type: ignore[arg-type]

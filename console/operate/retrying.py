@@ -1,0 +1,135 @@
+"""The commands for messages that were put aside: quarantine lists them, quarantine retry and drop settle them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+import typer
+from typer.core import TyperGroup
+
+from ...system.history.evidence import PutAside
+from ..remote import RemoteSystem
+from .reaching import (
+    FAILED,
+    Json,
+    Socket,
+    System,
+    Yes,
+    complete,
+    complete_path,
+    confirm,
+    ended,
+    reached,
+    show_json,
+)
+from .remembering import moment, print_lines
+
+LISTING = "list"
+
+
+class ListByDefault(TyperGroup):
+    """A group of commands of which `list` is meant where none of them is named: `holdfast quarantine /app/till`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Name the listing if no command is named; a shell that completes words has named none yet."""
+        is_named = bool(args) and (args[0] in self.commands or args[0] in ctx.help_option_names)
+        is_early = not args and ctx.resilient_parsing
+        return super().parse_args(ctx, args if is_named or is_early else [LISTING, *args])
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+        """The commands, and the addresses that the listing takes."""
+        listing = self.commands[LISTING]
+        address = next(one for one in listing.params if one.name == "path")
+        with listing.make_context(LISTING, [], parent=ctx, resilient_parsing=True) as inner:
+            return [*super().shell_complete(ctx, incomplete), *address.shell_complete(inner, incomplete)]
+
+
+quarantine = typer.Typer(
+    name="quarantine",
+    cls=ListByDefault,
+    help="List, retry or drop the messages that were put aside because they have ended their actor's process.",
+)
+
+Address = Annotated[str, typer.Argument(metavar="PATH", help="An address.", autocompletion=complete_path)]
+
+
+def complete_id(ctx: typer.Context, incomplete: str) -> list[str]:
+    """The ids of what is in quarantine at the address that was typed, for the shell."""
+    path: str | None = ctx.params.get("path")
+    return complete(ctx, incomplete, lambda remote: [str(one.id) for one in remote.put_aside(path)])
+
+
+Id = Annotated[
+    int | None,
+    typer.Argument(metavar="[ID]", help="The number of one message; without it, all.", autocompletion=complete_id),
+]
+
+
+@quarantine.command(LISTING, hidden=True)
+def list_quarantine(
+    path: Annotated[
+        str | None, typer.Argument(help="An address; without one, of all.", autocompletion=complete_path)
+    ] = None,
+    system: System = None,
+    socket: Socket = None,
+    as_json: Json = False,
+) -> None:
+    """List the messages that were put aside because they have ended their actor's process again and again.
+
+    Exit status 0: done, also if there is none. 2: no system answers.
+    """
+    with reached("quarantine", system, socket) as remote:
+        messages = remote.put_aside(path)
+    if as_json:
+        show_json({"quarantine": msgspec.to_builtins(messages)})
+    else:
+        print_lines(map(quarantine_line, messages))
+
+
+@quarantine.command()
+def retry(path: Address, id: Id = None, system: System = None, socket: Socket = None, as_json: Json = False) -> None:
+    """Have messages in quarantine handled as if they had come now. Who had asked has long got `Quarantined`.
+
+    Exit status 0: done. 1: nothing is there, or one could not be retried; the others were. 2: no system answers.
+    """
+    with reached("quarantine retry", system, socket) as remote:
+        _settle(remote, "retry", path, id, as_json)
+
+
+@quarantine.command()
+def drop(
+    path: Address, id: Id = None, system: System = None, socket: Socket = None, yes: Yes = False, as_json: Json = False
+) -> None:
+    """Forget messages in quarantine: they become dead letters. You are asked before.
+
+    Exit status 0: done. 1: nothing is there, or one could not be dropped; the others were. 2: no system answers.
+    """
+    with reached("quarantine drop", system, socket) as remote:
+        meant = [one for one in remote.put_aside(path) if id in (None, one.id)]
+        confirm("quarantine drop", [f"this is dropped: {quarantine_line(one)}" for one in meant], yes=yes)
+        _settle(remote, "drop", path, id, as_json)
+
+
+def _settle(remote: RemoteSystem, verb: Literal["retry", "drop"], path: str, id: int | None, as_json: bool) -> None:
+    """Have it done, and show for which messages it was done."""
+    done, failed = remote.settle_put_aside(verb, path, id)
+    if as_json:
+        told: Any = {"done": msgspec.to_builtins(done), "failed": failed}
+        show_json(told)
+    else:
+        words = {"retry": "handled again", "drop": "dropped"}
+        print_lines(f"{words[verb]}: {quarantine_line(one)}" for one in done)
+    if failed:
+        raise ended(f"quarantine {verb}", "; ".join(failed), FAILED)
+
+
+def quarantine_line(one: PutAside) -> str:
+    """A message in quarantine as a line of text, its number behind its address.
+
+    >>> quarantine_line(PutAside("/app/till", "shop.Pay", 3, 0.0, "/app/clerk", 7)).split(" ", 2)[2]
+    '/app/till 7 shop.Pay from /app/clerk, 3 deaths'
+    """
+    sender = f" from {one.sender}" if one.sender else ""
+    payload = f": {one.payload}" if one.payload else ""
+    return f"{moment(one.since)} {one.address} {one.id} {one.message}{sender}, {one.attempts} deaths{payload}"

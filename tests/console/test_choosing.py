@@ -1,0 +1,69 @@
+"""The commands that choose a mechanism, and the one that says what diagnosis says now."""
+
+import json
+from pathlib import Path
+
+import holdfast as hf
+from holdfast import diagnosis
+from holdfast.diagnosis.literals import parse
+from holdfast.diagnosis.observations import Observation
+from tests.console.commands import holdfast
+
+DONE, FAILED, UNUSABLE = 0, 1, 2
+
+
+async def test_coverage_is_what_the_mechanisms_declare() -> None:
+    status, output, _ = await holdfast("coverage", "--json", "--mechanism", "pbr")
+    told = json.loads(output)
+    assert (status, told["mechanisms"][0]["tolerates"], "crash" in told["faults"]) == (DONE, ["crash"], True)
+    status, output, _ = await holdfast("coverage")
+    assert (status, output.count("\n") > 8, "| tmr " in output) == (DONE, True, True)
+    status, _, errors = await holdfast("coverage", "--mechanism", "wishes")
+    assert (status, "there is no mechanism of that name" in errors) == (UNUSABLE, True)
+
+
+async def test_select_tells_the_cheapest_or_why_there_is_none() -> None:
+    status, output, _ = await holdfast("select", "crash", "--units", "2", "--json")
+    told = json.loads(output)
+    assert (status, told["best"], told["valid"][0]["units"]) == (DONE, ["pbr"], 2)
+    status, output, _ = await holdfast("select", "crash", "--units", "2", "--no-state-access", "--json")
+    assert json.loads(output)["best"] == ["lfr"]
+    status, output, _ = await holdfast("select", "crash")
+    assert (status, "needs 2 processing units, and has 1" in output) == (FAILED, True)
+    status, output, _ = await holdfast("select", "crash", "--units", "2", "--actor", "tests.system.trees:Counter")
+    assert (status, "pbr" in output) == (DONE, True)
+    for wrong, said in (
+        (("boom",), "unknown faults boom; there are crash"),
+        (("crash", "--actor", "tests.system.trees:NOBODY"), "tests.system.trees has no NOBODY"),
+        (("crash", "--actor", "json:loads"), "json:loads is no actor class"),
+    ):
+        status, _, errors = await holdfast("select", *wrong)
+        assert (status, said in errors) == (UNUSABLE, True), errors
+
+
+async def test_without_diagnosis_it_is_said_how_to_start_one(system: hf.ActorSystem, path: Path) -> None:
+    status, _, errors = await holdfast("diagnose", "--socket", path)
+    assert (status, errors.startswith("holdfast diagnose: no diagnosis of app runs: start one")) == (FAILED, True)
+
+
+async def test_diagnose_tells_suspects_with_their_addresses(system: hf.ActorSystem, path: Path) -> None:
+    watching = await diagnosis.watch(system, seconds=0.0, trust={"test": 2.0})
+    try:
+        await watching.diagnosis()
+        status, output, errors = await holdfast("diagnose", "--socket", path, "--json")
+        [told] = json.loads(output)
+        assert (status, errors, told["diagnoser"]) == (DONE, "", "/app/diagnosis/diagnoser")
+        component = next(name for name, where in watching.addresses.items() if where == "/app/left/a")
+        await system.suspend(system.ref("/app/left/a"))
+        now = system._node.loop.time()
+        seen = Observation(parse(f"not running({component})"), now, "test", 60.0)
+        await system.publish(diagnosis.OBSERVATIONS, seen)
+        assert component in (await watching.diagnosis()).suspects
+        status, output, _ = await holdfast("diagnose", "/app/left", "--socket", path)
+        assert (status, f"faulty: {component} at /app/left/a" in output) == (DONE, True)
+        status, output, _ = await holdfast("diagnose", "/app/right", "--socket", path)
+        assert (status, "components is suspected" in output) == (DONE, True)
+        status, _, errors = await holdfast("diagnose", "/app/nowhere", "--socket", path)
+        assert (status, "no component of the diagnosis is at /app/nowhere" in errors) == (FAILED, True)
+    finally:
+        await system.stop(watching.tree)
