@@ -56,7 +56,7 @@ class StoreInUse(StoreError):
 
     def __str__(self) -> str:
         if self.owner:
-            return f"store {self.path} is in use: {self.owner}, leads; stop it, or wait for it with standby='warm'"
+            return f"store {self.path} is in use: {self.owner} leads; stop it, or wait for it with standby='warm'"
         if not self.pid:
             return f"store {self.path} is open in a process that cannot be seen from here (another container?): stop it"
         return f"store {self.path} is open in process {self.pid}: stop it, or open with takeover=True, which kills it"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from importlib.util import find_spec
 from typing import TypeVar
 
@@ -33,6 +33,7 @@ async def join(
     store: str,
     system: str,
     standby: Standby | None,
+    settings: Mapping[str, str | bool | int],
     *,
     waits: Callable[[str], None],
     deposed: Callable[[Deposed], None],
@@ -43,6 +44,7 @@ async def join(
         store: "nats://HOST,HOST/NAME".
         system: the name of the system.
         standby: how to wait while another program leads; `None` does not.
+        settings: how the servers are reached, see `access_of`.
         waits: told who leads, on the running loop, each time that this changes.
         deposed: told on the running loop that another program leads.
 
@@ -59,7 +61,7 @@ async def join(
     from .nats.access import access_of
     from .nats.nats_engine import open_engine  # only now: it imports that library
 
-    access = access_of(store)
+    access = access_of(store, settings)
     loop = asyncio.get_running_loop()
     me = leader_name()
     thread = EngineThread(f"holdfast {system}")

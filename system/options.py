@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from typing import get_args
+from typing import Final, get_args
 
 from ..actors.errors import SpecError
 from ..actors.loop_watchdog import check_limits
@@ -15,9 +15,13 @@ from ..checkpoint.recovery_file import RecoveryFile, load_recovery
 from ..checkpoint.recovery_settings import RecoveryHooks
 from ..checkpoint.store_key import StoreKey
 from ..checkpoint.store_opening import check_durability, check_store_key
+from ..cluster.configuration import NatsSettings, read_configuration
 from ..cluster.joining import is_replicated
 from ..cluster.leadership import Standby
 from ..supervision.spec import Flags
+
+CONFIGURED: Final = "configured"
+"""The store that `holdfast.toml` and the environment name."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
@@ -33,6 +37,7 @@ class SystemOptions:
     store_key: StoreKey | None = dataclasses.field(repr=False)
     durability: Durability | None
     standby: Standby | None
+    nats: NatsSettings
     flags: Flags
     preload: tuple[str, ...]
     log: bool
@@ -60,6 +65,23 @@ class SystemOptions:
         if hooks is not None and not isinstance(hooks, RecoveryHooks):
             raise SpecError("ActorSystem", f"recovery_hooks must come from recovery_hooks(...), not be {hooks!r}")
         check_limits(self.watch_lag, self.watch_turns)
+
+    @staticmethod
+    def configured(
+        store: str | Journal | None, standby: Standby | None, durability: Durability | None
+    ) -> tuple[str | Journal | None, Standby | None, Durability | None, NatsSettings]:
+        """The arguments, and what `holdfast.toml` and the environment say where the store is "configured".
+
+        Raises:
+            SpecError: they name no store, or cannot be read.
+        """
+        if store != CONFIGURED:
+            return store, standby, durability, NatsSettings()
+        found = read_configuration().under(store=None, standby=standby, durability=durability)
+        if found.store is None:
+            problem = f"store={CONFIGURED!r}, and no store is configured: write store = '...' into holdfast.toml"
+            raise SpecError("ActorSystem", f"{problem}, or set HOLDFAST_STORE")
+        return found.store, found.standby, found.durability, found.nats
 
     def read_recovery_file(self) -> RecoveryFile | None:
         """The recovery file, read now if only its path was given.

@@ -91,7 +91,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         name: the first part of all addresses.
         store: where journals and snapshots go: None (memory: survives any process but this one), or
             "sqlite:PATH", or "nats://HOST,HOST/NAME": on several machines (docs/many-machines.md), or an engine of your
-            own: anything that keeps to `Journal` (see holdfast.testing.stores).
+            own: anything that keeps to `Journal` (see holdfast.testing.stores); or "configured": what `holdfast.toml`
+            and the environment say.
         store_key: encrypts the store "sqlite:PATH", from its making on: 32 bytes, the path of a file that has them and
             that only its owner may read, or a function that returns them (docs/recovery/encryption.md).
         durability: what an admission outlives when it is told of (send returns, an ask is fed, a reply leaves):
@@ -138,8 +139,10 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         recovery_hooks: RecoveryHooks | None = None,
         recovery: str | os.PathLike[str] | RecoveryFile | None = None,
     ) -> None:
+        store, standby, durability, nats = SystemOptions.configured(store, standby, durability)
         self._options = SystemOptions(
             name=name,
+            nats=nats,
             store=store,
             store_key=store_key,
             durability=durability,
@@ -245,6 +248,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             options.store,
             self.name,
             options.standby,
+            options.nats.told(),
             waits=lambda leader: node.emit(StandingBy(where, leader)),
             deposed=self._deposed,
         )

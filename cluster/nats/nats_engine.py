@@ -85,7 +85,7 @@ async def open_engine(access: NatsAccess) -> NatsEngine:
     """
     name = access.name
     client = Client()
-    options: dict[str, Any] = {**connect_options(access)}
+    options: dict[str, Any] = {**connect_options(access), "error_cb": _pass_over}
     with answering(name):
         try:
             async with asyncio.timeout(CONNECT_SECONDS):
@@ -101,6 +101,10 @@ async def open_engine(access: NatsAccess) -> NatsEngine:
         await engine.close()
         raise
     return engine
+
+
+async def _pass_over(error: Exception) -> None:
+    """Do nothing: the client connects again, and whoever waits for an answer meanwhile gets `Unanswered`."""
 
 
 @contextlib.contextmanager
