@@ -62,6 +62,7 @@ class EngineThread:
                 task.cancel()
             if left:
                 self.loop.run_until_complete(asyncio.wait(left, timeout=1.0))
+            self.loop.run_until_complete(asyncio.sleep(0))  # Transports that were closed are let go of.
             self.loop.close()
 
     def soon(self, call: Callable[[], None]) -> None:

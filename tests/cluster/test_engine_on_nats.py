@@ -1,0 +1,68 @@
+"""Real servers keep what every engine promises, and the journal on them what every store does."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from holdfast.cluster.engine_thread import EngineThread
+from holdfast.cluster.leadership import lead, leader_name
+from holdfast.cluster.nats.access import NatsAccess
+from holdfast.cluster.nats.nats_engine import NatsEngine, open_engine
+from holdfast.cluster.ports import Engine
+from holdfast.cluster.replicated_journal import ReplicatedJournal
+from holdfast.testing.stores import conformance
+from tests.cluster.engines import PROMISES, Connect
+from tests.cluster.servers import NatsServers
+
+SEEDS = 2
+"""Sequences of operations that are drawn: each is a few hundred round trips."""
+
+
+@pytest.mark.parametrize("promise", PROMISES, ids=lambda promise: promise.__name__)
+async def test_a_real_server_keeps_it(nats1: NatsServers, promise: Callable[[Connect], Awaitable[None]]) -> None:
+    access = nats1.access(nats1.new_system())
+    opened: list[Engine] = []
+
+    async def connect() -> Engine:
+        opened.append(await open_engine(access))
+        return opened[-1]
+
+    await promise(connect)
+    for engine in opened:
+        await engine.close()
+
+
+ACCESS: dict[str, NatsAccess] = {}
+"""By the digest of a folder: whose store it stands for."""
+SERVERS: list[NatsServers] = []
+
+
+def opened(path: Path) -> ReplicatedJournal:
+    """Lead the store that a folder stands for; whoever led it before is deposed."""
+    folder = hashlib.sha256(str(path).encode()).hexdigest()
+    if folder not in ACCESS:
+        ACCESS[folder] = SERVERS[-1].access(SERVERS[-1].new_system())
+    thread = EngineThread("test")
+
+    async def take() -> NatsEngine:
+        engine = await open_engine(ACCESS[folder])
+        await engine.lease.release(1 << 53)  # Whoever has it is not asked.
+        return engine
+
+    engine = thread.wait(take())
+    return ReplicatedJournal(engine, thread, thread.wait(lead(engine, leader_name(), standby="cold")))
+
+
+class TestReplicatedOnNats(conformance(opened)):  # type: ignore[misc]
+    seeds = SEEDS
+
+    @pytest.fixture(autouse=True)
+    def _servers(self, nats1: NatsServers) -> Iterator[None]:
+        SERVERS.append(nats1)
+        yield
+        SERVERS.clear()
+        ACCESS.clear()
