@@ -9,7 +9,8 @@ from importlib.util import find_spec
 from typing import TypeVar
 
 from ..actors.errors import SpecError
-from ..checkpoint.journal import DamagedStore, StoreFailed, StoreInUse
+from ..checkpoint.journal import DamagedStore, Journal, StoreFailed, StoreInUse
+from ..checkpoint.store_opening import open_journal
 from .engine_thread import EngineThread
 from .leadership import LeaderElsewhere, Standby, lead, leader_name
 from .log_records import DamagedLog
@@ -107,3 +108,22 @@ async def _connected(connect: Callable[[], Awaitable[Engine]], *, insists: bool)
                 raise
         await asyncio.sleep(pause)
         pause = min(2 * pause, LONGEST_PAUSE)
+
+
+def open_store(store: str, settings: Mapping[str, str | bool | int] | None = None) -> Journal:
+    """Open a store by itself, for a tool: no system may have it open, and none may open it meanwhile.
+
+    Args:
+        store: "sqlite:PATH" or "nats://HOST,HOST/NAME".
+        settings: how servers are reached, see `access_of`.
+
+    Raises:
+        SpecError: the name cannot be read. StoreInUse, StoreFailed, DamagedStore, UnsafeServer: it cannot be opened.
+    """
+    if not is_replicated(store):
+        return open_journal(store)
+
+    async def joined() -> ReplicatedJournal:
+        return await join(store, "tool", None, settings or {}, waits=lambda leader: None, deposed=lambda error: None)
+
+    return asyncio.run(joined())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import errno
 import json
@@ -26,6 +27,8 @@ from ..checkpoint.store_tools import (
     store_stats,
     verify_store,
 )
+from ..cluster.configuration import read_configuration
+from ..cluster.joining import open_store
 
 DAMAGED = 1
 UNREADABLE = 2
@@ -209,6 +212,38 @@ def restore(
     Exit status 0: done. 1: the copy is damaged. 2: the backup is damaged or cannot be read, or DEST cannot be written.
     """
     _copy("restore", lambda: restore_store(path, dest, key=key_file), check=True, key=key_file, as_json=as_json)
+
+
+@store.command("copy")
+def copy(
+    source: Annotated[str, typer.Argument(metavar="STORE", help="As in `store=`: sqlite:PATH or nats://HOST/NAME.")],
+    dest: Annotated[str, typer.Argument(metavar="DEST", help="The same, of a store that has nothing yet.")],
+    as_json: Json = False,
+) -> None:
+    """Copy what one store has into another one, between a file and servers, both ways, and compare the two.
+
+    No system may have either of them open. The copy is there completely, or not at all. How servers are reached is said
+    in their address, or by holdfast.toml and the environment.
+
+    Exit status 0: done. 2: one of them is open, damaged or cannot be reached, or DEST has something already.
+    """
+    from ..cluster.store_copy import copy_store
+
+    try:
+        settings = read_configuration().nats.told()
+        names = source.partition("?")[0], dest.partition("?")[0]
+        with contextlib.ExitStack() as stack:
+            first, second = (
+                stack.enter_context(contextlib.closing(open_store(one, settings))) for one in (source, dest)
+            )
+            made = copy_store(first, second, names=names)
+    except HoldfastError as error:
+        raise _ended("copy", error, UNREADABLE) from error
+    if as_json:
+        typer.echo(json.dumps(made._asdict()))
+    else:
+        counts = f"{made.addresses} addresses, {made.snapshots} snapshots, {made.entries} entries, {made.notes} notes"
+        typer.echo(f"copied {counts}")
 
 
 @store.command()

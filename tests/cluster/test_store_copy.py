@@ -1,0 +1,106 @@
+"""A store goes to servers and back: what a system had in it, it finds in the copy."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import holdfast as hf
+from holdfast.checkpoint.journal import NotCopied
+from holdfast.cluster.joining import open_store
+from holdfast.cluster.store_copy import copy_store, kept_of
+from tests.cluster.servers import NatsServers
+
+
+class Put(hf.Message[int]):
+    text: str
+
+
+class Grow(hf.Message[int]):
+    megabytes: int
+
+
+class Shelf(hf.Actor):
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.bulk = b""
+
+    @hf.on(Put)
+    def put(self, message: Put) -> int:
+        self.lines.append(message.text)
+        return len(self.lines)
+
+    @hf.on(Grow)
+    def grow(self, message: Grow) -> int:
+        self.bulk += bytes(range(256)) * 4096 * message.megabytes
+        return len(self.bulk)
+
+
+async def fill(store: str) -> None:
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        large = await system.start(hf.child("large", hf.start(Shelf), recovery=hf.hybrid(every=2)))
+        small = await system.start(hf.child("small", hf.start(Shelf), recovery=hf.replay_only()))
+        for n in range(5):
+            await large.ask(Grow(1))
+            await small.ask(Put(f"line {n}"))
+
+
+async def found_in(store: str) -> tuple[int, int]:
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        large = await system.start(hf.child("large", hf.start(Shelf), recovery=hf.hybrid(every=2)))
+        small = await system.start(hf.child("small", hf.start(Shelf), recovery=hf.replay_only()))
+        return await large.ask(Grow(0)), await small.ask(Put("one more"))
+
+
+def copied(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "holdfast.console.cli", "store", "copy", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+async def test_a_store_goes_to_servers_and_back(nats1: NatsServers, tmp_path: Path) -> None:
+    file, back = f"sqlite:{tmp_path / 'app.db'}", f"sqlite:{tmp_path / 'back.db'}"
+    servers = nats1.store(nats1.new_system())
+    await fill(file)
+    for source, dest in ((file, servers), (servers, back)):
+        done = copied(source, dest)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.startswith("copied "), done.stdout
+    assert await found_in(servers) == (5 << 20, 6)
+    assert await found_in(back) == (5 << 20, 6)
+
+
+async def test_nothing_is_copied_into_a_store_that_has_something(nats1: NatsServers, tmp_path: Path) -> None:
+    file, servers = f"sqlite:{tmp_path / 'app.db'}", nats1.store(nats1.new_system())
+    await fill(file)
+    await fill(servers)
+    done = copied(file, servers)
+    assert (done.returncode, "there is something in it already" in done.stderr) == (2, True), done.stderr
+    assert "nkey" not in done.stderr
+
+
+async def test_a_store_that_is_open_is_not_copied(nats1: NatsServers, tmp_path: Path) -> None:
+    servers = nats1.store(nats1.new_system())
+    async with hf.ActorSystem("app", store=servers, log=False):
+        done = copied(servers, f"sqlite:{tmp_path / 'app.db'}")
+    assert (done.returncode, "is in use" in done.stderr) == (2, True), done.stderr
+
+
+def test_a_copy_that_is_not_the_same_is_told(tmp_path: Path) -> None:
+    with contextlib.ExitStack() as stack:
+        one, other = (
+            stack.enter_context(contextlib.closing(open_store(f"sqlite:{tmp_path / name}"))) for name in ("a", "b")
+        )
+        one.append([("/app/a", ("in", n)) for n in range(4)])
+        keep = other.append
+
+        def forgetful(entries: list[tuple[str, tuple[str, int]]]) -> list[int]:
+            return [*keep(entries[:-1]), 0]
+
+        other.append = forgetful  # type: ignore[method-assign, assignment]
+        with pytest.raises(NotCopied, match="something else of /app/a"):
+            copy_store(one, other, names=("a", "b"))
+        assert len(kept_of(other, "/app/a").entries) == 3
