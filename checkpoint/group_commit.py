@@ -364,6 +364,17 @@ class Commits:
         self.barrier()
         self.engine.sync()
 
+    async def safe(self) -> None:
+        """Wait until what was noted so far outlives the process, in a store in which that takes a sync.
+
+        Raises:
+            HoldfastError: it never will.
+        """
+        if self.engine.safe_at == "sync":
+            synced = self.engine.synced()
+            if synced is not None:
+                await synced
+
     async def settled(self) -> None:
         """Wait until everything that was submitted has taken effect, or never will."""
         while not self._lanes.is_empty and self.stopped is None and self.blocked is None:

@@ -435,6 +435,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             ref = cast("ActorRef[A]", await root.ask(StartChild(wanted, fresh=fresh), LONG))
         known.started(address, spec, wanted, fresh=fresh)
         await known.start_added(lambda one: root.ask(StartChild(one), LONG))
+        await self._homes.journal.safe()
         return ref
 
     def spawn(self, start: Start[A], name: str | None = None, *, mailbox: Bounded | None = None) -> ActorRef[A]:
@@ -470,6 +471,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         caller = current.get(None)
         if caller is None or not is_below(caller._cell, cell):
             await self._stop(cell, reason, deadline if drain else None)
+            await self._homes.journal.safe()
             return
         node = self._node  # In nobody's name: it has to go on when the caller's life is over.
         task = node.loop.create_task(

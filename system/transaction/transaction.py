@@ -240,6 +240,10 @@ class Transaction:
                     await finish(self._system)
                 except Exception as error:  # The tree has changed; the others are tidied up all the same.
                     problems.append(f"{text}: {said(error)}")
+            try:
+                await self._system._homes.journal.safe()
+            except HoldfastError as error:
+                problems.append(f"it is not in the store: {said(error)}")
         finally:
             self._shared.lock.release()
             self._emit(TransactionCommitted(self._address, self._texts, tuple(problems)))

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.checkpoint.engine_calls import Called
 from holdfast.checkpoint.group_commit import Commits
 from holdfast.checkpoint.journal import Entry, StoreFailed
 from holdfast.checkpoint.protocol import SnapshotNow
@@ -77,7 +78,7 @@ def engine(tmp_path: Path) -> Any:
 @asynccontextmanager
 async def opened(engine: Any, events: list[Any] | None = None, durability: Any = "os") -> AsyncGenerator[Commits]:
     emit = (lambda event: None) if events is None else events.append
-    commits = Commits(engine, asyncio.get_running_loop(), durability=durability, emit=emit)
+    commits = Commits(Called(engine), asyncio.get_running_loop(), durability=durability, emit=emit)
     try:
         yield commits
     finally:
@@ -114,6 +115,19 @@ async def test_what_wants_a_sync_waits_for_it_and_gathers_meanwhile(engine: Any)
         engine.let_sync.set()
         await commits.settled()
         assert (done, engine.appends, engine.syncs) == (list("abcd"), [1, 3], 2)
+
+
+async def test_what_is_safe_only_when_it_is_synced_waits_for_that_whatever_is_wanted(engine: Any) -> None:
+    done: list[str] = []
+    engine.safe_at = "sync"
+    async with opened(engine) as commits:
+        commits.want("/a", "os")
+        commits.submit(Effect("a", done))
+        await ticks()
+        assert (done, engine.appends) == ([], [1])
+        engine.let_sync.set()
+        await commits.settled()
+        assert (done, engine.syncs) == (["a"], 1)
 
 
 async def test_each_has_its_own_lane_but_never_overtakes_itself(engine: Any) -> None:

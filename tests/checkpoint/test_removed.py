@@ -449,6 +449,13 @@ CHECKS = {
         "tests/checkpoint/test_commits.py",
         "test_a_failed_sync_stops_it_for_good",
     ),
+    "in a store that is safe only when it is synced, everything waits for that": Check(
+        "checkpoint/group_commit.py",
+        'is_synced = self.engine.safe_at == "sync" or ',
+        "is_synced = ",
+        "tests/checkpoint/test_commits.py",
+        "test_what_is_safe_only_when_it_is_synced",
+    ),
     "T13: a store whose sync failed refuses": Check(
         "checkpoint/sqlite/open_store.py",
         "        self.failure = self.failure or translated\n",
