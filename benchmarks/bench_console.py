@@ -55,7 +55,12 @@ def reader(socket: str) -> None:
     """Asks for the tree and for one actor in turn, until its input ends: prints when each began and what it took."""
     found: list[tuple[str, float, float]] = []
     is_over = threading.Event()
-    threading.Thread(target=lambda: (sys.stdin.read(), is_over.set()), daemon=True).start()
+
+    def wait() -> None:
+        sys.stdin.read()
+        is_over.set()
+
+    threading.Thread(target=wait, daemon=True).start()
     with RemoteSystem(socket) as remote:
         print("ready", flush=True)
         while not is_over.is_set():

@@ -10,7 +10,7 @@ import os
 import sys
 from typing import Final
 
-ROOMS: Final = ("actors", "checkpoint", "console", "diagnosis", "ftm", "supervision", "system", "testing")
+ROOMS: Final = ("actors", "checkpoint", "cluster", "console", "diagnosis", "ftm", "supervision", "system", "testing")
 """The folders of the package. What else is below its root (tests, examples, environments) is not the library's."""
 MODULES: Final = ("adapters", "errors", "events")
 """The modules beside them."""

@@ -13,6 +13,7 @@ import json
 import os
 import sys
 from pathlib import Path
+from typing import Any, Literal
 
 import holdfast as hf
 
@@ -46,19 +47,21 @@ class Account(hf.Actor):
 
 
 async def main() -> None:
-    store, socket, isolation = sys.argv[1:4]
+    store, socket = sys.argv[1:3]
+    isolation: Literal["task", "process"] = "process" if sys.argv[3:] == ["process"] else "task"
     async with hf.ActorSystem("bank", store=store, standby="warm", log=False) as system:
         spec = hf.child("account", hf.start(Account), recovery=hf.hybrid(), isolation=isolation)
         account = await system.start(spec)
 
         async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            answer: Any
             with contextlib.suppress(OSError, hf.HoldfastError):
                 while line := await reader.readline():
                     request = json.loads(line)
                     if "id" in request:
                         answer = await account.ask(Deposit(request["id"], request["amount"]), timeout=60.0)
                     else:
-                        answer = await account.ask(Report(), timeout=60.0)
+                        answer = await system.ref(account.path, Account).ask(Report(), timeout=60.0)
                     writer.write(json.dumps({"pid": os.getpid(), "answer": answer}).encode() + b"\n")
                     await writer.drain()
             writer.close()

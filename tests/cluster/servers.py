@@ -119,7 +119,9 @@ class NatsServers:
 
     def stop(self, number: int) -> None:
         """Stop a server with SIGSTOP: its connections stay open, and it says nothing."""
-        self._processes[number].send_signal(signal.SIGSTOP)
+        process = self._processes[number]
+        process.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOWAIT)  # Until then it may still answer.
         self._stopped.add(number)
 
     def cont(self, number: int) -> None:

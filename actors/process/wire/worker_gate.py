@@ -153,6 +153,11 @@ class WorkerGate:
             raise BadFrame(f"{what} of {path}, and the process is that of {self.home}")
         return path
 
+    def require_voice(self, path: str, what: str) -> None:
+        """An address in whose name it acts: its own, or the one whose replica it is."""
+        if path not in self._voices():
+            self.require_own(path, what)
+
     def require_granted(self, path: str, what: str) -> None:
         """An address to which it may give orders."""
         cell = self._worker.cell
@@ -403,7 +408,7 @@ def _order(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     if frame.verb == "stop":
         unpack_exit(frame.data.get("reason"))
     if frame.verb == "faulted" and (by := text(frame, "by")):
-        gate.require_own(by, "a kill in the name")
+        gate.require_voice(by, "a kill in the name")
 
 
 def _tie(key: str, *, both: bool) -> Callable[[WorkerGate, str, frames.Command], None]:

@@ -40,7 +40,7 @@ def test_this_process_cannot_open_it_twice(store: SqliteJournal, path: Path) -> 
         for takeover in (False, True):
             with pytest.raises(StoreInUse) as caught:
                 SqliteJournal(name, takeover=takeover)
-            assert caught.value.args == (str(path), os.getpid())
+            assert (caught.value.path, caught.value.pid) == (str(path), os.getpid())
     store.append(inputs(1))
 
 
