@@ -24,7 +24,7 @@ from holdfast.cluster.nats.access import access_of
 from holdfast.cluster.nats.nats_engine import NatsEngine, open_engine
 
 sys.path.append(str(Path(__file__).parent.parent))
-from tests.cluster.servers import NatsServers
+from tests.cluster.servers import NatsServers  # pyright: ignore[reportMissingImports]  # found by the line above
 
 ASKS = 3_000
 """With one outstanding; ten times as many with more."""

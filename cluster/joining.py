@@ -68,14 +68,15 @@ async def join(
     thread = EngineThread(f"holdfast {system}")
     engine: Engine | None = None
     try:
-        engine = await thread.run(_connected(lambda: open_engine(access), insists=standby is not None))
-        leading = await thread.run(lead(engine, me, standby=standby, waits=lambda leader: _tell(loop, waits, leader)))
+        joined: Engine = await thread.run(_connected(lambda: open_engine(access), insists=standby is not None))
+        engine = joined
+        leading = await thread.run(lead(joined, me, standby=standby, waits=lambda leader: _tell(loop, waits, leader)))
 
         def lost(error: Exception) -> None:
             if isinstance(error, Deposed):
                 _tell(loop, deposed, error)
 
-        return ReplicatedJournal(engine, thread, leading, lost=lost)
+        return ReplicatedJournal(joined, thread, leading, lost=lost)
     except BaseException as error:
         if engine is not None:
             with contextlib.suppress(asyncio.CancelledError, TimeoutError):
@@ -89,7 +90,8 @@ async def join(
                 raise StoreFailed(named, error.problem) from error
             case DamagedLog():
                 raise DamagedStore(named, None, None, str(error)) from error
-        raise
+            case _:
+                raise
 
 
 def _tell(loop: asyncio.AbstractEventLoop, call: Callable[[T], None], what: T) -> None:

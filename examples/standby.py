@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import holdfast as hf
@@ -73,7 +73,7 @@ async def stand_by(system: hf.ActorSystem) -> None:
 
 
 @contextlib.contextmanager
-def nats_server() -> Iterator[str]:
+def nats_server() -> Generator[str]:
     """A server for this program alone, in a temporary folder; `holdfast nats config` writes the file of a real one."""
     beside = str(Path(sys.executable).parent)
     program = shutil.which("nats-server", path=beside) or shutil.which("nats-server")

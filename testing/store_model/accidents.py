@@ -198,6 +198,7 @@ def of_two_openings_one_acknowledges(bench: Bench) -> None:
     opened, model = bench.open(), StoreModel()
     fill(opened.journal, model)
     first = opened.journal
+    first.sync()  # What is not may be gone with its owner.
     try:
         second = bench.factory(opened.folder)
     except StoreError:

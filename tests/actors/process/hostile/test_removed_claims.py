@@ -55,7 +55,7 @@ CHECKS = {
     ),
     "a process kills in the name of its own actors": Check(
         GATE,
-        '        gate.require_own(by, "a kill in the name")\n',
+        '        gate.require_voice(by, "a kill in the name")\n',
         "        pass\n",
         "tests/actors/process/hostile/test_hostile.py",
         "test_a_breach_ends_the_worker_and_nobody_else",
