@@ -19,6 +19,13 @@ class Unanswered(HoldfastError, text="{engine} has not answered: {problem}"):
     problem: str
 
 
+class UnsafeServer(HoldfastError, text="{servers} may lose what was acknowledged: {problems:; }"):
+    """A server, or a stream on it, is not set up such that a system may rely on it."""
+
+    servers: str
+    problems: tuple[str, ...]
+
+
 class OutOfTurn(HoldfastError, text="the log goes on from another record than {after}"):
     """Nothing was appended: the last record of the log is not the one that the append named."""
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 import msgspec
 
-from ...actors.errors import HoldfastError, SpecError
-from ..ports import Unanswered
+from ...actors.errors import SpecError
+from ..ports import Unanswered, UnsafeServer
 from .access import NatsAccess, access_of, connect_options
 from .server_file import MOST_BYTES, NEEDS, VARZ
 
@@ -51,13 +51,6 @@ LOSES: Final = {
     "persist_mode": "what was acknowledged may not be on the disk",
 }
 """Settings of a stream on which it depends whether something is lost, and what another one leads to."""
-
-
-class UnsafeServer(HoldfastError, text="{servers} may lose what was acknowledged: {problems:; }"):
-    """A server, or a stream on it, is not set up such that a system may rely on it."""
-
-    servers: str
-    problems: tuple[str, ...]
 
 
 class Problem(msgspec.Struct, frozen=True):
