@@ -20,7 +20,6 @@ from holdfast.cluster.nats.server_check import (
     Seen,
     ServerSeen,
     StreamSetting,
-    UnsafeServer,
     check_server,
     look_at,
     problems_of,
@@ -29,7 +28,7 @@ from holdfast.cluster.nats.server_check import (
 )
 from holdfast.cluster.nats.server_file import MOST_BYTES, Role
 from holdfast.cluster.nats.streams import Names, stream_settings
-from holdfast.cluster.ports import Unanswered
+from holdfast.cluster.ports import Unanswered, UnsafeServer
 from tests.cluster.servers import NatsServers
 
 ACCESS = NatsAccess(servers=("nats://127.0.0.1:4222",), system="app")
