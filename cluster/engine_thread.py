@@ -6,9 +6,11 @@ import asyncio
 import concurrent.futures
 import threading
 from collections.abc import Callable, Coroutine
-from typing import Any, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar
 
 T = TypeVar("T")
+LAST_TICKS: Final = 10
+"""How often a loop that ends comes round once more: to close a connection takes a few times."""
 
 
 async def end_tasks(*tasks: asyncio.Future[Any]) -> None:
@@ -62,7 +64,8 @@ class EngineThread:
                 task.cancel()
             if left:
                 self.loop.run_until_complete(asyncio.wait(left, timeout=1.0))
-            self.loop.run_until_complete(asyncio.sleep(0))  # Transports that were closed are let go of.
+            for _ in range(LAST_TICKS):  # Transports that were closed are let go of.
+                self.loop.run_until_complete(asyncio.sleep(0))
             self.loop.close()
 
     def soon(self, call: Callable[[], None]) -> None:

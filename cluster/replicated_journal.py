@@ -105,12 +105,15 @@ class ReplicatedJournal:
 
     async def _lead(self) -> None:
         """Write, keep the lease and tidy up, until the journal is closed or another leads."""
+        works = (self._writer.run(), self._writer.drop_freed(), self._keep_lease(), self._drop_orphans())
+        tasks = [asyncio.ensure_future(work) for work in works]
         try:
-            async with asyncio.TaskGroup() as group:
-                for work in (self._writer.run(), self._writer.drop_freed(), self._keep_lease(), self._drop_orphans()):
-                    group.create_task(work)
-        except ExceptionGroup as errors:
-            cause = _first(errors)
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+        finally:
+            await end_tasks(*tasks)  # Not by a group: that cancels only once, and a wait may miss it.
+        causes = [error for task in tasks if not task.cancelled() and (error := task.exception()) is not None]
+        if causes:
+            cause = next((one for one in causes if isinstance(one, Deposed)), causes[0])
             failure: StaleEpoch | StoreFailed
             if isinstance(cause, Deposed):
                 failure = StaleEpoch(self.path, cause.epoch, cause.current)
@@ -468,11 +471,3 @@ class ReplicatedJournal:
             problem = f"it has not answered for {CLOSE_SECONDS:g} s: {left} writes may be lost"
             self._fail(StoreFailed(self.path, problem))
             raise StoreFailed(self.path, problem)
-
-
-def _first(errors: ExceptionGroup[Exception]) -> Exception:
-    """One error of a group, in whatever groups it stands."""
-    error: Exception = errors
-    while isinstance(error, ExceptionGroup):
-        error = error.exceptions[0]
-    return error
