@@ -14,16 +14,21 @@ LAST_TICKS: Final = 10
 
 
 async def end_tasks(*tasks: asyncio.Future[Any]) -> None:
-    """Cancel tasks, and wait until they have ended.
+    """Cancel tasks, and wait until they have ended; whoever is cancelled meanwhile waits, too.
 
     One that waits by `asyncio.wait_for` may miss a cancellation that comes just when it gets what it waits for (until
     Python 3.12): it is cancelled again.
     """
-    left = {task for task in tasks if not task.done()}
-    while left:
+    cancelled: asyncio.CancelledError | None = None
+    while left := [task for task in tasks if not task.done()]:
         for task in left:
             task.cancel()
-        _, left = await asyncio.wait(left, timeout=0.05)
+        try:
+            await asyncio.wait(left, timeout=0.05)
+        except asyncio.CancelledError as error:
+            cancelled = error
+    if cancelled is not None:
+        raise cancelled
 
 
 class EngineLoop(Protocol):

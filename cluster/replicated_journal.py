@@ -442,6 +442,7 @@ class ReplicatedJournal:
         except TimeoutError as error:
             raise StoreFailed(self.path, "its work for the engine does not end") from error
         finally:
+            self._is_open = False
             self._loop.close()
 
     async def end(self) -> None:

@@ -14,7 +14,7 @@ from ...actors.control.orders import Status, status_of
 from ...actors.kernel.cell import GONE
 from ...actors.kernel.envelope import Ask, Item, message_in
 from ...actors.process.process_host import Outlet
-from ...ftm.group.protected import protection_of
+from ...ftm.group.protected import ProtectionStatus, protection_of
 from ...supervision.children import STOPPED
 from ...supervision.intensity import recent_restarts
 from ...supervision.spec import ChildSpec
@@ -139,8 +139,7 @@ class Evidence(msgspec.Struct, frozen=True):
         children: if it is a supervisor that answers, its children.
         ended_below: the last lives of its children that are not there now, by address.
         own_allowance: what it allows itself, if it is a supervisor that answers.
-        replica_states: its replicas by name ("leads", "follows", "joining", "silent", "down"), if it is protected.
-        epoch: of its replicas.
+        protection: its mechanisms and replicas, if somebody lives there.
         memory: of its own process, if its limits bound that.
         waiting: what waits most in its mailbox.
     """
@@ -162,16 +161,9 @@ class Evidence(msgspec.Struct, frozen=True):
     children: list[ChildNow] = []
     ended_below: dict[str, PastLife] = {}
     own_allowance: Allowance | None = None
-    replica_states: dict[str, str] = {}
-    epoch: int = 0
+    protection: ProtectionStatus | None = None
     memory: Memory | None = None
     waiting: Waiting | None = None
-
-    @property
-    def is_whole(self) -> bool:
-        """Say whether one replica leads, and all others could."""
-        states = sorted(self.replica_states.values())
-        return states.count("leads") == 1 and states.count("follows") == len(states) - 1
 
     def ago(self, at: float) -> str:
         """A moment as people say it: how long ago, or the time of day if that is long."""
@@ -215,7 +207,6 @@ def collect(
         ancestors += answer(recorder, question(literal(above), kinds=GAVE_UP_KINDS, limit=5)).events
         above = above.rpartition("/")[0]
     children = _children(node, address, told.overview)
-    protection = None if cell is None else protection_of(cell)
     return Evidence(
         address,
         node.clock.wall(),
@@ -234,8 +225,7 @@ def collect(
         children,
         _ended_below(recorder, address, children),
         _own_allowance(told.overview),
-        {} if protection is None else protection.replicas,
-        0 if protection is None else protection.epoch,
+        None if cell is None else protection_of(cell),
         None if cell is None else _memory(cell),
         None if cell is None else _waiting(cell),
     )

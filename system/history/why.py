@@ -309,12 +309,13 @@ def _replicas(evidence: Evidence) -> list[str]:
     if over is not None:
         took = f"Replica {over.fields.get('replica')} took over {evidence.ago(over.at)}"
         said.append(f"{took}, in epoch {over.fields.get('epoch')}: {over.fields.get('why')}.")
-    if said and evidence.replica_states:
-        states = ", ".join(f"{name} {state}" for name, state in evidence.replica_states.items())
-        whole = "It is whole again" if evidence.is_whole else "It is not whole"
+    protection = evidence.protection
+    if said and protection is not None and protection.replicas:
+        states = ", ".join(f"{name} {state}" for name, state in protection.replicas.items())
+        whole = "It is whole again" if protection.is_whole else "It is not whole"
         if back is not None and is_back:
             whole += f", for {back.fields.get('replica')} came back {evidence.ago(back.at)}"
-        said.append(f"{whole}: {states}, epoch {evidence.epoch}.")
+        said.append(f"{whole}: {states}, epoch {protection.epoch}.")
     if gone is not None and (back is None or back.number < gone.number):
         said.append("It is not protected at the moment: no replica may die.")
     return said

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.ftm.group.protected import ProtectionStatus
 from holdfast.system.history.evidence import Allowance, ChildNow, Evidence, Memory, Outstanding, PutAside, Waiting
 from holdfast.system.history.why import RULES, why
 
@@ -325,14 +326,19 @@ LOST = [
 JOINED = told("ReplicaJoined", number=3, at=995.0, replica="a")
 
 
+def protection(**replicas: str) -> ProtectionStatus:
+    is_whole = "joining" not in replicas.values()
+    return ProtectionStatus(AT, ("PBR",), replicas, "b", 2, 0, is_whole, 0.0, False, False)
+
+
 def test_a_replica_that_was_lost_is_told_of_also_when_it_is_back() -> None:
-    said = why(Evidence(AT, NOW, events=LOST, replica_states={"a": "joining", "b": "leads"}, epoch=2))
+    said = why(Evidence(AT, NOW, events=LOST, protection=protection(a="joining", b="leads")))
     assert said == [
         "Replica a was lost 10 s ago and is not back: its process has ended (SIGKILL).",
         "Replica b took over 10 s ago, in epoch 2: its process has ended (SIGKILL).",
         "It is not whole: a joining, b leads, epoch 2.",
     ]
-    said = why(Evidence(AT, NOW, events=[*LOST, JOINED], replica_states={"a": "follows", "b": "leads"}, epoch=2))
+    said = why(Evidence(AT, NOW, events=[*LOST, JOINED], protection=protection(a="follows", b="leads")))
     assert said[0] == "Replica a was lost 10 s ago: its process has ended (SIGKILL)."
     assert said[2] == "It is whole again, for a came back 5.0 s ago: a follows, b leads, epoch 2."
 
