@@ -12,7 +12,6 @@ import contextlib
 import threading
 import uuid
 import zlib
-from collections import deque
 from collections.abc import Callable, Collection, Generator, Sequence
 from concurrent.futures import Future
 from typing import Final
@@ -29,6 +28,7 @@ from .leadership import Leading
 from .log_writer import Deposed, LogWriter, Write
 from .ports import Engine, Unanswered
 from .store_contents import Change
+from .write_progress import BlobsUnderWay, Tell, WriteProgress
 
 LARGE: Final = 64 << 10
 """Bytes of a snapshot from which on it is kept beside the log."""
@@ -81,12 +81,8 @@ class ReplicatedJournal:
         self._joint: list[Write] | None = None
         self._is_base_due = False
         self._count_lock = threading.Lock()  # of what follows
-        self._submitted = self._written = 0
-        self._waiting: deque[tuple[int, Callable[[HoldfastError | None], None]]] = deque()
-        self._unsent: dict[str, bytes] = {}
-        self._sending: deque[tuple[int, str]] = deque()
-        self._unsent_bytes = 0
-        self._known: set[str] | None = {name for name in leading.contents.kept() if isinstance(name, str)}  # no orphans
+        self._progress = WriteProgress()
+        self._blobs = BlobsUnderWay(name for name in leading.contents.kept() if isinstance(name, str))
         self._failure: HoldfastError | None = None
         self._is_open = True
         self._is_awake = False
@@ -132,7 +128,7 @@ class ReplicatedJournal:
         with contextlib.suppress(Unanswered):  # The next leader does it.
             names = await self._engine.blobs.names()
         with self._count_lock:
-            orphans, self._known = names - (self._known or set()), None
+            orphans = self._blobs.orphans(names)
         if orphans:  # Once a look is written, nobody led before it who could have kept any of these since.
             self._queue(Write(drops=sorted(orphans)))
 
@@ -141,12 +137,8 @@ class ReplicatedJournal:
     def _take_written(self, count: int) -> None:
         """So many of the writes that were submitted stand in the log."""
         with self._count_lock:
-            self._written = count
-            while self._sending and self._sending[0][0] <= count:
-                self._unsent_bytes -= len(self._unsent.pop(self._sending.popleft()[1]))
-            ready: list[Callable[[HoldfastError | None], None]] = []
-            while self._waiting and self._waiting[0][0] <= count:
-                ready.append(self._waiting.popleft()[1])
+            ready = self._progress.take(count)
+            self._blobs.sent(count)
         for tell in ready:
             tell(None)
 
@@ -154,8 +146,7 @@ class ReplicatedJournal:
         """Refuse everything from now on, and tell whoever waits."""
         with self._count_lock:
             self._failure = failure
-            waiting = [tell for _, tell in self._waiting]
-            self._waiting.clear()
+            waiting = self._progress.give_up()
         for tell in waiting:
             tell(failure)
 
@@ -188,13 +179,9 @@ class ReplicatedJournal:
 
     def _queue(self, write: Write) -> None:
         with self._count_lock:
-            self._submitted += 1
+            self._progress.submitted += 1
             for name, data in write.puts:
-                self._unsent[name] = data
-                self._unsent_bytes += len(data)
-                self._sending.append((self._submitted, name))
-                if self._known is not None:
-                    self._known.add(name)
+                self._blobs.add(self._progress.submitted, name, data)
             self._writer.submit(write)
             is_awake, self._is_awake = self._is_awake, True
         if not is_awake:
@@ -286,12 +273,11 @@ class ReplicatedJournal:
 
     # -- waiting ----------------------------------------------------------------------------------------------------
 
-    def _tell_written(self, tell: Callable[[HoldfastError | None], None]) -> None:
+    def _tell_written(self, tell: Tell) -> None:
         """Have it called, on any thread, when all that was submitted is in the log, or never will be."""
         with self._count_lock:
             self._refuse_failed()
-            if self._written < self._submitted:
-                self._waiting.append((self._submitted, tell))
+            if self._progress.wait(tell):
                 return
         tell(None)
 
@@ -340,7 +326,7 @@ class ReplicatedJournal:
         done.result(seconds)
 
     def _wait_for_room(self) -> None:
-        if self._unsent_bytes > MOST_UNSENT and self._joint is None:
+        if self._blobs.size > MOST_UNSENT and self._joint is None:
             self.sync()
 
     # -- reading ----------------------------------------------------------------------------------------------------
@@ -392,7 +378,7 @@ class ReplicatedJournal:
             StoreFailed: the engine does not answer.
         """
         with self._count_lock:
-            unsent = self._unsent.get(name)
+            unsent = self._blobs.get(name)
         with self._lock:
             if unsent is None and self._joint is not None:
                 unsent = next((data for write in self._joint for known, data in write.puts if known == name), None)
@@ -455,14 +441,12 @@ class ReplicatedJournal:
             if not self._is_open and self._leading.done():
                 return
             self._is_open = False
-            submitted = self._submitted
+            submitted = self._progress.submitted
             done = asyncio.get_running_loop().create_future()
-            if self._failure is None and self._written < submitted:
-                self._waiting.append((submitted, lambda error: done.set_result(None)))
-            else:
+            if self._failure is not None or not self._progress.wait(lambda error: done.set_result(None)):
                 done.set_result(None)  # Nothing more will be written.
         await asyncio.wait([done], timeout=CLOSE_SECONDS)
-        left = submitted - self._written if self._failure is None else 0
+        left = submitted - self._progress.written if self._failure is None else 0
         await end_tasks(self._leading)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_SECONDS):

@@ -211,9 +211,9 @@ CHECKS = {
         "orphans_stay",
     ),
     "what was kept since is no orphan": Check(
-        "cluster/replicated_journal.py",
-        "                    self._known.add(name)\n",
-        "                    pass\n",
+        "cluster/write_progress.py",
+        "            self._known.add(name)\n",
+        "            pass\n",
         LEADERSHIP,
         "kept_since_is_no_orphan",
     ),
@@ -226,7 +226,7 @@ CHECKS = {
     ),
     "a sync waits for the log": Check(
         "cluster/replicated_journal.py",
-        "            if self._written < self._submitted:\n",
+        "            if self._progress.wait(tell):\n",
         "            if False:\n",
         FLEETS,
         "was_safe_is_there",
@@ -254,8 +254,8 @@ CHECKS = {
     ),
     "the engine's loop does not wait for who writes": Check(
         "cluster/replicated_journal.py",
-        "        with self._count_lock:\n            self._written = count\n",
-        "        with self._lock:\n            self._written = count\n",
+        "        with self._count_lock:\n            ready =",
+        "        with self._lock:\n            ready =",
         LEADERSHIP,
         "a_transaction_keeps_nobody",
     ),
