@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import Callable, Collection, Generator, Sequence
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, ParamSpec, Protocol, TypeVar, runtime_checkable
 
 from ..actors.errors import HoldfastError
 from .journal import Entry, InHand, Journal, SafeAt, Saved, StoreFailed, StoreFile
@@ -16,6 +16,21 @@ if TYPE_CHECKING:
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+
+def safe_at_of(engine: Journal) -> SafeAt:
+    """When what was appended outlives the process; engines that do not say so keep it at once."""
+    said: SafeAt = getattr(engine, "safe_at", "append")
+    return said
+
+
+@runtime_checkable
+class SyncedEngine(Protocol):
+    """An engine that says when what was written is safe, so that no thread has to wait for it."""
+
+    def synced(self) -> asyncio.Future[None]:
+        """Done when all that was written so far is as safe as a `sync` makes it."""
+        ...
 
 
 class Called:
@@ -39,7 +54,8 @@ class Called:
         self.durable = engine.durable
         self.epoch = self._call(lambda: engine.epoch)
         self.in_hand: InHand | None = getattr(engine, "in_hand", None)
-        self.safe_at: SafeAt = getattr(engine, "safe_at", "append")
+        self._waits_for = engine if isinstance(engine, SyncedEngine) else None
+        self.safe_at = safe_at_of(engine)
 
     def _call(self, method: Callable[P, T], *args: P.args, **named: P.kwargs) -> T:
         try:
@@ -98,11 +114,10 @@ class Called:
 
     def synced(self) -> asyncio.Future[None] | None:
         """Done when all is as safe as a `sync` makes it, if the engine can say so; a failure is for good."""
-        synced: Callable[[], asyncio.Future[None]] | None = getattr(self._engine, "synced", None)
-        if synced is None:
+        if self._waits_for is None:
             return None
         with self._for_good():
-            return synced()
+            return self._waits_for.synced()
 
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """Keep a snapshot, and forget what it contains."""

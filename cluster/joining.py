@@ -9,7 +9,8 @@ from importlib.util import find_spec
 from typing import TypeVar
 
 from ..actors.errors import SpecError
-from ..checkpoint.journal import DamagedStore, Journal, StoreFailed, StoreInUse
+from ..checkpoint.engine_calls import Called
+from ..checkpoint.journal import DamagedStore, StoreEngine, StoreFailed, StoreInUse
 from ..checkpoint.store_opening import open_journal
 from .engine_thread import EngineThread
 from .leadership import LeaderElsewhere, Standby, lead, leader_name
@@ -112,7 +113,7 @@ async def _connected(connect: Callable[[], Awaitable[Engine]], *, insists: bool)
         pause = min(2 * pause, LONGEST_PAUSE)
 
 
-def open_store(store: str, settings: Mapping[str, str | bool | int] | None = None) -> Journal:
+def open_store(store: str, settings: Mapping[str, str | bool | int] | None = None) -> StoreEngine:
     """Open a store by itself, for a tool: no system may have it open, and none may open it meanwhile.
 
     Args:
@@ -128,4 +129,4 @@ def open_store(store: str, settings: Mapping[str, str | bool | int] | None = Non
     async def joined() -> ReplicatedJournal:
         return await join(store, "tool", None, settings or {}, waits=lambda leader: None, deposed=lambda error: None)
 
-    return asyncio.run(joined())
+    return Called(asyncio.run(joined()))

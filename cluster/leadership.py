@@ -35,8 +35,8 @@ from .log_records import (
     decode_epoch,
 )
 from .log_writer import FIRST_PAUSE, LONGEST_PAUSE, append_behind
-from .ports import Engine, LogReader, Record, Unanswered
-from .store_contents import StoreContents
+from .ports import Engine, LogReader, LogRecord, Unanswered
+from .store_contents import MemoryContents
 
 Standby: TypeAlias = Literal["warm", "cold"]
 """How a program waits until it leads: with what is stored in memory, or not."""
@@ -94,7 +94,7 @@ class Follower:
         self._stream: LogReader | None = None
         self._is_new = True
         self._wrong_beginnings = 0
-        self.contents = StoreContents()
+        self.contents = MemoryContents()
         self.reader = RecordReader()
         self.leader = ""
 
@@ -162,7 +162,7 @@ class Follower:
             with contextlib.suppress(Unanswered):
                 await stream.close()
 
-    def _begin_again(self, record: Record) -> None:
+    def _begin_again(self, record: LogRecord) -> None:
         """Read the log from its beginning, which is not this record.
 
         Raises:
@@ -174,9 +174,9 @@ class Follower:
                 raise DamagedLog(record.sequence, "what stood before it is gone, and it begins no base")
         else:
             self._wrong_beginnings = 0
-        self.contents, self.reader, self.leader = StoreContents(), RecordReader(), ""
+        self.contents, self.reader, self.leader = MemoryContents(), RecordReader(), ""
 
-    def _take(self, record: Record) -> None:
+    def _take(self, record: LogRecord) -> None:
         if record.sequence <= self.reader.at:
             return
         for said in self.reader.take(record):
@@ -201,7 +201,7 @@ class Leading:
         keeper: of its lease.
     """
 
-    contents: StoreContents
+    contents: MemoryContents
     maker: RecordMaker
     grown: int
     keeper: LeaseKeeper

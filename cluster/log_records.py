@@ -5,7 +5,7 @@ wrote it. What does not fit into one record goes on in the next ones: it counts 
 epoch in between says that it never will.
 
 Epoch    who leads from here on, and the format of what follows.
-Changes  what a leader's store has done at one time; see `StoreContents`.
+Changes  what a leader's store has done at one time; see `MemoryContents`.
 Base     all that there was when its first part was written, for those who read from there: once its last part stands
          there, what is older may be removed. Changes may stand between its parts.
 """
@@ -20,7 +20,7 @@ import msgspec
 
 from ..actors.errors import HoldfastError
 from ..checkpoint.encoding.entry_codec import decode_entries, entry_packer
-from .ports import Record
+from .ports import LogRecord
 from .store_contents import Change
 
 FORMAT: Final = 1
@@ -79,7 +79,7 @@ _encode_part = msgspec.msgpack.Encoder().encode
 _decode_part = msgspec.msgpack.Decoder(LogPart).decode
 
 
-def read_part(record: Record) -> LogPart:
+def read_part(record: LogRecord) -> LogPart:
     """What stands in a record.
 
     Raises:
@@ -191,7 +191,7 @@ class RecordReader:
         self._parts: dict[str, list[tuple[int, LogPart]]] = {}
         self._held: list[Said] | None = None  # behind the first part of a base that this reader began with
 
-    def take(self, record: Record) -> list[Said]:
+    def take(self, record: LogRecord) -> list[Said]:
         """Take in the next record; return what it completes, in the order in which it counts.
 
         A base is returned only if what stood before it was not read.
@@ -239,7 +239,7 @@ class RecordReader:
         if self._held is not None:
             raise DamagedLog(self.at, "the log begins with a base that was never finished")
 
-    def _checked(self, record: Record) -> LogPart:
+    def _checked(self, record: LogRecord) -> LogPart:
         part = read_part(record)
         begins = self.at == 0 and part.kind == BASE and part.part == 0
         if part.previous != self.at and not begins:

@@ -15,8 +15,8 @@ from typing import Final, NamedTuple, TypeVar
 
 from ..actors.errors import HoldfastError
 from .log_records import BASE, CHANGES, EPOCH, DamagedLog, RecordMaker, decode_epoch, encode_changes, read_part
-from .ports import Engine, OutOfTurn, Record, Unanswered
-from .store_contents import Change, StoreContents
+from .ports import Engine, LogRecord, OutOfTurn, Unanswered
+from .store_contents import Change, MemoryContents
 
 MOST_BYTES: Final = 256 << 10
 """About how much is written in one go: what comes meanwhile waits for the next one."""
@@ -35,7 +35,7 @@ class Deposed(HoldfastError, text="epoch {epoch} is over: {leader} leads, in epo
     leader: str
 
 
-class Write(NamedTuple):
+class LogWrite(NamedTuple):
     """What is to be written, in its turn.
 
     Attributes:
@@ -50,7 +50,7 @@ class Write(NamedTuple):
     size: int = 0
     puts: Sequence[tuple[str, bytes]] = ()
     drops: Sequence[str] = ()
-    base: StoreContents | None = None
+    base: MemoryContents | None = None
 
 
 class LogWriter:
@@ -75,7 +75,7 @@ class LogWriter:
     ) -> None:
         self._engine, self._maker = engine, maker
         self._written, self._want_base = written, want_base
-        self._queue: deque[Write] = deque()
+        self._queue: deque[LogWrite] = deque()
         self._work = asyncio.Event()
         self._may_write = asyncio.Event()
         self._may_write.set()
@@ -89,12 +89,12 @@ class LogWriter:
 
     # -- from the journal -------------------------------------------------------------------------------------------
 
-    def submit(self, write: Write) -> None:
+    def submit(self, write: LogWrite) -> None:
         """Take in a write; from any thread. `wake` has to follow, on the engine's loop."""
         self._queue.append(write)
 
     def wake(self) -> None:
-        """Something was submitted."""
+        """Have what was submitted written: nobody else tells the writer of it."""
         self._work.set()
 
     def hold(self) -> None:
@@ -102,7 +102,7 @@ class LogWriter:
         self._may_write.clear()
 
     def go_on(self) -> None:
-        """Write again."""
+        """Write again, now that nobody else is about to lead."""
         self._may_write.set()
 
     # -- writing ----------------------------------------------------------------------------------------------------
@@ -138,7 +138,7 @@ class LogWriter:
 
     async def _write_some(self) -> None:
         """Write what has gathered, as one; a base on its own."""
-        taken: list[Write] = []
+        taken: list[LogWrite] = []
         size = 0
         while self._queue and size < MOST_BYTES and (not taken or self._queue[0].base is None):
             taken.append(self._queue.popleft())
@@ -163,7 +163,7 @@ class LogWriter:
             self._is_base_wanted = True
             self._want_base()
 
-    async def _begin_base(self, contents: StoreContents) -> None:
+    async def _begin_base(self, contents: MemoryContents) -> None:
         """Write the first part of a base: what comes next in the queue stands behind it."""
         self._base = self._maker.parts(BASE, encode_changes(contents.as_changes()))
         self._grown = self._base_size = 0
@@ -216,7 +216,7 @@ async def insist(call: Callable[[], Awaitable[T]]) -> T:
             pause = min(2 * pause, LONGEST_PAUSE)
 
 
-async def append_behind(engine: Engine, record: bytes, after: int) -> int | Record:
+async def append_behind(engine: Engine, record: bytes, after: int) -> int | LogRecord:
     """Append a record behind the one with the number `after`, however long it takes.
 
     Returns:
@@ -236,7 +236,7 @@ async def append_behind(engine: Engine, record: bytes, after: int) -> int | Reco
         pause = min(2 * pause, LONGEST_PAUSE)
 
 
-def _deposed(found: Record, epoch: int) -> Deposed | DamagedLog:
+def _deposed(found: LogRecord, epoch: int) -> Deposed | DamagedLog:
     """What it means that this record stands where one of that epoch was to stand."""
     part = read_part(found)
     if part.epoch <= epoch:
@@ -245,10 +245,10 @@ def _deposed(found: Record, epoch: int) -> Deposed | DamagedLog:
     return Deposed(epoch, part.epoch, leader)
 
 
-async def behind(engine: Engine, after: int) -> Record | None:
+async def behind(engine: Engine, after: int) -> LogRecord | None:
     """The record that stands behind the one with that number, if the engine shows any now."""
 
-    async def read() -> Record | None:
+    async def read() -> LogRecord | None:
         reader = await engine.log.read(after)
         try:
             records = await reader.next(LONGEST_PAUSE)

@@ -32,7 +32,7 @@ class OutOfTurn(HoldfastError, text="the log goes on from another record than {a
     after: int
 
 
-class Record(NamedTuple):
+class LogRecord(NamedTuple):
     """One record of a log.
 
     Attributes:
@@ -47,7 +47,7 @@ class Record(NamedTuple):
 class LogReader(Protocol):
     """Reads a log from some record on, in order."""
 
-    async def next(self, seconds: float) -> Sequence[Record]:
+    async def next(self, seconds: float) -> Sequence[LogRecord]:
         """The next records, at least one if any is there within so many seconds; none is no proof of an end.
 
         Raises:
@@ -72,7 +72,7 @@ class Log(Protocol):
         """
         ...
 
-    async def last(self) -> Record | None:
+    async def last(self) -> LogRecord | None:
         """The last record, as a majority knows it; `None` if the log is empty.
 
         Raises:

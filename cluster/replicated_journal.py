@@ -25,7 +25,7 @@ from ..checkpoint.journal import DamagedStore, Entry, SafeAt, Saved, StaleEpoch,
 from ..checkpoint.snapshot.shared_blocks import Segment
 from .engine_thread import EngineLoop, end_tasks
 from .leadership import Leading
-from .log_writer import Deposed, LogWriter, Write
+from .log_writer import Deposed, LogWrite, LogWriter
 from .ports import Engine, Unanswered
 from .store_contents import Change
 from .write_progress import BlobsUnderWay, Tell, WriteProgress
@@ -78,7 +78,7 @@ class ReplicatedJournal:
         self._engine, self._loop, self._lost = engine, loop, lost
         self._contents = leading.contents
         self._lock = threading.RLock()  # of the contents; the engine's loop, which keeps the lease, never waits for it
-        self._joint: list[Write] | None = None
+        self._joint: list[LogWrite] | None = None
         self._is_base_due = False
         self._count_lock = threading.Lock()  # of what follows
         self._progress = WriteProgress()
@@ -120,7 +120,7 @@ class ReplicatedJournal:
         await self._keeper.release()  # Whoever leads next need not wait for its end.
 
     async def _keep_lease(self) -> None:
-        await self._keeper.run(hold=self._writer.hold, go_on=self._writer.go_on, look=lambda: self._queue(Write()))
+        await self._keeper.run(hold=self._writer.hold, go_on=self._writer.go_on, look=lambda: self._queue(LogWrite()))
 
     async def _drop_orphans(self) -> None:
         """Remove what earlier leaders have kept beside the log and nothing in it refers to."""
@@ -130,7 +130,7 @@ class ReplicatedJournal:
         with self._count_lock:
             orphans = self._blobs.orphans(names)
         if orphans:  # Once a look is written, nobody led before it who could have kept any of these since.
-            self._queue(Write(drops=sorted(orphans)))
+            self._queue(LogWrite(drops=sorted(orphans)))
 
     # -- from the engine's loop -------------------------------------------------------------------------------------
 
@@ -167,7 +167,7 @@ class ReplicatedJournal:
         if not self._is_open:
             raise StoreFailed(self.path, "it is closed")
 
-    def _submit(self, write: Write) -> None:
+    def _submit(self, write: LogWrite) -> None:
         """Queue a write for the log; the lock is held."""
         if self._joint is not None:
             self._joint.append(write)
@@ -175,9 +175,9 @@ class ReplicatedJournal:
         self._queue(write)
         if self._is_base_due:
             self._is_base_due = False
-            self._queue(Write(base=self._contents.copy()))
+            self._queue(LogWrite(base=self._contents.copy()))
 
-    def _queue(self, write: Write) -> None:
+    def _queue(self, write: LogWrite) -> None:
         with self._count_lock:
             self._progress.submitted += 1
             for name, data in write.puts:
@@ -196,7 +196,7 @@ class ReplicatedJournal:
         with self._lock:
             self._refuse_failed()
             drops = [one for one in self._contents.make(change) if isinstance(one, str)]
-            self._submit(Write((change,), size, puts, drops))
+            self._submit(LogWrite((change,), size, puts, drops))
 
     def append(self, entries: Sequence[tuple[str, Entry]]) -> list[int]:
         """Append (address, entry) pairs as one; see `Journal`."""
@@ -257,7 +257,7 @@ class ReplicatedJournal:
         with self._lock:
             self._refuse_failed()
             before = self._contents.copy()
-            joint: list[Write] = []
+            joint: list[LogWrite] = []
             self._joint = joint
             try:
                 yield
@@ -269,7 +269,7 @@ class ReplicatedJournal:
             changes = tuple(change for write in joint for change in write.changes)
             puts = tuple(put for write in joint for put in write.puts)
             drops = tuple(name for write in joint for name in write.drops)
-            self._submit(Write(changes, sum(write.size for write in joint), puts, drops))
+            self._submit(LogWrite(changes, sum(write.size for write in joint), puts, drops))
 
     # -- waiting ----------------------------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from ..checkpoint.journal import Entry
 
 Change = tuple[str, tuple[Any, ...]]
-"""A method of `StoreContents`, and its arguments."""
+"""A method of `MemoryContents`, and its arguments."""
 CHANGES = frozenset((
     "append", "cut", "erase", "keep_pack", "forget_packs", "note", "hand_out", "put_entries", "put_snapshot",
 ))  # fmt: skip
@@ -31,7 +31,7 @@ class KeptSnapshot(NamedTuple):
     contains: frozenset[int]
 
 
-class StoreContents:
+class MemoryContents:
     """All that a store holds. What takes something away returns what it has freed: data of snapshots, and packs.
 
     Attributes:
@@ -140,9 +140,9 @@ class StoreContents:
         """Put a snapshot of an address behind those that are there."""
         self.snapshots.setdefault(address, []).append(KeptSnapshot(data, turn, frozenset(contains)))
 
-    def copy(self) -> StoreContents:
+    def copy(self) -> MemoryContents:
         """The same contents, to be changed on their own."""
-        made = StoreContents()
+        made = MemoryContents()
         made.last, made.notes = self.last, self.notes.copy()
         made.entries = {address: own.copy() for address, own in self.entries.items()}
         made.snapshots = {address: kept.copy() for address, kept in self.snapshots.items()}

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from ..checkpoint.journal import DamagedStore, Entry, Journal, NotCopied, Saved
+from ..checkpoint.journal import DamagedStore, Entry, NotCopied, Saved, StoreEngine
 from ..checkpoint.snapshot.shared_blocks import by_segment
 from ..checkpoint.snapshot.snapshot_record import decode_meta
 
@@ -30,7 +30,7 @@ class CopiedStore(NamedTuple):
     notes: int
 
 
-class Kept(NamedTuple):
+class KeptAddress(NamedTuple):
     """What a store keeps of one address.
 
     Attributes:
@@ -45,7 +45,7 @@ class Kept(NamedTuple):
     blocks: dict[int, dict[int, bytes]]
 
 
-def copy_store(source: Journal, dest: Journal, *, names: tuple[str, str]) -> CopiedStore:
+def copy_store(source: StoreEngine, dest: StoreEngine, *, names: tuple[str, str]) -> CopiedStore:
     """Copy all that a store has into an empty one, and compare the two.
 
     Args:
@@ -60,12 +60,9 @@ def copy_store(source: Journal, dest: Journal, *, names: tuple[str, str]) -> Cop
     """
     if dest.addresses() or dest.notes(""):
         raise NotCopied(*names, "there is something in it already", "name an empty store")
-    together = getattr(dest, "together", None)
-    if together is None:
-        raise NotCopied(*names, "its engine cannot write a copy completely or not at all", "name another store")
     addresses = source.addresses()
     snapshots = entries = 0
-    with together():
+    with dest.together():
         for address in addresses:
             kept = kept_of(source, address)
             snapshots, entries = snapshots + len(kept.snapshots), entries + len(kept.entries)
@@ -79,7 +76,7 @@ def copy_store(source: Journal, dest: Journal, *, names: tuple[str, str]) -> Cop
     return CopiedStore(len(addresses), snapshots, entries, len(notes))
 
 
-def kept_of(store: Journal, address: str) -> Kept:
+def kept_of(store: StoreEngine, address: str) -> KeptAddress:
     """All that a store keeps of an address.
 
     Raises:
@@ -97,10 +94,10 @@ def kept_of(store: Journal, address: str) -> Kept:
             snapshots.append((one.snapshot, one.turn, [n for n, position in enumerate(positions) if position in gone]))
             before = left
             _read_blocks(store, address, one.snapshot, blocks)
-    return Kept(snapshots, [entry for _, entry in saved[0].entries], blocks)
+    return KeptAddress(snapshots, [entry for _, entry in saved[0].entries], blocks)
 
 
-def _saved(store: Journal, address: str) -> list[Saved]:
+def _saved(store: StoreEngine, address: str) -> list[Saved]:
     """What the store gives back with each snapshot that it keeps, the oldest first.
 
     Raises:
@@ -110,7 +107,7 @@ def _saved(store: Journal, address: str) -> list[Saved]:
     while True:
         one = store.load(address, older=len(found))
         if one.passed_over:
-            raise DamagedStore(str(getattr(store, "path", "")), address, None, one.passed_over)
+            raise DamagedStore("to be copied", address, None, one.passed_over)
         if found and (one.turn, one.snapshot) == (found[-1].turn, found[-1].snapshot):
             return found[::-1]
         found.append(one)
@@ -118,7 +115,7 @@ def _saved(store: Journal, address: str) -> list[Saved]:
             return found[::-1]
 
 
-def _read_blocks(store: Journal, address: str, snapshot: bytes, blocks: dict[int, dict[int, bytes]]) -> None:
+def _read_blocks(store: StoreEngine, address: str, snapshot: bytes, blocks: dict[int, dict[int, bytes]]) -> None:
     """Add the blocks that a snapshot consists of, by pack and offset."""
     for number, places in by_segment(decode_meta(snapshot).blocks).items():
         segment = store.read_blocks(address, number, places)
@@ -129,7 +126,7 @@ def _read_blocks(store: Journal, address: str, snapshot: bytes, blocks: dict[int
             segment.close()
 
 
-def _put(dest: Journal, address: str, kept: Kept) -> None:
+def _put(dest: StoreEngine, address: str, kept: KeptAddress) -> None:
     for number, blocks in kept.blocks.items():
         dest.keep_blocks(address, number, [(at, memoryview(block)) for at, block in sorted(blocks.items())], False)
     positions = dest.append([(address, entry) for entry in kept.entries])
@@ -138,7 +135,7 @@ def _put(dest: Journal, address: str, kept: Kept) -> None:
         dest.cut(address, data, drop, turn=turn, keep=len(kept.snapshots))
 
 
-def differences(one: Journal, other: Journal) -> Iterator[str]:
+def differences(one: StoreEngine, other: StoreEngine) -> Iterator[str]:
     """What two stores do not have alike, in words."""
     if one.addresses() != other.addresses():
         yield f"it has {len(other.addresses())} addresses, and not the {len(one.addresses())} of the first"

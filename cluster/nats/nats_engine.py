@@ -19,10 +19,10 @@ from nats.js.errors import APIError, NotFoundError
 from nats.js.errors import Error as JetStreamError
 
 from ..log_records import PART
-from ..ports import LogReader, OutOfTurn, Record, Unanswered
+from ..ports import LogReader, LogRecord, OutOfTurn, Unanswered
 from .access import NatsAccess, connect_options
 from .server_check import refuse_unsafe
-from .streams import Names, stream_settings
+from .system_streams import SubjectNames, stream_settings
 
 ANSWER_SECONDS: Final = 2.0
 """How long one request waits for its answer."""
@@ -53,7 +53,7 @@ class NatsEngine:
         self.name = name
         self._client = client
         stream = client.jetstream(timeout=ANSWER_SECONDS)
-        self.names = names = Names(system)
+        self.names = names = SubjectNames(system)
         self.log = NatsLog(stream, names, name)
         self.lease = NatsLease(stream, names, name)
         self.blobs = NatsBlobs(stream, names, name)
@@ -117,21 +117,21 @@ def answering(name: str) -> Generator[None, None, None]:
     try:
         yield
     except (nats.errors.Error, JetStreamError, TimeoutError, OSError) as error:
-        said = getattr(error, "description", None) or str(error) or type(error).__name__
-        raise Unanswered(name, str(said)) from error
+        said = error.description if isinstance(error, APIError) else str(error)
+        raise Unanswered(name, said or type(error).__name__) from error
 
 
 class NatsLog:
     """The log: one subject of one stream; see `cluster.ports.Log`."""
 
-    def __init__(self, stream: JetStreamContext, names: Names, name: str) -> None:
+    def __init__(self, stream: JetStreamContext, names: SubjectNames, name: str) -> None:
         self._stream, self._names, self._name = stream, names, name
 
     async def append(self, data: bytes, after: int) -> int:
         """Append a record behind the one with the number `after`; see `Log`."""
         return await _publish(self._stream, self._names.log, data, after, self._name)
 
-    async def last(self) -> Record | None:
+    async def last(self) -> LogRecord | None:
         """The last record, from whoever leads the stream; see `Log`."""
         return await _last(self._stream, self._names.log_stream, self._names.log, self._name)
 
@@ -168,7 +168,7 @@ class NatsReader:
     def __init__(self, consumer: JetStreamContext.PullSubscription, name: str) -> None:
         self._consumer, self._name = consumer, name
 
-    async def next(self, seconds: float) -> Sequence[Record]:
+    async def next(self, seconds: float) -> Sequence[LogRecord]:
         """The next records; see `LogReader`."""
         try:
             messages = await self._consumer.fetch(BATCH, timeout=seconds)
@@ -176,7 +176,7 @@ class NatsReader:
             return []
         except (nats.errors.Error, JetStreamError, OSError) as error:
             raise Unanswered(self._name, str(error) or type(error).__name__) from error
-        return [Record(message.metadata.sequence.stream, message.data) for message in messages]
+        return [LogRecord(message.metadata.sequence.stream, message.data) for message in messages]
 
     async def close(self) -> None:
         """Have the server forget the consumer; see `LogReader`."""
@@ -187,7 +187,7 @@ class NatsReader:
 class NatsLease:
     """The lease: one message with a time to live; see `cluster.ports.Lease`."""
 
-    def __init__(self, stream: JetStreamContext, names: Names, name: str) -> None:
+    def __init__(self, stream: JetStreamContext, names: SubjectNames, name: str) -> None:
         self._stream, self._names, self._name = stream, names, name
         self.seconds = float(LEASE_SECONDS)
 
@@ -217,7 +217,7 @@ class NatsLease:
         last = await self._last()
         return "" if last is None else last.data.decode()
 
-    async def _last(self) -> Record | None:
+    async def _last(self) -> LogRecord | None:
         return await _last(self._stream, self._names.lease_stream, self._names.lease, self._name)
 
     async def _publish(self, holder: str, after: int) -> int | None:
@@ -232,7 +232,7 @@ class NatsLease:
 class NatsBlobs:
     """Large values in parts, each a subject of its own; see `cluster.ports.Blobs`."""
 
-    def __init__(self, stream: JetStreamContext, names: Names, name: str) -> None:
+    def __init__(self, stream: JetStreamContext, names: SubjectNames, name: str) -> None:
         self._stream, self._names, self._name = stream, names, name
 
     def _subject(self, name: str) -> str:
@@ -305,7 +305,7 @@ async def _publish(
         raise
 
 
-async def _last(stream: JetStreamContext, stream_name: str, subject: str, name: str) -> Record | None:
+async def _last(stream: JetStreamContext, stream_name: str, subject: str, name: str) -> LogRecord | None:
     """The last message of a subject, from whoever leads the stream."""
     try:
         with answering(name):
@@ -314,4 +314,4 @@ async def _last(stream: JetStreamContext, stream_name: str, subject: str, name: 
         if isinstance(error.__cause__, NotFoundError):
             return None
         raise
-    return Record(found.seq or 0, found.data or b"")
+    return LogRecord(found.seq or 0, found.data or b"")

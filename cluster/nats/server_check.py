@@ -53,7 +53,7 @@ LOSES: Final = {
 """Settings of a stream on which it depends whether something is lost, and what another one leads to."""
 
 
-class Problem(msgspec.Struct, frozen=True):
+class ServerProblem(msgspec.Struct, frozen=True):
     """Something about a server or a stream that is not as it should be.
 
     Attributes:
@@ -162,7 +162,7 @@ class _Streams(_Info):
     streams: list[_ListedStream] | None = None
 
 
-async def check_server(client: Client, access: NatsAccess, *, seconds: float = 5.0) -> list[Problem]:
+async def check_server(client: Client, access: NatsAccess, *, seconds: float = 5.0) -> list[ServerProblem]:
     """What is wrong with the servers that a client is connected to, and with the streams of its system.
 
     Args:
@@ -174,7 +174,7 @@ async def check_server(client: Client, access: NatsAccess, *, seconds: float = 5
     return problems_of(await look_at(client, access, seconds=seconds), access)
 
 
-async def refuse_unsafe(client: Client, access: NatsAccess, *, seconds: float = 5.0) -> list[Problem]:
+async def refuse_unsafe(client: Client, access: NatsAccess, *, seconds: float = 5.0) -> list[ServerProblem]:
     """Check the servers, and return what is only a warning.
 
     Raises:
@@ -188,7 +188,7 @@ async def refuse_unsafe(client: Client, access: NatsAccess, *, seconds: float = 
     return found
 
 
-async def check_store(store: str, *, seconds: float = 5.0) -> list[Problem]:
+async def check_store(store: str, *, seconds: float = 5.0) -> list[ServerProblem]:
     """What is wrong with the servers and streams that a store names: connect, look, and go.
 
     Args:
@@ -246,20 +246,23 @@ async def look_at(client: Client, access: NatsAccess, *, seconds: float = 5.0) -
     )
 
 
-def problems_of(seen: Seen, access: NatsAccess) -> list[Problem]:
+def problems_of(seen: Seen, access: NatsAccess) -> list[ServerProblem]:
     """Judge what was seen of the servers; each problem says what to change."""
     told = seen.servers or (ServerSeen("the server", seen.version, seen.max_payload),)
     found = [problem for server in told for problem in _of_version(server)]
     if not seen.has_jetstream:
         remedy = "give the account `jetstream: enabled` and the server a block `jetstream { ... }`"
-        return [*found, Problem(f"the account of {access.system}", "JetStream is off, so nothing can be kept", remedy)]
+        return [
+            *found,
+            ServerProblem(f"the account of {access.system}", "JetStream is off, so nothing can be kept", remedy),
+        ]
     if not seen.servers:
         problem = "nobody can see from here whether each record is on the disk before it is acknowledged"
         remedy = (
             "look for `sync_interval: always` in the file of each server, or use what `holdfast nats config` writes, "
             f"which lets the account import {VARZ}"
         )
-        found.append(Problem("the servers", problem, remedy, is_warning=True))
+        found.append(ServerProblem("the servers", problem, remedy, is_warning=True))
     for server in seen.servers:
         found += _of_jetstream(server)
     found += _of_cluster(seen.servers, access)
@@ -270,36 +273,40 @@ def problems_of(seen: Seen, access: NatsAccess) -> list[Problem]:
     return found
 
 
-def _of_version(server: ServerSeen) -> list[Problem]:
-    where, found = server.server_name, list[Problem]()
+def _of_version(server: ServerSeen) -> list[ServerProblem]:
+    where, found = server.server_name, list[ServerProblem]()
     if _version(server.version) < OLDEST:
         problem = f"its version is {server.version}, which may lose acknowledged records when it is killed"
-        found.append(Problem(where, problem, f"install {'.'.join(map(str, OLDEST))} or later"))
+        found.append(ServerProblem(where, problem, f"install {'.'.join(map(str, OLDEST))} or later"))
     if server.max_payload < MOST_BYTES:
         problem = f"it takes messages of at most {server.max_payload} bytes, and a message may have {MOST_BYTES}"
         is_warning = server.max_payload >= LEAST_BYTES
-        found.append(Problem(where, problem, f"set `max_payload: {MOST_BYTES}`", is_warning=is_warning))
+        found.append(ServerProblem(where, problem, f"set `max_payload: {MOST_BYTES}`", is_warning=is_warning))
     return found
 
 
-def _of_jetstream(server: ServerSeen) -> list[Problem]:
+def _of_jetstream(server: ServerSeen) -> list[ServerProblem]:
     if server.jetstream.config is None:
         problem = "JetStream is off there, so it keeps no copies of what the others have"
-        return [Problem(server.server_name, problem, "add a block `jetstream { ... }`", is_warning=True)]
+        return [ServerProblem(server.server_name, problem, "add a block `jetstream { ... }`", is_warning=True)]
     if not server.jetstream.config.sync_always:
         problem = "it acknowledges records before they are on the disk, and a power cut loses them"
-        return [Problem(server.server_name, problem, "set `jetstream { sync_interval: always }`")]
+        return [ServerProblem(server.server_name, problem, "set `jetstream { sync_interval: always }`")]
     return []
 
 
-def _of_cluster(servers: Sequence[ServerSeen], access: NatsAccess) -> list[Problem]:
+def _of_cluster(servers: Sequence[ServerSeen], access: NatsAccess) -> list[ServerProblem]:
     size = _cluster_size(servers)
     if size == 2:
         problem = "the cluster has two servers, and the loss of either stops both"
-        return [Problem("the cluster", problem, "add a third server, or use one alone")]
+        return [ServerProblem("the cluster", problem, "add a third server, or use one alone")]
     if servers and access.replicas > max(size, 1):
         problem = f"{access.replicas} replicas are wanted, and there is one server"
-        return [Problem("the cluster", problem, f"add servers until there are {access.replicas}, or write ?replicas=1")]
+        return [
+            ServerProblem(
+                "the cluster", problem, f"add servers until there are {access.replicas}, or write ?replicas=1"
+            )
+        ]
     return []
 
 
@@ -308,14 +315,14 @@ def _cluster_size(servers: Sequence[ServerSeen]) -> int:
     return max((one.jetstream.meta.cluster_size for one in servers if one.jetstream.meta is not None), default=0)
 
 
-def _of_stream(stream: StreamSetting, wanted: StreamSetting) -> list[Problem]:
+def _of_stream(stream: StreamSetting, wanted: StreamSetting) -> list[ServerProblem]:
     """One problem for each setting of a stream that is not as the system makes it."""
-    where, found = f"the stream {stream.name}", list[Problem]()
+    where, found = f"the stream {stream.name}", list[ServerProblem]()
     for setting in LOSES:
         now, right = getattr(stream, setting), getattr(wanted, setting)
         if now != right and not (setting == "num_replicas" and now % 2 and now > right):
             problem = f"{setting} is {_shown(now)}, and {LOSES[setting]}"
-            found.append(Problem(where, problem, f"set it to {_shown(right)} (`nats stream edit {stream.name}`)"))
+            found.append(ServerProblem(where, problem, f"set it to {_shown(right)} (`nats stream edit {stream.name}`)"))
     return found
 
 
@@ -336,9 +343,9 @@ def _shown(value: object) -> str:
 
 def wanted_streams(access: NatsAccess) -> dict[str, StreamSetting]:
     """How the streams of a system have to be set, by name."""
-    from .streams import Names, stream_settings
+    from .system_streams import SubjectNames, stream_settings
 
-    settings = [one.as_dict() for one in stream_settings(Names(access.system), access.replicas)]
+    settings = [one.as_dict() for one in stream_settings(SubjectNames(access.system), access.replicas)]
     as_listed = msgspec.json.decode(msgspec.json.encode(settings), type=list[StreamSetting])
     return {one.name: one for one in as_listed}
 

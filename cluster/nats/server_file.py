@@ -38,7 +38,7 @@ class FileExists(HoldfastError, text="{path} is there already: give another fold
     path: str
 
 
-class Role(StrEnum):
+class UserRole(StrEnum):
     """What somebody may do in the account of a system."""
 
     NODE = "node"
@@ -81,11 +81,11 @@ class ServerPlan(msgspec.Struct, frozen=True, kw_only=True):
 class User(NamedTuple):
     """Somebody who may use a system: what for, and the public key that proves it."""
 
-    role: Role
+    role: UserRole
     key: str
 
 
-class Account(NamedTuple):
+class NatsAccount(NamedTuple):
     """One system on the servers, and who may use it."""
 
     system: str
@@ -132,17 +132,17 @@ def permissions(system: str, user: User) -> Permissions:
     own = f"{inbox_of(user.key)}.>"
     everything = f"hf.{system}.>"
     match user.role:
-        case Role.NODE:  # Nodes trust each other: a purge cannot be limited to one subject.
+        case UserRole.NODE:  # Nodes trust each other: a purge cannot be limited to one subject.
             return Permissions((everything, "$JS.API.>", "$JS.ACK.>", "$JS.FC.>", "_INBOX.>", VARZ), (everything, own))
-        case Role.CLIENT:
+        case UserRole.CLIENT:
             return Permissions((f"hf.{system}.*.in", f"hf.{system}.node.*.*.>"), (own,))
-        case Role.OBSERVER:
+        case UserRole.OBSERVER:
             looks = ("INFO", "STREAM.NAMES", "STREAM.LIST", "STREAM.INFO.*", "CONSUMER.LIST.*", "CONSUMER.INFO.*.*")
             apis = (f"$JS.API.{one}" for one in looks)
             return Permissions((*apis, VARZ), (f"hf.{system}.beat.*", f"hf.{system}.*.lease", own))
 
 
-def server_text(server: ServerPlan, cluster: Sequence[ServerPlan], accounts: Sequence[Account], secret: str) -> str:
+def server_text(server: ServerPlan, cluster: Sequence[ServerPlan], accounts: Sequence[NatsAccount], secret: str) -> str:
     """The configuration file of one server.
 
     Args:
@@ -214,14 +214,14 @@ def write_server_files(
         OSError: the folder cannot be written.
     """
     names = [*systems]
-    _check(servers, [Account(name, ()) for name in names])
+    _check(servers, [NatsAccount(name, ()) for name in names])
     files = [folder / f"{server.name}.conf" for server in servers]
     if not force and (there := next((file for file in files if file.exists()), None)):
         raise FileExists(str(there))
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    seeds = {(name, role): seed_file(folder, name, role) for name in names for role in Role}
+    seeds = {(name, role): seed_file(folder, name, role) for name in names for role in UserRole}
     accounts = [
-        Account(name, tuple(User(role, public_key(_kept(seeds[name, role], new_seed))) for role in Role))
+        NatsAccount(name, tuple(User(role, public_key(_kept(seeds[name, role], new_seed))) for role in UserRole))
         for name in names
     ]
     secret = _kept(folder / "routes.secret", lambda: secrets.token_hex(24)) if len(servers) > 1 else ""
@@ -231,7 +231,7 @@ def write_server_files(
     return [*files, *seeds.values()]
 
 
-def seed_file(folder: Path, system: str, role: Role) -> Path:
+def seed_file(folder: Path, system: str, role: UserRole) -> Path:
     """Where the key of a role in a system is kept."""
     return folder / f"{system}-{role.value}.nk"
 
@@ -290,7 +290,7 @@ def _write(file: Path, text: str) -> None:
         raise
 
 
-def _check(servers: Sequence[ServerPlan], accounts: Sequence[Account]) -> None:
+def _check(servers: Sequence[ServerPlan], accounts: Sequence[NatsAccount]) -> None:
     where = "nats config"
     if len(servers) not in (1, 3):
         raise SpecError(where, f"there are {len(servers)} servers: give 1, or 3, which go on without any one of them")
@@ -323,7 +323,7 @@ def _identity(server: ServerPlan, text: str) -> str:
             return _address(server.host, server.cluster_port)
 
 
-def _account(account: Account) -> list[str]:
+def _account(account: NatsAccount) -> list[str]:
     lines = [f"  {_quoted(account.system)} {{", "    jetstream: enabled", "    users: ["]
     for user in account.users:
         allowed = permissions(account.system, user)

@@ -103,7 +103,7 @@ class ChildNow(msgspec.Struct, frozen=True):
     awaited: str = ""
 
 
-class Memory(msgspec.Struct, frozen=True):
+class ProcessMemory(msgspec.Struct, frozen=True):
     """The resident memory of an actor's own process, and what its limits allow; both in bytes."""
 
     resident_bytes: int
@@ -162,7 +162,7 @@ class Evidence(msgspec.Struct, frozen=True):
     ended_below: dict[str, PastLife] = {}
     own_allowance: Allowance | None = None
     protection: ProtectionStatus | None = None
-    memory: Memory | None = None
+    memory: ProcessMemory | None = None
     waiting: Waiting | None = None
 
     def ago(self, at: float) -> str:
@@ -263,7 +263,7 @@ def _own_allowance(overview: dict[str, Any]) -> Allowance | None:
     return Allowance(overview["intensity"], overview["period"], overview["restarts"])
 
 
-def _memory(cell: Cell) -> Memory | None:
+def _memory(cell: Cell) -> ProcessMemory | None:
     """The memory of the actor's own process; None if it has none, or nothing bounds it."""
     limits = cell.spec.limits if isinstance(cell.spec, ChildSpec) else None
     process = cell.host.place.process(cell)
@@ -272,7 +272,7 @@ def _memory(cell: Cell) -> Memory | None:
     import psutil  # only now: a system that runs no process does without it
 
     try:
-        return Memory(psutil.Process(process.pid).memory_info().rss, limits.memory_bytes)
+        return ProcessMemory(psutil.Process(process.pid).memory_info().rss, limits.memory_bytes)
     except psutil.Error:
         return None  # It has ended meanwhile.
 

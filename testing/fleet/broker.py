@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from ...cluster.ports import OutOfTurn, Record
+from ...cluster.ports import LogRecord, OutOfTurn
 
 PATH: Final = "sim:broker"
 """What errors call a simulated engine."""
@@ -56,7 +56,7 @@ LATE: Final = 8.0
 class _Kept(NamedTuple):
     """A record, when it was appended, and where the log began then."""
 
-    record: Record
+    record: LogRecord
     since: float
     begins: int
 
@@ -108,7 +108,7 @@ class SimBroker:
         return share > 0.0 and self.draw.random() < share
 
     def arrived(self) -> None:
-        """A request is here."""
+        """Take note that a request has arrived at the servers."""
         self.requests += 1
         self.on_request(self.requests)
 
@@ -126,7 +126,7 @@ class SimBroker:
         self.lease_holder = ""
 
     def is_away(self) -> bool:
-        """Whether nobody answers."""
+        """Whether nobody answers at this moment, as during an election."""
         return _now() < self._away_until
 
     @property
@@ -141,13 +141,13 @@ class SimBroker:
         if after != self._last or self.strikes(self.faults.refused):
             raise OutOfTurn(after)
         self._last += 1 + self.strikes(0.1)  # Numbers may have gaps.
-        self._log.append(_Kept(Record(self._last, data), _now(), self._begins))
+        self._log.append(_Kept(LogRecord(self._last, data), _now(), self._begins))
         for one in self._waiting:
             if not one.done():
                 one.set_result(None)
         return self._last
 
-    def view(self, after: int, when: float) -> list[Record]:
+    def view(self, after: int, when: float) -> list[LogRecord]:
         """The records behind the one with that number, as somebody sees them who has come as far as all had then."""
         log = self._log
         end = next((number for number in range(len(log), 0, -1) if log[number - 1].since <= when), 0)
@@ -172,12 +172,12 @@ class SimBroker:
             self._waiting.discard(waiter)
 
     @property
-    def records(self) -> Sequence[Record]:
+    def records(self) -> Sequence[LogRecord]:
         """All records that there are."""
         return self.view(0, float("inf"))
 
     @property
-    def everything(self) -> Sequence[Record]:
+    def everything(self) -> Sequence[LogRecord]:
         """All records that there ever were, for judges."""
         return [kept.record for kept in self._log]
 

@@ -55,7 +55,7 @@ class SameLoop:
             result: T = done.value
             return result
         work.close()
-        raise WouldWait(getattr(work, "__qualname__", "this"))
+        raise WouldWait(repr(work))
 
     def close(self) -> None:
         """Do nothing: the loop is the program's."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final, TypeVar
 
-from ...cluster.ports import LogReader, OutOfTurn, Record, Unanswered
+from ...cluster.ports import LogReader, LogRecord, OutOfTurn, Unanswered
 from .broker import LAG, LATE, PATH, SimBroker
 
 T = TypeVar("T")
@@ -17,7 +17,7 @@ BATCH: Final = 40
 """Records that a read returns at most."""
 
 
-class Link:
+class SimLink:
     """What gets through between one program and the servers.
 
     Attributes:
@@ -67,7 +67,7 @@ class SimEngine:
     name = PATH
 
     def __init__(self, broker: SimBroker, *, seconds: float = 3.0) -> None:
-        self.link = Link()
+        self.link = SimLink()
         asks = _Asks(broker, self.link)
         self.log, self.lease, self.blobs = SimLog(asks), SimLease(asks, seconds), SimBlobs(asks)
 
@@ -78,7 +78,7 @@ class SimEngine:
 class _Asks:
     """Sends requests, and waits for their answers."""
 
-    def __init__(self, broker: SimBroker, link: Link) -> None:
+    def __init__(self, broker: SimBroker, link: SimLink) -> None:
         self.broker, self.link = broker, link
 
     async def ask(self, do: Callable[[], T], read: Callable[[float], T] | None = None) -> T:
@@ -151,10 +151,10 @@ class SimLog:
         """Append a record behind the one with the number `after`; see `Log`."""
         return await self._asks.ask(lambda: self._broker.append(data, after))
 
-    async def last(self) -> Record | None:
+    async def last(self) -> LogRecord | None:
         """The last record; see `Log`."""
 
-        def read(when: float) -> Record | None:
+        def read(when: float) -> LogRecord | None:
             seen = self._broker.view(0, when)
             return seen[-1] if seen else None
 
@@ -177,7 +177,7 @@ class SimReader:
         self._is_silent = False
         self._elections = self._broker.elections
 
-    async def next(self, seconds: float) -> Sequence[Record]:
+    async def next(self, seconds: float) -> Sequence[LogRecord]:
         """The next records; see `LogReader`."""
         loop, broker, link = asyncio.get_running_loop(), self._broker, self._asks.link
         until = loop.time() + seconds

@@ -18,7 +18,7 @@ from ...actors.errors import HoldfastError
 from ...checkpoint.journal import DamagedStore, Entry, Saved, StaleEpoch, StoreFailed
 from ...checkpoint.snapshot.shared_blocks import Segment
 from ...checkpoint.turn_word import blamed, is_at_work
-from ...cluster.store_contents import Change, StoreContents
+from ...cluster.store_contents import Change, MemoryContents
 from .choices import DELAY, LEVELS, LOSS, Choices
 
 PATH: Final = "simulated"
@@ -57,10 +57,10 @@ class SimulatedDisk:
     """
 
     def __init__(self) -> None:
-        self.written = StoreContents()
+        self.written = MemoryContents()
         self.epoch = 0
         self.words: dict[str, array[int]] = {}
-        self._synced = StoreContents()
+        self._synced = MemoryContents()
         self._unsynced: list[list[Change]] = []  # what stands together is lost together
 
     def open(self) -> SimulatedJournal:
@@ -142,7 +142,7 @@ class SimulatedJournal:
         self._is_open = True
 
     @property
-    def _contents(self) -> StoreContents:
+    def _contents(self) -> MemoryContents:
         return self.disk.written
 
     def _check(self) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ...actors.errors import StoreError
+from ...checkpoint.engine_calls import safe_at_of
 from ...checkpoint.journal import Journal, SafeAt
 from .comparing import PromiseBroken
 from .watching import full_disk, grown, signature, watched
@@ -19,16 +20,10 @@ Crash = Callable[[Journal, Path], Path]
 Fail = Callable[[Path], AbstractContextManager[None]]
 
 
-def safe_at(journal: Journal) -> SafeAt:
-    """When what was appended outlives a kill; engines that do not say so keep it at once."""
-    said: SafeAt = getattr(journal, "safe_at", "append")
-    return said
-
-
 def acknowledged(journal: Journal, write: Callable[[], object]) -> None:
     """Write, and wait until it is as safe as it has to be before anybody may be told of it."""
     write()
-    if safe_at(journal) == "sync":
+    if safe_at_of(journal) == "sync":
         journal.sync()
 
 
@@ -117,7 +112,7 @@ class OpenEngine:
     @property
     def safe_at(self) -> SafeAt:
         """When what was written outlives a kill: at once, or only when a `sync` has come back."""
-        return safe_at(self.journal)
+        return safe_at_of(self.journal)
 
     def kill(self, *, synced: bool = True) -> None:
         """Go on with what a kill leaves; what was open before is closed, in its own folder, as if it were not there.

@@ -14,7 +14,7 @@ from typing import Final
 import pytest
 
 from holdfast.cluster.log_records import PART
-from holdfast.cluster.ports import Engine, LogReader, OutOfTurn, Record
+from holdfast.cluster.ports import Engine, LogReader, LogRecord, OutOfTurn
 
 Connect = Callable[[], Awaitable[Engine]]
 WAIT: Final = 5.0
@@ -23,9 +23,9 @@ MARGIN: Final = 2.0
 """Seconds by which a lease may end later than it should."""
 
 
-async def _read(reader: LogReader, count: int) -> list[Record]:
+async def _read(reader: LogReader, count: int) -> list[LogRecord]:
     """So many records, and nothing behind them."""
-    found: list[Record] = []
+    found: list[LogRecord] = []
     while len(found) < count:
         some = await reader.next(WAIT)
         assert some, f"{len(found)} of {count} records came"
@@ -35,16 +35,16 @@ async def _read(reader: LogReader, count: int) -> list[Record]:
     return found
 
 
-async def _read_behind(engine: Engine, after: int, count: int) -> list[Record]:
+async def _read_behind(engine: Engine, after: int, count: int) -> list[LogRecord]:
     return await _read(await engine.log.read(after), count)
 
 
-async def _write(engine: Engine, count: int, after: int = 0) -> list[Record]:
-    written: list[Record] = []
+async def _write(engine: Engine, count: int, after: int = 0) -> list[LogRecord]:
+    written: list[LogRecord] = []
     for number in range(count):
         data = b"record %d" % number
         after = await engine.log.append(data, after)
-        written.append(Record(after, data))
+        written.append(LogRecord(after, data))
     return written
 
 
@@ -98,7 +98,7 @@ async def a_reader_hears_of_what_comes(connect: Connect) -> None:
         await asyncio.sleep(0.05)
         assert not hearing.done()
         after = await one.log.append(b"%d" % number, after)
-        assert await hearing == [Record(after, b"%d" % number)]
+        assert await hearing == [LogRecord(after, b"%d" % number)]
     await reader.close()
 
 
@@ -114,7 +114,7 @@ async def what_is_forgotten_is_gone(connect: Connect) -> None:
     assert (await _read(under_way, 3))[-3:] == written[3:]
     assert await other.log.last() == written[-1]
     more = await other.log.append(b"more", written[-1].sequence)
-    assert (await _read_behind(one, written[4].sequence, 2))[-1] == Record(more, b"more")
+    assert (await _read_behind(one, written[4].sequence, 2))[-1] == LogRecord(more, b"more")
 
 
 async def a_log_takes_many_records_and_large_ones(connect: Connect) -> None:
@@ -122,7 +122,7 @@ async def a_log_takes_many_records_and_large_ones(connect: Connect) -> None:
     engine = await connect()
     written = await _write(engine, 600)
     data = random.Random(1).randbytes(PART + 1000)
-    large = Record(await engine.log.append(data, written[-1].sequence), data)
+    large = LogRecord(await engine.log.append(data, written[-1].sequence), data)
     assert await _read_behind(engine, 0, 601) == [*written, large]
 
 

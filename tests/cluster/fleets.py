@@ -18,7 +18,7 @@ from holdfast.cluster import log_records, log_writer, replicated_journal
 from holdfast.cluster.leadership import Follower, Standby, lead
 from holdfast.cluster.log_records import CHANGES, EPOCH, RecordReader, decode_changes
 from holdfast.cluster.replicated_journal import ReplicatedJournal
-from holdfast.cluster.store_contents import StoreContents
+from holdfast.cluster.store_contents import MemoryContents
 from holdfast.testing.clock import virtual
 from holdfast.testing.fleet.broker import SimBroker
 from holdfast.testing.fleet.same_loop import SameLoop
@@ -61,7 +61,7 @@ def _owned_task(loop: asyncio.AbstractEventLoop, work: Any, **options: Any) -> a
     return task
 
 
-def everything_in(contents: StoreContents) -> object:
+def everything_in(contents: MemoryContents) -> object:
     """What a store holds, to be compared."""
     entries = {address: own for address, own in contents.entries.items() if own}
     snapshots = {address: kept for address, kept in contents.snapshots.items() if kept}
@@ -69,7 +69,7 @@ def everything_in(contents: StoreContents) -> object:
     return contents.last, entries, snapshots, packs, list(contents.notes.items())
 
 
-def names_in(contents: StoreContents) -> set[str]:
+def names_in(contents: MemoryContents) -> set[str]:
     """What it refers to beside the log."""
     return {name for name in contents.kept() if isinstance(name, str)}
 
@@ -86,7 +86,7 @@ class Judge:
         self._begin()
 
     def _begin(self) -> None:
-        self.reader, self.contents = RecordReader(), StoreContents()
+        self.reader, self.contents = RecordReader(), MemoryContents()
         self.ids: list[Any] = []
         self._read = 0
 
@@ -104,7 +104,7 @@ class Judge:
                     self.contents.make(change)
             self._read += 1
 
-    def check_contents(self, contents: StoreContents, at: int, whose: str) -> None:
+    def check_contents(self, contents: MemoryContents, at: int, whose: str) -> None:
         """These are what the log says up to that record."""
         self.read(at)
         assert everything_in(contents) == everything_in(self.contents), f"{whose} differs at record {at}"
@@ -251,7 +251,7 @@ class Fleet:
         self.programs.append(program)
         return program
 
-    def begins(self, contents: StoreContents, at: int, tag: str) -> None:
+    def begins(self, contents: MemoryContents, at: int, tag: str) -> None:
         """Judge what a leader begins with."""
         self.epochs.append(tag)
         self.judge.check_contents(contents, at, tag)

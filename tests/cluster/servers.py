@@ -24,7 +24,7 @@ import nats
 from nats.aio.client import Client
 
 from holdfast.cluster.nats.access import NatsAccess, access_of, connect_options
-from holdfast.cluster.nats.server_file import Role, ServerPlan, TlsFiles, seed_file, write_server_files
+from holdfast.cluster.nats.server_file import ServerPlan, TlsFiles, UserRole, seed_file, write_server_files
 
 PATIENCE = 60.0
 """Seconds for servers to answer, on a machine that is busy with other things; usually it takes a fraction of one."""
@@ -64,7 +64,7 @@ class NatsServers:
         assert found is not None, f"more than {SYSTEMS} tests share these servers: raise SYSTEMS"
         return found
 
-    def store(self, system: str, role: Role = Role.NODE) -> str:
+    def store(self, system: str, role: UserRole = UserRole.NODE) -> str:
         """What `store=` is for a system on these servers, with the key of that role."""
         hosts = ",".join(f"{plan.host}:{plan.port}" for plan in self.plans)
         nkey = f"nkey={seed_file(self.folder, system, role)}"
@@ -73,11 +73,11 @@ class NatsServers:
         files = f"ca={self.tls.ca}&certificate={self.tls.certificate}&key={self.tls.key}"
         return f"tls://{hosts}/{system}?{nkey}&{files}"
 
-    def access(self, system: str, role: Role = Role.NODE) -> NatsAccess:
+    def access(self, system: str, role: UserRole = UserRole.NODE) -> NatsAccess:
         """What a program with the key of that role may use the servers by."""
         return access_of(self.store(system, role))
 
-    async def connect(self, system: str, role: Role = Role.NODE, **more: Any) -> Client:
+    async def connect(self, system: str, role: UserRole = UserRole.NODE, **more: Any) -> Client:
         """A client of these servers; whoever asks for it closes it."""
         options: dict[str, Any] = {**connect_options(self.access(system, role)), **more}
         return await nats.connect(**options)

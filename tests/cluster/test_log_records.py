@@ -15,7 +15,7 @@ from holdfast.cluster.log_records import (
     RecordReader,
     Said,
 )
-from holdfast.cluster.ports import Record
+from holdfast.cluster.ports import LogRecord
 
 
 class Written:
@@ -26,7 +26,7 @@ class Written:
     """
 
     def __init__(self) -> None:
-        self.records: list[Record] = []
+        self.records: list[LogRecord] = []
         self.maker = RecordMaker(0, 0)
 
     def epoch(self, number: int, form: int = FORMAT) -> None:
@@ -42,7 +42,7 @@ class Written:
 
     def _append(self, data: bytes) -> None:
         self.maker.after += 1
-        self.records.append(Record(self.maker.after, data))
+        self.records.append(LogRecord(self.maker.after, data))
 
 
 @pytest.fixture(autouse=True)
@@ -57,12 +57,12 @@ def written() -> Written:
     return made
 
 
-def read(records: list[Record]) -> list[Said]:
+def read(records: list[LogRecord]) -> list[Said]:
     reader = RecordReader()
     return [said for record in records for said in reader.take(record)]
 
 
-def said_in(records: list[Record]) -> list[tuple[str, bytes]]:
+def said_in(records: list[LogRecord]) -> list[tuple[str, bytes]]:
     return [(said.kind, said.data) for said in read(records) if said.kind in (BASE, CHANGES)]
 
 
@@ -97,7 +97,7 @@ def test_changes_between_the_parts_of_a_base_come_behind_it(written: Written) ->
 
 
 def test_a_base_that_is_not_finished_hides_no_growth(written: Written) -> None:
-    def grown(records: list[Record]) -> int:
+    def grown(records: list[LogRecord]) -> int:
         reader = RecordReader()
         for record in records:
             reader.take(record)
@@ -139,9 +139,9 @@ def test_a_damaged_record_is_refused(written: Written) -> None:
     sequence, data = written.records[-1]
     assert data.endswith(b"abcd")
     with pytest.raises(DamagedLog, match="checksum"):
-        read([*written.records[:-1], Record(sequence, data[:-1] + b"x")])
+        read([*written.records[:-1], LogRecord(sequence, data[:-1] + b"x")])
     with pytest.raises(DamagedLog, match="no record of holdfast"):
-        read([*written.records[:-1], Record(sequence, b"hello")])
+        read([*written.records[:-1], LogRecord(sequence, b"hello")])
 
 
 def test_parts_come_in_order(written: Written) -> None:

@@ -11,8 +11,8 @@ import pytest
 from nats.js.api import StorageType
 from typer.testing import CliRunner, Result
 
-from holdfast.cluster.nats.server_file import Role
-from holdfast.cluster.nats.streams import Names, stream_settings
+from holdfast.cluster.nats.server_file import UserRole
+from holdfast.cluster.nats.system_streams import SubjectNames, stream_settings
 from holdfast.console.commands import commands
 from tests.cluster.servers import NatsServers, free_ports, server_binary
 
@@ -66,7 +66,7 @@ def test_servers_are_checked(nats1: NatsServers) -> None:
 
 async def _in_memory(servers: NatsServers, system: str) -> None:
     client = await servers.connect(system)
-    setting = stream_settings(Names(system), 1)[0]
+    setting = stream_settings(SubjectNames(system), 1)[0]
     setting.storage = StorageType.MEMORY
     await client.jetstream().add_stream(setting)
     await client.close()
@@ -76,7 +76,7 @@ def test_who_is_not_let_in_is_told(nats1: NatsServers) -> None:
     stranger = nats("check", nats1.store(nats1.new_system()).partition("?")[0])
     assert stranger.exit_code == 2
     assert "authorization violation" in stranger.output.lower()
-    client = nats("check", nats1.store(nats1.new_system(), Role.CLIENT), "--seconds", "0.3")
+    client = nats("check", nats1.store(nats1.new_system(), UserRole.CLIENT), "--seconds", "0.3")
     assert client.exit_code == 2
     assert "may this user ask?" in client.output
 

@@ -93,7 +93,7 @@ CHECKS = {
     "an epoch names the last record that was read": Check(
         "cluster/leadership.py",
         "append_behind(engine, record, reader.at)",
-        'append_behind(engine, record, (await engine.log.last() or Record(0, b"")).sequence)',
+        'append_behind(engine, record, (await engine.log.last() or LogRecord(0, b"")).sequence)',
         FLEETS,
         "was_safe_is_there",
     ),
@@ -198,14 +198,14 @@ CHECKS = {
     ),
     "a base is what there was at one time": Check(
         "cluster/replicated_journal.py",
-        "self._queue(Write(base=self._contents.copy()))",
-        "self._queue(Write(base=self._contents))",
+        "self._queue(LogWrite(base=self._contents.copy()))",
+        "self._queue(LogWrite(base=self._contents))",
         FLEETS,
         "was_safe_is_there",
     ),
     "a look is written before orphans are dropped": Check(
         "cluster/replicated_journal.py",
-        "            self._queue(Write(drops=sorted(orphans)))\n",
+        "            self._queue(LogWrite(drops=sorted(orphans)))\n",
         "            await asyncio.gather(*(self._engine.blobs.drop(name) for name in orphans))\n",
         LEADERSHIP,
         "orphans_stay",

@@ -26,8 +26,8 @@ from holdfast.cluster.nats.server_check import (
     refuse_unsafe,
     wanted_streams,
 )
-from holdfast.cluster.nats.server_file import MOST_BYTES, Role
-from holdfast.cluster.nats.streams import Names, stream_settings
+from holdfast.cluster.nats.server_file import MOST_BYTES, UserRole
+from holdfast.cluster.nats.system_streams import SubjectNames, stream_settings
 from holdfast.cluster.ports import Unanswered, UnsafeServer
 from tests.cluster.servers import NatsServers
 
@@ -53,7 +53,7 @@ def stream(replicas: int = 1, **more: Any) -> StreamSetting:
 async def test_a_server_of_our_own_configuration_has_no_problem(nats1: NatsServers) -> None:
     system = nats1.new_system()
     client = await nats1.connect(system)
-    for setting in stream_settings(Names(system), 1):
+    for setting in stream_settings(SubjectNames(system), 1):
         await client.jetstream().add_stream(setting)
     assert await refuse_unsafe(client, nats1.access(system)) == []
     found = await look_at(client, nats1.access(system))
@@ -121,7 +121,7 @@ async def test_who_may_not_ask_is_told(nats1: NatsServers) -> None:
     async def refused(error: Exception) -> None:
         assert "permissions violation" in str(error)
 
-    client = await nats1.connect(system, Role.CLIENT, error_cb=refused)
+    client = await nats1.connect(system, UserRole.CLIENT, error_cb=refused)
     with pytest.raises(Unanswered, match="may this user ask"):
         await check_server(client, nats1.access(system), seconds=0.1)
     await client.close()
@@ -130,7 +130,7 @@ async def test_who_may_not_ask_is_told(nats1: NatsServers) -> None:
 async def test_the_streams_of_a_system_are_all_looked_at(nats1: NatsServers) -> None:
     system = nats1.new_system()
     client = await nats1.connect(system)
-    for setting in stream_settings(Names(system), 1):
+    for setting in stream_settings(SubjectNames(system), 1):
         setting.storage = StorageType.MEMORY
         await client.jetstream().add_stream(setting)
     await client.jetstream().add_stream(StreamConfig(name="other", subjects=["other"], storage=StorageType.MEMORY))

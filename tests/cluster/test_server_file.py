@@ -25,12 +25,12 @@ from holdfast.cluster.nats.access import access_of, connect_options
 from holdfast.cluster.nats.server_check import check_server
 from holdfast.cluster.nats.server_file import (
     VARZ,
-    Account,
     FileExists,
-    Role,
+    NatsAccount,
     ServerPlan,
     TlsFiles,
     User,
+    UserRole,
     inbox_of,
     new_seed,
     permissions,
@@ -75,7 +75,7 @@ class Tried:
 
 
 @asynccontextmanager
-async def trying(servers: NatsServers, system: str, role: Role) -> AsyncGenerator[Tried]:
+async def trying(servers: NatsServers, system: str, role: UserRole) -> AsyncGenerator[Tried]:
     refused: asyncio.Queue[str] = asyncio.Queue()
 
     async def note(error: Exception) -> None:
@@ -96,21 +96,21 @@ def mode_of(file: Path) -> int:
     ("role", "publishes", "subscribes", "no_publishing", "no_subscribing"),
     [
         (
-            Role.NODE,
+            UserRole.NODE,
             ["hf.{s}.root.log", "hf.{s}.beat.n1", "$JS.API.STREAM.CREATE.x", "_INBOX.somebody.1", VARZ],
             ["hf.{s}.>", "{inbox}.*"],
             ["hf.other.root.in", "elsewhere", "$SYS.REQ.SERVER.PING.CONNZ"],
             ["hf.>", "_INBOX.>", ">", "$SYS.>", "$JS.API.>"],
         ),
         (
-            Role.CLIENT,
+            UserRole.CLIENT,
             ["hf.{s}.root.in", "hf.{s}.node.n1.b1.x"],
             ["{inbox}.*"],
             ["hf.{s}.root.log", "hf.{s}.root.lease", "hf.{s}.beat.n1", "$JS.API.STREAM.MSG.GET.x", "_INBOX.x.1", VARZ],
             ["hf.{s}.>", "hf.{s}.root.in", "hf.{s}.root.log", "_INBOX.>", ">"],
         ),
         (
-            Role.OBSERVER,
+            UserRole.OBSERVER,
             ["$JS.API.INFO", "$JS.API.STREAM.INFO.x", VARZ],
             ["hf.{s}.beat.*", "hf.{s}.*.lease", "{inbox}.*"],
             ["hf.{s}.root.in", "hf.{s}.root.lease", "_INBOX.x.1", "$JS.API.STREAM.PURGE.x", "$JS.API.STREAM.MSG.GET.x"],
@@ -120,7 +120,7 @@ def mode_of(file: Path) -> int:
 )
 async def test_a_role_may_do_what_it_is_for_and_nothing_else(
     nats1: NatsServers,
-    role: Role,
+    role: UserRole,
     publishes: list[str],
     subscribes: list[str],
     no_publishing: list[str],
@@ -138,7 +138,7 @@ async def test_a_role_may_do_what_it_is_for_and_nothing_else(
 async def test_a_node_answers_a_client_and_nobody_else_hears_it(nats1: NatsServers) -> None:
     system = nats1.new_system()
     node = await nats1.connect(system)
-    client = await nats1.connect(system, Role.CLIENT)
+    client = await nats1.connect(system, UserRole.CLIENT)
 
     async def answer(question: Msg) -> None:
         await question.respond(question.data + b" answered")
@@ -165,7 +165,7 @@ async def test_another_system_sees_nothing(nats1: NatsServers) -> None:
     assert [info.config.name for info in await node.jetstream().streams_info()] == ["log"]
     assert await stranger.jetstream().streams_info() == []
     await stranger.close()
-    async with trying(nats1, other, Role.NODE) as tried:
+    async with trying(nats1, other, UserRole.NODE) as tried:
         assert not await tried.may_publish(f"hf.{one}.root.log")
         assert not await tried.may_subscribe(f"hf.{one}.>")
     assert (await node.jetstream().stream_info("log")).state.messages == 0
@@ -263,7 +263,7 @@ def test_a_file_that_may_have_been_changed_by_hand_is_kept(tmp_path: Path) -> No
 
 def test_a_key_that_others_may_read_is_not_used_again(tmp_path: Path) -> None:
     write_server_files(tmp_path, [ONE], ["app"])
-    seed_file(tmp_path, "app", Role.NODE).chmod(0o644)
+    seed_file(tmp_path, "app", UserRole.NODE).chmod(0o644)
     with pytest.raises(SpecError, match=r"others may use .*app-node"):
         write_server_files(tmp_path, [ONE], ["app"], force=True)
 
@@ -301,12 +301,12 @@ def test_a_plan_that_does_not_work_is_refused(
 
 def test_no_text_of_a_plan_ends_its_quotes() -> None:
     strange = msgspec.structs.replace(ONE, store_dir='/var/"}\\')
-    assert 'store_dir: "/var/\\"}\\\\"' in server_text(strange, [strange], [Account("app", ())], "")
+    assert 'store_dir: "/var/\\"}\\\\"' in server_text(strange, [strange], [NatsAccount("app", ())], "")
 
 
 def test_a_server_that_others_reach_asks_for_certificates_everywhere() -> None:
     far = [msgspec.structs.replace(one, host=f"10.0.0.{one.name[1]}", tls=TLS) for one in THREE]
-    text = server_text(far[0], far, [Account("app", ())], "secret")
+    text = server_text(far[0], far, [NatsAccount("app", ())], "secret")
     assert text.count("verify: true") == text.count("tls {") == 2
     assert "nats-route://holdfast:secret@10.0.0.2:6224" in text
     assert 'http: "127.0.0.1:8222"' in text
@@ -316,5 +316,5 @@ def test_each_user_has_answers_of_its_own() -> None:
     keys = [public_key(new_seed()) for _ in range(2)]
     inboxes = {f"{inbox_of(key)}.>" for key in keys}
     for key in keys:
-        heard = permissions("app", User(Role.CLIENT, key)).subscribe
+        heard = permissions("app", User(UserRole.CLIENT, key)).subscribe
         assert inboxes & {*heard} == {f"{inbox_of(key)}.>"}

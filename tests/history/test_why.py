@@ -6,7 +6,15 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.group.protected import ProtectionStatus
-from holdfast.system.history.evidence import Allowance, ChildNow, Evidence, Memory, Outstanding, PutAside, Waiting
+from holdfast.system.history.evidence import (
+    Allowance,
+    ChildNow,
+    Evidence,
+    Outstanding,
+    ProcessMemory,
+    PutAside,
+    Waiting,
+)
 from holdfast.system.history.why import RULES, why
 
 AT = "/app/shop/till"
@@ -275,14 +283,14 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a child that is suspended": ({"children": [ChildNow("a", "suspended")]}, "Its child a is suspended."),
     "little memory is left": (
-        {"memory": Memory(250_000_000, 300_000_000)},
+        {"memory": ProcessMemory(250_000_000, 300_000_000)},
         (
             "Its process has 250 MB of memory, and is ended at 300 MB: if that goes on growing, look at what its "
             "state holds (`holdfast inspect --state`)."
         ),
     ),
     "much memory is left": (
-        {"memory": Memory(100_000_000, 300_000_000), "is_there": True, "lives": [life(1)], "status": status()},
+        {"memory": ProcessMemory(100_000_000, 300_000_000), "is_there": True, "lives": [life(1)], "status": status()},
         f"{AT} is running, in life 2, and nothing is wrong as far as is known.",
     ),
     "what waits": (

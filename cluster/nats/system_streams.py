@@ -7,7 +7,7 @@ from typing import Any
 from nats.js import api
 
 
-class Names:
+class SubjectNames:
     """What a system's subjects and streams are called.
 
     Args:
@@ -23,7 +23,7 @@ class Names:
         self.blob_stream = f"hf-{system}-blob"
 
 
-def stream_settings(names: Names, replicas: int) -> list[api.StreamConfig]:
+def stream_settings(names: SubjectNames, replicas: int) -> list[api.StreamConfig]:
     """The streams of a system, as they have to be."""
     common: dict[str, Any] = {
         "storage": api.StorageType.FILE,
