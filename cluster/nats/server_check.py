@@ -408,7 +408,7 @@ def _refusal(info: _Info) -> str | None:
 
 
 async def _asked(client: Client, what: str, kind: type[T], wanted: dict[str, int], seconds: float) -> T:
-    """The answer of the JetStream API.
+    """The answer of the JetStream API, asked for again each second: a request to a server that dies is lost.
 
     Raises:
         Unanswered: it does not come in time.
@@ -416,15 +416,19 @@ async def _asked(client: Client, what: str, kind: type[T], wanted: dict[str, int
     """
     from nats.errors import Error, NoRespondersError
 
-    try:
-        answer = await client.request(f"$JS.API.{what}", json.dumps(wanted).encode(), timeout=seconds)
-    except NoRespondersError:
-        raise
-    except TimeoutError as error:
-        raise Unanswered(_ENGINE, f"no answer to {what} in {seconds} s; may this user ask?") from error
-    except Error as error:
-        raise Unanswered(_ENGINE, f"{what}: {error}") from error
-    return _read(answer.data, kind)
+    until = monotonic() + seconds
+    while True:
+        left = until - monotonic()
+        try:
+            answer = await client.request(f"$JS.API.{what}", json.dumps(wanted).encode(), timeout=min(left, 1.0))
+            return _read(answer.data, kind)
+        except NoRespondersError:
+            raise
+        except TimeoutError as error:
+            if left <= 1.0:
+                raise Unanswered(_ENGINE, f"no answer to {what} in {seconds} s; may this user ask?") from error
+        except Error as error:
+            raise Unanswered(_ENGINE, f"{what}: {error}") from error
 
 
 def _read(data: bytes, kind: type[T]) -> T:
