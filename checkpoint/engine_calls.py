@@ -55,7 +55,7 @@ class Called:
         self.epoch = self._call(lambda: engine.epoch)
         self.in_hand: InHand | None = getattr(engine, "in_hand", None)
         self._waits_for = engine if isinstance(engine, SyncedEngine) else None
-        self.safe_at = safe_at_of(engine)
+        self.safe_at: SafeAt = safe_at_of(engine)
 
     def _call(self, method: Callable[P, T], *args: P.args, **named: P.kwargs) -> T:
         try:
