@@ -27,6 +27,7 @@ from holdfast.actors.errors import (
     StartFailed,
     TreeFailed,
     UnknownMessage,
+    Unreachable,
 )
 from holdfast.actors.exit_reasons import (
     KILLED,
@@ -38,6 +39,7 @@ from holdfast.actors.exit_reasons import (
     ExitReason,
     Hung,
     Killed,
+    NoConnection,
     NoProc,
     Normal,
     OutOfMemory,
@@ -65,6 +67,7 @@ from holdfast.supervision.rules import rule
 from holdfast.supervision.spec import ChildSpec, Plan, child
 from holdfast.supervision.supervisor import Supervisor
 from holdfast.supervision.tree import supervisor
+from holdfast.system.connection import Connection, connect
 from holdfast.system.run import run
 from holdfast.system.system import ActorSystem
 from holdfast.system.transaction.errors import TransactionFailed, TransactionRefused
@@ -82,6 +85,7 @@ __all__ = [
     "Backoff",
     "Binding",
     "ChildSpec",
+    "Connection",
     "Crash",
     "DeleteChild",
     "ExitReason",
@@ -98,6 +102,7 @@ __all__ = [
     "Monitor",
     "NOPROC",
     "NORMAL",
+    "NoConnection",
     "NoProc",
     "Normal",
     "OutOfMemory",
@@ -124,11 +129,13 @@ __all__ = [
     "TreeFailed",
     "TrustBreach",
     "UnknownMessage",
+    "Unreachable",
     "WhichChildren",
     "__version__",
     "bounded",
     "checkpoint_only",
     "child",
+    "connect",
     "dynamic",
     "fencing_token",
     "fresh",

@@ -212,6 +212,13 @@ class AskFailed(HoldfastError, text="{actor} ended while it handled the message:
     reason: str
 
 
+class Unreachable(SendError, text="{actor} cannot be reached: {problem}; nothing was sent"):
+    """The program that the receiver lives in is known to be cut off, or to have ended."""
+
+    actor: str
+    problem: str
+
+
 class RemoteCrash(HoldfastError):
     """The receiver's handler raised; the actor crashed.
 

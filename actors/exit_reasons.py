@@ -122,6 +122,15 @@ class Hung(ExitReason, frozen=True):
         return f"hung for {self.seconds:g} s"
 
 
+class NoConnection(ExitReason, frozen=True):
+    """The program that the actor lives in does not answer any more: a suspicion, the actor may well live on."""
+
+    node: str
+
+    def __str__(self) -> str:
+        return f"no connection to {self.node}"
+
+
 class TrustBreach(ExitReason, frozen=True):
     """The OS process was ended because it said what it may not, or what cannot be."""
 
@@ -180,6 +189,8 @@ def pack_exit(reason: ExitReason) -> dict[str, object]:
             return {"exit": "Hung", "seconds": seconds}
         case TrustBreach(problem=problem):
             return {"exit": "TrustBreach", "text": problem}
+        case NoConnection(node=node):
+            return {"exit": "NoConnection", "text": node}
         case _:
             return {"exit": type(reason).__name__}
 
@@ -210,6 +221,8 @@ def unpack_exit(data: object) -> ExitReason:
             return OutOfMemory(wire.text)
         case "Hung":
             return Hung(wire.seconds)
+        case "NoConnection":
+            return NoConnection(wire.text)
         case "TrustBreach":
             return TrustBreach(wire.text)
         case other:

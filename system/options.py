@@ -37,6 +37,7 @@ class SystemOptions:
     store_key: StoreKey | None = dataclasses.field(repr=False)
     durability: Durability | None
     standby: Standby | None
+    reachable: str | None
     nats: NatsSettings
     flags: Flags
     preload: tuple[str, ...]
@@ -65,6 +66,13 @@ class SystemOptions:
         if hooks is not None and not isinstance(hooks, RecoveryHooks):
             raise SpecError("ActorSystem", f"recovery_hooks must come from recovery_hooks(...), not be {hooks!r}")
         check_limits(self.watch_lag, self.watch_turns)
+
+    @property
+    def reached_at(self) -> str | None:
+        """Where other programs find the system, if they do."""
+        if self.reachable is None and isinstance(self.store, str) and is_replicated(self.store):
+            return self.store
+        return self.reachable
 
     @staticmethod
     def configured(

@@ -42,6 +42,7 @@ from ..checkpoint.store_key import StoreKey
 from ..checkpoint.store_opening import check_system, open_journal
 from ..cluster.joining import is_replicated, join
 from ..cluster.leadership import LeadershipLost, Standby
+from ..cluster.lines.lines import Lines, Transport, new_boot
 from ..cluster.log_writer import Deposed
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.children import tell_stopped
@@ -49,6 +50,7 @@ from ..supervision.patience import end_within
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor, kill_starting
+from .connection import serve
 from .controls import Controls
 from .full_collections import seldom_collected
 from .history.calls import HistoryCalls
@@ -100,6 +102,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             Each child may say otherwise: `hybrid(durability=...)`.
         standby: with a store on several machines: wait while another program leads the system, until this one does:
             "warm" with what is stored in memory, "cold" without. None: StoreInUse names who leads.
+        reachable: "nats://HOST,HOST/NAME": where `hf.connect` of other programs finds this system. A store on several
+            machines is that place by itself.
         intensity, period: how many restarts of its direct children the root allows before the tree fails.
         preload: modules the fork server imports beforehand, besides those of the actors it starts.
         log: write crashes, dead letters, output of processes and the like to structlog or standard logging, whichever
@@ -126,6 +130,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         store_key: StoreKey | None = None,
         durability: Durability | None = None,
         standby: Standby | None = None,
+        reachable: str | None = None,
         intensity: int = 3,
         period: float = 5.0,
         preload: Sequence[str] = (),
@@ -147,6 +152,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             store_key=store_key,
             durability=durability,
             standby=standby,
+            reachable=reachable,
             flags=Flags("one_for_one", intensity, period),
             preload=tuple(preload),
             log=log,
@@ -168,6 +174,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         self._failure: TreeFailed | LeadershipLost | None = None
         self._stopping: set[asyncio.Task[None]] = set()
         self._transactions = Transactions()
+        self._transport: Transport | None = None
         self._patience: asyncio.TimerHandle | None = None
 
     @property
@@ -213,12 +220,14 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         self._watch.open()
         self._specifications = Specifications(self._homes, is_kept=options.store is not None)
         self._mechanism_notes = MechanismNotes(self._homes)
+        epoch = engine.epoch if engine.safe_at == "sync" else None
+        self._lines = Lines(node, self.name, new_boot(epoch), self._homes)
         node.connect(
             Ports(
                 host_for=self._host_for,
                 complete=self._complete,
                 respec=respec,
-                outside=self._homes.addresses.find,
+                outside=self._outside,
                 keeper=self._homes,
                 run_in_process=self._workers.effects.run,
             )
@@ -232,6 +241,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
                 await up
             root.ended().add_done_callback(self._root_ended)
             await self._specifications.start_added(lambda spec: root.ref.ask(StartChild(spec), LONG))
+            if (at := options.reached_at) is not None:
+                self._transport = await serve(self._lines, at, options.nats)
         except asyncio.CancelledError as error:
             if self._failure is not None:  # Nobody is in the body yet who would hear of it.
                 await self.__aexit__(type(error), error, error.__traceback__)
@@ -311,6 +322,9 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         with contextlib.suppress(TimeoutError):  # Who keeps the store elsewhere may be away.
             async with asyncio.timeout(SETTLE_SECONDS if self._homes.journal.engine.safe_at == "sync" else None):
                 await self._homes.settled()
+        self._lines.close()
+        if self._transport is not None:
+            await self._transport.close()
         if self._history is not None:
             self._history.close()
         try:
@@ -320,6 +334,16 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             node.events.close()
             if self._sink is not None:
                 self._sink.close()
+
+    def _outside(self, path: str) -> Cell | None:
+        """Whoever is reached at an address that is not of a cell of the tree: recorded here, or another system's."""
+        return self._homes.addresses.find(path) or self._lines.find(path)
+
+    @property
+    def lines(self) -> Lines:
+        """The lines to other systems."""
+        assert self._node is self._running
+        return self._lines
 
     def _make_pool(self, node: Node) -> Workers:
         """The processes of this system."""

@@ -3,7 +3,7 @@
 The receiver's journal says of such an input whose turn asks, (turn, k). So the receiver, whose home may be open first,
 answers to whoever that is: to the asker's home if that is open, else into the asker's journal, where it finds it.
 What the receiver never had (its mailbox was full, say) ends at its deadline: it may have been forwarded, so it is not
-asked again.
+asked again. An ask of another system is answered to that, and comes again until it has its outcome.
 
 Whom a turn tells or asks something may not have been started by the new program yet. The message is kept for it in its
 journal, and becomes an input when its home is opened.
@@ -12,8 +12,11 @@ journal, and becomes an input when its home is opened.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+import msgspec
+
+from ...actors.errors import HoldfastError
 from ...actors.kernel.codec import Parcel
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer, Out
@@ -22,11 +25,17 @@ from .input_ledger import outcome_entry
 from .pending_asks import MARK, OVER, SwitchAsk
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from ...actors.kernel.codec import Codec
     from .homes import Homes
     from .switch import Switch
+
+
+FAR: Final = "far"
+"""The address of far answers in the store; no actor's, for those begin with a slash."""
+MOST_ENTRIES: Final = 2000
+"""Entries after which what is left is written anew."""
 
 
 class RejoinedAsk(SwitchAsk, eq=False):
@@ -53,9 +62,129 @@ class RejoinedAsk(SwitchAsk, eq=False):
         elif not self.is_over:
             self.is_over, self.future = True, OVER
             own = batch if batch is not None else Batch()
-            own.add(self.asker, outcome_entry(self.turn, self.k, answer), [])
+            if homes.far.is_far(self.asker):
+                homes.far.answered(FarId(self.asker, self.turn, self.k), answer, own)
+            else:
+                own.add(self.asker, outcome_entry(self.turn, self.k, answer), [])
             if batch is None:
                 own.commit(homes.journal)
+
+
+class FarId(NamedTuple):
+    """How an ask is known that another system has sent: no other ask has the name, in any run of that system.
+
+    Attributes:
+        asker: the address of who has asked.
+        number: that its program has given the ask.
+        run: the number of that run of the program.
+    """
+
+    asker: str
+    number: int
+    run: int
+
+
+class FarAnswer(msgspec.Struct, array_like=True, frozen=True):
+    """The outcome of such an ask, as it is kept."""
+
+    asker: str
+    number: int
+    run: int
+    kind: str
+    name: str
+    body: bytes
+
+
+class FarAsks:
+    """What recorded actors were asked by other systems: each ask has one outcome, whoever leads this system.
+
+    The journal of the receiver has an ask as an input; its outcome is kept in the append that ends its turn, until the
+    other system is known to have it. An ask that comes again is one of the two, or has never been accepted.
+
+    Attributes:
+        deliver: is told each outcome when it is safe.
+    """
+
+    def __init__(self, homes: Homes) -> None:
+        self._homes = homes
+        self._answers: dict[FarId, FarAnswer] = {}
+        self._open: set[FarId] = set()
+        self._positions: list[int] = []
+        self._opening: dict[str, list[Callable[[], None]]] = {}
+        self.deliver: Callable[[FarId, Answer], None] = lambda which, answer: None
+        saved = homes.journal.load(FAR)
+        if saved.snapshot is not None:
+            for one in msgspec.msgpack.decode(saved.snapshot, type=list[FarAnswer]):
+                self._answers[_id(one)] = one
+        for position, entry in saved.entries:
+            self._positions.append(position)
+            values: tuple[Any, ...] = entry
+            one = FarAnswer(*values[1:])
+            self._answers[_id(one)] = one
+        self._turn = saved.turn
+
+    def is_far(self, path: str) -> bool:
+        """Whether an address is another system's."""
+        top = f"/{self._homes.node.name}"
+        return path != top and not path.startswith(f"{top}/")
+
+    def begin(self, which: FarId) -> None:
+        """It is on its way to its receiver."""
+        self._open.add(which)
+
+    def is_open(self, which: FarId) -> bool:
+        """Whether its outcome will come: the receiver has it."""
+        return which in self._open or self._homes.rejoin.has(*which)
+
+    def outcome(self, which: FarId) -> Answer | None:
+        """The outcome, if it is known."""
+        one = self._answers.get(which)
+        return None if one is None else Answer(one.kind, one.name, one.body)
+
+    def answered(self, which: FarId, answer: Answer, batch: Batch) -> None:
+        """It has its outcome, which is safe behind the batch."""
+        self._open.discard(which)
+        one = FarAnswer(*which, answer.kind, answer.name, bytes(answer.body))
+
+        def safe() -> None:
+            self._answers[which] = one
+            self.deliver(which, answer)
+            self._tidy()
+
+        if self._homes.journal.durable:
+            batch.add(FAR, ("answered", *msgspec.structs.astuple(one)), self._positions)
+        batch.after.append(safe)
+
+    def settled(self, which: FarId) -> None:
+        """Whoever has asked has the outcome, or does not want it any more."""
+        self._answers.pop(which, None)
+
+    def when_opened(self, path: str, then: Callable[[], None]) -> None:
+        """Have something done when the home of a recorded address that nobody was started at yet is open."""
+        self._opening.setdefault(path, []).append(then)
+
+    def opened(self, path: str) -> None:
+        """A home is open: what it has is known."""
+        for then in self._opening.pop(path, ()):
+            then()
+
+    def _tidy(self) -> None:
+        """Write what is left anew when much has come and gone."""
+        if len(self._positions) < MOST_ENTRIES:
+            return
+        journal = self._homes.journal
+        left = msgspec.msgpack.encode(list(self._answers.values()))
+        try:
+            journal.barrier()
+            journal.cut(FAR, left, self._positions, turn=self._turn + 1, keep=1)
+        except HoldfastError:
+            return  # It stays as long as it is, and is tried again.
+        self._turn += 1
+        self._positions.clear()
+
+
+def _id(one: FarAnswer) -> FarId:
+    return FarId(one.asker, one.number, one.run)
 
 
 class KeptMessage(NamedTuple):
@@ -117,6 +246,7 @@ class Rejoin:
             home.calls.later[key] = self._of(asker, *_numbers(origin))
         home.calls.owed.clear()
         self._hand_over(home)
+        self._homes.far.opened(home.path)
 
     def _owed(self, home: Switch, source: Input) -> None:
         assert source.sender is not None
@@ -142,6 +272,11 @@ class Rejoin:
             ask.asker = paths.get(ask.asker, ask.asker)
         self._asks = {(ask.asker, ask.turn, ask.k): ask for ask in self._asks.values()}
         self._kept = {paths.get(path, path): kept for path, kept in self._kept.items()}
+
+    def has(self, asker: str, turn: int, k: int) -> bool:
+        """Whether the outcome of an ask from before this program began is still to come."""
+        ask = self._asks.get((asker, turn, k))
+        return ask is not None and not ask.is_over
 
     def forget(self, ask: RejoinedAsk) -> None:
         """Wait no longer for an ask that has its outcome."""

@@ -21,7 +21,7 @@ from ..snapshot.rollback import older_snapshot, roll_back
 from ..snapshot.snapshot_groups import Groups
 from ..snapshot.snapshot_record import take_over
 from ..snapshot.snapshot_schedule import nobody
-from .ask_recovery import Rejoin
+from .ask_recovery import FAR, FarAsks, Rejoin
 from .capacity import HomeBound
 from .disposal import drop_all, forget_home, put_into_quarantine
 from .held_messages import Holding, let_go
@@ -68,9 +68,10 @@ class Homes:
         self.planted: dict[str, Saved] = {}  # what the next life at an address begins with, whatever is recorded
         node.numbers.begin_tokens(_first_token(journal, node.clock.wall()))
         unfinished = journal.notes(ERASING).get(ERASING)
-        self._stored = set(journal.addresses()) - {PLACE}
+        self._stored = set(journal.addresses()) - {PLACE, FAR}
         self.groups = Groups(self)
         self.rejoin = Rejoin(self)
+        self.far = FarAsks(self)
         if unfinished is not None:  # This process's predecessor died in the middle of it.
             self._erase_tree(unfinished.decode())
 

@@ -18,6 +18,7 @@ class SubjectNames:
         self.log = f"hf.{system}.root.log"
         self.lease = f"hf.{system}.root.lease"
         self.blobs = f"hf.{system}.blob"
+        self.inbox = f"hf.{system}.root.in"
         self.log_stream = f"hf-{system}-log"
         self.lease_stream = f"hf-{system}-lease"
         self.blob_stream = f"hf-{system}-blob"

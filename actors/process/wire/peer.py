@@ -248,9 +248,13 @@ class Peer:
         parcel = Parcel(name, bytes(frame.body))
         Offered(self, frame.id, parcel, (sender, frame.chain), topic).begin(cells)
 
+    def ask_in(self, frame: frames.Ask, cell: Cell, page: memoryview | None) -> RelayedAsk:
+        """The ask in a frame, without its message."""
+        return RelayedAsk.taken(self, frame, cell, page)
+
     def on_ask(self, cell: Cell, frame: frames.Ask, page: memoryview | None) -> None:
         """Take in an ask; its outcome goes back over this connection."""
-        ask = RelayedAsk.taken(self, frame, cell, page)
+        ask = self.ask_in(frame, cell, page)
         try:
             try:
                 ask.message = self._message_in(cell, frame)

@@ -1,0 +1,1 @@
+"""Lines between systems: refs, asks, topics and watches across them, over a transport that may lose and repeat."""

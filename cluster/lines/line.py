@@ -1,0 +1,247 @@
+"""A line: what one program sends another arrives once and in order, over a transport that may lose and repeat.
+
+Both ends number what they send, keep it until the other end says that it has it, and send it again from there on. A
+line joins two incarnations: what was sent to a program that was started anew since is refused, however late it comes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from typing import Final, Literal, NamedTuple
+
+import msgspec
+
+RESEND_SECONDS: Final = 0.5
+"""After so long without a word that something has come, it is sent again."""
+ACK_SECONDS: Final = 0.02
+"""How long what has come may wait to be acknowledged with what is sent anyway."""
+ACK_AT_ONCE: Final = 256
+"""Items after which that is not waited for."""
+BATCH_BYTES: Final = 256 * 1024
+"""Bytes of items after which a batch is full."""
+MOST_BYTES: Final = 7 * 1024 * 1024
+"""The largest item, in bytes: servers take messages of 8 MiB."""
+WINDOW_BYTES: Final = 8 * 1024 * 1024
+"""Bytes on the way from which on senders that can wait do."""
+
+
+class Boot(NamedTuple):
+    """One run of a program: of two runs of one system the later one has the larger era."""
+
+    era: int
+    token: str
+
+
+NOBODY: Final = Boot(0, "")
+"""The incarnation that a greeting is for: whoever is there."""
+
+Note = Literal["", "lost", "unknown", "bye"]
+"""What a batch says besides: something before it has not come; whoever it answers is not known; the line ends."""
+
+
+class Batch(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
+    """What is posted at once.
+
+    Attributes:
+        sender: the name of the program that sends it.
+        boot: the incarnation of that program.
+        to: the incarnation that it is for; NOBODY in a greeting.
+        got: how many items of the other end have come.
+        first: the number of the first item.
+        items: in order.
+        note: what it says besides.
+    """
+
+    sender: str
+    boot: Boot
+    to: Boot
+    got: int
+    first: int
+    items: tuple[bytes, ...]
+    note: Note = ""
+
+
+class Item(NamedTuple):
+    """What is kept until it has arrived, and what is done then."""
+
+    data: bytes
+    arrived: Callable[[], None] | None
+
+
+class Line:
+    """One end of a line.
+
+    Args:
+        loop: whose clock it goes by.
+        post: posts a batch of the items from a number on, with what has come so far, and a note; it may get lost.
+        take: is given each item of the other end, once and in order.
+
+    Attributes:
+        got: how many items of the other end have come.
+    """
+
+    __slots__ = (
+        "_arrived",
+        "_bytes",
+        "_flushing",
+        "_loop",
+        "_missed",
+        "_owed",
+        "_owing",
+        "_post",
+        "_resend",
+        "_sent",
+        "_take",
+        "_waiters",
+        "_waiting",
+        "got",
+        "is_open",
+    )
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        post: Callable[[int, tuple[bytes, ...], Note], None],
+        take: Callable[[bytes], None],
+    ) -> None:
+        self._loop, self._post, self._take = loop, post, take
+        self.got = 0
+        self.is_open = True
+        self._waiting: deque[Item] = deque()  # sent, and not known to have arrived; then what is not sent yet
+        self._arrived = 0  # how many of all items so far the other end has said to have
+        self._sent = 0  # how many of all items so far have been sent
+        self._owed = 0  # items that have come and are not acknowledged
+        self._missed = -1  # how many had come when it was last said that the next one had not
+        self._bytes = 0
+        self._flushing: asyncio.Handle | None = None
+        self._owing: asyncio.TimerHandle | None = None
+        self._resend: asyncio.TimerHandle | None = None
+        self._waiters: list[asyncio.Future[None]] = []
+
+    # -- out --------------------------------------------------------------------------------------------------------
+
+    def put(self, data: bytes, arrived: Callable[[], None] | None = None) -> None:
+        """Send an item with all others of this tick; `arrived` is called when the other end has said that it has it."""
+        if not self.is_open:
+            return
+        self._waiting.append(Item(data, arrived))
+        self._bytes += len(data)
+        if self._flushing is None:
+            self._flushing = self._loop.call_soon(self.flush)
+
+    @property
+    def has_room(self) -> bool:
+        """Whether the other end keeps up."""
+        return self._bytes < WINDOW_BYTES
+
+    def room(self) -> asyncio.Future[None] | None:
+        """None while the other end keeps up; else a future that ends when it does again, or the line has ended."""
+        if self.has_room or not self.is_open:
+            return None
+        future: asyncio.Future[None] = self._loop.create_future()
+        self._waiters.append(future)
+        return future
+
+    def flush(self) -> None:
+        """Post what has not been sent yet."""
+        if self._flushing is not None:
+            self._flushing.cancel()
+            self._flushing = None
+        if not self.is_open:
+            return
+        at = self._sent - self._arrived
+        while at < len(self._waiting):
+            items: list[bytes] = []
+            size = 0
+            while at + len(items) < len(self._waiting) and (not items or size < BATCH_BYTES):
+                data = self._waiting[at + len(items)].data
+                items.append(data)
+                size += len(data)
+            first, self._sent = self._sent + 1, self._sent + len(items)
+            at += len(items)
+            self._acknowledged()
+            self._post(first, tuple(items), "")
+        if self._waiting and self._resend is None:
+            self._resend = self._loop.call_later(RESEND_SECONDS, self._again)
+
+    def say(self, note: Note = "") -> None:
+        """Post a batch without items: what has come, and a note."""
+        if self.is_open:
+            self._acknowledged()
+            self._post(self._sent + 1, (), note)
+
+    def _acknowledged(self) -> None:
+        self._owed = 0
+        if self._owing is not None:
+            self._owing.cancel()
+            self._owing = None
+
+    def _again(self) -> None:
+        if self._resend is not None:
+            self._resend.cancel()
+            self._resend = None
+        self._sent = self._arrived
+        self.flush()
+
+    # -- in ---------------------------------------------------------------------------------------------------------
+
+    def hear(self, batch: Batch) -> None:
+        """Take a batch of the other end."""
+        self._arrive(batch.got)
+        if batch.note == "lost" and self._waiting:
+            self._again()
+        if not batch.items:
+            return
+        if batch.first > self.got + 1:
+            if self._missed != self.got:  # Once: if that is lost too, it is sent again after a while.
+                self._missed = self.got
+                self.say("lost")
+            return
+        before = self.got
+        for data in batch.items[self.got + 1 - batch.first :]:
+            if not self.is_open:
+                return
+            self.got += 1
+            self._owed += 1
+            self._take(data)
+        if self._owed >= ACK_AT_ONCE or self.got == before:  # Or all of it is sent again: our word was lost.
+            self.say()
+        elif self._owed and self._owing is None:
+            self._owing = self._loop.call_later(ACK_SECONDS, self.say)
+
+    def _arrive(self, got: int) -> None:
+        """The other end has so many of our items."""
+        if got <= self._arrived:
+            return
+        if self._resend is not None:
+            self._resend.cancel()
+            self._resend = None
+        while self._arrived < got and self._waiting:
+            item = self._waiting.popleft()
+            self._arrived += 1
+            self._bytes -= len(item.data)
+            if item.arrived is not None:
+                item.arrived()
+        self._sent = max(self._sent, self._arrived)
+        if self._waiting:
+            self._resend = self._loop.call_later(RESEND_SECONDS, self._again)
+        if self.has_room:
+            self._release()
+
+    def _release(self) -> None:
+        waiters, self._waiters = self._waiters, []
+        for one in waiters:
+            if not one.done():
+                one.set_result(None)
+
+    def close(self) -> None:
+        """End it: nothing is sent or taken any more, and whoever waits for room goes on."""
+        self.is_open = False
+        for handle in (self._flushing, self._owing, self._resend):
+            if handle is not None:
+                handle.cancel()
+        self._flushing = self._owing = self._resend = None
+        self._waiting.clear()
+        self._release()

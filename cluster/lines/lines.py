@@ -1,0 +1,292 @@
+"""All lines of one program: who is reached over them, and who is greeted, suspected and forgotten when."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final, Protocol
+
+import msgspec
+
+from ...actors.errors import HoldfastError, SpecError
+from ...checkpoint.home.ask_recovery import FarId
+from ...checkpoint.protocol import Answer
+from .far_line import FarLine
+from .line import NOBODY, Batch, Boot
+
+if TYPE_CHECKING:
+    from ...actors.kernel.cell import Cell
+    from ...actors.kernel.node import Node
+    from ...checkpoint.home.homes import Homes
+
+BEAT_SECONDS: Final = 1.0
+"""How often each end says that it is there."""
+SILENT_SECONDS: Final = 5.0
+"""After so long without a word the other end is suspected to be gone."""
+FORGET_SECONDS: Final = 30.0
+"""After so long without a word whoever has called is forgotten."""
+STARTING_SECONDS: Final = 5.0
+"""How long after its begin a system keeps what comes for actors that it has not started yet."""
+_DECODER: Final[msgspec.msgpack.Decoder[Batch]] = msgspec.msgpack.Decoder(Batch)
+
+
+class LineTaken(HoldfastError, text="there is a connection to a system called {system} already: use that one"):
+    """Two systems of one name cannot both be reached: their addresses would be the same."""
+
+    system: str
+
+
+class Transport(Protocol):
+    """Carries bytes between programs, each at most once, those from one place to another in order."""
+
+    def post(self, to: str, data: bytes, back: str) -> None:
+        """Send bytes to a place; `back` is where answers go. They may get lost."""
+        ...
+
+    async def hear(self, at: str, take: Callable[[bytes, str], None]) -> None:
+        """Have what is sent to a place taken, with where answers go, on the running loop.
+
+        Raises:
+            Unanswered: it cannot be listened to there.
+        """
+        ...
+
+    def own_place(self) -> str:
+        """A place at which this program alone may listen."""
+        ...
+
+    async def close(self) -> None:
+        """Send what was posted, and end."""
+        ...
+
+
+def new_boot(era: int | None = None) -> Boot:
+    """An incarnation; `era` is a number that rises with each one of this system, the clock's if left out."""
+    return Boot(time.time_ns() // 1_000_000 if era is None else era, secrets.token_hex(6))
+
+
+class Lines:
+    """The lines of one node.
+
+    Args:
+        node: whose actors use them.
+        name: of this program, as others know it.
+        boot: the incarnation of this program.
+        homes: the recorded actors here, if there can be any.
+    """
+
+    def __init__(self, node: Node, name: str, boot: Boot, homes: Homes | None = None) -> None:
+        self.node, self.name, self.boot, self.homes = node, name, boot, homes
+        self._lines: dict[str, FarLine] = {}
+        self._gates: list[Gate] = []
+        self._began = node.loop.time()
+        self._awaited: list[tuple[str, Callable[[], None]]] = []
+        self._beat: asyncio.TimerHandle | None = None
+        if homes is not None:
+            homes.far.deliver = self._deliver
+
+    def find(self, path: str) -> Cell | None:
+        """The stand-in for an actor of another program, if there is a line to that."""
+        far = self._lines.get(path[1:].partition("/")[0])
+        return None if far is None else far.stand_in(path)
+
+    def open(self, name: str, post: Callable[[bytes], None]) -> FarLine:
+        """A line to another program, which has not answered yet.
+
+        Raises:
+            LineTaken: there is one to a program of that name, or this one is called so.
+        """
+        if name in self._lines or name == self.name:
+            raise LineTaken(name)
+        far = self._lines[name] = FarLine(self.node, (self.name, self.boot), name, post, self.homes)
+        far.await_actor = self._await_actor
+        if self._beat is None:
+            self._beat = self.node.loop.call_later(BEAT_SECONDS, self._look)
+        return far
+
+    def at(self, name: str) -> FarLine | None:
+        """The line to the program of that name."""
+        return self._lines.get(name)
+
+    def drop(self, far: FarLine) -> None:
+        """End a line."""
+        far.close()
+        if self._lines.get(far.name) is far:
+            del self._lines[far.name]
+
+    def serve(self, transport: Transport) -> Gate:
+        """Answer whoever calls by this transport."""
+        gate = Gate(self, transport)
+        self._gates.append(gate)
+        return gate
+
+    def close(self) -> None:
+        """End all lines."""
+        for far in list(self._lines.values()):
+            self.drop(far)
+        if self._beat is not None:
+            self._beat.cancel()
+
+    def _deliver(self, which: FarId, answer: Answer) -> None:
+        far = self._lines.get(which.asker[1:].partition("/")[0])
+        if far is not None:
+            far.deliver(which, answer)
+
+    def _await_actor(self, path: str, then: Callable[[], None]) -> bool:
+        """Have something done when an actor is started at an address, or cannot be hoped for any more."""
+        loop = self.node.loop
+        left = self._began + STARTING_SECONDS - loop.time()
+        if self.node.root is None or left <= 0.0:
+            return False
+        timer: asyncio.TimerHandle | None = None
+        come = self.node.awaited.setdefault(path, [])
+
+        def soon() -> None:
+            if timer is not None:
+                timer.cancel()
+            loop.call_soon(then)
+
+        def over() -> None:
+            if soon in come:
+                come.remove(soon)
+            then()
+
+        come.append(soon)
+        timer = loop.call_later(left, over)
+        return True
+
+    def _look(self) -> None:
+        """Say that we are here, and see who has not said so for long."""
+        loop = self.node.loop
+        self._beat = loop.call_later(BEAT_SECONDS, self._look) if self._lines else None
+        for far in list(self._lines.values()):
+            quiet = loop.time() - far.heard
+            if quiet > FORGET_SECONDS and any(gate.has(far) for gate in self._gates):
+                self.drop(far)
+                continue
+            if quiet > SILENT_SECONDS:
+                far.lose()
+            far.say()
+
+
+class Gate:
+    """Answers whoever calls this program."""
+
+    def __init__(self, lines: Lines, transport: Transport) -> None:
+        self._lines, self._transport = lines, transport
+        self._back: dict[FarLine, str] = {}
+
+    def has(self, far: FarLine) -> bool:
+        """Whether a line was made because somebody has called here."""
+        return far in self._back
+
+    def hear(self, data: bytes, back: str) -> None:
+        """Take what was posted to this program."""
+        lines = self._lines
+        try:
+            batch = _DECODER.decode(data)
+        except msgspec.MsgspecError:
+            return  # It comes from no program of ours.
+        far = lines.at(batch.sender)
+        if far is not None and far not in self._back:
+            return  # Its name is that of a system that this one has called.
+        if batch.to == NOBODY:
+            if far is not None and far.theirs != batch.boot:
+                if far.theirs.era > batch.boot.era:
+                    return  # An earlier run, late.
+                self._drop(far)
+                far = None
+            if far is None:
+                far = lines.open(batch.sender, lambda data: self._post(batch.sender, data))
+                self._back[far] = back
+                far.begin(batch.boot)
+            self._back[far] = back
+            far.alive()
+            far.say()
+        elif batch.to != lines.boot or far is None or far.theirs != batch.boot:
+            answer = Batch(lines.name, lines.boot, batch.boot, 0, 1, (), "unknown")
+            self._transport.post(back, msgspec.msgpack.encode(answer), "")
+        elif batch.note == "bye":
+            self._drop(far)
+        else:
+            self._back[far] = back
+            far.hear(batch)
+
+    def _drop(self, far: FarLine) -> None:
+        self._lines.drop(far)
+        self._back.pop(far, None)
+
+    def _post(self, name: str, data: bytes) -> None:
+        far = self._lines.at(name)
+        if far is not None:
+            self._transport.post(self._back[far], data, "")
+
+
+class Call:
+    """Calls another program, and calls again when that is led by another one.
+
+    Args:
+        lines: of this program.
+        transport: how the other one is reached.
+        to: where it listens.
+        name: of the other program.
+        begun: called whenever a program that leads it has answered for the first time.
+
+    Raises:
+        LineTaken: there is a line to a program of that name.
+    """
+
+    def __init__(
+        self, lines: Lines, transport: Transport, to: str, name: str, begun: Callable[[], None] = lambda: None
+    ) -> None:
+        self._begun = begun
+        self._lines, self._transport, self._to = lines, transport, to
+        self._own = transport.own_place()
+        self._newest = NOBODY
+        self.far = lines.open(name, lambda data: transport.post(to, data, self._own))
+        self._answered: asyncio.Future[None] = lines.node.loop.create_future()
+
+    async def begin(self, seconds: float) -> None:
+        """Greet the other program, and wait until it has answered.
+
+        Raises:
+            TimeoutError: it has not. SpecError: it has another name.
+        """
+        await self._transport.hear(self._own, self.hear)
+        async with asyncio.timeout(seconds):
+            while not self._answered.done():
+                self.far.say()
+                await asyncio.wait((self._answered,), timeout=0.2)
+        self._answered.result()
+
+    def hear(self, data: bytes, back: str) -> None:
+        """Take what the other program has posted."""
+        far, lines = self.far, self._lines
+        try:
+            batch = _DECODER.decode(data)
+        except msgspec.MsgspecError:
+            return
+        if batch.to != lines.boot or batch.boot.era < self._newest.era or far.is_closed:
+            return  # To an earlier run of this program, or of one that leads no more.
+        self._newest = batch.boot
+        if far.line is not None and (batch.boot != far.theirs or batch.note in ("unknown", "bye")):
+            far.end("another program leads it" if batch.boot != far.theirs else "it has ended")
+            if batch.note != "bye":
+                far.say()
+        elif far.line is None and not batch.note:
+            if batch.sender != far.name:
+                if not self._answered.done():
+                    problem = (
+                        f"the system there is called {batch.sender!r}, not {far.name!r}: say system={batch.sender!r}"
+                    )
+                    self._answered.set_exception(SpecError("connect", problem))
+                return
+            far.begin(batch.boot)
+            if not self._answered.done():
+                self._answered.set_result(None)
+            self._begun()
+            far.hear(batch)
+        elif far.line is not None:
+            far.hear(batch)

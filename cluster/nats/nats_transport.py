@@ -1,0 +1,98 @@
+"""Lines over NATS: plain messages between programs, which the servers pass on and do not keep."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import nats.errors
+from nats.aio.client import Client
+from nats.aio.msg import Msg
+
+from ..engine_thread import end_tasks
+from .access import NatsAccess, connect_options
+from .nats_engine import CONNECT_SECONDS, answering
+
+
+class NatsTransport:
+    """Carries the batches of lines; see `cluster.lines.lines.Transport`.
+
+    Args:
+        client: connected, and closed with the transport.
+        name: what errors call the servers, without secrets.
+    """
+
+    def __init__(self, client: Client, name: str) -> None:
+        self._client, self._name = client, name
+        self._out: deque[tuple[str, bytes, str]] = deque()
+        self._has_some = asyncio.Event()
+        self._is_closing = False
+        self._poster = asyncio.get_running_loop().create_task(self._post_all(), name=f"lines of {name}")
+
+    def post(self, to: str, data: bytes, back: str) -> None:
+        """Send bytes to a subject, unless no server is there; see `Transport`."""
+        if self._client.is_connected:
+            self._out.append((to, data, back))
+            self._has_some.set()
+
+    async def _post_all(self) -> None:
+        while self._out or not self._is_closing:
+            await self._has_some.wait()
+            self._has_some.clear()
+            while self._out:
+                to, data, back = self._out.popleft()
+                if self._client.is_connected:  # Else it would wait for a server, and come much later.
+                    with contextlib.suppress(nats.errors.Error, OSError):
+                        await self._client.publish(to, data, reply=back)
+
+    async def hear(self, at: str, take: Callable[[bytes, str], None]) -> None:
+        """Listen to a subject; see `Transport`."""
+
+        async def taken(message: Msg) -> None:
+            take(message.data, message.reply)
+
+        with answering(self._name):
+            await self._client.subscribe(at, cb=taken)
+            await self._client.flush()
+
+    def own_place(self) -> str:
+        """A subject of this client's own; see `Transport`."""
+        return self._client.new_inbox()
+
+    async def close(self) -> None:
+        """Send what was posted, and disconnect; see `Transport`."""
+        with contextlib.suppress(nats.errors.Error, TimeoutError, OSError):
+            self._is_closing = True
+            self._has_some.set()
+            async with asyncio.timeout(1.0):
+                await self._poster
+                await self._client.flush(timeout=1)
+        await end_tasks(self._poster)
+        with contextlib.suppress(nats.errors.Error, TimeoutError, OSError):
+            await self._client.close()
+
+
+async def _pass_over(error: Exception) -> None:
+    """Do nothing: the client connects again, and lines send again what was lost."""
+
+
+async def open_transport(access: NatsAccess) -> NatsTransport:
+    """Connect.
+
+    Raises:
+        SpecError: a file of secrets or certificates must not be used.
+        Unanswered: no server can be reached.
+    """
+    client = Client()
+    options: dict[str, Any] = {**connect_options(access), "error_cb": _pass_over}
+    with answering(access.name):
+        try:
+            async with asyncio.timeout(CONNECT_SECONDS):
+                await client.connect(**options)
+        except BaseException:
+            await client.close()
+            raise
+    return NatsTransport(client, access.name)

@@ -1,0 +1,219 @@
+"""Connections to other systems: `hf.connect`, and how a system is reached itself."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from importlib.util import find_spec
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, TypeVar, overload
+
+from ..actors.errors import HoldfastError, SpecError, Unreachable
+from ..actors.kernel.actor import Actor
+from ..actors.kernel.message import Message
+from ..actors.kernel.node import Node, Ports
+from ..actors.kernel.ref import ActorRef
+from ..actors.process.wire import frames
+from ..actors.seconds import check_seconds
+from ..actors.values.path_parts import check_path_part
+from ..cluster.configuration import NatsSettings
+from ..cluster.lines.lines import Call, Lines, Transport, new_boot
+from ..cluster.ports import Unanswered
+
+if TYPE_CHECKING:
+    from .system import ActorSystem
+
+A = TypeVar("A", bound=Actor)
+
+
+async def open_lines(at: str, settings: NatsSettings) -> tuple[Transport, str, str]:
+    """A transport by these servers; the subject at which the system listens that is kept there, and its name.
+
+    Raises:
+        SpecError: the address cannot be read, or the library for it is missing. Unanswered: no server can be reached.
+    """
+    if find_spec("nats") is None:
+        raise SpecError("connect", "nats:// needs the library nats-py: pip install 'holdfast[nats]'")
+    from ..cluster.nats.access import access_of
+    from ..cluster.nats.nats_transport import open_transport  # only now: they import that library
+    from ..cluster.nats.system_streams import SubjectNames
+
+    access = access_of(at, settings.told())
+    return await open_transport(access), SubjectNames(access.system).inbox, access.system
+
+
+class Connection:
+    """A connection to another system: refs to its actors, and its topics. Made by `connect`; an async context manager.
+
+    It stays while the other system is led by one program after the other.
+    """
+
+    def __init__(self, servers: str, system: str | None, within: ActorSystem | None, seconds: float) -> None:
+        self._servers, self._system, self._within, self._seconds = servers, system, within, seconds
+        self._own: Node | None = None
+        self._lines: Lines | None = None
+        self._transport: Transport | None = None
+        self._call: Call | None = None
+        self._topics: dict[str, set[str]] = {}
+
+    async def __aenter__(self) -> Connection:
+        if self._call is not None:
+            raise HoldfastError(f"the connection to {self.system!r} was opened already; make a new one")
+        try:
+            transport, to, kept = await open_lines(self._servers, NatsSettings())
+        except Unanswered as error:
+            raise Unreachable(f"/{self._system or self._servers}", error.problem) from error
+        self._transport = transport
+        self._system = self._system or kept
+        try:
+            lines = self._lines = self._lines_of(self._within)
+            call = self._call = Call(lines, transport, to, self._system, self._subscribe_again)
+            await call.begin(self._seconds)
+        except TimeoutError as error:
+            await self.close()
+            problem = f"no program that leads it has answered for {self._seconds:g} s"
+            raise Unreachable(f"/{self._system}", problem) from error
+        except BaseException:
+            await self.close()
+            raise
+        return self
+
+    def _lines_of(self, within: ActorSystem | None) -> Lines:
+        if within is not None:
+            return within.lines
+        boot = new_boot()
+        node = self._own = Node(f"client-{boot.token}", asyncio.get_running_loop())
+        lines = Lines(node, node.name, boot)
+        node.connect(Ports(outside=lines.find))
+        return lines
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """End the connection: asks that are out fail, and nothing more is sent. A second call changes nothing."""
+        if self._call is not None and self._lines is not None:
+            self._lines.drop(self._call.far)
+        transport, self._transport = self._transport, None
+        if transport is not None:
+            await transport.close()
+        node, self._own = self._own, None
+        if node is not None:
+            await node.close()
+            node.deadlines.close()
+            node.events.close()
+
+    @property
+    def system(self) -> str:
+        """The name of the other system: the first part of its addresses."""
+        return self._system or self._servers
+
+    @property
+    def is_reachable(self) -> bool:
+        """Whether a program that leads the other system has answered within the last seconds."""
+        return self._call is not None and self._call.far.line is not None and not self._call.far.is_lost
+
+    @overload
+    def ref(self, path: str) -> ActorRef[Any]: ...
+    @overload
+    def ref(self, path: str, kind: type[A]) -> ActorRef[A]: ...
+    def ref(self, path: str, kind: type[Actor] = Actor) -> ActorRef[Any]:
+        """A ref to an actor of the other system, whether it lives there or not: what is sent to nobody fails there.
+
+        Args:
+            path: its address, such as `/billing/bank/alice`.
+            kind: its class, for type checkers.
+
+        Raises:
+            SpecError: the address is not one of that system.
+        """
+        top = f"/{self.system}"
+        if path != top and not path.startswith(f"{top}/"):
+            raise SpecError("connect", f"{path!r} is no address of {self.system!r}: they begin with {top}/")
+        return ActorRef(self._opened().far.stand_in(path))
+
+    async def publish(self, topic: str, message: Message[Any]) -> None:
+        """Publish on a topic of the other system, and return when each subscriber there has accepted it.
+
+        Raises:
+            Unreachable: the other system is known to be cut off. AskFailed: it was lost meanwhile.
+            BadMessage: the message cannot be coded.
+        """
+        far = self._opened().far
+        name, body = far._payload(message)
+        key, accepted = far.acceptance()
+        far.connection.send(frames.Publish(key, topic, name, body), topic)
+        await accepted
+
+    def subscribe(self, topic: str, actor: ActorRef[Any]) -> None:
+        """Have an actor of this system get what is published on a topic of the other one, from now on.
+
+        While the other system changes its leader nobody gets what is published there.
+
+        Raises:
+            SpecError: the connection was not made within the system of the actor.
+        """
+        far = self._opened().far
+        if actor._cell.node is not far.node:
+            raise SpecError("connect", f"{actor.path} is not of the system that the connection was made within")
+        self._topics.setdefault(topic, set()).add(actor.path)
+        far.command(actor.path, "subscribe", {"topic": topic})
+
+    def unsubscribe(self, topic: str, actor: ActorRef[Any]) -> None:
+        """No more of a topic of the other system; unknown ones are fine."""
+        self._topics.get(topic, set()).discard(actor.path)
+        self._opened().far.command(actor.path, "unsubscribe", {"topic": topic})
+
+    def _subscribe_again(self) -> None:
+        """Another program leads the other system: it knows nothing of who has subscribed."""
+        assert self._call is not None
+        for topic, paths in self._topics.items():
+            for path in paths:
+                self._call.far.command(path, "subscribe", {"topic": topic})
+
+    def _opened(self) -> Call:
+        if self._call is None:
+            raise HoldfastError(f"the connection to {self.system!r} is not open: async with hf.connect(...) as it")
+        return self._call
+
+
+def connect(
+    servers: str, *, system: str | None = None, within: ActorSystem | None = None, timeout: float = 5.0
+) -> Connection:
+    """Describe a connection to another system; `async with` opens it.
+
+    Args:
+        servers: "nats://HOST,HOST/NAME", as the other system has it for a store; its credentials may be in it.
+        system: the first part of the addresses of the other system; NAME if left out.
+        within: the system whose actors use the refs, and are reached from there. None: this program has none.
+        timeout: seconds until a program that leads the other system has answered.
+
+    Raises:
+        SpecError: an argument is not valid.
+
+    Raises (when it is opened):
+        Unreachable: nobody has answered. SpecError: the address cannot be read.
+        LineTaken: there is a connection to a system of that name already.
+    """
+    if system is not None:
+        check_path_part("connect", "the system", system)
+    check_seconds("connect", "timeout", timeout)
+    return Connection(servers, system, within, timeout)
+
+
+async def serve(lines: Lines, at: str, settings: NatsSettings) -> Transport:
+    """Have this system reached at its servers.
+
+    Raises:
+        SpecError: the address cannot be read. Unanswered: no server can be reached.
+    """
+    transport, inbox, _ = await open_lines(at, settings)
+    try:
+        await transport.hear(inbox, lines.serve(transport).hear)
+    except BaseException:
+        with contextlib.suppress(TimeoutError):
+            await transport.close()
+        raise
+    return transport
