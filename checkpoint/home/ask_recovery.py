@@ -19,6 +19,7 @@ import msgspec
 
 from ...actors.errors import HoldfastError
 from ...actors.kernel.codec import Parcel
+from ...actors.kernel.envelope import Ask
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer, Out
 from ..schema import shape_entry
@@ -68,6 +69,8 @@ class RejoinedAsk(SwitchAsk, eq=False):
             self.is_over, self.future = True, OVER
             own = batch if batch is not None else Batch()
             if homes.far.is_far(self.asker):
+                if batch is None and homes.far.is_closing:
+                    return  # Its receiver has been stopped with the system: it asks whoever leads next.
                 homes.far.answered(FarId(self.asker, self.turn, self.k), answer, own)
             else:
                 own.add(self.asker, outcome_entry(self.turn, self.k, answer), [])
@@ -141,6 +144,7 @@ class FarMail:
     Attributes:
         deliver: is told each outcome when it is safe.
         sender: sends to other systems; none before there are lines.
+        is_closing: whether this system ends: asks that are not answered any more wait for whoever leads it next.
     """
 
     def __init__(self, homes: Homes) -> None:
@@ -152,6 +156,7 @@ class FarMail:
         self._positions: list[int] = []
         self._opening: dict[str, list[Callable[[], None]]] = {}
         self.sender: FarSender | None = None
+        self.is_closing = False
         self.deliver: Callable[[FarId, Answer], None] = lambda which, answer: None
         saved = homes.journal.load(FAR)
         if saved.snapshot is not None:
@@ -200,6 +205,10 @@ class FarMail:
     def is_open(self, which: FarId) -> bool:
         """Whether its outcome will come: the receiver has it."""
         return which in self._open or self._homes.rejoin.has(*which)
+
+    def goes_on(self, ask: Ask | None) -> bool:
+        """Whether an ask is not to end with this program: another system waits, and the next program answers it."""
+        return self.is_closing and isinstance(ask, SwitchAsk) and self.is_far(ask.asker)
 
     def outcome(self, which: FarId) -> Answer | None:
         """The outcome, if it is known."""
@@ -273,7 +282,7 @@ class FarMail:
     def opened(self, path: str) -> None:
         """A home is open: what it has is known."""
         for then in self._opening.pop(path, ()):
-            then()
+            self._homes.node.loop.call_soon(then)  # When its next life has a place there.
 
     def _tidy(self) -> None:
         """Write what is left anew when much has come and gone."""

@@ -232,6 +232,8 @@ class FarLine(Peer):
         line: the line to that; None until then.
         heard: when something of it has last come, on the loop's clock.
         is_lost: whether it has not answered for long.
+        is_closed: whether nothing goes over any more.
+        is_closing: whether this program ends: it takes in nothing new, and still answers.
         hand_back: is given the asks of recorded actors that are out when it is closed.
         await_actor: has something done when somebody is started at an address; None: nobody will be soon.
     """
@@ -248,7 +250,7 @@ class FarLine(Peer):
         self.line: Line | None = None
         self.heard = node.loop.time()
         self.is_lost = False
-        self.is_closed = False
+        self.is_closed = self.is_closing = False
         self.await_actor: Callable[[str, Callable[[], None]], bool] = lambda path, then: False
         self.hand_back: Callable[[SwitchAsk], None] = lambda ask: None
         self._held: list[bytes] = []  # until the other program has answered
@@ -466,6 +468,8 @@ class FarLine(Peer):
             take = self._takers.get(type(frame))
             if take is None:
                 raise BadFrame(f"a {type(frame).__name__} on a line")
+            if self.is_closing and isinstance(frame, (frames.Tell, frames.Ask, frames.Offer, frames.Publish)):
+                return  # Whoever asks, asks whoever leads this system next.
             take(frame, data[:1] == AGAIN)
         except (BadFrame, msgspec.MsgspecError) as error:
             self.node.dead_letter(self.stand_in(f"/{self.name}"), data, f"not understood: {error}")

@@ -103,6 +103,7 @@ class Lines:
             raise LineTaken(name)
         far = self._lines[name] = FarLine(self.node, (self.name, self.boot), name, post, self.homes)
         far.await_actor = self._await_actor
+        far.is_closing = self.homes is not None and self.homes.far.is_closing
         far.hand_back = lambda ask: self.ask(ask, again=True)
         self._send_kept(far)
         if self._beat is None:
@@ -124,6 +125,13 @@ class Lines:
         gate = Gate(self, transport)
         self._gates.append(gate)
         return gate
+
+    def closing(self) -> None:
+        """This program ends: what comes is for whoever follows it; what was asked before is still answered."""
+        if self.homes is not None:
+            self.homes.far.is_closing = True
+        for far in self._lines.values():
+            far.is_closing = True
 
     def close(self) -> None:
         """End all lines."""
