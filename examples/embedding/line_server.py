@@ -1,7 +1,7 @@
 """A plain asyncio program: a server that reads lines, under `hf.run`. It needs no framework, and no web server.
 
 `python line_server.py`, then `echo "note 5" | nc localhost 8000`. The same program is what line-server.service
-(systemd, with watchdog), Dockerfile (as PID 1) and kubernetes.yaml (with probes) run; `PROBES=0.0.0.0:8080` is for those.
+(systemd, with watchdog), Dockerfile (as PID 1) and kubernetes.yaml (with probes) run: see `PROBES` in the last two.
 """
 
 import asyncio
