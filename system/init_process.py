@@ -9,9 +9,6 @@ import sys
 import warnings
 from typing import NoReturn
 
-UNASKED = {signal.SIGCHLD, signal.SIGTTIN, signal.SIGTTOU}
-"""What is for the init process itself, and not for the program."""
-
 
 def leave_init() -> None:
     """If this is PID 1, go on in a child process: PID 1 stays behind as its init, and ends as the child ends.
@@ -42,9 +39,10 @@ def leave_init() -> None:
 
 def _serve_as_init(program: int) -> NoReturn:
     """Reap and pass signals on, until the program ends. All signals are blocked here, so that none gets lost."""
+    own = {signal.SIGCHLD, signal.SIGTTIN, signal.SIGTTOU}  # The others are for the program.
     while True:
         number = signal.sigwait(signal.valid_signals())
-        if number not in UNASKED:
+        if number not in own:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(program, number)
             continue

@@ -253,7 +253,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
 
     @property
     def has_failed(self) -> bool:
-        """Whether the root supervisor has given up, or another program has come to lead the system."""
+        """Tell whether the root supervisor gave up, or another program has come to lead in its place."""
         return self._failure is not None
 
     def store_problem(self, *, for_good: bool = False) -> str:

@@ -134,6 +134,24 @@ def test_as_pid_1_it_handles_signals_and_reaps_orphans(tmp_path: Path) -> None:
         assert load.confirmed | more.confirmed <= program.kept()
 
 
+WITH_THREAD = """
+import asyncio, threading
+import holdfast as hf
+threading.Thread(target=threading.Event().wait, daemon=True).start()
+hf.run(asyncio.sleep(0))
+"""
+
+
+def test_as_pid_1_with_threads_it_warns_and_runs(tmp_path: Path) -> None:
+    if not may_unshare():
+        pytest.skip("this machine does not allow a PID namespace (unshare --user --pid)")
+    command = [*AS_INIT, sys.executable, "-c", WITH_THREAD]
+    done = subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": PATHS}, cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, "RuntimeWarning" in done.stderr, "2 threads run already" in done.stderr) == (0, True, True)
+
+
 # -- one worker of several --------------------------------------------------------------------------------------------
 
 
