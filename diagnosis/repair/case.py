@@ -63,6 +63,7 @@ class Case:
         undos: how the present plan can be taken back, newest last.
         advised: the advice for each candidate.
         others: when each component was started by somebody else.
+        awaited: whom its supervisor was at work on when repair last looked.
         held: what repair waits for, as it was last told.
         doubted: since when a candidate is blamed although its actors answer.
     """
@@ -84,6 +85,7 @@ class Case:
     advised: dict[tuple[str, ...], Advice] = dataclasses.field(default_factory=dict[tuple[str, ...], Advice])
     others: dict[str, float] = dataclasses.field(default_factory=dict[str, float])
     held: str = ""
+    awaited: set[str] = dataclasses.field(default_factory=set[str])
     doubted: dict[tuple[str, ...], float] = dataclasses.field(default_factory=dict[tuple[str, ...], float])
 
     @property

@@ -26,19 +26,19 @@ async def answers(node: Node, address: str, seconds: float) -> bool | None:
     Returns:
         None: it was suspended by order, and says nothing.
     """
-    first = await _looked_at(node, address, seconds)
+    first = await looked_at(node, address, seconds)
     if first is None or first.state != "running":
         return None if first is not None and first.state == "suspended" else False
     if first.turn is None:
         return True
     await asyncio.sleep(seconds)
-    second = await _looked_at(node, address, seconds)
+    second = await looked_at(node, address, seconds)
     if second is None or second.state != "running":
         return None if second is not None and second.state == "suspended" else False
     return second.life != first.life or second.turn is None or second.turn_seconds < seconds
 
 
-async def _looked_at(node: Node, address: str, seconds: float) -> Status | None:
+async def looked_at(node: Node, address: str, seconds: float) -> Status | None:
     """Its status; None: it is not there, or its process does not answer."""
     cell = node.find(address)
     if cell is None:

@@ -43,12 +43,12 @@ from .advice import Advice, judge_advice
 from .approvals import Approvals, Approver
 from .case import Case, Finishing, Verifying, Watching, base_of, reached
 from .choice import CaseView, choose, components_of, problem_for
-from .executor import DONE, SKIPPED, Executor, Result
+from .executor import DONE, SKIPPED, UNVERIFIED, Executor, Result
 from .ledger import Ledger, Memory
 from .outlook import OURS, Outlook
 from .ping import answers
 from .policy import Policy, check_stance
-from .story import sentence
+from .story import about, sentence
 
 MOMENT: Final = 0.001
 """Seconds: a timer may come a little early."""
@@ -362,7 +362,11 @@ class Repairer(Actor):
         at, policy = self._moment(case), self._policy
         case.add_symptoms(at.diagnosis.symptoms)
         if (busy := self._busy(bad)) is not None:
+            case.awaited |= set(bad)
             return deciding.Wait(deciding.SOON, wakes=False) if case.has_heard(busy) else deciding.Enter(held=busy)
+        if back := tuple(sorted(case.awaited & set(bad))):
+            await self._give_time(case, back)
+            return deciding.Enter()
         problem = problem_for(self._model, self._actions, policy, self._ledger, at, bad, self._alone(), self._is_free)
         outcome = await find_plan(self._planner, problem, timeout=policy.plan_seconds, degrade=True)
         if not isinstance(outcome, Plan) or not outcome.stages:
@@ -387,9 +391,19 @@ class Repairer(Actor):
         results = await self._executor(case).execute(problem, outcome)
         case.failures += [f"{result.step} {result.outcome}: {result.why}" for result in results if result.why]
         case.undos = [(result.step, result.undo) for result in results if result.undo is not None]
+        if all(result.outcome in (UNVERIFIED, SKIPPED) for result in results):
+            await self._take_back(case)  # Nobody sees its effect: that is no reason to do it again.
         if deciding.was_skipped(results):
             case.take_back_plan(bad)
         return deciding.judge_results(bad, outcome, results, self.now(), policy)
+
+    async def _give_time(self, case: Case, names: tuple[str, ...]) -> None:
+        """Their supervisor has done its work just now: what was seen while it did says nothing of what has begun."""
+        case.awaited -= set(names)
+        grace = self._policy.grace
+        self._outlook.note_start(names, grace, self.now())
+        await self.ctx.publish(TOUCHED, say.Touched(names, "restart by its supervisor", self.now(), grace))
+        self.ctx.tell_after(grace + MOMENT, _GraceIsOver())
 
     def _busy(self, bad: tuple[str, ...]) -> str | None:
         """Why those who are blamed are left to their supervisors for now."""
@@ -434,7 +448,7 @@ class Repairer(Actor):
     async def _take_back(self, case: Case) -> None:
         """If the plan has not helped, count it, and undo of it what can be undone, the newest first."""
         suspects = set(self._outlook.diagnosis.suspects)
-        steps = case.take_carried_out()
+        steps = case.take_carried_out()  # Of a plan that was skipped there are none.
         if not steps or not suspects & case.midway:
             return  # It was judged before, or others are blamed now: it may have helped.
         self._memory.useless += 1
@@ -558,7 +572,7 @@ class Repairer(Actor):
     async def _tell(self, message: say.CaseNotice) -> None:
         if text := sentence(message):
             what = type(message).__name__
-            self._memory.stories.add(message.case, say.StoryEntry(time.time(), what, text))
+            self._memory.stories.add(message.case, say.StoryEntry(time.time(), what, text, about(message)))
             self.ctx._cell.node.emit(say.RepairTold(self.ctx.path, message.case, what, text))
         await self.ctx.publish(say.TOPIC, message)
 

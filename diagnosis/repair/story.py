@@ -69,6 +69,21 @@ def sentence(notice: Message) -> str:
             return ""
 
 
+def about(notice: Message) -> tuple[str, ...]:
+    """The components that a notice is about; none: it is about the case."""
+    match notice:
+        case say.RepairBegan(_, bad) | say.Planned(_, bad):
+            return bad
+        case say.ActionBegan(_, step) | say.ActionEnded(_, step) | say.Undone(_, step):
+            return step.args[:1]
+        case say.ApprovalWanted(_, steps) | say.Repaired(_, steps):
+            return tuple(dict.fromkeys(name for step in steps for name in step.args[:1]))
+        case say.GaveUp(_, components):
+            return components
+        case _:
+            return ()
+
+
 def _names(names: object) -> str:
     words = [str(one) for one in names]  # type: ignore[attr-defined]  # any iterable of names
     return " and ".join((", ".join(words[:-1]), words[-1])) if len(words) > 1 else "".join(words) or "nothing"
