@@ -437,6 +437,8 @@ class Repairer(Actor):
         reason = f"{', '.join(bad)} {'is' if len(bad) == 1 else 'are'} diagnosed"
         wanted = say.ApprovalWanted(case.number, plan.steps, reason, policy.approval)
         why = await self._approvals.ask(wanted, self._tell)
+        if why is None and self._chosen(case) != bad:
+            return deciding.Enter()  # Nobody was needed.
         if why is None:
             return deciding.GiveUp(bad, f"nobody has approved {what} within {policy.approval:g} s")
         if why:

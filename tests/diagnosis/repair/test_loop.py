@@ -399,6 +399,15 @@ async def test_when_asked_repair_waits_for_each_plan_and_goes_on_when_it_may(sys
     assert here.done() == ["stop_node(hm)", "start_node(hm)"]
 
 
+async def test_who_got_well_before_anybody_answered_is_not_given_up(system: hf.ActorSystem) -> None:
+    here = await scene(system, Policy(approval=20.0, **QUICK), stance="ask")
+    await here.change(lambda world: world.hung.add("hm"))
+    await here.hear(ApprovalWanted)
+    await here.change(lambda world: world.hung.discard("hm"))
+    await here.hear(Repaired)
+    assert (here.all(GaveUp), here.done()) == ([], [])
+
+
 async def test_what_was_denied_stays_so_in_later_cases_until_it_is_withdrawn(system: hf.ActorSystem) -> None:
     here = await scene(system, Policy(**QUICK), stance="ask")
     await here.change(lambda world: world.hung.add("hm"))
