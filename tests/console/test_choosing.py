@@ -9,10 +9,12 @@ from holdfast import diagnosis
 from holdfast.actors.events import EventStream
 from holdfast.diagnosis.literals import parse
 from holdfast.diagnosis.observations import Observation
+from holdfast.diagnosis.observers import Manner
 from holdfast.diagnosis.repair import Policy, RepairTold
 from tests.console.commands import holdfast
 
 DONE, FAILED, UNUSABLE = 0, 1, 2
+QUICK = Manner(every=0.1, time_to_live=2.0)
 
 
 async def test_coverage_is_what_the_mechanisms_declare() -> None:
@@ -75,7 +77,9 @@ async def test_diagnose_tells_suspects_with_their_addresses(system: hf.ActorSyst
 async def test_repair_waits_for_an_approval_from_the_command_line_and_tells_its_case(
     system: hf.ActorSystem, path: Path, tmp_path: Path
 ) -> None:
-    watching = await diagnosis.watch(system, seconds=0.0, repair="ask", policy=Policy(look=0.0, settle=0.1))
+    watching = await diagnosis.watch(
+        system, seconds=0.0, repair="ask", policy=Policy(look=0.0, settle=0.1, verify=1.0), manner=QUICK
+    )
     with system.events() as events:
         component = next(name for name, where in watching.addresses.items() if where == "/app/left/a")
         await watching.diagnosis()
