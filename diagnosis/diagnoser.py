@@ -17,9 +17,9 @@ from .messages import (
     GRACE,
     MODEL,
     OBSERVATIONS,
-    REPAIR,
     ROS_DIAGNOSTICS,
     STARTS,
+    TOUCHED,
     ComponentsStarted,
     Explained,
     GetDiagnosis,
@@ -141,7 +141,7 @@ class DiagnoserActor(Actor):
         self._refused.clear()
         self._due()
 
-    @subscribe(REPAIR)
+    @subscribe(TOUCHED)
     @on(Touched)
     async def _touched(self, message: Touched) -> None:
         until = message.time + self._recent

@@ -12,8 +12,8 @@ from holdfast.diagnosis import (
     EXPLANATION,
     GRACE,
     OBSERVATIONS,
-    REPAIR,
     ROS_DIAGNOSTICS,
+    TOUCHED,
     ChangeModel,
     DiagnoserActor,
     Explained,
@@ -211,7 +211,7 @@ async def test_what_was_just_repaired_is_suspected_last_for_a_while(system: hf.A
     diagnoser = await diagnosing(system)
     await observe(system, "on(ja)", "running(jn)", "not ok(/odom)")
     assert bad(await diagnoser.ask(GetDiagnosis())) == [{"jn"}, {"ja"}]
-    await system.publish(REPAIR, Touched(("jn",), "start_node", asyncio.get_running_loop().time()))
+    await system.publish(TOUCHED, Touched(("jn",), "start_node", asyncio.get_running_loop().time()))
     assert bad(await diagnoser.ask(GetDiagnosis())) == [{"ja"}, {"jn"}]
     await advance(40.0)
     await observe(system, "ok(/map)")
@@ -223,11 +223,11 @@ async def test_grace_goes_to_all_that_depends_on_what_was_repaired(system: hf.Ac
     await diagnosing(system)
     heard = probe(system)
     heard.subscribe(GRACE)
-    await system.publish(REPAIR, Touched(("hu",), "power_up", 0.0, grace=5.0))
+    await system.publish(TOUCHED, Touched(("hu",), "power_up", 0.0, grace=5.0))
     told = await heard.expect(Grace)
     assert {"hu", "/scan", "/map"} <= set(told.names)  # its driver's topic, and what is made of that
     assert not {"/odom", "jn"} & set(told.names)
-    await system.publish(REPAIR, Touched(("hu",), "shutdown", 0.0))
+    await system.publish(TOUCHED, Touched(("hu",), "shutdown", 0.0))
     await heard.expect_no_message()
 
 
