@@ -66,14 +66,14 @@ CHECKS = {
         "if known is not None or homes.far.is_open(which):",
         "if False:",
         CONNECTIONS,
-        "two_systems_reach_each_other_once",
+        "another_program_leads",
     ),
     "the outcome of an ask is stored with its turn's end": Check(
         "checkpoint/home/ask_recovery.py",
         'batch.add(FAR, ("answered", *msgspec.structs.astuple(one)), self._positions)',
         "pass",
         CONNECTIONS,
-        "two_systems_reach_each_other_once",
+        "another_program_leads",
     ),
     "what is told to another system is stored with its turn's end": Check(
         "checkpoint/home/ask_recovery.py",
