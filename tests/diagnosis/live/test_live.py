@@ -113,8 +113,8 @@ async def test_the_runtime_knows_who_publishes_subscribes_is_bound_and_is_superv
     assert matcher.bound == {"ledger": "desk/ledger"}
     assert matcher.supervisor == "/shop/desk"
     model = Model(found.declaration)
-    assert model.components["desk/matcher"].out == {"/trades": ("/prices", "desk/ledger:replies")}
-    assert model.components["feed"].out == {"/prices": ()}
+    assert model.components["desk/matcher"].out["/trades"] == ("/prices", "replies(desk/ledger)")
+    assert model.components["feed"].out["/prices"] == ()
     assert not found.left_out
 
 
