@@ -84,15 +84,16 @@ class Index:
                 users[atom].append(step)
         self.users = tuple(map(tuple, users))
         """By atom, the rules that need it."""
-        busy = {one for step in self.steps if not self._is_running(step) for one in step.needs}
+        busy = {one for step in self.steps if self.is_work(step.head) for one in step.needs}
         self.only_run = frozenset(range(len(self.names))) - busy
         """Components of which nothing else follows than that they run."""
         self.unconditional = tuple(step for step in self.steps if not step.needs)
         """Rules that hold whoever is faulty: they can make observations contradict the model."""
 
-    def _is_running(self, step: RuleStep) -> bool:
-        literal = self.atoms[step.head]
-        return literal is None or literal.name == "running"
+    def is_work(self, atom: int) -> bool:
+        """Whether an atom says something of the work of a component: more than that it runs, and has room."""
+        literal = self.atoms[atom]
+        return literal is not None and literal.name not in ("running", "room")
 
     def numbers(self, atoms: Collection[Literal]) -> frozenset[int]:
         """The numbers of atoms.

@@ -192,9 +192,8 @@ class Diagnoser:
         """The components of whose work nothing is seen; that one runs says nothing of its work, if it has any."""
         index, seen = self._index, set[int]()
         for atom in positive:
-            literal = index.atoms[atom]
+            is_work = index.is_work(atom)
             for step in index.makers[atom]:
-                is_work = literal is None or literal.name != "running"
                 seen.update(one for one in step.needs if is_work or one in index.only_run)
         return tuple(name for number, name in enumerate(index.names) if number not in seen)
 

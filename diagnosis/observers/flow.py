@@ -164,7 +164,7 @@ class FlowObserver(Observer):
     def _heard(self, message: Heard) -> Any:
         if message.sender is not None:
             self._heard_of.setdefault(message.sender, set()).add(message.topic)
-        return super()._heard(message)
+        self.hear(message.topic, message.message)
 
     def hear(self, topic: str, message: Any) -> None:
         """Learn how long the topic was silent, and how much has come in meanwhile."""

@@ -9,6 +9,7 @@ from typing import Final
 from ...actors.control.orders import Status, status_of
 from ...actors.control.orders_lane import ask_status
 from ...actors.errors import HoldfastError, SpecError
+from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.process.process_host import WorkerPlace
 from ...actors.process.wire.peer import OutsideHost, Peer
@@ -113,7 +114,7 @@ class NodeObserver(Observer):
         return status.state == "running" and (self._hung_after is None or status.turn_seconds <= self._hung_after)
 
 
-def at_root(observer: Observer) -> None:
-    """Refuse an observer that sees only its own process. Raises SpecError."""
+def at_root(observer: Actor) -> None:
+    """Refuse an actor that looks at others and sees only its own process. Raises SpecError."""
     if observer.ctx._cell.node.ports.uplink is not None:
         raise SpecError(observer.ctx.path, f"{type(observer).__name__} must be in the system's own process: a task")
