@@ -10,7 +10,7 @@
 
 from .assembly import observer, tree
 from .diagnoser import DiagnoserActor
-from .generate import Generated, Wired, generate, observers_for
+from .generate import Generated, LiveWiring, Wired, evident, generate, observers_for
 from .messages import (
     DIAGNOSIS,
     EXPLANATION,
@@ -29,6 +29,7 @@ from .messages import (
     RosDiagnostics,
     Touched,
 )
+from .model_follower import ModelFollower
 from .model_server import (
     ChangeModel,
     GetModel,
@@ -55,9 +56,11 @@ __all__ = [
     "GetObserved",
     "GetVersions",
     "Grace",
+    "LiveWiring",
     "LoadModel",
     "MODEL",
     "ModelChanged",
+    "ModelFollower",
     "ModelRefused",
     "ModelServer",
     "NextBest",
@@ -70,6 +73,7 @@ __all__ = [
     "ValidateModel",
     "Watch",
     "Wired",
+    "evident",
     "expecting",
     "generate",
     "observer",

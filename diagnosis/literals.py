@@ -17,8 +17,18 @@ import msgspec
 from ..actors.errors import HoldfastError
 
 ARITIES: Final = {
-    "ok": 1, "running": 1, "on": 1, "matched": 2, "inc": 1, "dec": 1, "const": 1,
-    "replies": 1, "progress": 1, "room": 1, "crashes": 1, "waits_for": 2,
+    "ok": 1,
+    "running": 1,
+    "on": 1,
+    "matched": 2,
+    "inc": 1,
+    "dec": 1,
+    "const": 1,
+    "replies": 1,
+    "progress": 1,
+    "room": 1,
+    "crashes": 1,
+    "waits_for": 2,
 }
 """The paper's predicates and those of the runtime, with their numbers of arguments."""
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
-from ...actors.errors import AskFailed, AskTimeout
+from ...actors.errors import AskTimeout
 from ...actors.events import ActorCrashed, EventStream
 from ...actors.exit_reasons import Crash
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.envelope import Ask, chain_of
+from ...actors.kernel.message import Refusal
 from ...actors.kernel.node import Node
 from ...actors.process.open_asks import open_asks, outlet_of
 from ...supervision.intensity import recent_restarts
@@ -89,6 +91,7 @@ class RuntimeObserver(Observer):
         self._failed: list[tuple[Ask, BaseException]] = []
         self._stream: EventStream | None = None
         self._rests_until = 0.0
+        self._let_down: dict[str, float] = {}  # when an ask of theirs has failed
         self._waiting: set[Literal] = set()
 
     def on_start(self, restored: bool) -> None:
@@ -178,12 +181,14 @@ class RuntimeObserver(Observer):
         for ask, error in failed:
             callee = names.get(ask.to.path)
             asker = names.get(ask.sender.path) if ask.sender is not None else None
-            if callee is None or not isinstance(error, (AskTimeout, AskFailed)):
-                continue
-            if isinstance(error, AskTimeout):
+            if isinstance(error, Refusal):
+                continue  # That is an answer.
+            if callee is not None and isinstance(error, AskTimeout):
                 self._seen(callee).unanswered.append((self.now, self.now - ask.timeout))
-            if asker is not None and chain_of(ask):
-                self._asked.setdefault(asker, set()).add(callee)
+            if asker is not None and asker != callee:
+                self._let_down[asker] = self.now
+                if callee is not None and chain_of(ask):
+                    self._asked.setdefault(asker, set()).add(callee)
 
     def _take_crashes(self, names: Mapping[str, str]) -> None:
         """Crashes by themselves; who could not bear that another one did not answer is not to blame."""
@@ -192,7 +197,8 @@ class RuntimeObserver(Observer):
             component = names.get(event.address) if isinstance(event, ActorCrashed) else None
             if component is None or not isinstance(event, ActorCrashed) or not isinstance(event.reason, Crash):
                 continue
-            if not _is_anothers(event.reason, event.address):
+            was_let_down = self.now - self._let_down.get(component, -math.inf) <= 2 * self.manner.every
+            if not (was_let_down or _is_anothers(event.reason)):
                 seen = self._seen(component)
                 seen.crashes = (*seen.crashes, self.now)
 
@@ -303,8 +309,6 @@ def _is_full(cell: Cell) -> bool:
     return bound is not None and bound.count >= bound.capacity
 
 
-def _is_anothers(reason: Crash, address: str) -> bool:
-    """Whether an actor crashed because another one did not answer."""
-    if isinstance(reason.error, (AskTimeout, AskFailed)):
-        return reason.error.actor != address
-    return reason.type_name.rpartition(".")[2] in ("AskTimeout", "AskFailed")
+def _is_anothers(reason: Crash) -> bool:
+    """Whether an actor crashed because another one did not answer; of one in a process nothing else is known."""
+    return reason.type_name.rpartition(".")[2] in ("AskTimeout", "AskFailed", "RemoteCrash")

@@ -29,6 +29,11 @@ class Worker(hf.Actor):
         match message.what.split():
             case ["ask", address]:
                 await self.ctx.find(address, Worker).ask(Go("", message.timeout), timeout=message.timeout)
+            case ["wrap", address]:
+                try:
+                    await self.ctx.find(address, Worker).ask(Go("crash"))
+                except hf.HoldfastError:
+                    raise ValueError("something of ours does not work") from None
             case ["both", address]:
                 await asyncio.sleep(0.05)
                 await self.ctx.find(address, Worker).ask(Go("", message.timeout), timeout=message.timeout)
@@ -135,6 +140,18 @@ async def test_who_crashes_because_another_one_does_not_answer_is_not_to_blame(s
     worker(system, "c").tell(Go("freeze"))
     for _ in range(4):
         worker(system, "a").tell(Go("ask /t/all/c", 0.5))
+        await advance(1.0)
+    found = await watching.diagnosis()
+    assert [one.bad for one in found.candidates] == [("all/c",)]
+
+
+@pytest.mark.parametrize("way", ["wrap /t/all/c", "ask /t/all/c"])
+async def test_a_callee_in_a_crash_loop_is_certain_whatever_its_callers_raise(system: hf.ActorSystem, way: str) -> None:
+    watching = await watched(system)
+    for _ in range(4):
+        if "ask" in way:
+            worker(system, "c").tell(Go("crash"))
+        worker(system, "b").tell(Go(way))
         await advance(1.0)
     found = await watching.diagnosis()
     assert [one.bad for one in found.candidates] == [("all/c",)]
