@@ -160,15 +160,13 @@ class Diagnoser:
             made = Diagnosis(State.BLIND)
             if not observed.is_blind:
                 positive, negative, torn = self._believed(observed)
-                made = self._solved(positive, negative, repaired, budget)
+                contested = self._contested(torn)
+                made = self._solved(positive, negative, repaired, budget, contested)
                 if torn:  # What is contested is unknown; of the rest there is a diagnosis all the same.
-                    is_faulty = made.state is State.FAULTY
-                    made = msgspec.structs.replace(
-                        made,
-                        state=State.FAULTY if is_faulty else State.CONTRADICTORY,
-                        candidates=made.candidates if is_faulty else (),
-                        contradictions=torn,
-                    )
+                    is_faulty = made.state is State.FAULTY and bool(made.candidates)
+                    state = State.FAULTY if is_faulty else State.CONTRADICTORY
+                    candidates = made.candidates if is_faulty else ()
+                    made = msgspec.structs.replace(made, state=state, candidates=candidates, contradictions=torn)
                 made = msgspec.structs.replace(made, unknown=self._unknown(positive), set_aside=observed.set_aside)
             return msgspec.structs.replace(
                 made,
@@ -188,6 +186,11 @@ class Diagnoser:
             positive, negative = positive - contested, negative - contested
         return positive, negative, tuple(torn)
 
+    def _contested(self, torn: Iterable[Contradiction]) -> frozenset[int]:
+        """The components that account for what is contested: to blame or to clear one of them would be a guess."""
+        atoms = self._index.numbers([literal.atom for one in torn for literal in one.literals])
+        return frozenset(one for atom in atoms for step in self._index.makers[atom] for one in step.needs)
+
     def _unknown(self, positive: frozenset[int]) -> tuple[str, ...]:
         """The components of whose work nothing is seen; that one runs says nothing of its work, if it has any."""
         index, seen = self._index, set[int]()
@@ -198,14 +201,20 @@ class Diagnoser:
         return tuple(name for number, name in enumerate(index.names) if number not in seen)
 
     def _solved(
-        self, positive: frozenset[int], negative: frozenset[int], repaired: frozenset[str], budget: SearchBudget
+        self,
+        positive: frozenset[int],
+        negative: frozenset[int],
+        repaired: frozenset[str],
+        budget: SearchBudget,
+        contested: frozenset[int],
     ) -> Diagnosis:
         cone = cone_of(self._index, positive, negative)
         if not cone.convicted and not cone.parts:
             return Diagnosis(State.HEALTHY, candidates=(Candidate(()),), found=1)
+        clear = [part for part in cone.parts if contested.isdisjoint(part.components)]
         ranking = Ranking(self._index.components, repaired)
         # The smallest first: what is certain is mostly there, and a large part may take all the time there is.
-        order = sorted(cone.parts, key=lambda part: len(part.denials) + len(part.steps))
+        order = sorted(clear, key=lambda part: len(part.denials) + len(part.steps))
         every = [solved for part in order for solved in self._part(part, budget)]
         parts = [solved for solved in every if solved.sets]  # Others have run out of time: candidates lack them.
         breathe()
@@ -222,7 +231,7 @@ class Diagnoser:
             symptoms=self._symptoms(cone),
             convicted=self._convicted(cone, parts),
             found=found,
-            truncated=(*["count"] * by_count, *["time"] * by_time),
+            truncated=(*["count"] * by_count, *["time"] * by_time, *["contested"] * (len(clear) < len(cone.parts))),
         )
 
     def _convicted(self, cone: Cone, parts: list[Solved]) -> tuple[str, ...]:

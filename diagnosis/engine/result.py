@@ -35,7 +35,7 @@ class Candidate(Message, gc=False):
 class Diagnosis(Message):
     """All minimal diagnoses within the limits, best first; what observers and repair act on.
 
-    If "time" is in `truncated`, candidates are what is known so far: what has not been thought through is in none.
+    If "time" or "contested" is in `truncated`, candidates are what is known so far: of the rest nothing is in any.
     """
 
     state: State
@@ -47,7 +47,8 @@ class Diagnosis(Message):
     found: int = 0
     """Minimal diagnoses that were found; `candidates` may hold fewer."""
     truncated: tuple[str, ...] = ()
-    """"count" and "time": what kept further ones from being listed; empty if these are all."""
+    """"count", "time" and "contested" (sources contradict each other on a suspect): what kept further ones from being
+    listed; empty if these are all."""
     version: int = 1
     """Of the model."""
     seconds: float = 0.0

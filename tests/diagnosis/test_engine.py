@@ -222,6 +222,7 @@ def test_sources_that_contradict_each_other_cost_only_what_they_contradict_each_
     seen.add(Observation(~ok("/odom"), 1.5, "rate"))
     said = Diagnoser(paper_robot()).diagnose_now(seen.current(2.0))
     assert [one.bad for one in said.candidates] == [("jn",), ("ja",)]
+    assert said.state is State.FAULTY
     assert running("hm") not in {symptom.atom for symptom in said.symptoms}
     assert "node says running(hm)" in str(said.contradictions[0])
 
@@ -265,6 +266,14 @@ async def test_names_the_model_does_not_know_are_refused_across_the_thread() -> 
 def test_limits_that_allow_nothing_are_refused(limit: int, seconds: float) -> None:
     with pytest.raises(ValueError, match="greater than 0"):
         Diagnoser(paper_robot(), limit=limit, seconds=seconds)
+
+
+def test_nobody_is_blamed_by_a_guess_where_sources_contradict_each_other_on_a_suspect() -> None:
+    said = Diagnoser(paper_robot()).diagnose_now(["on(ja)", "not on(ja)", "not ok(/odom)", "not running(hm)"])
+    assert [one.bad for one in said.candidates] == [("hm",)]
+    assert said.truncated == ("contested",)
+    said = Diagnoser(paper_robot()).diagnose_now(["on(ja)", "not on(ja)", "not ok(/odom)"])
+    assert (said.state, said.candidates) == (State.CONTRADICTORY, ())
 
 
 def test_what_is_certain_is_known_though_another_part_runs_out_of_time() -> None:

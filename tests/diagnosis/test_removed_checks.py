@@ -16,10 +16,17 @@ FLOW = "tests/diagnosis/observers/test_flow.py"
 CHECKS = {
     "what is contested is unknown, and the rest is diagnosed": Check(
         "diagnosis/engine/minimal_diagnoses.py",
-        "candidates=made.candidates if is_faulty else (),",
-        "candidates=(),",
+        "state = State.FAULTY if is_faulty else State.CONTRADICTORY",
+        "state = State.CONTRADICTORY",
         ENGINE,
-        "cost_only_what",
+        "nobody_is_blamed or cost_only_what",
+    ),
+    "nobody is blamed for what is contested": Check(
+        "diagnosis/engine/minimal_diagnoses.py",
+        "clear = [part for part in cone.parts if contested.isdisjoint(part.components)]",
+        "clear = list(cone.parts)",
+        ENGINE,
+        "nobody_is_blamed",
     ),
     "a part that ran out of time hides no other": Check(
         "diagnosis/engine/minimal_diagnoses.py",
@@ -29,9 +36,9 @@ CHECKS = {
         "what_is_certain_is_known",
     ),
     "an explanation has a time": Check(
-        "diagnosis/engine/explain.py",
-        "if time.monotonic() < until else None",
-        "if True else None",
+        "diagnosis/engine/minimal_diagnoses.py",
+        "return explain(index, positive, negative, time.monotonic() + seconds)",
+        "return explain(index, positive, negative)",
         ENGINE,
         "an_explanation_ends",
     ),
@@ -82,7 +89,7 @@ CHECKS = {
         "is_by_clock = not made.inputs and learned",
         "is_by_clock = learned",
         FLOW,
-        "double_less_and_bursts",
+        "when_its_input_stops",
     ),
 }
 

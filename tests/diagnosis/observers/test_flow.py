@@ -94,6 +94,15 @@ async def test_double_less_and_bursts_are_no_faults_and_silence_without_input_is
     assert ok("/out") not in world.said
 
 
+async def test_when_its_input_stops_a_regular_topic_is_unknown_and_one_that_went_by_a_clock_is_not(
+    world: World,
+) -> None:
+    await world.send(100, 0.1)
+    assert world.said[ok("/out")]
+    await asyncio.sleep(30.0)
+    assert world.said == {ok("/in"): False}
+
+
 async def test_a_topic_that_is_dead_while_its_input_comes_is_not_ok_until_it_flows_again(world: World) -> None:
     await world.send(100, 0.1)
     await world.set_each(0)
