@@ -18,10 +18,11 @@ from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import Node, cell_kind
 from ..actors.kernel.ref import ActorRef
 from ..supervision.spec import ChildSpec
+from ..supervision.supervisor import Supervisor
 from .assembly import observer
 from .literals import crashes, made_atom, progress, replies, room, waits_for
 from .messages import DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, ROS_DIAGNOSTICS, STARTS
-from .model import Clause, Component, Declaration, Expectation, Kind
+from .model import Component, Declaration, Expectation, Kind
 from .observers.flow import Baselines, FlowObserver, Made
 from .observers.hearing import Heard, listen
 from .observers.node_observer import NodeObserver
@@ -130,7 +131,7 @@ class LiveWiring:
         """Have observers go by this from their next look on."""
         self._wiring = found.wiring
         _replace(self.addresses, found.addresses)
-        _replace(self.made, _made(found.wiring))
+        _replace(self.made, _made(found.wiring, set().union(*self.heard.values())))
 
     def look_again(self, node: Node) -> Generated | None:
         """What the system is like now; None if it is as before."""
@@ -146,8 +147,9 @@ def _is_missed(node: Node, wired: Wired) -> bool:
     above = None if wired.supervisor is None else node.find(wired.supervisor)
     if above is None or above.is_dead:
         return True  # Its supervisor has given up.
-    child = (above.children or {}).get(wired.path.rpartition("/")[2])
-    return child is not None
+    name, keeper = wired.path.rpartition("/")[2], above.actor
+    is_kept = isinstance(keeper, Supervisor) and name in keeper._children  # It was stopped, and may be started again.
+    return is_kept or name in (above.children or {})
 
 
 def _replace(old: dict[str, T], new: Mapping[str, T]) -> None:
@@ -155,13 +157,13 @@ def _replace(old: dict[str, T], new: Mapping[str, T]) -> None:
     old.update(new)
 
 
-def _made(wiring: Mapping[str, Wired]) -> dict[str, Made]:
-    """How each topic comes about."""
+def _made(wiring: Mapping[str, Wired], known: Collection[str]) -> dict[str, Made]:
+    """How each topic comes about; what was ever heard is an input also while nobody publishes it any more."""
     published = {topic for wired in wiring.values() for topic in wired.publishes}
     made: dict[str, Made] = {}
     for topic in sorted(published):
         makers = [wired for wired in wiring.values() if topic in wired.publishes]
-        inputs = {one for wired in makers for one in wired.subscribes if one in published and one != topic}
+        inputs = {one for wired in makers for one in wired.subscribes if one in known and one != topic}
         made[topic] = Made(tuple(wired.path for wired in makers), tuple(sorted(inputs)))
     return made
 
@@ -276,7 +278,6 @@ def evident(declaration: Declaration, components: Iterable[str], waits: Iterable
     return msgspec.structs.replace(
         declaration,
         expectations=(*declaration.expectations, *expected),
-        clauses=(*declaration.clauses, *(Clause(f"NAB({name}), crashes({name}) -> false") for name in actors)),
         propositions=(*declaration.propositions, *seen),
     )
 

@@ -91,6 +91,7 @@ class RuntimeObserver(Observer):
         self._failed: list[tuple[Ask, BaseException]] = []
         self._stream: EventStream | None = None
         self._rests_until = 0.0
+        self._loops: set[str] = set()  # who crashes again and again
         self._let_down: dict[str, float] = {}  # when an ask of theirs has failed
         self._waiting: set[Literal] = set()
 
@@ -125,7 +126,7 @@ class RuntimeObserver(Observer):
 
     def spares(self, grace: Any, about: Literal) -> bool:
         """How often it crashes is just what is to be known."""
-        return about.name != "crashes" and super().spares(grace, about)
+        return self._loops.isdisjoint(about.args) and super().spares(grace, about)
 
     def afresh(self) -> None:
         """What was late before somebody acted says nothing of after."""
@@ -156,7 +157,8 @@ class RuntimeObserver(Observer):
             else:
                 self._seen(component).full = None
                 for atom in (progress(component), replies(component), room(component)):
-                    self.verdict(atom, None)
+                    if component not in self._loops:
+                        self.verdict(atom, None)
         self._tell(late, waits, now)
         if self._node.clock.is_monotonic:
             self._rests_until = now + (time.thread_time() - began) * SHARE
@@ -201,6 +203,9 @@ class RuntimeObserver(Observer):
             if not (was_let_down or _is_anothers(event.reason)):
                 seen = self._seen(component)
                 seen.crashes = (*seen.crashes, self.now)
+        for seen in self._known.values():
+            seen.crashes = recent_restarts(seen.crashes, self.now, WITHIN)
+        self._loops = {component for component, seen in self._known.items() if len(seen.crashes) >= LOOP}
 
     def _seen(self, component: str) -> _Seen:
         seen = self._known.get(component)
@@ -238,7 +243,7 @@ class RuntimeObserver(Observer):
         is_full = seen.full is not None and now - seen.full >= self._patience
         if cell.more is not None and cell.more.bound is not None and not is_full:
             self.verdict(room(component), True)
-        if not is_late and not is_full:
+        if not is_late and not is_full and component not in self._loops:
             answered = isinstance(cell.item, Ask) and cell.item.is_done and not seen.unanswered
             self.verdict(
                 progress(component),
@@ -278,9 +283,10 @@ class RuntimeObserver(Observer):
         self._waiting = waiting
         for one in waiting:
             self.verdict(one, True)
-        for component, seen in self._known.items():
-            seen.crashes = recent_restarts(seen.crashes, now, WITHIN)
-            self.verdict(crashes(component), True if len(seen.crashes) >= LOOP else None)
+        for component in self._known:
+            self.verdict(crashes(component), True if component in self._loops else None)
+            if component in self._loops:
+                self.verdict(progress(component), False)
 
     def _awaited(self, component: str, waits: Mapping[str, Iterable[str]]) -> str | None:
         """Whom an actor waits for now, or waited for at most of the last looks."""

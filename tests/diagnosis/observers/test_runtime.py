@@ -132,7 +132,7 @@ async def test_a_crash_loop_is_certain_and_one_crash_is_none(system: hf.ActorSys
         await advance(1.0)
     assert (await watching.diagnosis()).certain == ("all/b",)
     assert crashes("all/b") in (await watching.observed()).positive
-    assert "crashes(all/b): all/b is faulty" in (await watching.why()).text
+    assert "not progress(all/b): all/b is faulty" in (await watching.why()).text
 
 
 async def test_who_crashes_because_another_one_does_not_answer_is_not_to_blame(system: hf.ActorSystem) -> None:
