@@ -10,7 +10,7 @@
 
 from .assembly import observer, tree
 from .diagnoser import DiagnoserActor
-from .generate import Generated, LiveWiring, Wired, evident, generate, observers_for
+from .generate import Generated, Wired, generate, observers_for
 from .messages import (
     DIAGNOSIS,
     EXPLANATION,
@@ -29,7 +29,6 @@ from .messages import (
     RosDiagnostics,
     Touched,
 )
-from .model_follower import ModelFollower
 from .model_server import (
     ChangeModel,
     GetModel,
@@ -56,11 +55,9 @@ __all__ = [
     "GetObserved",
     "GetVersions",
     "Grace",
-    "LiveWiring",
     "LoadModel",
     "MODEL",
     "ModelChanged",
-    "ModelFollower",
     "ModelRefused",
     "ModelServer",
     "NextBest",
@@ -73,7 +70,6 @@ __all__ = [
     "ValidateModel",
     "Watch",
     "Wired",
-    "evident",
     "expecting",
     "generate",
     "observer",

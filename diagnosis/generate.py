@@ -110,7 +110,7 @@ async def generate(
 
 
 class LiveWiring:
-    """How a running system is connected, as observers see it and go by it; it outlives their lives.
+    """Holds how a running system is connected, as observers see it and go by it; it outlives their lives.
 
     Attributes:
         addresses: component to address.
