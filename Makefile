@@ -41,9 +41,11 @@ campaign: $(VENV)/.dev
 	HOLDFAST_FLEETS=2000 HOLDFAST_CROSSED=1 HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s \
 	    tests/cluster/test_takeover.py tests/cluster/test_removed_checks.py
 	HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s tests/system/test_removed_checks.py \
-	    tests/actors/process/hostile/test_removed_claims.py tests/telemetry/test_removed_checks.py
+	    tests/actors/process/hostile/test_removed_claims.py tests/telemetry/test_removed_checks.py \
+	    tests/diagnosis/test_removed_checks.py
 	HOLDFAST_REPAIRS=25 HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -s -p no:xdist -o faulthandler_timeout=0 \
 	    tests/diagnosis/repair/test_no_worse.py tests/diagnosis/repair/test_removed_repair.py
+	HOLDFAST_FOREIGN=20 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=0 tests/diagnosis/foreign
 	HOLDFAST_BUILDS=1 $(BIN)/python -m pytest -q -s tests/packaging
 	HOLDFAST_MUTANTS=100 $(BIN)/python -m pytest -q -s -o faulthandler_timeout=0 tests/test_mutants.py
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final
 
 import msgspec
@@ -10,16 +10,17 @@ import msgspec
 from ..actors.kernel.actor import Start
 from ..actors.kernel.node import Node
 from ..actors.kernel.ref import ActorRef
-from ..supervision.spec import ChildSpec
+from ..supervision.spec import ChildSpec, child
 from .assembly import observer, tree
-from .diagnoser import DiagnoserActor
+from .diagnoser import SERVER, DiagnoserActor
 from .engine import Diagnosis
-from .generate import Generated, WatchedSystem, child_name, generate, observers_for
+from .generate import Generated, LiveWiring, WatchedSystem, child_name, evident, generate, observers_for
 from .literals import ok
 from .messages import DIAGNOSER, Explained, GetDiagnosis, GetExplanation, GetObserved
 from .model import Declaration, Expectation, History, System
+from .model_follower import ModelFollower
 from .observations import Observed
-from .observers import Bound, Limits, Manner, NodeObserver, Property, PropertyObserver
+from .observers import Baselines, Bound, Limits, Manner, NodeObserver, Property, PropertyObserver, RuntimeObserver
 from .repair import (
     Approver,
     GetRepairStatus,
@@ -102,6 +103,7 @@ async def watch(
     seconds: float = 3.0,
     window: float = 2.0,
     hung_after: float | None = None,
+    baselines: Baselines | None = None,
     name: str = "diagnosis",
     **options: Any,
 ) -> Watch:
@@ -126,7 +128,8 @@ async def watch(
             "restart_subtree" in place of that one.
         manner: of the observers that are made here.
         seconds: see `model`.
-        window: of a generated model: seconds over which rates are counted, and five times as long learned.
+        window: of a generated model: seconds of silence of a topic that are never too long.
+        baselines: of a generated model: what is usual of its topics, such as `Baselines("usual.json")`, which is kept.
         hung_after: seconds after which an actor that is still in the same turn counts as not running, such as one that
             others ask in vain. None: nothing takes too long.
         name: of the supervisor that is started.
@@ -141,13 +144,20 @@ async def watch(
     watchers = [*observers]
     if generated is not None:
         declaration = generated.declaration
-        watchers += observers_for(generated, window=window, hung_after=hung_after, manner=manner)
+        live = LiveWiring(generated)
+        watchers += observers_for(
+            generated, window=window, hung_after=hung_after, manner=manner, wiring=live, baselines=baselines
+        )
+        follower = child("follower", Start(ModelFollower, (live, SERVER, _with_limits(limits))))
+        options["others"] = (*options.get("others", ()), follower)
     else:
         assert model is not None
         declaration = model.declaration() if isinstance(model, System) else model
     where = (dict(generated.addresses) if generated is not None else {}) | dict(addresses or {})
     if generated is None and where:
         watchers.append(observer("nodes", Start(NodeObserver, (where,), {"hung_after": hung_after, "manner": manner})))
+        watchers.append(observer("runtime", Start(RuntimeObserver, (where,))))
+        declaration = evident(declaration, where)
     if limits:
         declaration = expecting(declaration, limits)
         watchers += property_observers(limits, where, manner)
@@ -157,6 +167,16 @@ async def watch(
         mend = repairer(declaration, ways, policy, name=REPAIRER, addresses=where, stance=repair, approve=approve)
     started = await system.start(tree(History(declaration), watchers, name=name, repairer=mend, **options))
     return Watch(started, system._node, where, generated)
+
+
+def _with_limits(limits: LimitsOf | None) -> Callable[[Generated], Generated]:
+    """What is added to each model that is generated anew; limits of components that have gone are left out."""
+
+    def adapt(found: Generated) -> Generated:
+        kept = {name: some for name, some in (limits or {}).items() if name in found.addresses}
+        return msgspec.structs.replace(found, declaration=expecting(found.declaration, kept))
+
+    return adapt
 
 
 def expecting(declaration: Declaration, limits: LimitsOf) -> Declaration:

@@ -201,7 +201,7 @@ async def test_properties_are_watched_by_their_limits(shop: Shop) -> None:
         await asyncio.sleep(1.0)
     await asyncio.sleep(3.0)
     found = await watching.diagnosis()
-    assert "not ok(shop/feed.restarts)" in set(map(str, found.symptoms))
+    assert "ok(shop/feed.restarts)" in set(map(str, (await watching.observed()).negative))
     assert str(found) == "faulty: shop/feed"
 
 
