@@ -82,6 +82,7 @@ class FleetOfMachines:
         stack.push_async_callback(self.programs.close)
         await self.complete()
         self.clients = Clients(self.programs.socket, CLIENTS, self._seed)
+        stack.push_async_callback(self.clients.close)
         await self.clients.progress(5)
         self.watch = LogWatch(self.engine)
         await self.watch.start()
@@ -152,8 +153,10 @@ class FleetOfMachines:
 
     def said(self) -> str:
         """What programs and servers have written, for somebody who looks into a failure."""
-        logs = (f"{file.name}: {file.read_text('utf-8', 'replace')[-3000:]}" for file in self.folder.glob("*.log"))
-        return "\n".join([self.programs.errors(), *logs])
+        logs = (file.read_text("utf-8", "replace").splitlines() for file in self.folder.glob("*.log"))
+        lines = [line for log in logs for line in log if "[ERR]" in line or "[FTL]" in line][-20:]
+        ended = [f"program {one.pid} has ended: {one.returncode}" for one in self.programs.processes if one.returncode]
+        return "\n".join([self.programs.errors(), *ended, *lines])
 
     async def close(self) -> None:
         """End all of it."""

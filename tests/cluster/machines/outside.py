@@ -24,7 +24,6 @@ from typing import Any
 from holdfast.cluster.leadership import Follower
 from holdfast.cluster.nats.nats_engine import NatsEngine
 from holdfast.testing import History, Model, linearizable
-from holdfast.testing.histories.history import Operation
 from tests.cluster.servers import PATIENCE
 
 ANSWER_SECONDS = 1.5
@@ -32,7 +31,7 @@ ANSWER_SECONDS = 1.5
 PER_KEY = 60
 """Operations on one key: the checker is quick with many small histories."""
 PAUSE = 0.02
-"""Seconds between two requests of a client; twice as long at most."""
+"""Seconds between two requests, and between two looks."""
 
 
 def added(sums: int, message: tuple[str, int, int]) -> tuple[int, int]:
@@ -57,12 +56,13 @@ class Clients:
         socket: of whoever leads; all programs have theirs beside it.
         count: how many clients there are.
         seed: for what they ask whom.
+        pause: seconds between two requests of a client; twice as long at most.
     """
 
-    def __init__(self, socket: Path, count: int, seed: int) -> None:
+    def __init__(self, socket: Path, count: int, seed: int, pause: float = PAUSE) -> None:
         self.history = History()
         self.leader = self.epoch = self.answered = self.size = 0
-        self._socket, self._seed = socket, seed
+        self._socket, self._seed, self._pause = socket, seed, pause
         self._numbers = itertools.count(1)
         self._answers: list[tuple[int, int, int]] = []  # (epoch, number of the operation, epoch known when it began)
         self._told: set[int] = set()
@@ -92,11 +92,15 @@ class Clients:
                         return (await connection.ask(what))["answer"]
                 await asyncio.sleep(PAUSE)
 
-    async def stop(self) -> None:
-        """End all clients, and have the keys looked at once more."""
+    async def close(self) -> None:
+        """End all clients."""
         for task in self._tasks:
             task.cancel()
         await asyncio.wait(self._tasks)
+
+    async def stop(self) -> None:
+        """End all clients, and look at the keys once more."""
+        await self.close()
         for key in dict.fromkeys(operation.to for operation in self.history.operations):
             number = self.history.begin("last", ("look", 0, 0), to=key)
             self.history.end(number, await self.request({"of": key}))
@@ -106,7 +110,7 @@ class Clients:
         connection: Connection | None = None
         try:
             while True:
-                await asyncio.sleep(PAUSE * draws.uniform(1, 2))
+                await asyncio.sleep(self._pause * draws.uniform(1, 2))
                 if connection is None or draws.random() < 0.05:
                     if connection is not None:
                         await connection.close()
@@ -249,8 +253,3 @@ class LogWatch:
         await asyncio.wait([self._following])
         await self._follower.begin_anew()
         await self._engine.close()
-
-
-def unanswered(history: History) -> list[Operation]:
-    """The operations of which nobody knows."""
-    return [operation for operation in history.operations if operation.end == float("inf")]

@@ -69,9 +69,13 @@ def drawn(number: int) -> tuple[Kind, str, list[Fault]]:
     """What a fleet of the campaign has to outlive."""
     draws = random.Random(f"{SEED} {number}")
     kind: Kind = draws.choice(["network", "links"]) if not WHY_NOT else "links"
-    possible = [name for name, strike in STRIKES.items() if kind in strike.kinds]
-    faults = [Fault(draws.choice(MOMENTS), draws.choice(possible)) for _ in range(OF_A_FLEET)]
-    return kind, draws.choice(["task", "process"]), faults
+    isolation = draws.choice(["task", "process"])
+    possible = [
+        name
+        for name, strike in STRIKES.items()
+        if kind in strike.kinds and (isolation == "process" or not name.endswith("worker"))  # Else there is none.
+    ]
+    return kind, isolation, [Fault(draws.choice(MOMENTS), draws.choice(possible)) for _ in range(OF_A_FLEET)]
 
 
 @pytest.mark.skipif(not FAULTS, reason="a campaign: HOLDFAST_MACHINES=1000 has so many faults")
