@@ -264,8 +264,10 @@ class NatsBlobs:
             while len(parts) < wanted:
                 try:
                     messages = await consumer.fetch(BATCH, timeout=ANSWER_SECONDS)
-                except TimeoutError:
-                    return None
+                except TimeoutError as error:
+                    if await _last(self._stream, stream, f"{subject}.size", self._name) is None:
+                        return None  # It was dropped meanwhile.
+                    raise Unanswered(self._name, f"{wanted - len(parts)} parts of {name} do not come") from error
                 for message in messages:
                     part = message.subject.rpartition(".")[2]
                     if part != "size":

@@ -12,7 +12,8 @@ from holdfast.cluster.engine_thread import EngineThread
 from holdfast.cluster.leadership import lead, leader_name
 from holdfast.cluster.nats.access import NatsAccess
 from holdfast.cluster.nats.nats_engine import NatsEngine, open_engine
-from holdfast.cluster.ports import Engine
+from holdfast.cluster.nats.system_streams import SubjectNames
+from holdfast.cluster.ports import Engine, Unanswered
 from holdfast.cluster.replicated_journal import ReplicatedJournal
 from holdfast.testing.stores import conformance
 from tests.cluster.engines import PROMISES, Connect
@@ -34,6 +35,20 @@ async def test_a_real_server_keeps_it(nats1: NatsServers, promise: Callable[[Con
     await promise(connect)
     for engine in opened:
         await engine.close()
+
+
+async def test_a_blob_whose_parts_do_not_come_is_not_taken_for_one_that_is_not_there(nats1: NatsServers) -> None:
+    """Parts that are late, since servers choose a leader, are there all the same: whoever reads has to ask again."""
+    system = nats1.new_system()
+    engine, client = await open_engine(nats1.access(system)), await nats1.connect(system)
+    await client.jetstream().publish(f"{SubjectNames(system).blobs}.late.size", b"3")
+    with pytest.raises(Unanswered, match="1 parts of late do not come"):
+        await engine.blobs.get("late")
+    await client.jetstream().publish(f"{SubjectNames(system).blobs}.late.0", b"abc")
+    assert await engine.blobs.get("late") == b"abc"
+    assert await engine.blobs.get("never") is None
+    await client.close()
+    await engine.close()
 
 
 ACCESS: dict[str, NatsAccess] = {}

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from holdfast.cluster.leadership import Follower
+from holdfast.cluster.log_writer import insist
 from holdfast.cluster.nats.nats_engine import NatsEngine
 from holdfast.testing import History, Model, linearizable
 from tests.cluster.servers import PATIENCE
@@ -227,17 +228,17 @@ class LogWatch:
 
     async def start(self) -> None:
         """Begin to follow."""
-        self._engine = await self._opened()
+        self._engine = await insist(self._opened)
         self._follower = Follower(self._engine)
         self._following = asyncio.ensure_future(self._follower.follow())
 
     async def judge(self) -> None:
         """Compare with what somebody else reads now; nobody writes any more."""
-        engine = await self._opened()
+        engine = await insist(self._opened)
         other = Follower(engine)
         try:
-            await other.catch_up()
             async with asyncio.timeout(PATIENCE):
+                await insist(other.catch_up)
                 while self._follower.reader.at < other.reader.at and not self._following.done():
                     await asyncio.sleep(PAUSE)
             assert not self._following.done(), self._following
