@@ -135,7 +135,7 @@ async def answer(system: hf.ActorSystem, request: dict[str, Any]) -> Any:
 async def epoch_of(system: hf.ActorSystem) -> int:
     """In which epoch the system leads; waits until it does."""
     with system.events() as events:
-        return (await events.until(hf.events.LeadershipTaken)).epoch
+        return (await events.until(hf.events.LeadershipTaken, timeout=86400.0)).epoch
 
 
 async def main() -> None:

@@ -22,8 +22,8 @@ CHECKS = {
     ),
     "a blob whose parts are late is not taken for one that is not there": Check(
         "cluster/nats/nats_engine.py",
-        '                    raise Unanswered(self._name, f"{wanted - len(parts)} parts of {name} do not come") from error\n',
-        "                    return None\n",
+        'raise Unanswered(self._name, f"{wanted - len(parts)} parts of {name} do not come") from error',
+        "return None",
         "tests/cluster/test_engine_on_nats.py",
         "whose_parts_do_not_come",
     ),

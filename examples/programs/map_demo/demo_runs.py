@@ -61,7 +61,7 @@ def tree(geometry: Geometry, recovery: Method, kills: int, *, desk: bool = False
     """
     mapper = child("mapper", start(Mapper, geometry), isolation="process", recovery=recovery)
     planner = child("planner", start(Planner), bindings={"mapper": MAPPER}, recovery=recovery if desk else None)
-    children = [mapper, planner, child("reader", start(Reader))]
+    children: list[ChildSpec] = [mapper, planner, child("reader", start(Reader))]
     if desk:
         bindings = {"mapper": MAPPER, "planner": PLANNER}
         children.append(child("desk", start(Desk), bindings=bindings, recovery=recovery))

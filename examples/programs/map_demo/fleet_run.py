@@ -16,7 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import monotonic
 
-from tests.cluster.servers import NatsServers
+from tests.cluster.servers import NatsServers  # pyright: ignore[reportMissingImports]  # by the path that fleet.py adds
 
 from .demo_runs import DemoPlan, DemoRun, Scene, begin, undisturbed
 from .far import FarFleet

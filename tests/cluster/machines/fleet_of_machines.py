@@ -65,7 +65,7 @@ class FleetOfMachines:
             for disk in self.disks:
                 disk.mkdir()
                 subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "none", disk], check=True)
-                stack.callback(subprocess.run, ["umount", "-l", disk], check=True)
+                stack.callback(subprocess.check_call, ["umount", "-l", disk])
             self.servers = NatsServers(self.folder, 3, tls, network=network, stores=self.disks)
         else:
             self.servers = NatsServers(self.folder, 3, advertise=False)

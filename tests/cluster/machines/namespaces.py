@@ -11,7 +11,7 @@ import ctypes
 import os
 import shutil
 import subprocess
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from pathlib import Path
 
 NAMES = Path("/run/netns")
@@ -71,7 +71,7 @@ class Network:
         return ["ip", "netns", "exec", self.namespace(machine), *command]
 
     @contextlib.contextmanager
-    def on(self, machine: str | None) -> Iterator[None]:
+    def on(self, machine: str | None) -> Generator[None]:
         """Have the sockets that this thread makes meanwhile be a machine's; of none: be the hub's."""
         with open("/proc/thread-self/ns/net") as before:
             with open(NAMES / (self.hub if machine is None else self.namespace(machine))) as there:

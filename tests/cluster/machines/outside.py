@@ -137,7 +137,8 @@ class Clients:
         number = next(self._numbers)
         key, epoch = f"key {number // PER_KEY}", self.epoch
         if draws.random() < 0.3:
-            message, request = ("look", 0, 0), {"of": key}
+            message = ("look", 0, 0)
+            request: dict[str, Any] = {"of": key}
         else:
             amount = draws.randrange(1, 1000)
             message = ("add", number, amount)
