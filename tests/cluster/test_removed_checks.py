@@ -13,6 +13,13 @@ LEADERSHIP = "tests/cluster/test_leadership.py"
 FLEETS = "tests/cluster/test_takeover.py"
 
 CHECKS = {
+    "a silent connection is not closed in good order": Check(
+        "cluster/nats/nats_engine.py",
+        "            transport._io_writer.transport.abort()\n",
+        "            pass\n",
+        "tests/cluster/test_engine_on_nats.py",
+        "silent_is_let_go_of_at_once",
+    ),
     "a large snapshot is asked for again while servers do not answer": Check(
         "cluster/replicated_journal.py",
         "self._loop.wait(insist(lambda: self._engine.blobs.get(name)), READ_SECONDS)",

@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 from tests.cluster.machines.fleet_of_machines import FleetOfMachines, Kind
 
 Undo = Callable[[], Awaitable[None]]
-LARGE: Final = 32 << 10
+LARGE: Final = 96 << 10
 """Bytes of a message when snapshots are to be large, and bases frequent."""
 SLOW_SECONDS: Final = 0.03
 """How much later a slow disk has written."""

@@ -44,6 +44,12 @@ class SlowLinks:
             if is_hushed:
                 self._passes[way].clear()
 
+    def freeze(self) -> None:
+        """Pass nothing on, for ever, over the connections that there are; new ones are as they should be."""
+        self.hush()
+        self._passes = {True: asyncio.Event(), False: asyncio.Event()}
+        self.mend()
+
     def mend(self) -> None:
         """Pass everything on, and at once."""
         self.delay = self.jitter = self.rate = 0.0
@@ -97,7 +103,8 @@ class SlowLinks:
         """Pass on what comes, in order: what is on its way does not hold up what follows, unless there is a limit."""
         loop = asyncio.get_running_loop()
         under_way: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(256)
-        delivering = asyncio.ensure_future(self._deliver(under_way, writer, self._passes[up]))
+        passes = self._passes[up]
+        delivering = asyncio.ensure_future(self._deliver(under_way, writer, passes))
         with contextlib.suppress(OSError):
             try:
                 while (data := await reader.read(CHUNK)) and not delivering.done():
@@ -105,6 +112,7 @@ class SlowLinks:
                     await under_way.put((loop.time() + late, data))
                     if self.rate:
                         await asyncio.sleep(len(data) / self.rate)
+                await passes.wait()  # Of the end nobody is told either.
             finally:
                 delivering.cancel()
                 await asyncio.wait([delivering])

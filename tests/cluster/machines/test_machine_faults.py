@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import random
 from pathlib import Path
+from time import monotonic
 
 import pytest
 
@@ -49,9 +50,12 @@ async def outlive(folder: Path, kind: Kind, seed: int, isolation: str, faults: l
     try:
         await fleet.start()
         for fault in faults:
+            began = monotonic()
             done.append(str(fault))
             await commit(fleet, fault)
+            done[-1] += f" ({monotonic() - began:.1f} s)"
         await fleet.judge()
+        print(f"{kind}, seed {seed}, {isolation}; outlived: {'; '.join(done)}")
     except BaseException as error:
         error.add_note(f"{kind}, seed {seed}, {isolation}; faults: {'; '.join(done)}\n{fleet.said()}")
         raise
