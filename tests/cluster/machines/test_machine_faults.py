@@ -22,19 +22,19 @@ OF_A_FLEET = 10
 CHOSEN: dict[Kind, list[Fault]] = {
     "network": [
         Fault("in calm", "cut off the leader with one server"),
-        Fault("at a base", "kill the log's server"),
         Fault("at a snapshot", "cut off the log's server again and again"),
-        Fault("in calm", "cut off what the leader sends"),
+        Fault("in calm", "cut off the standby with one server"),
         Fault("in calm", "fill the disk of another server"),
-        Fault("at a snapshot", "stop the leader"),
+        Fault("at a snapshot", "slow down the disk of the log's server"),
+        Fault("at a snapshot", "stop the standby"),
     ],
     "links": [
         Fault("in calm", "have links be late"),
-        Fault("at a takeover", "kill two servers"),
-        Fault("in calm", "have the next leader see another time"),
         Fault("in calm", "kill the worker"),
-        Fault("at a base", "break links"),
-        Fault("in calm", "kill all servers"),
+        Fault("at a snapshot", "break links"),
+        Fault("in calm", "stop another server"),
+        Fault("at a snapshot", "kill the standby"),
+        Fault("in calm", "stop the leader"),
     ],
 }
 KINDS = [
