@@ -14,12 +14,15 @@ import signal
 import sys
 import tempfile
 import time
+from collections import deque
 from collections.abc import AsyncGenerator
 from pathlib import Path
 
 from harness import Run, ask_all, main
 
 import holdfast as hf
+from holdfast.cluster.leadership import Follower
+from holdfast.cluster.log_records import CHANGES, FORMAT, EpochBegun, RecordMaker, encode_changes
 from holdfast.cluster.nats.access import access_of
 from holdfast.cluster.nats.nats_engine import NatsEngine, open_engine
 
@@ -160,6 +163,36 @@ async def standby(run: Run) -> None:
     run.bound("a standby's processor time beside its leader's", 100.0 * spent[1] / spent[0], unit="%", target=15.0)
 
 
+async def lag(run: Run) -> None:
+    """From the acknowledgement of a record until a follower has it, at 500 records a second."""
+    async with servers(1) as made:
+        access = access_of(made.store(made.new_system()))
+        engine, other = await open_engine(access), await open_engine(access)
+        follower = Follower(other)
+        following = asyncio.ensure_future(follower.follow())
+        maker = RecordMaker(1, 0)
+        last = await engine.log.append(maker.beginning(EpochBegun("bench", "bench", FORMAT, 0.0)), 0)
+        known: deque[tuple[int, float]] = deque()
+        lags: list[float] = []
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        for number in range(run.size(5_000)):
+            maker.after = last
+            note = encode_changes([("note", (f"key {number % 100}", RECORD))])
+            (record,) = maker.parts(CHANGES, note)
+            last = await engine.log.append(record, last)
+            known.append((last, loop.time()))
+            await asyncio.sleep(max(0.0, began + number / 500 - loop.time()))
+            while known and known[0][0] <= follower.reader.at:
+                lags.append(loop.time() - known.popleft()[1])
+        following.cancel()
+        await asyncio.wait([following])
+        await follower.begin_anew()
+        await engine.close()
+        await other.close()
+    run.bound("a standby's lag, p99", 1e3 * sorted(lags)[int(0.99 * len(lags))], unit="ms", target=100.0)
+
+
 def _spent(pid: int) -> float:
     """Seconds of processor time of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -208,4 +241,4 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["--program"]:
         hf.run(_lead(sys.argv[2], loads="load" in sys.argv[3:]))
     else:
-        main([asks, takeover, standby])
+        main([asks, takeover, standby, lag])
