@@ -16,6 +16,7 @@ from ..actors.kernel.ref import ActorRef
 from ..actors.process.wire import frames
 from ..actors.seconds import check_seconds
 from ..actors.values.path_parts import check_path_part
+from ..checkpoint.home.ask_recovery import PASSING
 from ..cluster.configuration import NatsSettings
 from ..cluster.lines.lines import Call, Lines, Transport, new_boot
 from ..cluster.ports import Unanswered
@@ -82,7 +83,7 @@ class Connection:
         if within is not None:
             return within.lines
         boot = new_boot()
-        node = self._own = Node(f"client-{boot.token}", asyncio.get_running_loop())
+        node = self._own = Node(f"{PASSING[1:]}{boot.token}", asyncio.get_running_loop())
         lines = Lines(node, node.name, boot)
         node.connect(Ports(outside=lines.find))
         return lines

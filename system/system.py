@@ -305,6 +305,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             raise cancelled
 
     async def _close(self, root: Cell, node: Node) -> None:
+        self._lines.closing()
         gone = lifecycle.stop_and_wait(root)
         end_within(root, gone)
         await gone

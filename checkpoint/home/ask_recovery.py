@@ -12,12 +12,14 @@ journal, and becomes an input when its home is opened.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from hashlib import blake2b
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import msgspec
 
 from ...actors.errors import HoldfastError
 from ...actors.kernel.codec import Parcel
+from ...actors.kernel.envelope import Ask
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer, Out
 from ..schema import shape_entry
@@ -34,6 +36,10 @@ if TYPE_CHECKING:
 
 FAR: Final = "far"
 """The address of far answers in the store; no actor's, for those begin with a slash."""
+SYSTEM: Final = "connected "
+"""How the key of a fact begins that names a system to which there was a line."""
+PASSING: Final = "/client~"
+"""How the addresses of programs begin that are no systems, and only connect to some."""
 MOST_ENTRIES: Final = 2000
 """Entries after which what is left is written anew."""
 
@@ -63,6 +69,8 @@ class RejoinedAsk(SwitchAsk, eq=False):
             self.is_over, self.future = True, OVER
             own = batch if batch is not None else Batch()
             if homes.far.is_far(self.asker):
+                if batch is None and homes.far.is_closing:
+                    return  # Its receiver has been stopped with the system: it asks whoever leads next.
                 homes.far.answered(FarId(self.asker, self.turn, self.k), answer, own)
             else:
                 own.add(self.asker, outcome_entry(self.turn, self.k, answer), [])
@@ -76,12 +84,43 @@ class FarId(NamedTuple):
     Attributes:
         asker: the address of who has asked.
         number: that its program has given the ask.
-        run: the number of that run of the program.
+        run: the number of that run of the program; LASTING if the ask outlives it, being recorded itself.
     """
 
     asker: str
     number: int
     run: int
+
+
+LASTING: Final = 0
+"""The run of an ask that a recorded actor has made: each run of its program asks it under the same number."""
+
+
+def lasting_number(origin: str) -> int:
+    """The number of what a recorded actor sends another system, by its name in the journal here."""
+    return int.from_bytes(blake2b(origin.encode(), digest_size=8).digest(), "big") >> 1
+
+
+class FarOut(msgspec.Struct, array_like=True, frozen=True):
+    """A message of a recorded actor to another system, kept until that has accepted it."""
+
+    origin: str
+    to: str
+    name: str
+    body: bytes
+    sender: str
+
+
+class FarSender(Protocol):
+    """Whoever sends to other systems, now or when they can be reached."""
+
+    def ask(self, ask: SwitchAsk, *, again: bool) -> None:
+        """Send an ask of a recorded actor."""
+        ...
+
+    def tell(self, out: FarOut, *, again: bool) -> None:
+        """Send a message of a recorded actor; `FarMail.accepted` is called when the other system has it."""
+        ...
 
 
 class FarAnswer(msgspec.Struct, array_like=True, frozen=True):
@@ -95,38 +134,69 @@ class FarAnswer(msgspec.Struct, array_like=True, frozen=True):
     body: bytes
 
 
-class FarAsks:
-    """What recorded actors were asked by other systems: each ask has one outcome, whoever leads this system.
+class FarMail:
+    """What recorded actors are asked by other systems, and what they tell those: once, whoever leads the systems.
 
     The journal of the receiver has an ask as an input; its outcome is kept in the append that ends its turn, until the
-    other system is known to have it. An ask that comes again is one of the two, or has never been accepted.
+    other system is known to have it. An ask that comes again is one of the two, or has never been accepted. A message
+    to another system is kept in the append that ends the turn, until that system has accepted it as if it were an ask.
 
     Attributes:
         deliver: is told each outcome when it is safe.
+        sender: sends to other systems; none before there are lines.
+        is_closing: whether this system ends: asks that are not answered any more wait for whoever leads it next.
     """
 
     def __init__(self, homes: Homes) -> None:
         self._homes = homes
         self._answers: dict[FarId, FarAnswer] = {}
         self._open: set[FarId] = set()
+        self._outs: dict[str, FarOut] = {}
+        self._systems = {key.removeprefix(SYSTEM) for key in homes.journal.notes(SYSTEM)}
         self._positions: list[int] = []
         self._opening: dict[str, list[Callable[[], None]]] = {}
+        self.sender: FarSender | None = None
+        self.is_closing = False
         self.deliver: Callable[[FarId, Answer], None] = lambda which, answer: None
         saved = homes.journal.load(FAR)
         if saved.snapshot is not None:
-            for one in msgspec.msgpack.decode(saved.snapshot, type=list[FarAnswer]):
-                self._answers[_id(one)] = one
+            answers, outs = msgspec.msgpack.decode(saved.snapshot, type=tuple[list[FarAnswer], list[FarOut]])
+            self._answers.update((_id(one), one) for one in answers)
+            self._outs.update((out.origin, out) for out in outs)
         for position, entry in saved.entries:
             self._positions.append(position)
-            values: tuple[Any, ...] = entry
-            one = FarAnswer(*values[1:])
-            self._answers[_id(one)] = one
+            self._read(position, entry)
         self._turn = saved.turn
+
+    def _read(self, position: int, entry: tuple[Any, ...]) -> None:
+        match entry:
+            case ("answered", *fields):
+                one = FarAnswer(*fields)
+                self._answers[_id(one)] = one
+            case ("settled", asker, number, run):
+                self._answers.pop(FarId(asker, number, run), None)
+            case ("out", *fields):
+                out = FarOut(*fields)
+                self._outs[out.origin] = out
+            case ("accepted", origin):
+                self._outs.pop(origin, None)
+            case _:
+                raise HoldfastError(f"other systems: entry {position} is of an unknown kind {entry[0]!r}")
 
     def is_far(self, path: str) -> bool:
         """Whether an address is another system's."""
         top = f"/{self._homes.node.name}"
         return path != top and not path.startswith(f"{top}/")
+
+    def connected(self, system: str) -> None:
+        """There is a line to a system: what recorded actors send it from now on is kept until it has it."""
+        if system not in self._systems and not f"/{system}".startswith(PASSING):
+            self._systems.add(system)
+            self._homes.journal.note(f"{SYSTEM}{system}", b"")
+
+    def _lasts(self, path: str) -> bool:
+        """Whether an address is that of a system that there has been a line to, in this run or an earlier one."""
+        return path[1:].partition("/")[0] in self._systems
 
     def begin(self, which: FarId) -> None:
         """It is on its way to its receiver."""
@@ -135,6 +205,10 @@ class FarAsks:
     def is_open(self, which: FarId) -> bool:
         """Whether its outcome will come: the receiver has it."""
         return which in self._open or self._homes.rejoin.has(*which)
+
+    def goes_on(self, ask: Ask | None) -> bool:
+        """Whether an ask is not to end with this program: another system waits, and the next program answers it."""
+        return self.is_closing and isinstance(ask, SwitchAsk) and self.is_far(ask.asker)
 
     def outcome(self, which: FarId) -> Answer | None:
         """The outcome, if it is known."""
@@ -157,7 +231,49 @@ class FarAsks:
 
     def settled(self, which: FarId) -> None:
         """Whoever has asked has the outcome, or does not want it any more."""
-        self._answers.pop(which, None)
+        if self._answers.pop(which, None) is not None and which.run == LASTING and self._homes.journal.durable:
+            batch = Batch()
+            batch.add(FAR, ("settled", *which), self._positions)
+            batch.commit(self._homes.journal)
+
+    # -- what is told to other systems ------------------------------------------------------------------------------
+
+    def keeps(self, origin: str, out: Out, sender: str, batch: Batch) -> bool:
+        """Keep what a turn tells an actor of another system that lasts, and send it when that is safe."""
+        if self.sender is None or not self._lasts(out.to):
+            return False
+        kept = self._outs[origin] = FarOut(origin, out.to, out.name, bytes(out.body), sender)
+        if self._homes.journal.durable:
+            batch.add(FAR, ("out", *msgspec.structs.astuple(kept)), self._positions)
+        send = self.sender.tell
+        batch.after.append(lambda: send(kept, again=False))
+        return True
+
+    def accepted(self, origin: str, then: Callable[[], None]) -> None:
+        """Another system has a message, or has refused it: it is not sent again. `then` is called when that is safe."""
+        if self._outs.pop(origin, None) is None:
+            return
+        batch = Batch()
+        if self._homes.journal.durable:
+            batch.add(FAR, ("accepted", origin), self._positions)
+        batch.after += (then, self._tidy)
+        batch.commit(self._homes.journal)
+
+    def asks_again(self, home: Switch, turn: int, key: int, out: Out) -> bool:
+        """A turn asks another system what it asked before the restart: under the same name, so its outcome is one."""
+        if self.sender is None or not self._lasts(out.to):
+            return False
+        source = home.ledger.open.get(key)
+        chain = ((home.path, key), *(source.chain if source is not None else ()))
+        ask = SwitchAsk.made(home, turn, out, chain, home.node.cell_at(out.to))
+        home.calls.asks[turn, out.k] = ask
+        home.node.deadlines.add(ask)
+        self.sender.ask(ask, again=True)
+        return True
+
+    def outs(self, system: str) -> list[FarOut]:
+        """What is kept for a system, oldest first."""
+        return [out for out in self._outs.values() if out.to.startswith(f"/{system}/")]
 
     def when_opened(self, path: str, then: Callable[[], None]) -> None:
         """Have something done when the home of a recorded address that nobody was started at yet is open."""
@@ -166,14 +282,14 @@ class FarAsks:
     def opened(self, path: str) -> None:
         """A home is open: what it has is known."""
         for then in self._opening.pop(path, ()):
-            then()
+            self._homes.node.loop.call_soon(then)  # When its next life has a place there.
 
     def _tidy(self) -> None:
         """Write what is left anew when much has come and gone."""
         if len(self._positions) < MOST_ENTRIES:
             return
         journal = self._homes.journal
-        left = msgspec.msgpack.encode(list(self._answers.values()))
+        left = msgspec.msgpack.encode((list(self._answers.values()), list(self._outs.values())))
         try:
             journal.barrier()
             journal.cut(FAR, left, self._positions, turn=self._turn + 1, keep=1)
@@ -284,6 +400,8 @@ class Rejoin:
 
     def joins(self, home: Switch, turn: int, key: int, out: Out) -> bool:
         """A turn of `home` asks again what it asked before the restart: whether the answer may still come."""
+        if self._homes.far.asks_again(home, turn, key, out):
+            return True
         ask = self._asks.get((home.path, turn, out.k))
         if ask is None and not self._homes.knows(out.to):
             return False  # Whoever was asked keeps no journal.
@@ -308,6 +426,11 @@ def origin_kept(home: Switch, turn: int, key: int, out: Out) -> str:
 def origin_asked(home: Switch, turn: int, out: Out) -> str:
     """The same of what was asked: the origin of the input that it becomes, and who has asked."""
     return f"{MARK}{turn}.{out.k} {home.path}"
+
+
+def origin_asked_by(ask: SwitchAsk) -> str:
+    """The same of an ask that was made."""
+    return f"{MARK}{ask.turn}.{ask.k} {ask.asker}"
 
 
 def _numbers(origin: str) -> tuple[int, int]:

@@ -70,6 +70,8 @@ def drop_all(home: Switch, why: str, *, keep_tells: bool = False, keep_ticks: bo
     for source in list(ledger.open.values()):
         if source.kind == START or (keep_tells and source.ask is None) or (keep_ticks and source.kind == TICK):
             continue
+        if home.homes.far.goes_on(source.ask):
+            continue
         if source.ask is None and source.kind == MESSAGE:
             lose(home, source, why)
         if source.id == ledger.begun and ledger.released and ledger.lasts and keep_tells:

@@ -21,7 +21,7 @@ from ..snapshot.rollback import older_snapshot, roll_back
 from ..snapshot.snapshot_groups import Groups
 from ..snapshot.snapshot_record import take_over
 from ..snapshot.snapshot_schedule import nobody
-from .ask_recovery import FAR, FarAsks, Rejoin
+from .ask_recovery import FAR, FarMail, Rejoin
 from .capacity import HomeBound
 from .disposal import drop_all, forget_home, put_into_quarantine
 from .held_messages import Holding, let_go
@@ -71,7 +71,7 @@ class Homes:
         self._stored = set(journal.addresses()) - {PLACE, FAR}
         self.groups = Groups(self)
         self.rejoin = Rejoin(self)
-        self.far = FarAsks(self)
+        self.far = FarMail(self)
         if unfinished is not None:  # This process's predecessor died in the middle of it.
             self._erase_tree(unfinished.decode())
 

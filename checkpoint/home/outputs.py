@@ -186,7 +186,9 @@ class Outputs:
         batch.after.append(send)
 
     def _keeps(self, target: Cell, out: Out, batch: Batch, origin: str, sender: str) -> bool:
-        """Whether a message is kept for a recorded actor that this program has not started yet."""
+        """Whether a message is kept for another system, or for a recorded actor that was not started here yet."""
+        if out.verb != "ask" and self._home.homes.far.keeps(origin, out, sender, batch):
+            return True
         return target.is_dead and self._home.homes.rejoin.keep(self._home, origin, out, sender, batch)
 
     def _publish(self, turn: int, out: Out, batch: Batch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -52,6 +53,7 @@ class SwitchAsk(RelayedAsk, eq=False):
     turn: int = 0
     k: int = 0
     asked: str = ""  # the type of the message, if it is known
+    settled: Callable[[], None] | None = None  # called when its outcome is safe
 
     @classmethod
     def made(cls, switch: Switch, turn: int, out: Out, chain: Any, to: Cell) -> SwitchAsk:
@@ -216,12 +218,14 @@ class PendingCalls:
     def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None) -> None:
         """An ask of ours has its outcome: journal it, then tell the turn that waits."""
         own = batch if batch is not None else Batch()
-        self.asks.pop((turn, k), None)
+        ask = self.asks.pop((turn, k), None)
         if self._home.ledger.note_outcome(turn, k, answer):
             if self._home.journal.durable:
                 self._home.note_shape(shape_name(answer), own)
             self._home.note(turn, outcome_entry(turn, k, answer), own)
         own.after.append(lambda: self._tell(turn, k, answer))
+        if ask is not None and ask.settled is not None:
+            own.after.append(ask.settled)
         if batch is None:
             own.commit(self._home.journal)
 

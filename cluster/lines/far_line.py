@@ -7,6 +7,7 @@ under that name, and has one outcome. What was sent to other actors then ends wi
 
 from __future__ import annotations
 
+import math
 import secrets
 import weakref
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
 
+from ...actors.control.trace_tail import enveloped
 from ...actors.errors import (
     AskFailed,
     BadMessage,
@@ -26,9 +28,9 @@ from ...actors.errors import (
 )
 from ...actors.exit_reasons import ExitReason, NoConnection
 from ...actors.kernel import links
-from ...actors.kernel.cell import RUNNING, Cell
-from ...actors.kernel.codec import encode_special, unencodable
-from ...actors.kernel.envelope import AnyTable
+from ...actors.kernel.cell import ANY, RUNNING, Cell
+from ...actors.kernel.codec import Parcel, encode_special, unencodable
+from ...actors.kernel.envelope import AnyTable, Ask
 from ...actors.kernel.message import Message, RuntimeOrder
 from ...actors.process.wire import frames
 from ...actors.process.wire.frames import BadFrame
@@ -42,9 +44,11 @@ from ...actors.process.wire.peer import (
     obey,
 )
 from ...actors.process.wire.worker_gate import is_order
-from ...checkpoint.home.ask_recovery import FarId, RejoinedAsk
+from ...checkpoint.home.ask_recovery import LASTING, FarId, FarOut, RejoinedAsk, lasting_number, origin_asked_by
+from ...checkpoint.home.pending_asks import ACCEPTED, SwitchAsk
 from ...checkpoint.home.recorded_home import switch_of
-from ...checkpoint.protocol import REPLY, Answer
+from ...checkpoint.inputs import Batch as Append
+from ...checkpoint.protocol import MESSAGE, REPLY, Answer
 from .line import MOST_BYTES, NOBODY, WINDOW_BYTES, Batch, Boot, Line, Note
 
 if TYPE_CHECKING:
@@ -56,8 +60,11 @@ if TYPE_CHECKING:
 
 NEW, AGAIN = b"\x00", b"\x01"
 """The first byte of an item: whether it may have come before, to another program that led the system."""
+PASSING, ASKED, TOLD = 0, 1, 2
+"""The number in an ask's frame: its name is void with the run of its program, is not, or it is a message that is kept
+there until it is accepted here."""
 COMMANDS: Final = frozenset(
-    ("monitor", "demonitor", "link", "unlink", "exit", "down", "subscribe", "unsubscribe")
+    ("monitor", "demonitor", "link", "unlink", "exit", "down", "subscribe", "unsubscribe", "settled")
 )  # fmt: skip
 """What one system may want of the actors of another one."""
 _DECODER: Final[msgspec.msgpack.Decoder[frames.AnyFrame]] = msgspec.msgpack.Decoder(frames.AnyFrame)
@@ -183,6 +190,33 @@ class FarAsk(RejoinedAsk, eq=False):
         return ask
 
 
+class KeptTell(RelayedAsk, eq=False):
+    """A message of a recorded actor to another system, which answers when it has accepted it."""
+
+    far: Any = None
+    origin: str = ""
+
+    def answer_raw(self, body: bytes) -> None:
+        """It is accepted."""
+        self._over("")
+
+    def fail(self, error: BaseException) -> None:
+        """It has not been sent: it stays kept."""
+
+    def fail_raw(self, kind: str, name: str, body: bytes) -> None:
+        """It is refused, for good."""
+        self._over(str(self.far.codec.decode_error(kind, name, body)))
+
+    def _over(self, problem: str) -> None:
+        if self.is_over:
+            return
+        self.is_over = True
+        far: FarLine = self.far
+        if problem:
+            far.node.dead_letter(self.to, self.message, problem, self.sender)
+        far.kept_is_over(self)
+
+
 class FarLine(Peer):
     """A line to another program, with the stand-ins for its actors.
 
@@ -198,6 +232,9 @@ class FarLine(Peer):
         line: the line to that; None until then.
         heard: when something of it has last come, on the loop's clock.
         is_lost: whether it has not answered for long.
+        is_closed: whether nothing goes over any more.
+        is_closing: whether this program ends: it takes in nothing new, and still answers.
+        hand_back: is given the asks of recorded actors that are out when it is closed.
         await_actor: has something done when somebody is started at an address; None: nobody will be soon.
     """
 
@@ -213,12 +250,14 @@ class FarLine(Peer):
         self.line: Line | None = None
         self.heard = node.loop.time()
         self.is_lost = False
-        self.is_closed = False
+        self.is_closed = self.is_closing = False
         self.await_actor: Callable[[str, Callable[[], None]], bool] = lambda path, then: False
+        self.hand_back: Callable[[SwitchAsk], None] = lambda ask: None
         self._held: list[bytes] = []  # until the other program has answered
         self._held_bytes = 0
         self._last_id = secrets.randbits(40) << 12  # A late reply to an earlier run names nothing of this one.
-        self._sent_id = 0  # the newest frame with a number that an earlier line has taken
+        self._held_asks: set[int] = set()  # the asks among those
+        self._fresh: set[int] = set()  # asks that wait, and that nobody has been sent yet
         self._cells: weakref.WeakValueDictionary[str, Cell] = weakref.WeakValueDictionary()
         self._host = FarHost(self)
         self.join(cast("Any", LineConnection(self)))
@@ -249,8 +288,9 @@ class FarLine(Peer):
         Raises:
             Unreachable: it has not answered for long, and nobody waits for what the frame comes to.
         """
-        waits = isinstance(frame, (frames.Ask, frames.Reply, frames.Failure, frames.Command))
-        if self.is_closed or (self.is_lost and not waits):
+        if self.is_closed and isinstance(frame, (frames.Reply, frames.Failure, frames.Command)):
+            return  # Nobody is there who would care.
+        if self.is_closed or (self.is_lost and isinstance(frame, (frames.Tell, frames.Offer, frames.Publish))):
             raise Unreachable(f"/{self.name}", "the connection is closed" if self.is_closed else "it does not answer")
         if self.line is not None:
             self.line.put(NEW + data)
@@ -259,6 +299,8 @@ class FarLine(Peer):
             raise Unreachable(f"/{self.name}", "too much waits for it already")
         self._held_bytes += len(data)
         self._held.append(NEW + data)
+        if isinstance(frame, frames.Ask):
+            self._held_asks.add(frame.id)
 
     def command(self, path: str, verb: str, data: dict[str, Any]) -> None:
         """Tell the other program what an actor here, or one of its own, wants."""
@@ -267,14 +309,60 @@ class FarLine(Peer):
     def deliver(self, which: FarId, answer: Answer) -> None:
         """Send the outcome of an ask to a recorded actor here; it is kept until the other program has it."""
         homes, line = self._homes, self.line
-        if homes is None or line is None or which.run != run_number(self.theirs):
+        if homes is None or line is None or which.run not in (LASTING, run_number(self.theirs)):
             return  # It asks again when it is back; or it has been started anew, and nobody there waits.
         frame: frames.Frame
         if answer.kind == REPLY:
             frame = frames.Reply(which.number, msgspec.Raw(answer.body))
         else:
             frame = frames.Failure(which.number, answer.kind, answer.name, msgspec.Raw(answer.body))
-        line.put(NEW + msgspec.msgpack.encode(frame), lambda: homes.far.settled(which))
+        # A recorded asker says by itself when it has the outcome for good.
+        arrived = None if which.run == LASTING else lambda: homes.far.settled(which)
+        line.put(NEW + msgspec.msgpack.encode(frame), arrived)
+
+    def _send_ask(self, cell: Cell, path: str, ask: Ask, number: int) -> None:
+        if isinstance(ask, SwitchAsk):
+            self.ask_lasting(ask, again=False)
+        else:
+            super()._send_ask(cell, path, ask, number)
+
+    def ask_lasting(self, ask: SwitchAsk, *, again: bool) -> None:
+        """Ask what a recorded actor asks, under the name that its ask has for good."""
+        key = lasting_number(origin_asked_by(ask))
+        asker = ask.asker
+        ask.settled = lambda: self.command(asker, "settled", {"number": key})
+        self._put_ask(key, ask, again=again)
+
+    def tell_lasting(self, out: FarOut, *, again: bool) -> None:
+        """Tell what a recorded actor tells; it is kept until it is accepted."""
+        told = KeptTell(Parcel(out.name, out.body), self.node.cell_at(out.sender), (), math.inf, math.inf, None)
+        told.to, told.future, told.far, told.origin = self.stand_in(out.to), told, self, out.origin
+        self._put_ask(lasting_number(out.origin), told, again=again)
+
+    def kept_is_over(self, told: KeptTell) -> None:
+        """The other program has accepted what was kept for it, or never will."""
+        homes, key, sender = self._homes, lasting_number(told.origin), told.sender.path
+        if homes is not None:
+            homes.far.accepted(told.origin, lambda: self.command(sender, "settled", {"number": key}))
+
+    def _put_ask(self, key: int, ask: Ask, *, again: bool) -> None:
+        """Send an ask under this number, now or when the other program has answered."""
+        self.pending[key] = ask
+        ask.started = True
+        if self.line is not None:
+            self.line.put((AGAIN if again else NEW) + self._ask_frame(key, ask))
+        elif not again:
+            self._fresh.add(key)
+
+    def _ask_frame(self, key: int, ask: Ask) -> bytes:
+        """The frame of an ask under this number."""
+        until = self.node.clock.on_machine(ask.deadline) - monotonic()
+        name, body = self._payload(ask.message)
+        sender = None if ask.sender is None else ask.sender.path
+        kind = TOLD if isinstance(ask, KeptTell) else ASKED if isinstance(ask, SwitchAsk) else PASSING
+        assert ask.to is not None
+        frame = frames.Ask(key, ask.to.path, name, body, until, kind, sender, ask.chain)
+        return msgspec.msgpack.encode(frame, enc_hook=encode_special)
 
     def say(self, note: Note = "") -> None:
         """Post a batch without items: a greeting as long as the other program has not answered."""
@@ -299,7 +387,6 @@ class FarLine(Peer):
         held, self._held, self._held_bytes = self._held, [], 0
         for data in held:
             self.line.put(data)
-        self._sent_id = self._last_id
         for cell in list(self._cells.values()):
             self._watch_again(cell)
 
@@ -310,7 +397,6 @@ class FarLine(Peer):
     def end(self, why: str) -> None:
         """The line leads nowhere any more: whoever was reached over it may have ended; asks go over the next one."""
         if self.line is not None:
-            self._sent_id = self._last_id
             self.line.close()
         self.line, self.theirs = None, NOBODY
         self._suspect()
@@ -333,6 +419,10 @@ class FarLine(Peer):
         self.say("bye")
         self.is_closed = True
         self.end("the connection was closed")
+        for key, ask in list(self.pending.items()):
+            if isinstance(ask, SwitchAsk):  # It waits for the next connection, as long as its turn does.
+                del self.pending[key]
+                self.hand_back(ask)
         self.fail_pending(AskFailed(f"/{self.name}", str(NoConnection(self.name))))
 
     def _suspect(self) -> None:
@@ -358,14 +448,11 @@ class FarLine(Peer):
     def _ask_again(self) -> None:
         """Ask the new program what was asked of the one before it, in the same order and under the same names."""
         assert self.line is not None
-        for key, ask in sorted(self.pending.items()):
-            if key > self._sent_id or ask.is_done or ask.to is None:
-                continue
-            until = self.node.clock.on_machine(ask.deadline) - monotonic()
-            name, body = self._payload(ask.message)
-            sender = None if ask.sender is None else ask.sender.path
-            frame = frames.Ask(key, ask.to.path, name, body, until, 0, sender, ask.chain)
-            self.line.put(AGAIN + msgspec.msgpack.encode(frame, enc_hook=encode_special))
+        for key, ask in list(self.pending.items()):
+            if not ask.is_done and ask.to is not None and key not in self._held_asks:
+                self.line.put((NEW if key in self._fresh else AGAIN) + self._ask_frame(key, ask))
+        self._fresh.clear()
+        self._held_asks.clear()
 
     # -- in ---------------------------------------------------------------------------------------------------------
 
@@ -381,6 +468,8 @@ class FarLine(Peer):
             take = self._takers.get(type(frame))
             if take is None:
                 raise BadFrame(f"a {type(frame).__name__} on a line")
+            if self.is_closing and isinstance(frame, (frames.Tell, frames.Ask, frames.Offer, frames.Publish)):
+                return  # Whoever asks, asks whoever leads this system next.
             take(frame, data[:1] == AGAIN)
         except (BadFrame, msgspec.MsgspecError) as error:
             self.node.dead_letter(self.stand_in(f"/{self.name}"), data, f"not understood: {error}")
@@ -418,23 +507,57 @@ class FarLine(Peer):
             return
         cell = self._receiver(frame.to)
         homes = self._homes
-        if again:
-            if homes is None or switch_of(cell) is None:
+        which = self._named(frame)
+        if again and (homes is None or switch_of(cell) is None):
+            if frame.number == TOLD:
+                self.connection.send(frames.Reply(frame.id, msgspec.Raw(ACCEPTED.body)))  # Once at most.
+            else:
                 self._fail(frame, AskFailed(path, str(NoConnection(self._me))))
-                return
-            which = FarId(self._asker(frame).path, frame.id, run_number(self.theirs))
+            return
+        if homes is not None and (again or frame.number != PASSING):
             known = homes.far.outcome(which)
             if known is not None:
                 self.deliver(which, known)
             if known is not None or homes.far.is_open(which):
                 return
+        if frame.number == TOLD:
+            self._take_kept(cell, frame, which)
+            return
         self.on_ask(cell, frame, None)
 
     def ask_in(self, frame: frames.Ask, cell: Cell, page: memoryview | None) -> RelayedAsk:
         homes = self._homes
         if homes is None or switch_of(cell) is None:
             return super().ask_in(frame, cell, page)
-        return FarAsk.arrived(frame, self._asker(frame), cell, homes, run_number(self.theirs))
+        return FarAsk.arrived(frame, self._asker(frame), cell, homes, self._named(frame).run)
+
+    def _named(self, frame: frames.Ask) -> FarId:
+        """The name of an ask that has come, by which it is known when it comes again."""
+        run = run_number(self.theirs) if frame.number == PASSING else LASTING
+        return FarId(self._asker(frame).path, frame.id, run)
+
+    def _take_kept(self, cell: Cell, frame: frames.Ask, which: FarId) -> None:
+        """Take in a message that the other system keeps until it is accepted: once, if its receiver is recorded."""
+        name, body, sender = self.connection.names.from_wire(frame.name), bytes(frame.body), self._asker(frame)
+        homes, switch = self._homes, switch_of(cell)
+        try:
+            if switch is None or homes is None:
+                message = self.codec.message_in(cell, name, body)
+                cell.admit(cell, enveloped(message, sender, frame.chain))
+                self.connection.send(frames.Reply(frame.id, msgspec.Raw(ACCEPTED.body)))
+                return
+            if cell.table is not ANY:
+                cell.table.kind_named(name)
+            append = Append()
+            bound = switch.intake.bound
+            if bound is None or bound.makes_room(None, name, body, sender.path):
+                source = switch.record(MESSAGE, name, body, sender.path, append)
+                source.chain = frame.chain
+                append.after.append(lambda: switch.admitted(source))
+            homes.far.answered(which, ACCEPTED, append)
+            append.commit(homes.journal)
+        except HoldfastError as error:
+            self._fail(frame, error)
 
     def _asker(self, frame: frames.Ask) -> Cell:
         return self.stand_in(f"/{self.name}" if frame.sender is None else self.connection.names.from_wire(frame.sender))
@@ -462,6 +585,10 @@ class FarLine(Peer):
                 topics = self.node.topics
                 change = topics.subscribe if frame.verb == "subscribe" else topics.unsubscribe
                 change(str(frame.data.get("topic")), self.stand_in(path))
+            case "settled":
+                number = frame.data.get("number")
+                if self._homes is not None and isinstance(number, int):
+                    self._homes.far.settled(FarId(path, number, LASTING))
             case verb if verb in COMMANDS:
                 obey(self.node, self._receiver(frame.to), path, frame)
             case verb:

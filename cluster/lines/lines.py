@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Final, Protocol
 import msgspec
 
 from ...actors.errors import HoldfastError, SpecError
-from ...checkpoint.home.ask_recovery import FarId
+from ...checkpoint.home.ask_recovery import FarId, FarOut
+from ...checkpoint.home.pending_asks import SwitchAsk
 from ...checkpoint.protocol import Answer
 from .far_line import FarLine
 from .line import NOBODY, Batch, Boot
@@ -82,14 +83,14 @@ class Lines:
         self._lines: dict[str, FarLine] = {}
         self._gates: list[Gate] = []
         self._began = node.loop.time()
-        self._awaited: list[tuple[str, Callable[[], None]]] = []
+        self._waiting: dict[str, list[Callable[[FarLine], None]]] = {}
         self._beat: asyncio.TimerHandle | None = None
         if homes is not None:
-            homes.far.deliver = self._deliver
+            homes.far.deliver, homes.far.sender = self._deliver, self
 
     def find(self, path: str) -> Cell | None:
         """The stand-in for an actor of another program, if there is a line to that."""
-        far = self._lines.get(path[1:].partition("/")[0])
+        far = self._lines.get(_system(path))
         return None if far is None else far.stand_in(path)
 
     def open(self, name: str, post: Callable[[bytes], None]) -> FarLine:
@@ -102,6 +103,9 @@ class Lines:
             raise LineTaken(name)
         far = self._lines[name] = FarLine(self.node, (self.name, self.boot), name, post, self.homes)
         far.await_actor = self._await_actor
+        far.is_closing = self.homes is not None and self.homes.far.is_closing
+        far.hand_back = lambda ask: self.ask(ask, again=True)
+        self._send_kept(far)
         if self._beat is None:
             self._beat = self.node.loop.call_later(BEAT_SECONDS, self._look)
         return far
@@ -112,15 +116,22 @@ class Lines:
 
     def drop(self, far: FarLine) -> None:
         """End a line."""
-        far.close()
         if self._lines.get(far.name) is far:
             del self._lines[far.name]
+        far.close()
 
     def serve(self, transport: Transport) -> Gate:
         """Answer whoever calls by this transport."""
         gate = Gate(self, transport)
         self._gates.append(gate)
         return gate
+
+    def closing(self) -> None:
+        """This program ends: what comes is for whoever follows it; what was asked before is still answered."""
+        if self.homes is not None:
+            self.homes.far.is_closing = True
+        for far in self._lines.values():
+            far.is_closing = True
 
     def close(self) -> None:
         """End all lines."""
@@ -129,8 +140,36 @@ class Lines:
         if self._beat is not None:
             self._beat.cancel()
 
+    def ask(self, ask: SwitchAsk, *, again: bool) -> None:
+        """Send an ask of a recorded actor, now or when there is a line to whom it asks."""
+        assert ask.to is not None
+        path = ask.to.path
+        self._to(path, lambda far: _ask(far, path, ask, again=again))
+
+    def tell(self, out: FarOut, *, again: bool) -> None:
+        """Send a message of a recorded actor, now or when there is a line to whom it is for."""
+        far = self._lines.get(_system(out.to))
+        if far is not None:  # Else it is sent with all that is kept when there is a line.
+            far.tell_lasting(out, again=again)
+
+    def _to(self, path: str, send: Callable[[FarLine], None]) -> None:
+        far = self._lines.get(_system(path))
+        if far is not None:
+            send(far)
+        else:
+            self._waiting.setdefault(_system(path), []).append(send)
+
+    def _send_kept(self, far: FarLine) -> None:
+        """Send what has waited for a line."""
+        if self.homes is not None:
+            self.homes.far.connected(far.name)
+            for out in self.homes.far.outs(far.name):
+                far.tell_lasting(out, again=True)
+        for send in self._waiting.pop(far.name, ()):
+            send(far)
+
     def _deliver(self, which: FarId, answer: Answer) -> None:
-        far = self._lines.get(which.asker[1:].partition("/")[0])
+        far = self._lines.get(_system(which.asker))
         if far is not None:
             far.deliver(which, answer)
 
@@ -169,6 +208,17 @@ class Lines:
             if quiet > SILENT_SECONDS:
                 far.lose()
             far.say()
+
+
+def _system(path: str) -> str:
+    """The first part of an address: the program that it is of."""
+    return path[1:].partition("/")[0]
+
+
+def _ask(far: FarLine, path: str, ask: SwitchAsk, *, again: bool) -> None:
+    if not ask.is_over:
+        ask.to = far.stand_in(path)
+        far.ask_lasting(ask, again=again)
 
 
 class Gate:

@@ -51,8 +51,13 @@ class NatsTransport:
     async def hear(self, at: str, take: Callable[[bytes, str], None]) -> None:
         """Listen to a subject; see `Transport`."""
 
+        loop = asyncio.get_running_loop()
+
         async def taken(message: Msg) -> None:
-            take(message.data, message.reply)
+            try:
+                take(message.data, message.reply)
+            except Exception as error:  # The client would keep it to itself.
+                loop.call_exception_handler({"message": f"what came at {at} was not taken", "exception": error})
 
         with answering(self._name):
             await self._client.subscribe(at, cb=taken)

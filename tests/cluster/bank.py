@@ -23,6 +23,10 @@ class Deposit(hf.Message[int]):
     amount: int
 
 
+class Add(hf.Message[int]):
+    amount: int
+
+
 class Report(hf.Message[dict[str, int]]): ...
 
 
@@ -40,6 +44,12 @@ class Account(hf.Actor):
             self.balance += message.amount
             known = self.done[message.id] = self.balance
         return known
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        """As a deposit, but each one counts, also one that is the same again."""
+        self.balance += message.amount
+        return self.balance
 
     @hf.on(Report)
     def report(self, message: Report) -> dict[str, int]:
@@ -73,7 +83,14 @@ async def main() -> None:
             await asyncio.Event().wait()
 
 
-if __name__ == "__main__":
+def program() -> None:
+    """Stand by and lead, until a signal ends it."""
     with contextlib.suppress(FileNotFoundError):
         hf.run(main, again=True)
     Path(sys.argv[2]).with_suffix(".ended").touch()
+
+
+if __name__ == "__main__":
+    from tests.cluster import bank  # Here the messages would have other names than for those who send them.
+
+    bank.program()

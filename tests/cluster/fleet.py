@@ -7,6 +7,7 @@ import contextlib
 import json
 import signal
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from tests.cluster.servers import PATIENCE
@@ -16,16 +17,16 @@ ATTEMPT_SECONDS = 1.0
 
 
 class Programs:
-    """Processes of `tests.cluster.bank` on one store."""
+    """Processes of one program on one store: of `tests.cluster.bank`, if nothing else is said."""
 
-    def __init__(self, store: str, folder: Path, isolation: str = "task") -> None:
+    def __init__(self, store: str, folder: Path, isolation: str = "task", command: Sequence[str] = ()) -> None:
         self.store, self.socket, self.isolation = store, folder / "bank.sock", isolation
-        self.folder = folder
+        self.folder, self.command = folder, command
         self.processes: list[asyncio.subprocess.Process] = []
 
     async def start(self) -> asyncio.subprocess.Process:
         """Start another program; it stands by, or leads."""
-        command = ["-m", "tests.cluster.bank", self.store, str(self.socket), self.isolation]
+        command = self.command or ("-m", "tests.cluster.bank", self.store, str(self.socket), self.isolation)
         errors = (self.folder / f"program-{len(self.processes)}.err").open("wb")
         with errors:
             process = await asyncio.create_subprocess_exec(
@@ -89,6 +90,10 @@ class Client:
         """Deposits, until the event is set."""
         while not until.is_set():
             await self.deposit()
+
+    async def check_pid(self) -> None:
+        """Find out who leads."""
+        await self._answered({})
 
     async def check(self) -> None:
         """Compare what the account says of itself."""

@@ -1,0 +1,487 @@
+"""Refs to actors of other systems, over a simulated post on the virtual clock; systems end, and begin anew."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+import holdfast as hf
+from holdfast.actors.errors import AskDeadlock, NotGranted
+from holdfast.actors.process.wire import frames
+from holdfast.cluster.lines.far_line import NEW
+from holdfast.cluster.lines.line import NOBODY, Batch, Boot
+from holdfast.cluster.lines.lines import FORGET_SECONDS, SILENT_SECONDS, LineTaken
+from holdfast.system import connection
+from holdfast.testing.fleet.post import NO_POST_FAULTS, PostFaults, SimPost, SimTransport
+from tests.cluster.fleets import simulate
+
+
+class Add(hf.Message[int]):
+    amount: int
+
+
+class Total(hf.Message[int]): ...
+
+
+class Wait(hf.Message[int]):
+    seconds: float
+
+
+class No(hf.Refusal):
+    why: str
+
+
+class Refuse(hf.Message[None]): ...
+
+
+class Crash(hf.Message[None]): ...
+
+
+class News(hf.Message[None]):
+    text: str
+
+
+class Account(hf.Actor):
+    def __init__(self) -> None:
+        self.total = 0
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.total += message.amount
+        return self.total
+
+    @hf.on(Total)
+    def say(self, message: Total) -> int:
+        return self.total
+
+    @hf.on(Wait)
+    async def wait(self, message: Wait) -> int:
+        await asyncio.sleep(message.seconds)
+        return self.total
+
+    @hf.on(Refuse)
+    def refuse(self, message: Refuse) -> None:
+        raise No("not today")
+
+    @hf.on(Crash)
+    def crash(self, message: Crash) -> None:
+        raise ValueError("broken")
+
+    @hf.on(News)
+    def news(self, message: News) -> None:
+        self.total += len(message.text)
+
+
+class Reach:
+    """Systems that are reached over one post."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, seed: int, faults: PostFaults = NO_POST_FAULTS) -> None:
+        self.post = SimPost(seed, faults)
+        self.transports: list[SimTransport] = []
+        patch.setattr(connection, "open_lines", self._open)
+
+    async def _open(self, at: str, settings: object) -> tuple[SimTransport, str, str]:
+        self.transports.append(self.post.transport())
+        return self.transports[-1], f"inbox of {at}", at
+
+    @asynccontextmanager
+    async def bank_stack(self, store: Path) -> AsyncIterator[Bank]:
+        """A bank that can end and begin anew."""
+        made = Bank(self, store)
+        await made.begin()
+        yield made
+        await made.end()
+
+    @asynccontextmanager
+    async def bank(self, store: Path | None = None) -> AsyncIterator[hf.ActorSystem]:
+        """A system with a plain account and a recorded one."""
+        kept = None if store is None else f"sqlite:{store}"
+        async with hf.ActorSystem("bank", store=kept, reachable="bank", log=False) as system:
+            await system.start(hf.child("plain", hf.start(Account)))
+            await system.start(hf.child("kept", hf.start(Account), recovery=hf.hybrid()))
+            yield system
+
+
+class Bank:
+    """A system that ends and begins anew, on one store."""
+
+    def __init__(self, reach: Reach, store: Path) -> None:
+        self._reach, self._store = reach, store
+        self._stack = AsyncExitStack()
+        self.transport = reach.post.transport()
+
+    async def begin(self) -> None:
+        self._system = await self._stack.enter_async_context(self._reach.bank(self._store))
+        self.transport = self._reach.transports[-1]
+
+    async def end(self) -> None:
+        await self._stack.aclose()
+
+    async def again(self) -> None:
+        await self.end()
+        await self.begin()
+
+    async def total(self) -> int:
+        return await self._system.ref("/bank/kept", Account).ask(Total())
+
+
+Work = Callable[[Reach], Coroutine[Any, Any, None]]
+
+
+def run(work: Work, seed: int = 0, faults: PostFaults = NO_POST_FAULTS) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+
+        async def reached() -> None:
+            await work(Reach(patch, seed, faults))
+
+        simulate(reached, seed)
+
+
+@pytest.mark.parametrize("who", ["plain", "kept"])
+def test_whoever_is_connected_tells_sends_and_asks(who: str) -> None:
+    async def work(reach: Reach) -> None:
+        async with reach.bank(), hf.connect("bank") as bank:
+            account = bank.ref(f"/bank/{who}", Account)
+            assert await account.ask(Add(5)) == 5
+            account.tell(Add(1))
+            await account.send(Add(1))
+            assert await account.ask(Total()) == 7
+            with pytest.raises(No) as refused:
+                await account.ask(Refuse())
+            assert refused.value.why == "not today"
+            with pytest.raises(hf.RemoteCrash, match="ValueError: broken"):
+                await account.ask(Crash())
+            with pytest.raises(hf.AskTimeout):
+                await account.ask(Wait(10.0), timeout=1.0)
+            with pytest.raises(hf.SpecError, match="no address of 'bank'"):
+                bank.ref("/shop/clerk")
+
+    run(work)
+
+
+async def sums_up(reach: Reach) -> None:
+    async with reach.bank() as system, hf.connect("bank", timeout=60.0) as bank:
+        for who in ("plain", "kept"):
+            account = bank.ref(f"/bank/{who}", Account)
+            answers = await asyncio.gather(*(account.ask(Add(1), timeout=600.0) for _ in range(100)))
+            assert answers == [*range(1, 101)]
+            for _ in range(50):
+                account.tell(Add(1))
+            await account.send(Add(1))
+            assert await account.ask(Total(), timeout=600.0) == 151
+        assert not system._homes.far._open
+        await asyncio.sleep(600.0)
+        assert not system._homes.far._answers  # All are known to have arrived.
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_each_ask_has_one_outcome_in_order_whatever_the_post_does(seed: int) -> None:
+    run(sums_up, seed, PostFaults(lost=0.1, doubled=0.1, late=0.1))
+
+
+def test_nobody_answers_and_that_is_said_in_time() -> None:
+    async def work(reach: Reach) -> None:
+        with pytest.raises(hf.Unreachable, match="/bank cannot be reached: no program that leads it has answered"):
+            async with hf.connect("bank", timeout=2.0):
+                pass
+
+    run(work)
+
+
+def test_a_system_of_another_name_is_told_of_at_once() -> None:
+    async def work(reach: Reach) -> None:
+        async with reach.bank():
+            with pytest.raises(hf.SpecError, match="called 'bank', not 'blank': say system='bank'"):
+                async with hf.connect("bank", system="blank"):
+                    pass
+
+    run(work)
+
+
+def test_another_program_leads_and_only_what_is_kept_goes_on(tmp_path: Path) -> None:
+    """What was asked of a plain actor ends, for nobody knows whether it was done; a recorded one is asked again."""
+
+    async def work(reach: Reach) -> None:
+        async with hf.ActorSystem("shop", log=False) as shop:
+            async with reach.bank(tmp_path / "bank.db"):
+                connected = hf.connect("bank", within=shop)
+                bank = await connected.__aenter__()
+                plain, kept = bank.ref("/bank/plain", Account), bank.ref("/bank/kept", Account)
+                assert await kept.ask(Add(5)) == 5
+                reach.transports[0].is_cut = True  # The machine of the bank is cut off, and then ends.
+                lost = plain.ask(Add(1), timeout=600.0)
+                again = kept.ask(Add(1), timeout=600.0)
+                await asyncio.sleep(1.0)
+            async with reach.bank(tmp_path / "bank.db"):
+                with pytest.raises(hf.AskFailed, match="no connection to bank"):
+                    await lost
+                assert await again == 6
+                assert await kept.ask(Total()) == 6
+                await bank.close()
+
+    run(work)
+
+
+def test_tells_to_a_system_that_is_away_are_refused_and_asks_wait(tmp_path: Path) -> None:
+    async def work(reach: Reach) -> None:
+        async with reach.bank(), hf.connect("bank") as bank:
+            account = bank.ref("/bank/plain", Account)
+            reach.transports[0].is_cut = True
+            await asyncio.sleep(SILENT_SECONDS + 3.0)
+            assert not bank.is_reachable
+            with pytest.raises(hf.Unreachable, match="/bank cannot be reached: it does not answer; nothing was sent"):
+                account.tell(Add(1))
+            asked = account.ask(Add(2), timeout=600.0)
+            reach.transports[0].is_cut = False
+            assert await asked == 2
+            assert bank.is_reachable
+
+    run(work)
+
+
+def test_whoever_has_called_and_is_silent_is_forgotten_and_may_come_back() -> None:
+    async def work(reach: Reach) -> None:
+        async with reach.bank() as system, hf.connect("bank") as bank:
+            account = bank.ref("/bank/kept", Account)
+            assert await account.ask(Add(1)) == 1
+            reach.transports[1].is_cut = True
+            await asyncio.sleep(FORGET_SECONDS + 5.0)
+            assert system.lines.at(bank._call.far._me) is None  # type: ignore[union-attr]
+            reach.transports[1].is_cut = False
+            assert await account.ask(Add(1), timeout=60.0) == 2
+
+    run(work)
+
+
+class Watcher(hf.Actor):
+    """Watches an actor of another system, subscribes, and asks it."""
+
+    def __init__(self, heard: list[str], whom: hf.ActorRef[Account]) -> None:
+        self.heard, self.whom = heard, whom
+
+    def on_start(self, restored: bool) -> None:
+        self.ctx.monitor(self.whom)
+
+    def on_down(self, ref: hf.ActorRef[Any], reason: hf.ExitReason, recovering: bool) -> None:
+        self.heard.append(f"{ref.path}: {reason}")
+
+    @hf.on(News)
+    def news(self, message: News) -> None:
+        self.heard.append(message.text)
+
+    @hf.on(Add)
+    async def add(self, message: Add) -> int:
+        return await self.whom.ask(message)
+
+
+def test_actors_watch_each_other_over_systems() -> None:
+    async def work(reach: Reach) -> None:
+        heard: list[str] = []
+        async with hf.ActorSystem("shop", log=False) as shop:
+            async with reach.bank() as system:
+                bank = await hf.connect("bank", within=shop).__aenter__()
+                plain = bank.ref("/bank/plain", Account)
+                watcher = await shop.start(hf.child("watcher", hf.start(Watcher, heard, plain)))
+                assert await watcher.ask(Add(3)) == 3
+                system.ref("/bank/plain").kill()
+                while not heard:
+                    await asyncio.sleep(0.1)
+                assert heard == ["/bank/plain: killed"]
+                watcher.kill()
+                assert await watcher.ask(Add(3)) == 3  # Its next life watches again; the account's was new.
+                bank.subscribe("/news", watcher)
+                await asyncio.sleep(1.0)
+                await system.publish("/news", News("from the bank"))
+                await bank.publish("/news", News("from outside"))
+                while len(heard) < 3:
+                    await asyncio.sleep(0.1)
+                assert heard[1:] == ["from the bank", "from outside"]
+                reach.transports[0].is_cut = True
+            await asyncio.sleep(SILENT_SECONDS + 3.0)
+            assert heard[3:] == ["/bank/plain: no connection to bank"]
+            await bank.close()
+
+    run(work)
+
+
+class Looped(hf.Actor):
+    def __init__(self, whom: hf.ActorRef[Any]) -> None:
+        self.whom = whom
+
+    @hf.on(Add)
+    async def add(self, message: Add) -> int:
+        return await self.whom.ask(message, timeout=60.0)  # type: ignore[no-any-return]
+
+
+def test_two_systems_that_reach_each_other_see_a_deadlock_at_once() -> None:
+    async def work(reach: Reach) -> None:
+        async with (
+            reach.bank() as system,
+            hf.ActorSystem("shop", log=False) as shop,
+            hf.connect("bank", within=shop) as bank,
+        ):
+            here = await shop.start(hf.child("loop", hf.start(Looped, bank.ref("/bank/loop"))))
+            back = system.lines.find("/shop/loop")
+            assert back is not None
+            await system.start(hf.child("loop", hf.start(Looped, back.ref)))
+            began = asyncio.get_running_loop().time()
+            with pytest.raises((AskDeadlock, hf.RemoteCrash), match=r"AskDeadlock|waits"):
+                await here.ask(Add(1), timeout=60.0)
+            assert asyncio.get_running_loop().time() - began < 5.0
+
+    run(work)
+
+
+def test_one_system_may_not_order_another_about() -> None:
+    async def work(reach: Reach) -> None:
+        async with reach.bank(), hf.connect("bank") as bank:
+            account = bank.ref("/bank/plain", Account)
+            with pytest.raises(NotGranted):
+                account.stop()
+            with pytest.raises(NotGranted):
+                account.kill()
+            with pytest.raises(hf.UnknownMessage):
+                bank.ref("/bank").ask(hf.TerminateChild("plain"))
+            far = bank._call.far  # type: ignore[union-attr]
+            name, body = "holdfast.supervision.admin:TerminateChild", hf.TerminateChild("plain")
+            key, answer = far.acceptance()
+            far.connection.send(frames.Offer(key, "/bank", name, body))  # type: ignore[arg-type]
+            with pytest.raises(hf.UnknownMessage):
+                await answer
+            far.command("/bank/plain", "kill", {})
+            assert await account.ask(Add(1)) == 1
+
+    run(work)
+
+
+def test_two_systems_of_one_name_are_not_reached_at_once() -> None:
+    async def work(reach: Reach) -> None:
+        async with reach.bank(), hf.ActorSystem("shop", log=False) as shop, hf.connect("bank", within=shop):
+            with pytest.raises(LineTaken):
+                async with hf.connect("bank", within=shop):
+                    pass
+
+    run(work)
+
+
+def test_what_an_earlier_run_has_sent_is_refused_however_late() -> None:
+    async def work(reach: Reach) -> None:
+        async with reach.bank() as system:
+            late = frames.Tell("/bank/plain", f"{__name__}:Add", Add(7))  # type: ignore[arg-type]
+            items = (NEW + msgspec.msgpack.encode(late),)
+            for to in (NOBODY, Boot(system.lines.boot.era, "abcd"), Boot(1, "00")):
+                batch = Batch("client", Boot(5, "ff"), to, 0, 1, items)
+                reach.post.post("client", "inbox of bank", msgspec.msgpack.encode(batch), "client")
+            reach.post.post("client", "inbox of bank", b"garbage", "client")
+            await asyncio.sleep(5.0)
+            assert await system.ref("/bank/plain", Account).ask(Total()) == 0
+
+    run(work)
+
+
+class Pay(hf.Message[int]):
+    amount: int
+    how: str
+
+
+class Clerk(hf.Actor):
+    """Recorded: pays into an account of another system."""
+
+    def __init__(self, account: hf.ActorRef[Account]) -> None:
+        self._account = account
+        self.paid = 0
+
+    @hf.on(Pay)
+    async def pay(self, message: Pay) -> int:
+        self.paid += message.amount
+        match message.how:
+            case "tell":
+                self._account.tell(Add(message.amount))
+            case "send":
+                await self._account.send(Add(message.amount))
+            case "ask":
+                await self._account.ask(Add(message.amount), timeout=3000.0)
+        return self.paid
+
+
+@asynccontextmanager
+async def shop_of(store: Path, name: str = "kept") -> AsyncIterator[hf.ActorRef[Clerk]]:
+    """A system whose recorded clerk pays into an account of the bank."""
+    async with (
+        hf.ActorSystem("shop", store=f"sqlite:{store}", log=False) as shop,
+        hf.connect("bank", within=shop, timeout=600.0) as bank,
+    ):
+        account = bank.ref(f"/bank/{name}", Account)
+        yield await shop.start(hf.child("clerk", hf.start(Clerk, account), recovery=hf.hybrid()))
+
+
+@pytest.mark.parametrize("how", ["tell", "send", "ask"])
+@pytest.mark.parametrize("faults", [NO_POST_FAULTS, PostFaults(lost=0.1, doubled=0.1, late=0.1)], ids=["", "lossy"])
+def test_recorded_actors_of_two_systems_reach_each_other_once(tmp_path: Path, how: str, faults: PostFaults) -> None:
+    """The receiver's system ends and begins anew while messages are on their way; none is lost or comes twice."""
+
+    async def work(reach: Reach) -> None:
+        paid = 0
+        async with AsyncExitStack() as stack:
+            bank = await stack.enter_async_context(reach.bank_stack(tmp_path / "bank.db"))
+            clerk = await stack.enter_async_context(shop_of(tmp_path / "shop.db"))
+            for round_ in range(4):
+                answers = [clerk.ask(Pay(1, how), timeout=3000.0) for _ in range(20)]
+                paid += 20
+                if round_ % 2:
+                    bank.transport.is_cut = True
+                    await asyncio.sleep(1.0)
+                    await bank.again()
+                await asyncio.gather(*answers)
+            assert await clerk.ask(Pay(0, "ask"), timeout=3000.0) == paid
+            assert await bank.total() == paid
+
+    run(work, faults=faults)
+
+
+@pytest.mark.parametrize("how", ["tell", "send"])
+def test_what_a_recorded_actor_tells_another_system_outlives_its_own_program(tmp_path: Path, how: str) -> None:
+    async def work(reach: Reach) -> None:
+        async with reach.bank(tmp_path / "bank.db") as system:
+            account = system.ref("/bank/kept", Account)
+            async with shop_of(tmp_path / "shop.db") as clerk:
+                assert await clerk.ask(Pay(1, how)) == 1
+                await asyncio.sleep(1.0)
+                reach.transports[1].is_cut = True
+                assert await clerk.ask(Pay(2, how)) == 3
+            assert await account.ask(Total()) == 1
+            async with shop_of(tmp_path / "shop.db") as clerk:
+                await asyncio.sleep(5.0)
+                assert await account.ask(Total()) == 3
+                assert await clerk.ask(Pay(4, how)) == 7
+                await asyncio.sleep(5.0)
+                assert await account.ask(Total()) == 7
+
+    run(work)
+
+
+def test_what_a_recorded_actor_asks_another_system_waits_for_the_next_connection(tmp_path: Path) -> None:
+    async def work(reach: Reach) -> None:
+        async with reach.bank(tmp_path / "bank.db") as system, hf.ActorSystem("shop", log=False) as shop:
+            connected = await hf.connect("bank", within=shop).__aenter__()
+            account = connected.ref("/bank/kept", Account)
+            clerk = await shop.start(hf.child("clerk", hf.start(Clerk, account), recovery=hf.hybrid()))
+            assert await clerk.ask(Pay(1, "ask")) == 1
+            reach.transports[0].is_cut = True
+            paid = clerk.ask(Pay(2, "ask"), timeout=600.0)
+            await asyncio.sleep(1.0)
+            await connected.close()
+            reach.transports[0].is_cut = False
+            await asyncio.sleep(1.0)
+            assert not paid.done()
+            async with hf.connect("bank", within=shop):
+                assert await paid == 3
+                assert await system.ref("/bank/kept", Account).ask(Total()) == 3
+
+    run(work)

@@ -1,0 +1,108 @@
+"""Refs to actors of systems on real servers, whose leaders are killed, paused and ended meanwhile."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import signal
+from pathlib import Path
+
+import pytest
+
+import holdfast as hf
+from holdfast.cluster.nats.server_file import UserRole
+from tests.cluster.bank import Account, Add, Report
+from tests.cluster.fleet import Client, Programs
+from tests.cluster.servers import NatsServers
+from tests.cluster.till import Clerk, Pay
+
+SEED = 20261127
+PATIENT = 120.0
+"""Seconds that an ask may take: far more than a takeover does."""
+
+
+async def test_what_was_asked_of_a_leader_that_dies_is_done_once(nats1: NatsServers, tmp_path: Path) -> None:
+    """Eight askers add 1, again and again; no answer comes twice, and what was answered is what there is."""
+    system = nats1.new_system()
+    programs = Programs(nats1.store(system), tmp_path)
+    pids = Client(programs.socket)
+    strikes = [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM]
+    random.Random(SEED).shuffle(strikes)
+    answers: list[int] = []
+    done = asyncio.Event()
+    try:
+        await programs.leads(await programs.start())
+        async with hf.connect(nats1.store(system, UserRole.CLIENT), system="bank") as bank:
+            account = bank.ref("/bank/account", Account)
+
+            async def add() -> None:
+                while not done.is_set():
+                    answers.append(await account.ask(Add(1), timeout=PATIENT))
+
+            adding = [asyncio.ensure_future(add()) for _ in range(8)]
+            standby = await programs.start()
+            for strike in strikes:
+                await pids.check_pid()
+                leader = programs.of(pids.leader)
+                known = len(answers)
+                while len(answers) < known + 50:
+                    await asyncio.wait(adding, timeout=0.05)
+                    assert not any(one.done() for one in adding), adding
+                if strike == signal.SIGSTOP:
+                    leader.send_signal(strike)
+                    await programs.leads(standby)
+                    leader.send_signal(signal.SIGCONT)  # It wakes with what it had in hand.
+                else:
+                    await programs.end(leader, strike)
+                    await programs.leads(standby)
+                    await programs.start()
+                standby = next(one for one in programs.processes if one is not standby)
+            known = len(answers)
+            while len(answers) < known + 50:
+                await asyncio.wait(adding, timeout=0.05)
+            done.set()
+            await asyncio.gather(*adding)
+            assert sorted(answers) == [*range(1, len(answers) + 1)], f"seed {SEED}"
+            assert (await account.ask(Report()))["balance"] == len(answers)
+    finally:
+        done.set()
+        await pids.close()
+        await programs.close()
+
+
+@pytest.mark.parametrize("how", ["tell", "ask"])
+async def test_what_a_recorded_actor_pays_arrives_once_whoever_dies(
+    nats1: NatsServers, tmp_path: Path, how: str
+) -> None:
+    """The bank and the till are killed in turn while the clerk pays."""
+    names = [nats1.new_system(), nats1.new_system()]
+    for folder in ("bank", "till"):
+        (tmp_path / folder).mkdir()
+    bank = Programs(nats1.store(names[0]), tmp_path / "bank")
+    url = nats1.store(names[0], UserRole.CLIENT)
+    command = ("-m", "tests.cluster.till", url, nats1.store(names[1]), how)
+    till = Programs(nats1.store(names[1]), tmp_path / "till", command=command)
+    try:
+        await bank.leads(await bank.start())
+        await till.leads(await till.start())
+        async with (
+            hf.connect(url, system="bank") as to_bank,
+            hf.connect(nats1.store(names[1], UserRole.CLIENT), system="till") as to_till,
+        ):
+            account, clerk = to_bank.ref("/bank/account", Account), to_till.ref("/till/clerk", Clerk)
+            paid = 0
+            for victim in (till, bank, till, bank):
+                answers = [clerk.ask(Pay(1), timeout=PATIENT) for _ in range(20)]
+                paid += 20
+                await asyncio.wait(answers, return_when=asyncio.FIRST_COMPLETED)
+                await victim.end(victim.processes[0])
+                await victim.leads(await victim.start())
+                await asyncio.gather(*answers)
+            assert await clerk.ask(Pay(0), timeout=PATIENT) == paid
+            async with asyncio.timeout(PATIENT):
+                while (await account.ask(Report(), timeout=PATIENT))["balance"] < paid:
+                    await asyncio.sleep(0.1)
+            assert (await account.ask(Report()))["balance"] == paid
+    finally:
+        await till.close()
+        await bank.close()
