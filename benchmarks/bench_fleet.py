@@ -1,7 +1,8 @@
-"""What does a journal on several machines cost, and how fast does another program take over?
+"""What does a journal on several machines cost, how fast does another program take over, and what does a line cost?
 
 Servers on this machine, `sync_interval: always`, one (R1) and three (R3). Limits: the same records appended by hand,
-each naming its predecessor, over the same client library.
+each naming its predecessor, over the same client library; for lines, bytes of the same size between two programs, as
+requests and as publications.
 Command: python benchmarks/bench_fleet.py [--quick]
 """
 
@@ -17,13 +18,18 @@ import time
 from collections import deque
 from collections.abc import AsyncGenerator
 from pathlib import Path
+from typing import NamedTuple
 
-from harness import Run, ask_all, main
+import msgspec
+import nats
+from harness import BURST, Run, ask_all, main
+from nats.aio.client import Client
+from nats.aio.msg import Msg
 
 import holdfast as hf
 from holdfast.cluster.leadership import Follower
 from holdfast.cluster.log_records import CHANGES, FORMAT, EpochBegun, RecordMaker, encode_changes
-from holdfast.cluster.nats.access import access_of
+from holdfast.cluster.nats.access import access_of, connect_options
 from holdfast.cluster.nats.nats_engine import NatsEngine, open_engine
 
 sys.path.append(str(Path(__file__).parent.parent))
@@ -33,10 +39,16 @@ ASKS = 3_000
 """With one outstanding; ten times as many with more."""
 RECORD = bytes(200)
 """About what the record of one ask takes."""
+TELLS = 200_000
+ASKED, ANSWERED = bytes(130), bytes(70)
+"""As many bytes as the batches of one ask between programs, and of its reply."""
 
 
 class Add(hf.Message[int]):
     n: int
+
+
+class Total(hf.Message[int]): ...
 
 
 class Sum(hf.Actor):
@@ -48,6 +60,10 @@ class Sum(hf.Actor):
     @hf.on(Add)
     def add(self, message: Add) -> int:
         self.total += message.n
+        return self.total
+
+    @hf.on(Total)
+    def told(self, message: Total) -> int:
         return self.total
 
 
@@ -193,6 +209,134 @@ async def lag(run: Run) -> None:
     run.bound("a standby's lag, p99", 1e3 * sorted(lags)[int(0.99 * len(lags))], unit="ms", target=100.0)
 
 
+class Neighbour(NamedTuple):
+    """Another program, which leads a system, and answers raw messages besides."""
+
+    store: str
+    by_hand: Client
+
+    def subject(self, what: str) -> str:
+        """Where it answers what is sent by hand."""
+        return _subject(self.store, what)
+
+    async def asks(self, actor: str, count: int, outstanding: int) -> float:
+        """Asks per second to an actor there."""
+        async with hf.connect(self.store, system="bench") as far:
+            ref = far.ref(f"/bench/{actor}", Sum)
+            await ask_all(ref.ask, Add(1), 200)
+            return (await ask_all(ref.ask, Add(1), count, outstanding=outstanding)).rate
+
+    async def requests(self, count: int, outstanding: int) -> float:
+        """Requests per second by hand."""
+        to = self.subject("asked")
+
+        async def ask(message: bytes) -> None:
+            await self.by_hand.request(to, message, timeout=10.0)
+
+        await ask_all(ask, ASKED, 200)
+        return (await ask_all(ask, ASKED, count, outstanding=outstanding)).rate
+
+    async def tells(self, count: int) -> float:
+        """Tells per second to an actor there, until it has handled the last one."""
+        async with hf.connect(self.store, system="bench") as far:
+            ref = far.ref("/bench/plain", Sum)
+            before = await ref.ask(Total())
+            began = time.perf_counter()
+            for sent in range(count):
+                ref.tell(Add(1))
+                if sent % BURST == 0:
+                    await asyncio.sleep(0)
+            assert await ref.ask(Total(), 60.0) == before + count
+            return count / (time.perf_counter() - began)
+
+    async def publications(self, count: int) -> float:
+        """The same messages per second by hand: each is encoded, and decoded there; as many in one publication."""
+        encode = msgspec.msgpack.Encoder().encode
+        began = time.perf_counter()
+        for _ in range(count // BURST):
+            await self.by_hand.publish(self.subject("told"), encode([encode(Add(1)) for _ in range(BURST)]))
+            await asyncio.sleep(0)
+        total = await self.by_hand.request(self.subject("total"), b"", timeout=60.0)
+        assert int(total.data) == count // BURST * BURST
+        return count / (time.perf_counter() - began)
+
+
+@contextlib.asynccontextmanager
+async def neighbour() -> AsyncGenerator[Neighbour]:
+    """Another program that leads a system and answers raw messages; and a client for those."""
+    async with servers(1) as made:
+        store = made.store(made.new_system())
+        program = await _program(store, "neighbour")
+        by_hand = await nats.connect(**connect_options(access_of(store)))
+        try:
+            await _answers(program)
+            yield Neighbour(store, by_hand)
+        finally:
+            await by_hand.close()
+            program.kill()
+            await program.wait()
+
+
+async def lines(run: Run) -> None:
+    """Asks and tells between two programs, beside requests and publications by hand."""
+    async with neighbour() as other:
+        for actor, outstanding, target in (
+            ("plain", 1, 0.67),
+            ("plain", 100, 0.67),
+            ("sum", 1, 0.3),
+            ("sum", 100, 0.3),
+        ):
+            number = run.size(ASKS) * (1 if outstanding == 1 else 10)
+
+            async def ours(actor: str = actor, number: int = number, outstanding: int = outstanding) -> float:
+                return await other.asks(actor, number, outstanding)
+
+            async def limit(number: int = number, outstanding: int = outstanding) -> float:
+                return await other.requests(number, outstanding)
+
+            kind = "a recorded" if actor == "sum" else "an"
+            job = f"asks of {kind} actor of another program, {outstanding} outstanding, R1"
+            await run.compare(job, ours, limit, unit="asks/s", target=target)
+        number = run.size(TELLS)
+        job = "tells to an actor of another program"
+        await run.compare(
+            job, lambda: other.tells(number), lambda: other.publications(number), unit="tells/s", target=0.6
+        )
+
+
+def _subject(store: str, what: str) -> str:
+    return f"hf.{access_of(store).system}.bench.{what}"
+
+
+async def _neighbour(store: str) -> None:
+    """The other process of `lines`."""
+    client = await nats.connect(**connect_options(access_of(store)))
+    decoder, total = msgspec.msgpack.Decoder(list[bytes]), 0
+    message = msgspec.msgpack.Decoder(Add)
+
+    async def asked(request: Msg) -> None:
+        await client.publish(request.reply, ANSWERED)
+
+    async def told(batch: Msg) -> None:
+        nonlocal total
+        for one in decoder.decode(batch.data):
+            total += message.decode(one).n
+
+    async def summed(request: Msg) -> None:
+        nonlocal total
+        was, total = total, 0
+        await client.publish(request.reply, str(was).encode())
+
+    for what, take in (("asked", asked), ("told", told), ("total", summed)):
+        await client.subscribe(_subject(store, what), cb=take)
+    await client.flush()
+    async with hf.ActorSystem("bench", store=store, log=False, history=False) as system:
+        await system.start(hf.child("sum", hf.start(Sum), recovery=hf.hybrid()))
+        await system.start(hf.child("plain", hf.start(Sum)))
+        print("answers", flush=True)
+        await asyncio.Event().wait()
+
+
 def _spent(pid: int) -> float:
     """Seconds of processor time of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -239,6 +383,7 @@ async def _work(system: hf.ActorSystem, *, loads: bool) -> None:
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--program"]:
-        hf.run(_lead(sys.argv[2], loads="load" in sys.argv[3:]))
+        store, does = sys.argv[2], sys.argv[3:]
+        hf.run(_neighbour(store) if "neighbour" in does else _lead(store, loads="load" in does))
     else:
-        main([asks, takeover, standby, lag])
+        main([asks, takeover, standby, lag, lines])
