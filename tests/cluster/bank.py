@@ -36,7 +36,7 @@ class Deposit(hf.Message[int]):
     amount: int
 
 
-class Add(hf.Message[int]):
+class Gain(hf.Message[int]):
     amount: int
 
 
@@ -96,8 +96,8 @@ class Account(hf.Actor):
             known = self.done[message.id] = self.balance
         return known
 
-    @hf.on(Add)
-    def add(self, message: Add) -> int:
+    @hf.on(Gain)
+    def gain(self, message: Gain) -> int:
         """As a deposit, but each one counts, also one that is the same again."""
         self.balance += message.amount
         return self.balance

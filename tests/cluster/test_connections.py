@@ -316,7 +316,7 @@ class Looped(hf.Actor):
 
     @hf.on(Add)
     async def add(self, message: Add) -> int:
-        return await self.whom.ask(message, timeout=60.0)  # type: ignore[no-any-return]
+        return await self.whom.ask(message, timeout=60.0)
 
 
 def test_two_systems_that_reach_each_other_see_a_deadlock_at_once() -> None:
