@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncGenerator, Callable, Coroutine
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -91,7 +91,7 @@ class Reach:
         return self.transports[-1], f"inbox of {at}", at
 
     @asynccontextmanager
-    async def bank_stack(self, store: Path) -> AsyncIterator[Bank]:
+    async def bank_stack(self, store: Path) -> AsyncGenerator[Bank]:
         """A bank that can end and begin anew."""
         made = Bank(self, store)
         await made.begin()
@@ -99,7 +99,7 @@ class Reach:
         await made.end()
 
     @asynccontextmanager
-    async def bank(self, store: Path | None = None) -> AsyncIterator[hf.ActorSystem]:
+    async def bank(self, store: Path | None = None) -> AsyncGenerator[hf.ActorSystem]:
         """A system with a plain account and a recorded one."""
         kept = None if store is None else f"sqlite:{store}"
         async with hf.ActorSystem("bank", store=kept, reachable="bank", log=False) as system:
@@ -268,8 +268,8 @@ class Watcher(hf.Actor):
     def on_start(self, restored: bool) -> None:
         self.ctx.monitor(self.whom)
 
-    def on_down(self, ref: hf.ActorRef[Any], reason: hf.ExitReason, recovering: bool) -> None:
-        self.heard.append(f"{ref.path}: {reason}")
+    def on_down(self, source: hf.ActorRef[Any], reason: hf.ExitReason, recovering: bool) -> None:
+        self.heard.append(f"{source.path}: {reason}")
 
     @hf.on(News)
     def news(self, message: News) -> None:
@@ -412,7 +412,7 @@ class Clerk(hf.Actor):
 
 
 @asynccontextmanager
-async def shop_of(store: Path, name: str = "kept") -> AsyncIterator[hf.ActorRef[Clerk]]:
+async def shop_of(store: Path, name: str = "kept") -> AsyncGenerator[hf.ActorRef[Clerk]]:
     """A system whose recorded clerk pays into an account of the bank."""
     async with (
         hf.ActorSystem("shop", store=f"sqlite:{store}", log=False) as shop,
@@ -508,7 +508,7 @@ def test_what_was_asked_and_waits_at_the_end_of_a_program_is_answered_by_the_nex
 
     async def work(reach: Reach) -> None:
         @asynccontextmanager
-        async def bank() -> AsyncIterator[hf.ActorSystem]:
+        async def bank() -> AsyncGenerator[hf.ActorSystem]:
             async with hf.ActorSystem("bank", store=f"sqlite:{tmp_path}/b.db", reachable="bank", log=False) as system:
                 await system.start(hf.child("slow", hf.start(Slow), recovery=hf.hybrid(), shutdown=1.0))
                 yield system
