@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 from collections.abc import Awaitable, Callable, Mapping
 from importlib.util import find_spec
-from typing import TypeVar
+from typing import Final, TypeVar
+from urllib.parse import urlsplit
 
 from ..actors.errors import SpecError
 from ..checkpoint.engine_calls import Called
@@ -20,6 +22,8 @@ from .ports import Engine, Unanswered
 from .replicated_journal import ReplicatedJournal
 
 T = TypeVar("T")
+SILENT_SECONDS: Final = 30.0
+"""How often a program that waits says that the servers do not answer."""
 
 
 def is_replicated(store: object) -> bool:
@@ -38,7 +42,9 @@ async def join(
     settings: Mapping[str, str | bool | int],
     *,
     waits: Callable[[str], None],
+    silent: Callable[[str], None],
     deposed: Callable[[Deposed], None],
+    is_new: bool = True,
 ) -> ReplicatedJournal:
     """Wait until this program leads the system, and return the journal of its store.
 
@@ -48,12 +54,15 @@ async def join(
         standby: how to wait while another program leads; `None` does not.
         settings: how the servers are reached, see `access_of`.
         waits: told who leads, on the running loop, each time that this changes.
+        silent: told on the running loop why no server answers, at once and each SILENT_SECONDS, while that is so.
         deposed: told on the running loop that another program leads.
+        is_new: whether it is made if it is not there.
 
     Raises:
         SpecError: the store cannot be read, or the library for it is missing.
+        AccessRefused: the servers do not let this program in.
         StoreInUse: another program leads, and this one was not to wait.
-        StoreFailed: no server can be reached, and this program was not to wait.
+        StoreFailed: no server can be reached, and this program was not to wait; or the store is not there.
         UnsafeServer: the servers may lose what they have acknowledged.
         DamagedStore: what the log holds cannot be used.
     """
@@ -68,10 +77,20 @@ async def join(
     me = leader_name()
     thread = EngineThread(f"holdfast {system}")
     engine: Engine | None = None
+    unanswered = NowAndThen(lambda problem: _tell(loop, silent, problem))
     try:
-        joined: Engine = await thread.run(_connected(lambda: open_engine(access), insists=standby is not None))
+        opening = _connected(lambda: open_engine(access, is_new=is_new), unanswered if standby is not None else None)
+        joined: Engine = await thread.run(opening)
         engine = joined
-        leading = await thread.run(lead(joined, me, standby=standby, waits=lambda leader: _tell(loop, waits, leader)))
+        leading = await thread.run(
+            lead(
+                joined,
+                me,
+                standby=standby,
+                waits=lambda leader: _tell(loop, waits, leader),
+                unanswered=unanswered,
+            )
+        )
 
         def lost(error: Exception) -> None:
             if isinstance(error, Deposed):
@@ -100,33 +119,85 @@ def _tell(loop: asyncio.AbstractEventLoop, call: Callable[[T], None], what: T) -
         loop.call_soon_threadsafe(call, what)
 
 
-async def _connected(connect: Callable[[], Awaitable[Engine]], *, insists: bool) -> Engine:
-    """Connect; again and again if somebody waits for it."""
+class NowAndThen:
+    """Passes on what it is told, but not more often than each SILENT_SECONDS. Only for a running loop.
+
+    Args:
+        tell: whom it is passed on to.
+    """
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell = tell
+        self._next = 0.0
+
+    def __call__(self, what: str) -> None:
+        """Pass it on, if the last time is long enough ago."""
+        now = asyncio.get_running_loop().time()
+        if now >= self._next:
+            self._next = now + SILENT_SECONDS
+            self._tell(what)
+
+
+async def _connected(connect: Callable[[], Awaitable[Engine]], unanswered: NowAndThen | None) -> Engine:
+    """Connect; again and again if somebody waits for it, who is told why it takes so long."""
     pause = FIRST_PAUSE
     while True:
         try:
             return await connect()
-        except Unanswered:
-            if not insists:
+        except Unanswered as error:
+            if unanswered is None:
                 raise
+            unanswered(error.problem)
         await asyncio.sleep(pause)
         pause = min(2 * pause, LONGEST_PAUSE)
 
 
-def open_store(store: str, settings: Mapping[str, str | bool | int] | None = None) -> StoreEngine:
+def open_store(
+    store: str, settings: Mapping[str, str | bool | int] | None = None, *, is_new: bool = True
+) -> StoreEngine:
     """Open a store by itself, for a tool: no system may have it open, and none may open it meanwhile.
 
     Args:
         store: "sqlite:PATH" or "nats://HOST,HOST/NAME".
         settings: how servers are reached, see `access_of`.
+        is_new: whether it is made if it is not there.
 
     Raises:
-        SpecError: the name cannot be read. StoreInUse, StoreFailed, DamagedStore, UnsafeServer: it cannot be opened.
+        SpecError: the name cannot be read, or is that of memory.
+        StoreFailed: it is not there, or cannot be reached. AccessRefused: the servers do not let this program in.
+        StoreInUse, DamagedStore, UnsafeServer: it cannot be opened.
     """
+    kind, _, path = store.partition(":")
+    if kind == "memory":
+        raise SpecError("store", "what is in memory belongs to one program: name sqlite:PATH or nats://HOST/NAME")
     if not is_replicated(store):
+        if not is_new and kind == "sqlite" and path and not os.path.exists(path):
+            raise StoreFailed(path, "there is no such file; name the database, as in store='sqlite:PATH'")
         return open_journal(store)
 
+    def pass_over(what: object) -> None:
+        """Nobody waits here to whom it would matter."""
+
     async def joined() -> ReplicatedJournal:
-        return await join(store, "tool", None, settings or {}, waits=lambda leader: None, deposed=lambda error: None)
+        return await join(
+            store, "tool", None, settings or {}, waits=pass_over, silent=pass_over, deposed=pass_over, is_new=is_new
+        )
 
     return Called(asyncio.run(joined()))
+
+
+def is_same_store(one: str, other: str) -> bool:
+    """Whether two names are of one store, as far as the names tell.
+
+    >>> is_same_store("nats://a,b/app?nkey=x", "nats://b:4222/app"), is_same_store("sqlite:a.db", "sqlite:./a.db")
+    (True, True)
+    >>> is_same_store("nats://a/app", "nats://a/shop"), is_same_store("sqlite:a.db", "nats://a/app")
+    (False, False)
+    """
+    if is_replicated(one) != is_replicated(other):
+        return False
+    if not is_replicated(one):
+        return os.path.realpath(one.partition(":")[2]) == os.path.realpath(other.partition(":")[2])
+    first, second = urlsplit(one), urlsplit(other)
+    hosts = [{host if ":" in host else f"{host}:4222" for host in each.netloc.split(",")} for each in (first, second)]
+    return first.path.strip("/") == second.path.strip("/") and bool(hosts[0] & hosts[1])

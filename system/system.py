@@ -11,8 +11,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
 
 from ..actors.control.drain import drain as drain_queue
-from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, TreeFailed
-from ..actors.events import EventStream, LeadershipTaken, RecoveryTableUnused, StandingBy
+from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, StoreError, TreeFailed
+from ..actors.events import EventStream, LeadershipTaken, RecoveryTableUnused, ServersSilent, StandingBy
 from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, pack_exit
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
@@ -250,6 +250,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             options.standby,
             options.nats.told(),
             waits=lambda leader: node.emit(StandingBy(where, leader)),
+            silent=lambda reason: node.emit(ServersSilent(where, reason)),
             deposed=self._deposed,
         )
         node.emit(LeadershipTaken(where, journal.epoch))
@@ -265,7 +266,11 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         body = self._body
-        await self.shutdown()
+        try:
+            await self.shutdown()
+        except StoreError:  # JournalStopped has told of it: whoever has cancelled the body sees it cancelled.
+            if self._failure is None and not isinstance(error, asyncio.CancelledError):
+                raise
         if self._failure is not None:
             failure, self._failure = self._failure, None
             if body is not None:  # The cancel was ours: whoever catches TreeFailed must not look cancelled.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import datetime
-import ipaddress
 import stat
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
@@ -13,9 +11,6 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.errors import Error as NatsError
@@ -40,11 +35,14 @@ from holdfast.cluster.nats.server_file import (
     write_server_files,
 )
 from holdfast.errors import SpecError
+from tests.cluster.certificates import certificates
 from tests.cluster.servers import PATIENCE, NatsServers
 
 ONE = ServerPlan(name="n0", host="127.0.0.1", store_dir="/var/lib/nats")
 THREE = [
-    msgspec.structs.replace(ONE, name=f"n{number}", port=4222 + number, cluster_port=6222 + number)
+    msgspec.structs.replace(
+        ONE, name=f"n{number}", port=4222 + number, cluster_port=6222 + number, monitor_port=8222 + number
+    )
     for number in range(3)
 ]
 TLS = TlsFiles("/c.pem", "/k.pem", "/ca.pem")
@@ -212,29 +210,6 @@ async def _unheard(error: Exception) -> None:
     """What the client reports is raised, too."""
 
 
-def certificates(folder: Path) -> TlsFiles:
-    """A certificate of 127.0.0.1 that has signed itself, for both ends."""
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "holdfast test")])
-    now = datetime.datetime.now(datetime.UTC)
-    addresses = x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))])
-    made = (
-        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(hours=1))
-        .not_valid_after(now + datetime.timedelta(hours=24))
-        .add_extension(addresses, critical=False)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .sign(key, hashes.SHA256())
-    )
-    pem, own = folder / "cert.pem", folder / "key.pem"
-    pem.write_bytes(made.public_bytes(serialization.Encoding.PEM))
-    own.touch(0o600)
-    own.write_bytes(
-        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    )
-    return TlsFiles(str(pem), str(own), str(pem))
-
-
 def test_all_files_are_for_their_owner_alone_and_keys_stay(tmp_path: Path) -> None:
     folder = tmp_path / "servers"
     files = write_server_files(folder, THREE, ["app"])
@@ -268,6 +243,14 @@ def test_a_key_that_others_may_read_is_not_used_again(tmp_path: Path) -> None:
         write_server_files(tmp_path, [ONE], ["app"], force=True)
 
 
+def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    with pytest.raises(SpecError, match=f"chmod go-w {tmp_path / 'open'}"):
+        write_server_files(tmp_path / "open", [ONE], ["app"])
+    assert not [*(tmp_path / "open").iterdir()]
+
+
 def replaced(number: int, **more: object) -> list[ServerPlan]:
     return [msgspec.structs.replace(one, **more) if one.name == f"n{number}" else one for one in THREE]
 
@@ -280,6 +263,14 @@ def replaced(number: int, **more: object) -> list[ServerPlan]:
         (replaced(1, name="n0"), ["app"], "two servers have one name"),
         (replaced(1, port=4222), ["app"], "two servers have one client address"),
         (replaced(1, cluster_port=6222), ["app"], "two servers have one cluster address"),
+        (
+            replaced(1, monitor_port=4222),
+            ["app"],
+            "port 4222 of 127.0.0.1 is for clients of n0 and for health checks of n1",
+        ),
+        ([msgspec.structs.replace(ONE, port=8222)], ["app"], "port 8222 of 127.0.0.1 is for clients of n0"),
+        ([msgspec.structs.replace(ONE, host='x"y', tls=TLS)], ["app"], "is no host"),
+        ([msgspec.structs.replace(ONE, host="a.example:7", tls=TLS)], ["app"], "is no host"),
         (replaced(1, host="10.0.0.2"), ["app"], "n1 listens on 10.0.0.2, which others reach"),
         (replaced(1, host="0.0.0.0"), ["app"], "which others reach"),
         (replaced(1, name="n 1"), ["app"], "must be at most 64 letters"),
