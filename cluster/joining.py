@@ -15,7 +15,7 @@ from ..checkpoint.engine_calls import Called
 from ..checkpoint.journal import DamagedStore, StoreEngine, StoreFailed, StoreInUse
 from ..checkpoint.store_opening import open_journal
 from .engine_thread import EngineThread
-from .leadership import LeaderElsewhere, Standby, lead, leader_name
+from .leadership import LeaderElsewhere, Standby, give_up, lead, leader_name
 from .log_records import DamagedLog
 from .log_writer import FIRST_PAUSE, LONGEST_PAUSE, Deposed
 from .ports import Engine, Unanswered
@@ -100,7 +100,7 @@ async def join(
     except BaseException as error:
         if engine is not None:
             with contextlib.suppress(asyncio.CancelledError, TimeoutError):
-                await asyncio.wait_for(thread.run(engine.close()), 2.0)
+                await asyncio.wait_for(thread.run(_let_go(engine, me)), 2.0)
         await asyncio.to_thread(thread.close)
         named = store.partition("?")[0] if engine is None else engine.name
         match error:
@@ -112,6 +112,13 @@ async def join(
                 raise DamagedStore(named, None, None, str(error)) from error
             case _:
                 raise
+
+
+async def _let_go(engine: Engine, me: str) -> None:
+    try:
+        await give_up(engine, me)  # Else whoever starts next waits for its end, or is told that this program leads.
+    finally:
+        await engine.close()
 
 
 def _tell(loop: asyncio.AbstractEventLoop, call: Callable[[T], None], what: T) -> None:

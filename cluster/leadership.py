@@ -263,6 +263,15 @@ async def lead(
         await follower.begin_anew()
 
 
+async def give_up(engine: Engine, me: str) -> None:
+    """Give the lease up if this process has it; so it may be that asked for it and was cancelled before the answer."""
+    with contextlib.suppress(Unanswered):  # Then it expires.
+        if await engine.lease.holder() == me:
+            token = await engine.lease.acquire(me)
+            if token is not None:
+                await engine.lease.release(token)
+
+
 async def _take_lease(
     engine: Engine,
     me: str,

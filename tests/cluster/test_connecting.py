@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import signal
 import sys
+import threading
 from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
 
@@ -259,6 +260,25 @@ async def test_who_asks_a_deposed_leader_is_told_that_the_store_failed(nats1: Na
         raise AssertionError("it leads for ever")
     finally:
         await engine.close()
+
+
+async def test_a_start_that_is_cancelled_leaves_nothing(nats1: NatsServers) -> None:
+    """No thread, and no lease: the next start need not wait, whenever it was cancelled."""
+    store = nats1.store(nats1.new_system())
+
+    async def lead_on() -> None:
+        async with hf.ActorSystem("app", store=store, log=False):
+            await asyncio.Event().wait()
+
+    for moment in range(12):
+        leading = asyncio.create_task(lead_on())
+        await asyncio.wait([leading], timeout=0.006 * moment)
+        leading.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await leading
+        assert [one.name for one in threading.enumerate() if one.name == "holdfast app"] == []
+        async with asyncio.timeout(PATIENCE), hf.ActorSystem("app", store=store, log=False):
+            pass
 
 
 LEADS = """

@@ -163,6 +163,20 @@ CHECKS = {
         CONNECTING,
         "test_who_is_ended_while_the_servers_are_down",
     ),
+    "a start that is cancelled gives the lease up": Check(
+        "cluster/joining.py",
+        "        await give_up(engine, me)  #",
+        "        pass  #",
+        CONNECTING,
+        "test_a_start_that_is_cancelled",
+    ),
+    "who tidies up is left to do so": Check(
+        "cluster/engine_thread.py",
+        "                    if is_last or not task.cancelling():",
+        "                    if True:",
+        CONNECTING,
+        "test_a_start_that_is_cancelled",
+    ),
     "nothing is said twice": Check(
         "cluster/nats/access.py",
         "    if twice := [name for",
