@@ -76,12 +76,11 @@ async def join(
     loop = asyncio.get_running_loop()
     me = leader_name()
     thread = EngineThread(f"holdfast {system}")
-    engine: Engine | None = None
+    opened: list[Engine] = []  # filled in there: whoever is cancelled here would not get to know of it
     unanswered = NowAndThen(lambda problem: _tell(loop, silent, problem))
     try:
-        opening = _connected(lambda: open_engine(access, is_new=is_new), unanswered if standby is not None else None)
-        joined: Engine = await thread.run(opening)
-        engine = joined
+        insists = unanswered if standby is not None else None
+        joined = await thread.run(_connected(lambda: open_engine(access, is_new=is_new), insists, opened))
         leading = await thread.run(
             lead(
                 joined,
@@ -98,11 +97,10 @@ async def join(
 
         return ReplicatedJournal(joined, thread, leading, lost=lost)
     except BaseException as error:
-        if engine is not None:
-            with contextlib.suppress(asyncio.CancelledError, TimeoutError):
-                await asyncio.wait_for(thread.run(_let_go(engine, me)), 2.0)
+        with contextlib.suppress(asyncio.CancelledError, TimeoutError):
+            await asyncio.wait_for(thread.run(_let_go(opened, me)), 2.0)
         await asyncio.to_thread(thread.close)
-        named = store.partition("?")[0] if engine is None else engine.name
+        named = opened[0].name if opened else store.partition("?")[0]
         match error:
             case LeaderElsewhere():
                 raise StoreInUse(named, 0, error.leader) from error
@@ -114,11 +112,15 @@ async def join(
                 raise
 
 
-async def _let_go(engine: Engine, me: str) -> None:
-    try:
-        await give_up(engine, me)  # Else whoever starts next waits for its end, or is told that this program leads.
-    finally:
-        await engine.close()
+async def _let_go(opened: list[Engine], me: str) -> None:
+    """Wait for what was cancelled, for a moment, and let go of the engine, if one was opened."""
+    if cancelled := [task for task in asyncio.all_tasks() if task.cancelling()]:
+        await asyncio.wait(cancelled, timeout=1.0)
+    for engine in opened:
+        try:
+            await give_up(engine, me)  # Else whoever starts next waits for its end, or is told that this program leads.
+        finally:
+            await engine.close()
 
 
 def _tell(loop: asyncio.AbstractEventLoop, call: Callable[[T], None], what: T) -> None:
@@ -145,12 +147,15 @@ class NowAndThen:
             self._tell(what)
 
 
-async def _connected(connect: Callable[[], Awaitable[Engine]], unanswered: NowAndThen | None) -> Engine:
-    """Connect; again and again if somebody waits for it, who is told why it takes so long."""
+async def _connected(
+    connect: Callable[[], Awaitable[Engine]], unanswered: NowAndThen | None, opened: list[Engine]
+) -> Engine:
+    """Connect; again and again if somebody waits for it, who is told why it takes so long. Take it down in `opened`."""
     pause = FIRST_PAUSE
     while True:
         try:
-            return await connect()
+            opened.append(await connect())
+            return opened[0]
         except Unanswered as error:
             if unanswered is None:
                 raise

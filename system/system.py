@@ -232,9 +232,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
                 await up
             root.ended().add_done_callback(self._root_ended)
             await self._specifications.start_added(lambda spec: root.ref.ask(StartChild(spec), LONG))
-        except asyncio.CancelledError as error:
-            if self._failure is not None:  # Nobody is in the body yet who would hear of it.
-                await self.__aexit__(type(error), error, error.__traceback__)
+        except BaseException as error:  # Nobody is in the body yet who would hear of a failure, or end what has begun.
+            await self.__aexit__(type(error), error, error.__traceback__)
             raise
         return self
 

@@ -177,6 +177,13 @@ CHECKS = {
         CONNECTING,
         "test_a_start_that_is_cancelled",
     ),
+    "a start that is cancelled ends what it has begun": Check(
+        "system/system.py",
+        "            await self.__aexit__(type(error), error, error.__traceback__)\n            raise",
+        "            raise",
+        CONNECTING,
+        "test_a_start_that_is_cancelled",
+    ),
     "nothing is said twice": Check(
         "cluster/nats/access.py",
         "    if twice := [name for",
