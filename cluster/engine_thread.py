@@ -64,13 +64,11 @@ class EngineThread:
         try:
             self.loop.run_forever()
         finally:
-            for is_last in (False, True):
-                left = asyncio.all_tasks(self.loop)
-                for task in left:
-                    if is_last or not task.cancelling():  # Another cancel would end its tidying up: it closes sockets.
-                        task.cancel()
-                if left:
-                    self.loop.run_until_complete(asyncio.wait(left, timeout=1.0))
+            left = asyncio.all_tasks(self.loop)
+            for task in left:
+                task.cancel()
+            if left:
+                self.loop.run_until_complete(asyncio.wait(left, timeout=1.0))
             for _ in range(LAST_TICKS):  # Transports that were closed are let go of.
                 self.loop.run_until_complete(asyncio.sleep(0))
             self.loop.close()

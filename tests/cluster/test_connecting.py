@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
+from time import monotonic
 
 import pytest
 
@@ -270,9 +271,12 @@ async def test_a_start_that_is_cancelled_leaves_nothing(nats1: NatsServers) -> N
         async with hf.ActorSystem("app", store=store, log=False):
             await asyncio.Event().wait()
 
-    for moment in range(12):
+    began = monotonic()
+    async with hf.ActorSystem("app", store=store, log=False):
+        took = monotonic() - began
+    for moment in range(40):  # over the time that a start takes
         leading = asyncio.create_task(lead_on())
-        await asyncio.wait([leading], timeout=0.006 * moment)
+        await asyncio.wait([leading], timeout=took * moment / 40)
         leading.cancel()
         with pytest.raises(asyncio.CancelledError):
             await leading

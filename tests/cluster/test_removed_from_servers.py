@@ -170,13 +170,6 @@ CHECKS = {
         CONNECTING,
         "test_a_start_that_is_cancelled",
     ),
-    "who tidies up is left to do so": Check(
-        "cluster/engine_thread.py",
-        "                    if is_last or not task.cancelling():",
-        "                    if True:",
-        CONNECTING,
-        "test_a_start_that_is_cancelled",
-    ),
     "a start that is cancelled ends what it has begun": Check(
         "system/system.py",
         "            await self.__aexit__(type(error), error, error.__traceback__)\n            raise",
