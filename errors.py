@@ -58,7 +58,7 @@ from .checkpoint.snapshot.snapshot_groups import NoSuchGroup
 from .checkpoint.snapshot.snapshot_schedule import CheckpointFailed
 from .checkpoint.upgrade.mapping import NotMapped
 from .cluster.leadership import LeadershipLost
-from .cluster.ports import UnsafeServer
+from .cluster.ports import AccessRefused, UnsafeServer
 from .ftm.group.reconfiguration import CannotAdapt
 from .ftm.mechanisms.rb import NotAccepted
 from .ftm.model.mechanism import MechanismRefused
@@ -83,6 +83,7 @@ from .system.script import UntrustedFile
 from .system.transaction.errors import TransactionFailed, TransactionRefused
 
 __all__ = [
+    "AccessRefused",
     "ActorRestarting",
     "ActorStopped",
     "AlreadyPresent",

@@ -31,7 +31,7 @@ HoldfastError
 ├── SpecError            a child specification is not valid
 ├── UnsavableValue       a value that no snapshot can hold
 ├── DamagedValue         saved bytes that cannot be read
-├── StoreError           what must be kept could not be: StoreFailed, DamagedStore, StoreInUse, StaleEpoch
+├── StoreError           what must be kept could not be: StoreFailed, DamagedStore, StoreInUse, AccessRefused
 ├── ProcessUnavailable   no OS process could be had
 ├── TreeFailed           the root supervisor gave up
 └── Refusal              a handler's typed "no" (`message.py`)

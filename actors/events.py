@@ -375,6 +375,12 @@ class StandingBy(Event, frozen=True, eq=False):
     leader: str
 
 
+class ServersSilent(Event, frozen=True, eq=False):
+    """The servers of the store do not answer a program that waits to lead, and why. Told anew each 30 s of it."""
+
+    reason: str
+
+
 class LeadershipTaken(Event, frozen=True, eq=False):
     """From now on this program leads the system, in this `epoch`; its tree is started next."""
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from ..actors.errors import HoldfastError
 from ..actors.events import Event, JournalBlocked, JournalGoesOn, JournalStopped
 from .commit_lanes import CommitLanes, Submission
-from .journal import Entry, InHand, MemoryJournal, Saved, StoreEngine, StoreFailed
+from .journal import Entry, InHand, MemoryJournal, Saved, StaleEpoch, StoreEngine, StoreFailed
 from .method import Durability
 
 if TYPE_CHECKING:
@@ -179,7 +179,7 @@ class Commits:
         try:
             positions = self.engine.append(entries) if entries else []
         except StoreFailed as error:
-            if self.engine.has_failed():
+            if isinstance(error, StaleEpoch) or self.engine.has_failed():
                 self._stop(error)
             else:
                 self._block(error)

@@ -62,18 +62,6 @@ class StoreInUse(StoreError):
         return f"store {self.path} is open in process {self.pid}: stop it, or open with takeover=True, which kills it"
 
 
-class StaleEpoch(
-    StoreError,
-    text="store {path} was opened with epoch {epoch} and now has epoch {current}: another opening owns it, "
-    "this one acknowledges nothing any more; stop it",
-):
-    """The store was opened by somebody else since: nothing is acknowledged; stop, for you are no longer its owner."""
-
-    path: str
-    epoch: int
-    current: int
-
-
 class DamagedStore(StoreError):
     """The store holds something that cannot be trusted: `address` and `position` say where, when that is known."""
 
@@ -99,6 +87,21 @@ class StoreFailed(StoreError, text="store {path} failed: {reason}"):
 
     path: str
     reason: str
+
+
+class StaleEpoch(
+    StoreFailed,
+    text="store {path} was opened with epoch {epoch} and now has epoch {current}: {reason}, and this one acknowledges "
+    "nothing any more; what it had taken in may be handled by the new owner; stop it",
+):
+    """The store was opened by somebody else since: nothing is acknowledged; stop, for you are no longer its owner.
+
+    To whoever had asked it is what any StoreFailed is: the new owner may have handled the message, or will.
+    """
+
+    reason: str = "another opening owns it"
+    epoch: int = 0
+    current: int = 0
 
 
 class ForeignStore(

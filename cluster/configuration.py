@@ -23,6 +23,8 @@ FILE: Final = "holdfast.toml"
 CONFIG: Final = "HOLDFAST_CONFIG"
 """The variable that names another file."""
 _PREFIX: Final = "HOLDFAST_"
+_NEAR: Final = 0.8
+"""How alike two words are, from 0 to 1, of which one is taken for the other one misspelt: STOR and STORE have 0.89."""
 _PATHS: Final = ("creds", "nkey", "ca", "certificate", "key")
 
 
@@ -83,7 +85,7 @@ def read_configuration(path: Path | None = None, environ: Mapping[str, str] = os
 
     Raises:
         SpecError: naming the file and the line, or the variable, and what is wrong there; or the named file is not
-            there, or others may write to it.
+            there, is no regular one, or others may write to it.
     """
     named = path or (Path(environ[CONFIG]) if environ.get(CONFIG) else None)
     file = named or Path(FILE)
@@ -116,6 +118,7 @@ def _of_file(file: Path) -> Configuration:
 
 
 def _with_environment(found: Configuration, environ: Mapping[str, str]) -> Configuration:
+    _refuse_misspelt(environ)
     top: dict[str, Any] = {}
     for key in _keys(Configuration):
         if value := environ.get(f"{_PREFIX}{key.upper()}"):
@@ -131,6 +134,24 @@ def _with_environment(found: Configuration, environ: Mapping[str, str]) -> Confi
     return msgspec.structs.replace(found, **top, nats=msgspec.structs.replace(found.nats, **nats))
 
 
+def _refuse_misspelt(environ: Mapping[str, str]) -> None:
+    """Refuse a variable that is nearly one of ours, and would be passed over; other programs have theirs.
+
+    Raises:
+        SpecError: naming it, and the one that it resembles.
+    """
+    from difflib import get_close_matches  # only where there are such variables
+
+    known = [CONFIG.removeprefix(_PREFIX), *(key.upper() for key in _keys(Configuration))]
+    known += [f"NATS_{key.upper()}" for key in _keys(NatsSettings)]
+    for name, value in environ.items():
+        word = name.removeprefix(_PREFIX)
+        if value and word != name and word not in known and not word.startswith("NATS_"):
+            near = get_close_matches(word, known, n=1, cutoff=_NEAR)
+            if near:
+                raise SpecError(name, f"there is no such variable, did you mean {_PREFIX}{near[0]}?")
+
+
 def _text(file: Path) -> str:
     """The text of the file.
 
@@ -138,11 +159,14 @@ def _text(file: Path) -> str:
         SpecError: it cannot be read, or somebody else can write to it, and so say where this program keeps things.
     """
     try:
-        with file.open("rb") as opened:
+        # Without waiting for somebody who may never write, as behind the name of a pipe.
+        with open(file, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as opened:
             info = os.fstat(opened.fileno())
+            if not stat.S_ISREG(info.st_mode):
+                raise SpecError(str(file), "is no regular file: put the configuration into one")
             if info.st_uid not in (0, os.geteuid()) or info.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
                 raise SpecError(str(file), f"somebody else may write to it: make it your own, and chmod go-w {file}")
-            return opened.read().decode("utf-8")
+            return opened.read().decode("utf-8-sig")  # Some editors begin a file with a mark that TOML does not know.
     except OSError as error:
         raise SpecError(str(file), f"cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 from collections.abc import Awaitable, Callable, Mapping
 from importlib.util import find_spec
-from typing import TypeVar
+from typing import Final, TypeVar
+from urllib.parse import urlsplit
 
 from ..actors.errors import SpecError
 from ..checkpoint.engine_calls import Called
 from ..checkpoint.journal import DamagedStore, StoreEngine, StoreFailed, StoreInUse
 from ..checkpoint.store_opening import open_journal
 from .engine_thread import EngineThread
-from .leadership import LeaderElsewhere, Standby, lead, leader_name
+from .leadership import LeaderElsewhere, Standby, give_up, lead, leader_name
 from .log_records import DamagedLog
 from .log_writer import FIRST_PAUSE, LONGEST_PAUSE, Deposed
 from .ports import Engine, Unanswered
 from .replicated_journal import ReplicatedJournal
 
 T = TypeVar("T")
+SILENT_SECONDS: Final = 30.0
+"""How often a program that waits says that the servers do not answer."""
 
 
 def is_replicated(store: object) -> bool:
@@ -38,7 +42,9 @@ async def join(
     settings: Mapping[str, str | bool | int],
     *,
     waits: Callable[[str], None],
+    silent: Callable[[str], None],
     deposed: Callable[[Deposed], None],
+    is_new: bool = True,
 ) -> ReplicatedJournal:
     """Wait until this program leads the system, and return the journal of its store.
 
@@ -48,12 +54,15 @@ async def join(
         standby: how to wait while another program leads; `None` does not.
         settings: how the servers are reached, see `access_of`.
         waits: told who leads, on the running loop, each time that this changes.
+        silent: told on the running loop why no server answers, at once and each SILENT_SECONDS, while that is so.
         deposed: told on the running loop that another program leads.
+        is_new: whether it is made if it is not there.
 
     Raises:
         SpecError: the store cannot be read, or the library for it is missing.
+        AccessRefused: the servers do not let this program in.
         StoreInUse: another program leads, and this one was not to wait.
-        StoreFailed: no server can be reached, and this program was not to wait.
+        StoreFailed: no server can be reached, and this program was not to wait; or the store is not there.
         UnsafeServer: the servers may lose what they have acknowledged.
         DamagedStore: what the log holds cannot be used.
     """
@@ -67,11 +76,20 @@ async def join(
     loop = asyncio.get_running_loop()
     me = leader_name()
     thread = EngineThread(f"holdfast {system}")
-    engine: Engine | None = None
+    opened: list[Engine] = []  # filled in there: whoever is cancelled here would not get to know of it
+    unanswered = NowAndThen(lambda problem: _tell(loop, silent, problem))
     try:
-        joined: Engine = await thread.run(_connected(lambda: open_engine(access), insists=standby is not None))
-        engine = joined
-        leading = await thread.run(lead(joined, me, standby=standby, waits=lambda leader: _tell(loop, waits, leader)))
+        insists = unanswered if standby is not None else None
+        joined = await thread.run(_connected(lambda: open_engine(access, is_new=is_new), insists, opened))
+        leading = await thread.run(
+            lead(
+                joined,
+                me,
+                standby=standby,
+                waits=lambda leader: _tell(loop, waits, leader),
+                unanswered=unanswered,
+            )
+        )
 
         def lost(error: Exception) -> None:
             if isinstance(error, Deposed):
@@ -79,11 +97,10 @@ async def join(
 
         return ReplicatedJournal(joined, thread, leading, lost=lost)
     except BaseException as error:
-        if engine is not None:
-            with contextlib.suppress(asyncio.CancelledError, TimeoutError):
-                await asyncio.wait_for(thread.run(engine.close()), 2.0)
+        with contextlib.suppress(asyncio.CancelledError, TimeoutError):
+            await asyncio.wait_for(thread.run(_let_go(opened, me)), 2.0)
         await asyncio.to_thread(thread.close)
-        named = store.partition("?")[0] if engine is None else engine.name
+        named = opened[0].name if opened else store.partition("?")[0]
         match error:
             case LeaderElsewhere():
                 raise StoreInUse(named, 0, error.leader) from error
@@ -95,38 +112,104 @@ async def join(
                 raise
 
 
+async def _let_go(opened: list[Engine], me: str) -> None:
+    """Wait for what was cancelled, for a moment, and let go of the engine, if one was opened."""
+    if cancelled := [task for task in asyncio.all_tasks() if task.cancelling()]:
+        await asyncio.wait(cancelled, timeout=1.0)
+    for engine in opened:
+        try:
+            await give_up(engine, me)  # Else whoever starts next waits for its end, or is told that this program leads.
+        finally:
+            await engine.close()
+
+
 def _tell(loop: asyncio.AbstractEventLoop, call: Callable[[T], None], what: T) -> None:
     with contextlib.suppress(RuntimeError):  # That loop has ended.
         loop.call_soon_threadsafe(call, what)
 
 
-async def _connected(connect: Callable[[], Awaitable[Engine]], *, insists: bool) -> Engine:
-    """Connect; again and again if somebody waits for it."""
+class NowAndThen:
+    """Passes on what it is told, but not more often than each SILENT_SECONDS. Only for a running loop.
+
+    Args:
+        tell: whom it is passed on to.
+    """
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell = tell
+        self._next = 0.0
+
+    def __call__(self, what: str) -> None:
+        """Pass it on, if the last time is long enough ago."""
+        now = asyncio.get_running_loop().time()
+        if now >= self._next:
+            self._next = now + SILENT_SECONDS
+            self._tell(what)
+
+
+async def _connected(
+    connect: Callable[[], Awaitable[Engine]], unanswered: NowAndThen | None, opened: list[Engine]
+) -> Engine:
+    """Connect; again and again if somebody waits for it, who is told why it takes so long. Take it down in `opened`."""
     pause = FIRST_PAUSE
     while True:
         try:
-            return await connect()
-        except Unanswered:
-            if not insists:
+            opened.append(await connect())
+            return opened[0]
+        except Unanswered as error:
+            if unanswered is None:
                 raise
+            unanswered(error.problem)
         await asyncio.sleep(pause)
         pause = min(2 * pause, LONGEST_PAUSE)
 
 
-def open_store(store: str, settings: Mapping[str, str | bool | int] | None = None) -> StoreEngine:
+def open_store(
+    store: str, settings: Mapping[str, str | bool | int] | None = None, *, is_new: bool = True
+) -> StoreEngine:
     """Open a store by itself, for a tool: no system may have it open, and none may open it meanwhile.
 
     Args:
         store: "sqlite:PATH" or "nats://HOST,HOST/NAME".
         settings: how servers are reached, see `access_of`.
+        is_new: whether it is made if it is not there.
 
     Raises:
-        SpecError: the name cannot be read. StoreInUse, StoreFailed, DamagedStore, UnsafeServer: it cannot be opened.
+        SpecError: the name cannot be read, or is that of memory.
+        StoreFailed: it is not there, or cannot be reached. AccessRefused: the servers do not let this program in.
+        StoreInUse, DamagedStore, UnsafeServer: it cannot be opened.
     """
+    kind, _, path = store.partition(":")
+    if kind == "memory":
+        raise SpecError("store", "what is in memory belongs to one program: name sqlite:PATH or nats://HOST/NAME")
     if not is_replicated(store):
+        if not is_new and kind == "sqlite" and path and not os.path.exists(path):
+            raise StoreFailed(path, "there is no such file; name the database, as in store='sqlite:PATH'")
         return open_journal(store)
 
+    def pass_over(what: object) -> None:
+        """Nobody waits here to whom it would matter."""
+
     async def joined() -> ReplicatedJournal:
-        return await join(store, "tool", None, settings or {}, waits=lambda leader: None, deposed=lambda error: None)
+        return await join(
+            store, "tool", None, settings or {}, waits=pass_over, silent=pass_over, deposed=pass_over, is_new=is_new
+        )
 
     return Called(asyncio.run(joined()))
+
+
+def is_same_store(one: str, other: str) -> bool:
+    """Whether two names are of one store, as far as the names tell.
+
+    >>> is_same_store("nats://a,b/app?nkey=x", "nats://b:4222/app"), is_same_store("sqlite:a.db", "sqlite:./a.db")
+    (True, True)
+    >>> is_same_store("nats://a/app", "nats://a/shop"), is_same_store("sqlite:a.db", "nats://a/app")
+    (False, False)
+    """
+    if is_replicated(one) != is_replicated(other):
+        return False
+    if not is_replicated(one):
+        return os.path.realpath(one.partition(":")[2]) == os.path.realpath(other.partition(":")[2])
+    first, second = urlsplit(one), urlsplit(other)
+    hosts = [{host if ":" in host else f"{host}:4222" for host in each.netloc.split(",")} for each in (first, second)]
+    return first.path.strip("/") == second.path.strip("/") and bool(hosts[0] & hosts[1])

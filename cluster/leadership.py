@@ -214,8 +214,17 @@ class Leading:
     keeper: LeaseKeeper
 
 
+def _nobody(what: str) -> None:
+    """Nobody is told."""
+
+
 async def lead(
-    engine: Engine, me: str, *, standby: Standby | None, waits: Callable[[str], None] = lambda leader: None
+    engine: Engine,
+    me: str,
+    *,
+    standby: Standby | None,
+    waits: Callable[[str], None] = _nobody,
+    unanswered: Callable[[str], None] = _nobody,
 ) -> Leading:
     """Wait until this process leads, and return what it begins with.
 
@@ -224,6 +233,7 @@ async def lead(
         me: what this process calls itself.
         standby: "warm" follows the log meanwhile, "cold" reads it only then, `None` does not wait for another leader.
         waits: told who leads, each time that this has changed.
+        unanswered: told why the engine cannot be reached, each time that it was asked in vain.
 
     Raises:
         LeaderElsewhere: another leads, and nobody is to wait for it.
@@ -234,7 +244,7 @@ async def lead(
     following = asyncio.ensure_future(follower.follow()) if standby == "warm" else None
     try:
         while True:
-            keeper = await _take_lease(engine, me, standby, waits, following)
+            keeper = await _take_lease(engine, me, standby, waits, unanswered, following)
             if following is not None:
                 await end_tasks(following)
                 if not following.cancelled():
@@ -243,9 +253,10 @@ async def lead(
             renewing = asyncio.ensure_future(keeper.renew_while_reading(follower))
             try:
                 maker = await _begin_epoch(engine, me, follower, keeper)
-            except Unanswered:
+            except Unanswered as error:
                 if standby is None:
                     raise
+                unanswered(error.problem)
                 maker = None
             finally:
                 await end_tasks(renewing)
@@ -259,11 +270,21 @@ async def lead(
         await follower.begin_anew()
 
 
+async def give_up(engine: Engine, me: str) -> None:
+    """Give the lease up if this process has it; so it may be that asked for it and was cancelled before the answer."""
+    with contextlib.suppress(Unanswered):  # Then it expires.
+        if await engine.lease.holder() == me:
+            token = await engine.lease.acquire(me)
+            if token is not None:
+                await engine.lease.release(token)
+
+
 async def _take_lease(
     engine: Engine,
     me: str,
     standby: Standby | None,
     waits: Callable[[str], None],
+    unanswered: Callable[[str], None],
     following: asyncio.Future[None] | None,
 ) -> LeaseKeeper:
     """Wait for the lease, and return what keeps it."""
@@ -285,9 +306,10 @@ async def _take_lease(
                 has_failed = False
                 continue
             leader = await engine.lease.holder()
-        except Unanswered:
+        except Unanswered as error:
             if standby is None:
                 raise
+            unanswered(error.problem)
             has_failed = following is not None
             await asyncio.sleep(LOOK_SECONDS)
             continue

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
-from ..actors.errors import HoldfastError
+from ..actors.errors import HoldfastError, StoreError
 
 
 class Unanswered(HoldfastError, text="{engine} has not answered: {problem}"):
@@ -17,6 +17,14 @@ class Unanswered(HoldfastError, text="{engine} has not answered: {problem}"):
 
     engine: str
     problem: str
+
+
+class AccessRefused(StoreError, text="store {path} does not let this program in: {problem}; {remedy}"):
+    """The servers of a store have answered, and have refused: to wait or to try again changes nothing."""
+
+    path: str
+    problem: str
+    remedy: str
 
 
 class UnsafeServer(HoldfastError, text="{servers} may lose what was acknowledged: {problems:; }"):

@@ -112,7 +112,7 @@ class ReplicatedJournal:
             cause = next((one for one in causes if isinstance(one, Deposed)), causes[0])
             failure: StaleEpoch | StoreFailed
             if isinstance(cause, Deposed):
-                failure = StaleEpoch(self.path, cause.epoch, cause.current)
+                failure = StaleEpoch(self.path, epoch=cause.epoch, current=cause.current)
             else:  # Also what nobody expects of an engine: no sync may wait for a dead writer.
                 failure = StoreFailed(self.path, f"{cause}" or type(cause).__name__)
             self._fail(failure)

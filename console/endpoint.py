@@ -33,7 +33,7 @@ from .wire import (
     check_user,
     failure,
     frame,
-    peer_uid,
+    peer_of,
 )
 
 MOST_CLIENTS = 32
@@ -126,7 +126,7 @@ class Endpoint:
         self._clients.add(task)
         session = ClientSession(self._system, self._since)
         try:
-            check_user(peer_uid(writer.get_extra_info("socket")), self._uid)
+            check_user(peer_of(writer.get_extra_info("socket")).uid, self._uid)
             self._make_place()
             while (body := await self._next(task, reader)) is not None and await self._answer(
                 session, body, reader, writer

@@ -59,11 +59,13 @@ from .wire import (
     open_arg,
     outcome,
     pack_arg,
-    peer_uid,
+    peer_of,
 )
 
 ABOUT_TIMEOUT = 5.0
 """Seconds that a system has to say which it is."""
+CONNECT_TIMEOUT = 4.0
+"""Seconds that the kernel has to connect: more only if many others wait there for a system that does not answer."""
 GRACE = 35.0
 """Seconds beyond its own time limit that a request is waited for: it may have to be undone."""
 
@@ -80,6 +82,18 @@ class NotReached(
 
     path: str
     why: str
+
+
+class NotAnswering(
+    HoldfastError,
+    text="the system at {path} (process {pid}) is there and does not answer within {seconds:g} s: {state}",
+):
+    """A running system is at this socket, and says nothing: it is stopped, or something occupies its event loop."""
+
+    path: str
+    pid: int
+    seconds: float
+    state: str
 
 
 class RemoteRef:
@@ -106,6 +120,9 @@ RemoteTarget = RemoteRef | str
 class Client:
     """One connection; a request, then its answer. It blocks: `RemoteSystem` waits for it in a thread.
 
+    Attributes:
+        pid: of the process that listens there; 0 if it cannot be seen from here.
+
     Raises:
         NotReached: nobody listens there. WrongUser: somebody else does.
     """
@@ -115,9 +132,11 @@ class Client:
         self._lock = threading.Lock()
         self._sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
         try:
-            self._sock.settimeout(10.0)
+            self._sock.settimeout(CONNECT_TIMEOUT)
             self._sock.connect(self.path)
-            check_user(peer_uid(self._sock), os.geteuid())
+            peer = peer_of(self._sock)
+            check_user(peer.uid, os.geteuid())
+            self.pid = peer.pid
         except OSError as error:
             self._sock.close()
             raise NotReached(self.path, error.strerror or str(error)) from error
@@ -140,6 +159,23 @@ class Client:
                 raise NotReached(self.path, error.strerror or str(error)) from error
         return outcome(RESPONSE.decode(body), read)
 
+    def greet(self, seconds: float) -> None:
+        """Find out whether anybody answers, before something is asked that may take its time.
+
+        Raises:
+            NotAnswering: the process is there, and says nothing within so many seconds.
+            NotReached: it has closed the connection.
+        """
+        with self._lock:
+            try:
+                self._sock.settimeout(seconds)
+                self._sock.sendall(frame(About()))
+                self._read(body_size(self._read(LENGTH.size)))
+            except TimeoutError as error:
+                raise NotAnswering(self.path, self.pid, seconds, _state_of(self.pid)) from error
+            except OSError as error:
+                raise NotReached(self.path, error.strerror or str(error)) from error
+
     def _read(self, size: int) -> bytes:
         data = bytearray()
         while len(data) < size:
@@ -156,6 +192,17 @@ class Client:
         except OSError:
             pass  # It was closed by the other side.
         self._sock.close()
+
+
+def _state_of(pid: int) -> str:
+    """Why a process says nothing, as far as the kernel knows, and what to do."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace").rpartition(")")[2].split()[0]
+    except (OSError, IndexError):  # Another system than Linux, or it has ended just now.
+        state = ""
+    if state in ("T", "t"):
+        return f"it is stopped; kill -CONT {pid} lets it go on"
+    return "something occupies its event loop, or the machine; wait, or end the process"
 
 
 class RemoteSystem:
@@ -191,6 +238,10 @@ class RemoteSystem:
 
     def __exit__(self, *exc: object) -> None:
         self._client.close()
+
+    def greet(self, seconds: float) -> None:
+        """Find out whether the system answers at all. Raises NotAnswering, NotReached."""
+        self._client.greet(seconds)
 
     # -- looking at it ------------------------------------------------------------------------------------------------
 

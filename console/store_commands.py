@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from ..actors.errors import HoldfastError
-from ..checkpoint.journal import DamagedStore, StoreInUse
+from ..checkpoint.journal import DamagedStore, NotCopied, StoreInUse
 from ..checkpoint.store_tools import (
     StoreCopy,
     StoreStats,
@@ -28,7 +28,7 @@ from ..checkpoint.store_tools import (
     verify_store,
 )
 from ..cluster.configuration import read_configuration
-from ..cluster.joining import open_store
+from ..cluster.joining import is_same_store, open_store
 
 DAMAGED = 1
 UNREADABLE = 2
@@ -225,17 +225,19 @@ def copy(
     No system may have either of them open. The copy is there completely, or not at all. How servers are reached is said
     in their address, or by holdfast.toml and the environment.
 
-    Exit status 0: done. 2: one of them is open, damaged or cannot be reached, or DEST has something already.
+    Exit status 0: done. 2: STORE is not there, one of them is open, damaged or cannot be reached, or DEST has something
+    already.
     """
     from ..cluster.store_copy import copy_store
 
     try:
         settings = read_configuration().nats.told()
         names = source.partition("?")[0], dest.partition("?")[0]
+        if is_same_store(source, dest):
+            raise NotCopied(*names, "both are one store", "name another one as DEST")
         with contextlib.ExitStack() as stack:
-            first, second = (
-                stack.enter_context(contextlib.closing(open_store(one, settings))) for one in (source, dest)
-            )
+            first = stack.enter_context(contextlib.closing(open_store(source, settings, is_new=False)))
+            second = stack.enter_context(contextlib.closing(open_store(dest, settings)))
             made = copy_store(first, second, names=names)
     except HoldfastError as error:
         raise _ended("copy", error, UNREADABLE) from error

@@ -10,7 +10,7 @@ import socket
 import struct
 from collections.abc import Callable
 from types import NoneType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 
@@ -65,10 +65,17 @@ class WrongUser(HoldfastError, text="the other end runs as the user with uid {ui
     expected: int
 
 
-def peer_uid(sock: socket.socket) -> int:
-    """The user at the other end of a Unix socket, as the kernel says."""
-    _, uid, _ = CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
-    return int(uid)
+class Peer(NamedTuple):
+    """Who is at the other end of a Unix socket: the process that has connected, or listens there, and its user."""
+
+    pid: int
+    uid: int
+
+
+def peer_of(sock: socket.socket) -> Peer:
+    """Who is at the other end of a Unix socket, as the kernel says."""
+    pid, uid, _ = CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
+    return Peer(pid, uid)
 
 
 def check_user(uid: int, expected: int) -> None:
@@ -354,8 +361,11 @@ RESPONSE: msgspec.msgpack.Decoder[ControlResponse] = msgspec.msgpack.Decoder(Con
 
 
 def frame(value: ControlRequest | ControlResponse) -> bytes:
-    """Head and body. Raises BadRequest: too large."""
-    body = msgspec.msgpack.encode(value)
+    """Head and body. Raises BadRequest: too large, or with a number that is."""
+    try:
+        body = msgspec.msgpack.encode(value)
+    except OverflowError as error:
+        raise BadRequest("a number in it has more than 64 bits") from error
     head = LENGTH.pack(len(body))
     body_size(head)
     return head + body

@@ -50,6 +50,8 @@ async def main() -> None:
                 print("somebody else leads")  # somebody else leads
             except hf.errors.UnsafeServer as unsafe:
                 print(unsafe.problems)
+            except hf.errors.AccessRefused as refused:
+                print(refused.problem, refused.remedy)
             waiting = asyncio.create_task(stand_by(second))
             await asyncio.sleep(0)  # It begins to wait, and tells events from then on.
             events = second.events()

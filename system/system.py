@@ -11,8 +11,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
 
 from ..actors.control.drain import drain as drain_queue
-from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, TreeFailed
-from ..actors.events import EventStream, LeadershipTaken, RecoveryTableUnused, StandingBy
+from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, StoreError, TreeFailed
+from ..actors.events import EventStream, LeadershipTaken, RecoveryTableUnused, ServersSilent, StandingBy
 from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, pack_exit
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
@@ -243,9 +243,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             await self._specifications.start_added(lambda spec: root.ref.ask(StartChild(spec), LONG))
             if (at := options.reached_at) is not None:
                 self._transport = await serve(self._lines, at, options.nats)
-        except asyncio.CancelledError as error:
-            if self._failure is not None:  # Nobody is in the body yet who would hear of it.
-                await self.__aexit__(type(error), error, error.__traceback__)
+        except BaseException as error:  # Nobody is in the body yet who would hear of a failure, or end what has begun.
+            await self.__aexit__(type(error), error, error.__traceback__)
             raise
         return self
 
@@ -289,6 +288,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             options.standby,
             options.nats.told(),
             waits=lambda leader: node.emit(StandingBy(where, leader)),
+            silent=lambda reason: node.emit(ServersSilent(where, reason)),
             deposed=self._deposed,
         )
         node.emit(LeadershipTaken(where, journal.epoch))
@@ -308,7 +308,11 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         body = self._body
-        await self.shutdown()
+        try:
+            await self.shutdown()
+        except StoreError:  # JournalStopped has told of it: whoever has cancelled the body sees it cancelled.
+            if self._failure is None and not isinstance(error, asyncio.CancelledError):
+                raise
         if self._failure is not None:
             failure, self._failure = self._failure, None
             if body is not None:  # The cancel was ours: whoever catches TreeFailed must not look cancelled.

@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager
 from typing import Final, Literal
 
 from ..encoding.entry_codec import check_entry, entry_packer, is_plain
-from ..journal import DamagedStore, Entry, Saved, StaleEpoch, StoreFailed
+from ..journal import DamagedStore, Entry, Saved, StoreFailed
 from ..snapshot.shared_blocks import Segment
 from ..store_key import StoreKey, read_store_key
 from .append_log import Row
@@ -174,7 +174,7 @@ class SqliteJournal:
                 chain.floor = chain.last
                 files = self._clean_at_once(chain, db, keep)
                 chain.write(db, self._cipher)
-        except (StaleEpoch, StoreFailed):
+        except StoreFailed:
             if file is not None and self._store.failure is None:  # After a failed sync nobody knows if the row exists.
                 os.unlink(os.path.join(self._store.files.folder, file))
             raise

@@ -257,7 +257,7 @@ class Store:
                 db.execute("BEGIN IMMEDIATE")
                 (current,) = db.execute("SELECT epoch FROM store").fetchone()
                 if current != self.claim.epoch:
-                    raise StaleEpoch(self.path, self.claim.epoch, current)
+                    raise StaleEpoch(self.path, epoch=self.claim.epoch, current=current)
                 self.in_doubt = True
                 if log.is_due:
                     log.prepare()
@@ -320,7 +320,7 @@ class Store:
             self.log.write(rows)
         except LogSealed as error:
             (current,) = self.db.execute("SELECT epoch FROM store").fetchone()
-            raise StaleEpoch(self.path, self.claim.epoch, current) from error
+            raise StaleEpoch(self.path, epoch=self.claim.epoch, current=current) from error
         except OSError as error:
             raise self.translate(error) from error
         self.in_doubt = False
@@ -462,7 +462,7 @@ class Store:
             view = None if chain is None else (chain, chain.positions[:], chain.kept[:])
         try:
             if current != self.claim.epoch:
-                raise StaleEpoch(self.path, self.claim.epoch, current)
+                raise StaleEpoch(self.path, epoch=self.claim.epoch, current=current)
             if chain is not None and chain.damage is not None:
                 raise DamagedStore(*chain.damage.args)
             yield view

@@ -6,6 +6,7 @@ import os
 import re
 import ssl
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, TypedDict
 from urllib.parse import parse_qsl, unquote, urlsplit
@@ -14,12 +15,14 @@ import msgspec
 
 from ...actors.errors import SpecError
 from .private_files import read_private
-from .server_file import check_name, inbox_of, is_loopback, public_key
+from .server_file import check_host, check_name, inbox_of, is_loopback, public_key
 
 DEFAULT_PORT: Final = 4222
 SETTINGS: Final = ("ca", "certificate", "creds", "insecure", "key", "nkey", "replicas")
 """What may stand behind the question mark of a store, and in the settings."""
 _SEED: Final = re.compile(r"S[A-Z2-7]{50,}")
+_CREDENTIALS: Final = {"BEGIN NATS USER JWT": "user", "BEGIN USER NKEY SEED": "private key"}
+"""Lines of a file of credentials, and what stands in the one behind each."""
 _WHERE: Final = "store"
 _EXAMPLE: Final = "nats://HOST[:PORT][,HOST,HOST]/SYSTEM"
 _BOOLS: Final = {"": True, "1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
@@ -107,7 +110,10 @@ def access_of(store: str, settings: Mapping[str, str | bool | int] | None = None
     servers = tuple(f"{scheme}://{_address(one)}" for one in parts.netloc.split(","))
     if len({*servers}) < len(servers):
         raise SpecError(_WHERE, f"a server is named twice: {', '.join(servers)}")
-    told = {**(settings or {}), **dict(parse_qsl(parts.query, keep_blank_values=True))}
+    said = parse_qsl(parts.query, keep_blank_values=True)
+    if twice := [name for number, (name, _) in enumerate(said) if name in dict(said[:number])]:
+        raise SpecError(_WHERE, f"{twice[0]} is said twice: say it once")
+    told = {**(settings or {}), **dict(said)}
     if unknown := sorted(told.keys() - {*SETTINGS}):
         raise SpecError(_WHERE, f"there is no setting {unknown[0]!r}: there are {', '.join(SETTINGS)}")
     access = NatsAccess(
@@ -138,7 +144,7 @@ def connect_options(access: NatsAccess) -> ConnectOptions:
         max_outstanding_pings=2,
     )
     if access.creds is not None:
-        read_private(_WHERE, Path(access.creds))
+        _check_credentials(Path(access.creds))
         options["user_credentials"] = access.creds
     elif access.nkey is not None:
         seed = read_private(_WHERE, Path(access.nkey)).decode("ascii", "replace")
@@ -147,6 +153,22 @@ def connect_options(access: NatsAccess) -> ConnectOptions:
     if access.is_encrypted:
         options["tls"] = _tls(access)
     return options
+
+
+def _check_credentials(file: Path) -> None:
+    """Refuse a file in which the library would not find what it looks for.
+
+    Raises:
+        SpecError: naming the file, and what it lacks.
+    """
+    lines = read_private(_WHERE, file).decode("ascii", "replace").splitlines()
+    for begin, what in _CREDENTIALS.items():
+        if not any(begin in line and after.strip() for line, after in pairwise(lines)):
+            alone = _SEED.fullmatch("".join(lines).strip()) is not None
+            hint = "; a private key alone is given as nkey=" if alone else ""
+            raise SpecError(_WHERE, f"creds: there is no {what} in {file}, after a line with {begin!r}{hint}")
+    seed = next(after for line, after in pairwise(lines) if "BEGIN USER NKEY SEED" in line)
+    public_key(seed)
 
 
 def _tls(access: NatsAccess) -> ssl.SSLContext:
@@ -193,6 +215,7 @@ def _address(server: str) -> str:
         raise SpecError(_WHERE, f"the server {server!r} has no valid port: write HOST:PORT") from error
     if not host:
         raise SpecError(_WHERE, f"a server has no host: write {_EXAMPLE}")
+    check_host(_WHERE, host)
     return f"[{host}]:{port or DEFAULT_PORT}" if ":" in host else f"{host}:{port or DEFAULT_PORT}"
 
 

@@ -9,24 +9,23 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Generator, Sequence
-from typing import Any, Final
+from collections.abc import Sequence
+from typing import Final
 
 import nats.errors
 from nats.aio.client import Client
-from nats.aio.transport import TcpTransport
 from nats.js import JetStreamContext, api
 from nats.js.errors import APIError, NotFoundError
 from nats.js.errors import Error as JetStreamError
 
+from ...checkpoint.journal import StoreFailed
 from ..log_records import PART
 from ..ports import LogReader, LogRecord, OutOfTurn, Unanswered
-from .access import NatsAccess, connect_options
+from .access import NatsAccess
+from .connecting import ANSWER_SECONDS, SystemClient, answering
 from .server_check import refuse_unsafe
 from .system_streams import SubjectNames, stream_settings
 
-ANSWER_SECONDS: Final = 2.0
-"""How long one request waits for its answer."""
 CONNECT_SECONDS: Final = 5.0
 """How long it may take until the first server answers."""
 LEASE_SECONDS: Final = 3
@@ -59,13 +58,22 @@ class NatsEngine:
         self.lease = NatsLease(stream, names, name)
         self.blobs = NatsBlobs(stream, names, name)
 
-    async def _make_streams(self, replicas: int) -> None:
+    async def prepare(self, access: NatsAccess, *, is_new: bool) -> None:
+        """Refuse servers that may lose something, and make the streams that are not there.
+
+        Raises:
+            StoreFailed, UnsafeServer, Unanswered: as `open_engine`.
+        """
+        await refuse_unsafe(self._client, access)
         stream = self._client.jetstream(timeout=5 * ANSWER_SECONDS)
         with answering(self.name):
-            for settings in stream_settings(self.names, replicas):
+            for settings in stream_settings(self.names, access.replicas):
                 try:
                     await stream.stream_info(settings.name or "")
-                except NotFoundError:
+                except NotFoundError as error:
+                    if not is_new:
+                        problem = f"there is no system {access.system} on these servers; is it written as it was made?"
+                        raise StoreFailed(self.name, problem) from error
                     await stream.add_stream(settings)
 
     async def close(self) -> None:
@@ -76,64 +84,30 @@ class NatsEngine:
             await self._client.close()
 
 
-class EngineClient(Client):
-    """A client that lets go at once of a connection whose other end is silent, before it makes another.
+async def open_engine(access: NatsAccess, *, is_new: bool = True) -> NatsEngine:
+    """Connect, refuse servers that may lose something, and make the streams of the system if they are not there.
 
-    Its base waits until the old one is closed in good order. On a network that is cut that takes 30 seconds with TLS,
-    and as long as the kernel tries to send, a quarter of an hour, if anything was still to be sent.
-    """
-
-    async def _attempt_reconnect(self) -> None:
-        transport = self._transport
-        if isinstance(transport, TcpTransport) and transport._io_writer is not None:
-            transport._io_writer.transport.abort()
-        await super()._attempt_reconnect()
-
-
-async def open_engine(access: NatsAccess) -> NatsEngine:
-    """Connect, make the streams of the system if they are not there, and refuse servers that may lose something.
+    Args:
+        access: where the servers are, and how they are reached.
+        is_new: whether the streams are made; else it is an error that they are not there.
 
     Raises:
+        StoreFailed: nothing is there of the system, and nothing is to be made.
         SpecError: a file of secrets or certificates must not be used.
+        AccessRefused: the servers do not let this program in, or do not let it run the system.
         UnsafeServer: the servers or streams are not set as they have to be.
         Unanswered: no server can be reached, or they have no leader now.
     """
-    name = access.name
-    client = EngineClient()
-    options: dict[str, Any] = {**connect_options(access), "error_cb": _pass_over}
-    with answering(name):
-        try:
-            async with asyncio.timeout(CONNECT_SECONDS):
-                await client.connect(**options)
-        except BaseException:
-            await client.close()
-            raise
-    engine = NatsEngine(client, name, access.system)
+    client = SystemClient(access)
     try:
-        await engine._make_streams(access.replicas)
-        await refuse_unsafe(client, access)
+        await client.enter(CONNECT_SECONDS)
+        engine = NatsEngine(client, access.name, access.system)
+        await client.probe(is_node=True)
+        await client.unless_denied(engine.prepare(access, is_new=is_new))
     except BaseException:
-        await engine.close()
+        await client.close()
         raise
     return engine
-
-
-async def _pass_over(error: Exception) -> None:
-    """Do nothing: the client connects again, and whoever waits for an answer meanwhile gets `Unanswered`."""
-
-
-@contextlib.contextmanager
-def answering(name: str) -> Generator[None, None, None]:
-    """Whatever means that nobody knows is `Unanswered`.
-
-    Raises:
-        Unanswered: the server has not answered, or has answered that it cannot do that now.
-    """
-    try:
-        yield
-    except (nats.errors.Error, JetStreamError, TimeoutError, OSError) as error:
-        said = error.description if isinstance(error, APIError) else str(error)
-        raise Unanswered(name, said or type(error).__name__) from error
 
 
 class NatsLog:

@@ -6,15 +6,15 @@ import asyncio
 import contextlib
 from collections import deque
 from collections.abc import Callable
-from typing import Any
 
 import nats.errors
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from ..engine_thread import end_tasks
-from .access import NatsAccess, connect_options
-from .nats_engine import CONNECT_SECONDS, EngineClient, answering
+from .access import NatsAccess
+from .connecting import SystemClient, answering
+from .nats_engine import CONNECT_SECONDS
 
 
 class NatsTransport:
@@ -80,24 +80,14 @@ class NatsTransport:
             await self._client.close()
 
 
-async def _pass_over(error: Exception) -> None:
-    """Do nothing: the client connects again, and lines send again what was lost."""
-
-
 async def open_transport(access: NatsAccess) -> NatsTransport:
     """Connect.
 
     Raises:
         SpecError: a file of secrets or certificates must not be used.
+        AccessRefused: the servers do not let this program in.
         Unanswered: no server can be reached.
     """
-    client = EngineClient()
-    options: dict[str, Any] = {**connect_options(access), "error_cb": _pass_over}
-    with answering(access.name):
-        try:
-            async with asyncio.timeout(CONNECT_SECONDS):
-                await client.connect(**options)
-        except BaseException:
-            await client.close()
-            raise
+    client = SystemClient(access)
+    await client.enter(CONNECT_SECONDS)
     return NatsTransport(client, access.name)

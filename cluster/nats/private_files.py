@@ -25,10 +25,11 @@ def read_private(where: str, path: Path) -> bytes:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError as error:
         raise SpecError(where, f"the file {path} cannot be read: {error.strerror}") from error
+    info = os.fstat(descriptor)
+    if not stat.S_ISREG(info.st_mode):  # Python opens no folder, and says so in its own way.
+        os.close(descriptor)
+        raise SpecError(where, f"{path} must be a regular file")
     with open(descriptor, "rb") as file:
-        info = os.fstat(descriptor)
-        if not stat.S_ISREG(info.st_mode):
-            raise SpecError(where, f"{path} must be a regular file")
         if info.st_uid not in (0, os.geteuid()):
             raise SpecError(
                 where, f"{path} belongs to the user {info.st_uid}: copy it to a file of your own, mode 0600"

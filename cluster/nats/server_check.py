@@ -6,7 +6,6 @@ a warning; `holdfast nats check` prints them all.
 
 from __future__ import annotations
 
-import asyncio
 import json
 from collections.abc import Sequence
 from time import monotonic
@@ -16,7 +15,7 @@ import msgspec
 
 from ...actors.errors import SpecError
 from ..ports import Unanswered, UnsafeServer
-from .access import NatsAccess, access_of, connect_options
+from .access import NatsAccess, access_of
 from .server_file import MOST_BYTES, NEEDS, VARZ
 
 if TYPE_CHECKING:
@@ -171,7 +170,10 @@ async def check_server(client: Client, access: NatsAccess, *, seconds: float = 5
     Raises:
         Unanswered: a server has not answered in time, or has no leader now.
     """
-    return problems_of(await look_at(client, access, seconds=seconds), access)
+    from .connecting import answering  # which imports the library
+
+    with answering(access.name):
+        return problems_of(await look_at(client, access, seconds=seconds), access)
 
 
 async def refuse_unsafe(client: Client, access: NatsAccess, *, seconds: float = 5.0) -> list[ServerProblem]:
@@ -197,29 +199,18 @@ async def check_store(store: str, *, seconds: float = 5.0) -> list[ServerProblem
 
     Raises:
         SpecError: the store cannot be read, or the library for it is missing.
-        Unanswered: no server lets us in, or one has not answered in time.
+        AccessRefused: the servers do not let this program in, or its key is not for this system.
+        Unanswered: no server answers, or one has not done so in time.
     """
-    access = access_of(store)
-    options = connect_options(access)
-    options["max_reconnect_attempts"] = 2
     try:
-        from nats.aio.client import Client
-        from nats.errors import Error
+        from .connecting import SystemClient
     except ImportError as error:
         raise SpecError("store", NEEDS) from error
-    told: list[str] = []
-
-    async def note(error: Exception) -> None:
-        told.append(str(error) or type(error).__name__)
-
-    client = Client()
+    client = SystemClient(access_of(store))
     try:
-        async with asyncio.timeout(seconds):
-            await client.connect(**options, error_cb=note)
-        return await check_server(client, access, seconds=seconds)
-    except (Error, OSError) as error:  # TimeoutError is one of these
-        last = told[-1] if told else str(error) or type(error).__name__
-        raise Unanswered(access.name, f"no server lets us in: {last}") from error
+        await client.enter(seconds)
+        await client.probe(is_node=False)
+        return await client.unless_denied(check_server(client, client.access, seconds=seconds))
     finally:
         await client.close()
 

@@ -12,6 +12,7 @@ import ipaddress
 import os
 import re
 import secrets
+import stat
 from collections.abc import Callable, Iterable, Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -29,6 +30,7 @@ VARZ: Final = "$SYS.REQ.SERVER.PING.VARZ"
 """Where each server answers how it is set up. The system account exports it, so that nodes can check the servers."""
 NEEDS: Final = "a store on NATS needs the library nats-py: pip install 'holdfast[nats]'"
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+_HOST: Final = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9._-]*[A-Za-z0-9_])?\.?")
 _LOOPBACK_NAMES: Final = ("localhost", "ip6-localhost")
 
 
@@ -122,6 +124,21 @@ def check_name(where: str, name: str) -> str:
     return name
 
 
+def check_host(where: str, host: str) -> str:
+    """The host, if it is a number of a machine or can be its name.
+
+    Raises:
+        SpecError: it cannot.
+    """
+    if not (_HOST.fullmatch(host) and len(host) <= 253):
+        try:
+            ipaddress.IPv6Address(host.removeprefix("[").removesuffix("]"))
+        except ValueError:
+            problem = f"{host!r} is no host: give the name or the number of a machine, without port and scheme"
+            raise SpecError(where, problem) from None
+    return host
+
+
 def inbox_of(key: str) -> str:
     """The prefix of the subjects on which the user with that public key gets answers; nobody else may listen there."""
     return f"_INBOX.{key}"
@@ -151,8 +168,8 @@ def server_text(server: ServerPlan, cluster: Sequence[ServerPlan], accounts: Seq
         secret: what the servers know each other by.
 
     Raises:
-        SpecError: there are not one or three servers, two are of one name or address, a host that others reach has no
-            certificate, or a name cannot be part of a subject.
+        SpecError: there are not one or three servers, two are of one name or address, a port is to serve twice, a host
+            is none or has no certificate though others reach it, or a name cannot be part of a subject.
     """
     _check(cluster, accounts)
     lines = [
@@ -210,7 +227,8 @@ def write_server_files(
 
     Raises:
         FileExists: a configuration file is there, and it is not to be replaced.
-        SpecError: a plan that does not work (see `server_text`), or a key in the folder that others may read.
+        SpecError: a plan that does not work (see `server_text`), or a key in the folder that others may read, or a
+            folder that others may write to.
         OSError: the folder cannot be written.
     """
     names = [*systems]
@@ -219,6 +237,7 @@ def write_server_files(
     if not force and (there := next((file for file in files if file.exists()), None)):
         raise FileExists(str(there))
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    _refuse_shared(folder)
     seeds = {(name, role): seed_file(folder, name, role) for name in names for role in UserRole}
     accounts = [
         NatsAccount(name, tuple(User(role, public_key(_kept(seeds[name, role], new_seed))) for role in UserRole))
@@ -269,6 +288,18 @@ def _library() -> ModuleType:
         raise SpecError("store", NEEDS) from error
 
 
+def _refuse_shared(folder: Path) -> None:
+    """Refuse a folder in which somebody else could put other files in the place of those that are written there.
+
+    Raises:
+        SpecError: it is somebody else's, or others may write to it.
+    """
+    info = folder.stat()
+    if info.st_uid not in (0, os.geteuid()) or info.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        problem = f"somebody else may write to {folder}: make it your own, and chmod go-w {folder}"
+        raise SpecError("nats config", problem)
+
+
 def _kept(file: Path, make: Callable[[], str]) -> str:
     """What the file says; if it is not there, what is made is written to it."""
     if not file.exists():
@@ -298,8 +329,10 @@ def _check(servers: Sequence[ServerPlan], accounts: Sequence[NatsAccount]) -> No
         found = [_identity(one, text) for one in servers]
         if len({*found}) < len(found):
             raise SpecError(where, f"two servers have one {text}: {', '.join(found)}")
+    _check_ports(where, servers)
     for server in servers:
         check_name(where, server.name)
+        check_host(where, server.host)
         if server.tls is None and not is_loopback(server.host):
             raise SpecError(
                 where,
@@ -311,6 +344,24 @@ def _check(servers: Sequence[ServerPlan], accounts: Sequence[NatsAccount]) -> No
     names = [check_name(where, account.system) for account in accounts]
     if len({*names}) < len(names) or "SYS" in names:
         raise SpecError(where, f"the systems must have different names, none of them SYS: {', '.join(names)}")
+
+
+def _check_ports(where: str, servers: Sequence[ServerPlan]) -> None:
+    """Refuse plans in which one port of a machine is to serve twice.
+
+    Raises:
+        SpecError: naming the port.
+    """
+    taken: dict[tuple[str, int], str] = {}
+    for server in servers:
+        uses = {"clients": server.port, "health checks": server.monitor_port}
+        if len(servers) > 1:
+            uses["the other servers"] = server.cluster_port
+        for use, port in uses.items():
+            this = f"{use} of {server.name}"
+            other = taken.setdefault((server.host, port), this) if port else this
+            if other != this:
+                raise SpecError(where, f"port {port} of {server.host} is for {other} and for {this}: give another one")
 
 
 def _identity(server: ServerPlan, text: str) -> str:

@@ -19,6 +19,7 @@ from ..runtime_folder import found_sockets, sweep
 from .patterns import select
 from .reaching import (
     FAILED,
+    GREETING_SECONDS,
     UNUSABLE,
     Json,
     Paths,
@@ -62,6 +63,7 @@ def _about(path: Path, name: str, pid: int) -> dict[str, Any]:
     found: dict[str, Any] = {"name": name, "pid": pid, "since": None, "actors": None}
     try:
         with RemoteSystem(path) as remote:
+            remote.greet(GREETING_SECONDS)
             found |= remote.about()
     except HoldfastError:
         pass  # It is there, and stopped or hung: its line says so.

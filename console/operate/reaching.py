@@ -15,13 +15,15 @@ from ...actors.errors import HoldfastError
 from ...actors.values.path_parts import CONTROL
 from ...system.script import UntrustedFile
 from ..overview import ActorRow
-from ..remote import NotReached, RemoteSystem
+from ..remote import NotAnswering, NotReached, RemoteSystem
 from ..runtime_folder import found_sockets, sweep
 from ..wire import WrongUser
 from .patterns import select
 
 FAILED: Final = 1
 UNUSABLE: Final = 2
+GREETING_SECONDS: Final = 4.0
+"""How long a system has to show that it answers, before it is asked for what may take longer."""
 
 
 UNPRINTED: Final = dict.fromkeys(CONTROL, "?")
@@ -121,7 +123,7 @@ def told(command: str) -> Generator[None, None, None]:
     """Say what went wrong in a sentence, and end with 2 if the system or a file cannot be had, else with 1."""
     try:
         yield
-    except (NotReached, NoSystem, WrongUser, UntrustedFile) as error:
+    except (NotReached, NotAnswering, NoSystem, WrongUser, UntrustedFile) as error:
         raise ended(command, error, UNUSABLE) from error
     except HoldfastError as error:
         raise ended(command, error, FAILED) from error
@@ -137,7 +139,19 @@ def ended(command: str, error: Exception | str, code: int) -> typer.Exit:
 def reached(command: str, system: str | None, socket: Path | None) -> Generator[RemoteSystem, None, None]:
     """The running system that is meant; whatever goes wrong ends the command with a sentence."""
     with told(command), RemoteSystem(chosen(system, socket)) as remote:
+        remote.greet(GREETING_SECONDS)
         yield remote
+
+
+def no_pattern(path: str) -> str:
+    """What is to be said of an address at which nobody was found, if it looks as if it meant several.
+
+    >>> no_pattern("/app/**"), no_pattern("/app/till")
+    ("; '/app/**' is taken for one address: patterns are for other commands, such as `holdfast tree`", '')
+    """
+    if not {*"*[?"} & {*path}:
+        return ""
+    return f"; {path!r} is taken for one address: patterns are for other commands, such as `holdfast tree`"
 
 
 def meant_rows(remote: RemoteSystem, paths: list[str]) -> list[ActorRow]:

@@ -21,6 +21,7 @@ from .reaching import (
     Socket,
     System,
     ended,
+    no_pattern,
     printable,
     reached,
     show_json,
@@ -42,7 +43,7 @@ def why(path: OnePath, system: System = None, socket: Socket = None, as_json: Js
     with reached("why", system, socket) as remote:
         sentences = asyncio.run(remote.why(path))
         if not remote.lives(path) and path not in remote.tree():
-            raise ended("why", " ".join(sentences), FAILED)
+            raise ended("why", " ".join(sentences) + no_pattern(path), FAILED)
     if as_json:
         show_json({"address": path, "why": sentences})
     else:
@@ -54,7 +55,7 @@ def history(path: OnePath, system: System = None, socket: Socket = None, as_json
     with reached("history", system, socket) as remote:
         lives = remote.lives(path)
         if not lives:
-            raise ended("history", f"the history knows of no life at {path}", FAILED)
+            raise ended("history", f"the history knows of no life at {path}{no_pattern(path)}", FAILED)
     if as_json:
         show_json({"address": path, "lives": msgspec.to_builtins(lives)})
     else:

@@ -62,7 +62,13 @@ def complete_id(ctx: typer.Context, incomplete: str) -> list[str]:
 
 Id = Annotated[
     int | None,
-    typer.Argument(metavar="[ID]", help="The number of one message; without it, all.", autocompletion=complete_id),
+    typer.Argument(
+        min=0,
+        max=2**63 - 1,
+        metavar="[ID]",
+        help="The number of one message; without it, all.",
+        autocompletion=complete_id,
+    ),
 ]
 
 

@@ -11,7 +11,7 @@ import typer
 from ...actors.errors import HoldfastError, SpecError
 from ...system.script import load_script
 from ..remote import RemoteChange, RemoteSystem
-from .reaching import FAILED, UNUSABLE, chosen, ended, told
+from .reaching import FAILED, GREETING_SECONDS, UNUSABLE, chosen, ended, told
 
 
 def run_script(script: Path, system: str | None, socket: Path | None, *, dry_run: bool, timeout: float) -> None:
@@ -24,6 +24,7 @@ def run_script(script: Path, system: str | None, socket: Path | None, *, dry_run
         source = (loaded.source.path, loaded.source.sha256)
         path = chosen(system, socket)
         with RemoteSystem(path, dry_run=dry_run, timeout=timeout, script=source, told=_show) as remote:
+            remote.greet(GREETING_SECONDS)
             _run(loaded.reconfigure, remote)
     typer.echo("nothing was done: this was a dry run" if dry_run else "done")
 

@@ -149,7 +149,7 @@ class SimulatedJournal:
         if not self._is_open:
             raise StoreFailed(PATH, "it is closed")
         if self.epoch != self.disk.epoch:
-            raise StaleEpoch(PATH, self.epoch, self.disk.epoch)
+            raise StaleEpoch(PATH, epoch=self.epoch, current=self.disk.epoch)
 
     def append(self, entries: Sequence[tuple[str, Entry]]) -> list[int]:
         """See `Journal`."""

@@ -71,7 +71,7 @@ def test_close_twice(journal: Journal) -> None:
     "error",
     [
         StoreInUse("/app.db", 7),
-        StaleEpoch("/app.db", 1, 2),
+        StaleEpoch("/app.db", epoch=1, current=2),
         DamagedStore("/app.db", A, 3, "bit"),
         DamagedStore("/app.db", None, None, "bit"),
         StoreFailed("/app.db", "no space"),

@@ -1,4 +1,4 @@
-"""Certificates for the servers of tests."""
+"""Certificates for tests, each of which has signed itself."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from holdfast.cluster.nats.server_file import TlsFiles
 
 def certificates(folder: Path, *addresses: str) -> TlsFiles:
     """A certificate of these addresses, or of 127.0.0.1, that has signed itself, for both ends."""
+    folder.mkdir(exist_ok=True)
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "holdfast test")])
     now = datetime.datetime.now(datetime.UTC)

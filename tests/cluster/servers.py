@@ -15,7 +15,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -161,6 +161,16 @@ class NatsServers:
             self.kill(number)
         self._start(number)
         assert await self._answers(number), f"server {number} does not start again:\n{self.log(number)}"
+
+    def reload(self, number: int, change: Callable[[str], str]) -> None:
+        """Change the file of a server that runs, and have it take that up; when it has done so it tells nobody."""
+        self.rewrite(number, change)
+        self._processes[number].send_signal(signal.SIGHUP)
+
+    def rewrite(self, number: int, change: Callable[[str], str]) -> None:
+        """Change the file of a server, which it reads when it is started again."""
+        file = self.folder / f"{self.plans[number].name}.conf"
+        file.write_text(change(file.read_text()))
 
     def close(self) -> None:
         """End all servers."""

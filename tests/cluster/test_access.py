@@ -59,6 +59,10 @@ def test_the_address_goes_before_the_settings(seed: Path) -> None:
         ("nats://127.0.0.1/app?nkey=/nowhere", "the file /nowhere cannot be read: No such file"),
         ("nats://127.0.0.1/app?key=/nowhere", "belong together"),
         ("nats://127.0.0.1/app?nkey=/a&creds=/b", "both creds and nkey"),
+        ("nats://127.0.0.1/app?nkey=/a&nkey=/b", "nkey is said twice"),
+        ("nats://127.0.0.1/app?nkey=/tmp", "/tmp must be a regular file"),
+        ("nats://127.0.0.1/app?creds=/tmp", "/tmp must be a regular file"),
+        ('nats://a"b/app?insecure=1', "is no host"),
         ("nats://10.0.0.1/app", "10.0.0.1:4222 is another machine"),
         ("nats://127.0.0.1,db.example/app", "db.example:4222 is another machine"),
     ],
@@ -100,6 +104,25 @@ def test_a_file_of_secrets_that_others_may_read_is_refused(seed: Path) -> None:
     seed.chmod(0o604)  # between the two
     with pytest.raises(SpecError, match="its mode is 0604"):
         connect_options(access)
+
+
+def test_a_file_of_credentials_has_to_be_one(seed: Path) -> None:
+    access = access_of(f"nats://127.0.0.1/app?creds={seed}")
+    with pytest.raises(SpecError, match=r"no user in .* a private key alone is given as nkey="):
+        connect_options(access)
+    jwt = "-----BEGIN NATS USER JWT-----\nabc\n------END NATS USER JWT------\n"
+    key = "-----BEGIN USER NKEY SEED-----\n{}\n------END USER NKEY SEED------\n"
+    own = seed.read_text().strip()
+    for text, problem in (
+        (jwt, "no private key"),
+        (key.format(own), "no user"),
+        (jwt + key.format("S1"), "no private"),
+    ):
+        seed.write_text(text)
+        with pytest.raises(SpecError, match=problem):
+            connect_options(access)
+    seed.write_text(jwt + key.format(own))
+    assert connect_options(access).get("user_credentials") == str(seed)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -94,6 +95,9 @@ def test_what_is_wrong_is_refused_with_file_line_and_key(file: Path, text: str, 
     [
         ("HOLDFAST_STANDBY", "hot", "must be one of 'warm', 'cold'"),
         ("HOLDFAST_NATS_REPLICAS", "many", "replicas: "),
+        ("HOLDFAST_STOR", "x", "did you mean HOLDFAST_STORE?"),
+        ("HOLDFAST_STADNBY", "warm", "did you mean HOLDFAST_STANDBY?"),
+        ("HOLDFAST_NAT_NKEY", "x", "did you mean HOLDFAST_NATS_NKEY?"),
         ("HOLDFAST_NATS_CRED", "x", "no key 'cred', did you mean 'creds'?"),
     ],
 )
@@ -102,6 +106,38 @@ def test_a_wrong_variable_is_refused_by_its_name(file: Path, name: str, value: s
         read_configuration(None, {name: value})
     assert str(refused.value).startswith(f"{name}: ")
     assert problem in str(refused.value)
+
+
+def test_variables_of_others_are_not_ours(file: Path) -> None:
+    others = [
+        "DATA",
+        "KILLS",
+        "STORMS",
+        "SEED",
+        "COLD",
+        "STORE_KEY_FILE",
+        "SYSTEM",
+        "TRACEBACK",
+        "FORK_SERVER",
+        "STRIKES",
+        "ROOTS",
+        "RUNS",
+        "CUTS",
+    ]
+    file.write_text("store = 'sqlite:app.db'")
+    assert read_configuration(None, {f"HOLDFAST_{one}": "1" for one in others}).store == "sqlite:app.db"
+
+
+def test_a_mark_before_the_text_is_passed_over(file: Path) -> None:
+    file.write_bytes(b"\xef\xbb\xbfstore = 'sqlite:app.db'")
+    assert read_configuration(None, {}).store == "sqlite:app.db"
+
+
+def test_a_pipe_in_the_place_of_the_file_is_refused(file: Path) -> None:
+    file.unlink(missing_ok=True)
+    os.mkfifo(file, 0o600)
+    with pytest.raises(SpecError, match="is no regular file"):
+        read_configuration(None, {})
 
 
 def test_a_named_file_has_to_be_there(file: Path) -> None:

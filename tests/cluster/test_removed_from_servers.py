@@ -11,6 +11,8 @@ from tests.removing import Check, as_tests
 ACCESS = "tests/cluster/test_access.py"
 CHECK = "tests/cluster/test_server_check.py"
 FILE = "tests/cluster/test_server_file.py"
+CONNECTING = "tests/cluster/test_connecting.py"
+COPY = "tests/cluster/test_store_copy.py"
 CONFIGURATION = "tests/cluster/test_configuration.py"
 
 CHECKS = {
@@ -118,6 +120,139 @@ CHECKS = {
         "            if False:",
         CONFIGURATION,
         "test_a_file_that_others_may_write_to",
+    ),
+    "nothing is sent before a connection is encrypted": Check(
+        "cluster/nats/connecting.py",
+        "        if not self._is_encrypted:",
+        "        if False:",
+        CONNECTING,
+        "test_nothing_is_sent_to_a_server_without_encryption",
+    ),
+    "a connection that is made anew is encrypted anew": Check(
+        "cluster/nats/connecting.py",
+        "        self._is_encrypted = False\n        await super().connect(",
+        "        await super().connect(",
+        CONNECTING,
+        "test_a_server_that_comes_back_without_encryption",
+    ),
+    "what is encrypted is written by nobody else": Check(
+        "cluster/nats/connecting.py",
+        "        if self.access.is_encrypted and not isinstance(self._transport, EncryptedTransport):",
+        "        if False:",
+        CONNECTING,
+        "test_nothing_is_sent_to_a_server_without_encryption",
+    ),
+    "a key of another system is refused": Check(
+        "cluster/nats/connecting.py",
+        "        if denied:",
+        "        if False:",
+        CONNECTING,
+        "test_each_refusal_has_its_own_words",
+    ),
+    "a connection that a server has ended is made anew": Check(
+        "cluster/nats/connecting.py",
+        "        if _STALE in err_msg or _PERMISSIONS in err_msg:",
+        "        if True:",
+        CONNECTING,
+        "test_a_connection_that_a_server_has_ended",
+    ),
+    "a body that was cancelled stays cancelled": Check(
+        "system/system.py",
+        "            if self._failure is None and not isinstance(error, asyncio.CancelledError):",
+        "            if True:",
+        CONNECTING,
+        "test_who_is_ended_while_the_servers_are_down",
+    ),
+    "a start that is cancelled gives the lease up": Check(
+        "cluster/joining.py",
+        "        await give_up(engine, me)  #",
+        "        pass  #",
+        CONNECTING,
+        "test_a_start_that_is_cancelled",
+    ),
+    "a start that is cancelled ends what it has begun": Check(
+        "system/system.py",
+        "            await self.__aexit__(type(error), error, error.__traceback__)\n            raise",
+        "            raise",
+        CONNECTING,
+        "test_a_start_that_is_cancelled",
+    ),
+    "nothing is said twice": Check(
+        "cluster/nats/access.py",
+        "    if twice := [name for",
+        "    if twice := [][:0] and [name for",
+        ACCESS,
+        "test_a_wrong_address_is_refused",
+    ),
+    "a file of credentials has in it what the library reads": Check(
+        "cluster/nats/access.py",
+        "        if not any(begin in line and after.strip() for line, after in pairwise(lines)):",
+        "        if False:",
+        ACCESS,
+        "test_a_file_of_credentials_has_to_be_one",
+    ),
+    "a key is read from a regular file": Check(
+        "cluster/nats/private_files.py",
+        "    if not stat.S_ISREG(info.st_mode):",
+        "    if False:",
+        ACCESS,
+        "test_a_wrong_address_is_refused",
+    ),
+    "a port serves once": Check(
+        "cluster/nats/server_file.py",
+        "            if other != this:",
+        "            if False:",
+        FILE,
+        "test_a_plan_that_does_not_work",
+    ),
+    "a host is one": Check(
+        "cluster/nats/server_file.py",
+        "        check_host(where, server.host)\n",
+        "",
+        FILE,
+        "test_a_plan_that_does_not_work",
+    ),
+    "nobody else writes where keys are made": Check(
+        "cluster/nats/server_file.py",
+        "    _refuse_shared(folder)\n",
+        "",
+        FILE,
+        "test_a_folder_that_others_may_write_to",
+    ),
+    "a pipe is no configuration": Check(
+        "cluster/configuration.py",
+        "            if not stat.S_ISREG(info.st_mode):",
+        "            if False:",
+        CONFIGURATION,
+        "test_a_pipe_in_the_place_of_the_file",
+    ),
+    "a variable that is misspelt is refused": Check(
+        "cluster/configuration.py",
+        "    _refuse_misspelt(environ)\n",
+        "",
+        CONFIGURATION,
+        "test_a_wrong_variable_is_refused",
+    ),
+    "what is not there is not copied": Check(
+        "cluster/joining.py",
+        "        if not is_new and kind ==",
+        "        if False and kind ==",
+        COPY,
+        "test_what_is_not_there_is_not_copied",
+    ),
+    "a system that is not on the servers is not made to be copied": Check(
+        "cluster/nats/nats_engine.py",
+        "                    if not is_new:",
+        "                    if False:",
+        COPY,
+        "test_what_is_not_there_is_not_copied",
+    ),
+    "a store is not copied into itself": Check(
+        "console/store_commands.py",
+        "        if is_same_store(source, dest):",
+        "        if False:",
+        COPY,
+        "test_a_store_is_not_copied_into_itself",
     ),
 }
 

@@ -40,7 +40,9 @@ from tests.cluster.servers import PATIENCE, NatsServers
 
 ONE = ServerPlan(name="n0", host="127.0.0.1", store_dir="/var/lib/nats")
 THREE = [
-    msgspec.structs.replace(ONE, name=f"n{number}", port=4222 + number, cluster_port=6222 + number)
+    msgspec.structs.replace(
+        ONE, name=f"n{number}", port=4222 + number, cluster_port=6222 + number, monitor_port=8222 + number
+    )
     for number in range(3)
 ]
 TLS = TlsFiles("/c.pem", "/k.pem", "/ca.pem")
@@ -241,6 +243,14 @@ def test_a_key_that_others_may_read_is_not_used_again(tmp_path: Path) -> None:
         write_server_files(tmp_path, [ONE], ["app"], force=True)
 
 
+def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    with pytest.raises(SpecError, match=f"chmod go-w {tmp_path / 'open'}"):
+        write_server_files(tmp_path / "open", [ONE], ["app"])
+    assert not [*(tmp_path / "open").iterdir()]
+
+
 def replaced(number: int, **more: object) -> list[ServerPlan]:
     return [msgspec.structs.replace(one, **more) if one.name == f"n{number}" else one for one in THREE]
 
@@ -253,6 +263,14 @@ def replaced(number: int, **more: object) -> list[ServerPlan]:
         (replaced(1, name="n0"), ["app"], "two servers have one name"),
         (replaced(1, port=4222), ["app"], "two servers have one client address"),
         (replaced(1, cluster_port=6222), ["app"], "two servers have one cluster address"),
+        (
+            replaced(1, monitor_port=4222),
+            ["app"],
+            "port 4222 of 127.0.0.1 is for clients of n0 and for health checks of n1",
+        ),
+        ([msgspec.structs.replace(ONE, port=8222)], ["app"], "port 8222 of 127.0.0.1 is for clients of n0"),
+        ([msgspec.structs.replace(ONE, host='x"y', tls=TLS)], ["app"], "is no host"),
+        ([msgspec.structs.replace(ONE, host="a.example:7", tls=TLS)], ["app"], "is no host"),
         (replaced(1, host="10.0.0.2"), ["app"], "n1 listens on 10.0.0.2, which others reach"),
         (replaced(1, host="0.0.0.0"), ["app"], "which others reach"),
         (replaced(1, name="n 1"), ["app"], "must be at most 64 letters"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.journal import NotCopied
+from holdfast.checkpoint.journal import NotCopied, StoreFailed
 from holdfast.cluster.joining import open_store
 from holdfast.cluster.store_copy import copy_store, kept_of
 from tests.cluster.servers import NatsServers
@@ -87,6 +88,28 @@ async def test_a_store_that_is_open_is_not_copied(nats1: NatsServers, tmp_path: 
     async with hf.ActorSystem("app", store=servers, log=False):
         done = copied(servers, f"sqlite:{tmp_path / 'app.db'}")
     assert (done.returncode, "is in use" in done.stderr) == (2, True), done.stderr
+
+
+async def test_what_is_not_there_is_not_copied_and_not_made(nats1: NatsServers, tmp_path: Path) -> None:
+    typed, dest = tmp_path / "typo.db", tmp_path / "new.db"
+    servers = nats1.store(nats1.new_system())
+    for source, problem in (
+        (f"sqlite:{typed}", "there is no such file"),
+        (servers, "there is no system"),
+        ("memory", "belongs to one program"),
+    ):
+        done = copied(source, f"sqlite:{dest}")
+        assert (done.returncode, problem in done.stderr) == (2, True), done.stderr
+    assert [*tmp_path.glob("*.db*")] == []
+    with pytest.raises(StoreFailed, match="there is no system"):
+        await asyncio.to_thread(open_store, servers, is_new=False)
+
+
+def test_a_store_is_not_copied_into_itself(tmp_path: Path) -> None:
+    file = tmp_path / "app.db"
+    contextlib.closing(open_store(f"sqlite:{file}")).__exit__()
+    done = copied(f"sqlite:{file}", f"sqlite:{file.parent}/./app.db")
+    assert (done.returncode, "both are one store" in done.stderr) == (2, True), done.stderr
 
 
 def test_a_copy_that_is_not_the_same_is_told(tmp_path: Path) -> None:

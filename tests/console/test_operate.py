@@ -17,6 +17,7 @@ import pytest
 import holdfast as hf
 from holdfast.console.endpoint import control_endpoint
 from holdfast.console.runtime_folder import runtime_folder
+from holdfast.console.wire import BadRequest, SettleQuarantined, frame
 from tests.console.commands import holdfast
 from tests.system.trees import Add, Counter, ref
 
@@ -88,6 +89,39 @@ async def test_what_a_dead_system_has_left_is_removed(own_folder: Path) -> None:
     assert left.is_socket()
     assert await as_json("ls") == []
     assert list(left.parent.iterdir()) == []
+
+
+LIVES = DIES.replace("os._exit(9)", "await asyncio.Event().wait()")
+
+
+async def test_a_system_that_is_there_and_does_not_answer_is_told_from_none(own_folder: Path) -> None:
+    lives = subprocess.Popen([sys.executable, "-c", LIVES], stdout=subprocess.PIPE)
+    try:
+        assert lives.stdout is not None
+        assert lives.stdout.readline()
+        lives.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, lives.pid, os.WSTOPPED | os.WNOWAIT)
+        said = await asyncio.gather(holdfast("why", "/x"), holdfast("restart", "/x"), holdfast("ls"))
+        for status, _, errors in said[:2]:
+            assert status == UNUSABLE
+            assert f"(process {lives.pid}) is there and does not answer within 4 s: it is stopped; kill -CONT" in errors
+        assert "does not answer" in said[2][1]
+    finally:
+        lives.kill()
+        lives.communicate()
+
+
+async def test_a_number_that_is_too_large_is_refused_in_words() -> None:
+    status, _, errors = await holdfast("quarantine", "retry", "/x", "99999999999999999999")
+    assert (status, "Traceback" in errors) == (UNUSABLE, False), errors
+    with pytest.raises(BadRequest, match="more than 64 bits"):
+        frame(SettleQuarantined("retry", "/x", 1 << 64))
+
+
+async def test_who_asks_why_of_a_pattern_is_told_that_it_is_none(named: hf.ActorSystem) -> None:
+    for command in ("why", "history"):
+        status, _, errors = await holdfast(command, "/app/**")
+        assert (status, "is taken for one address" in errors) == (FAILED, True), errors
 
 
 async def test_a_folder_that_others_may_enter_is_refused(own_folder: Path) -> None:

@@ -79,6 +79,20 @@ CHECKS = {
         EMBEDDED,
         "test_as_pid_1",
     ),
+    "a system that does not answer is not waited for": Check(
+        "console/operate/reaching.py",
+        "        remote.greet(GREETING_SECONDS)\n",
+        "",
+        OPERATE,
+        "test_a_system_that_is_there_and_does_not_answer",
+    ),
+    "a number that no request can have is told": Check(
+        "console/wire.py",
+        "    except OverflowError as error:",
+        "    except ZeroDivisionError as error:",
+        OPERATE,
+        "test_a_number_that_is_too_large",
+    ),
     "nobody else may look into the folder of sockets": Check(
         "console/runtime_folder.py",
         "    if info.st_mode & (stat.S_IRWXG | stat.S_IRWXO):",

@@ -318,7 +318,7 @@ def test_what_a_stale_owner_writes_is_refused_and_never_read(path: Path, monkeyp
         for start in (10, 11):
             with pytest.raises(StaleEpoch) as caught:
                 journal.append(inputs(1, start=start))
-            assert caught.value.args == (str(path), 1, 2)
+            assert (caught.value.path, caught.value.epoch, caught.value.current) == (str(path), 1, 2)
     assert numbers(reopened(path)) == [0, 1, 2]
 
 

@@ -126,7 +126,7 @@ def test_an_owner_whose_epoch_is_stale_writes_nothing(store: SqliteJournal, path
     for attempt in attempts:
         with pytest.raises(StaleEpoch) as caught:
             attempt()
-        assert caught.value.args == (str(path), 1, 2)
+        assert (caught.value.path, caught.value.epoch, caught.value.current) == (str(path), 1, 2)
     store.close()
     with closing(SqliteJournal(path)) as journal:
         assert journal.epoch == 3
