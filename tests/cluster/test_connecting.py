@@ -295,9 +295,11 @@ async def main():
         shelf = await system.start(hf.child("shelf", hf.start(Shelf), recovery=hf.hybrid()))
         await shelf.ask(Put())
         print("leads", flush=True)
-        while True:
-            shelf.tell(Put())
-            await asyncio.sleep(0.01)
+        await asyncio.to_thread(sys.stdin.readline)
+        shelf.tell(Put())
+        await asyncio.sleep(0.05)
+        print("told", flush=True)
+        await asyncio.Event().wait()
 
 hf.run(main)
 """
@@ -307,13 +309,19 @@ async def test_who_is_ended_while_the_servers_are_down_ends_in_order(own_nats1: 
     """Its status is that of SIGTERM, and one line says what could not be written."""
     store = own_nats1.store(own_nats1.new_system())
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-c", LEADS, store), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
+        *(sys.executable, "-c", LEADS, store),
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
     )
+    assert process.stdin is not None
     assert process.stdout is not None
     async with asyncio.timeout(PATIENCE):
         while (line := await process.stdout.readline()) != b"leads\n":
             assert line, "it has ended"
         own_nats1.stop(0)
+        process.stdin.write(b"tell\n")
+        assert await process.stdout.readline() == b"told\n"
         process.send_signal(signal.SIGTERM)
         output, errors = await process.communicate()
     said = (output + errors).decode()
