@@ -1,4 +1,4 @@
-"""A bank, and programs that use it over NATS: they keep their refs when its leader is killed and another one takes over.
+"""A bank, and programs that use it over NATS: they keep their refs when its leader is killed and another one leads.
 
 `python connect.py` starts a server and two programs of the bank, each in a process of its own, and kills the one that
 leads. The server is that of `standby.py`.
@@ -16,7 +16,15 @@ class Deposit(hf.Message[int]):
     amount: int
 
 
-class Count(hf.Message[int]): ...
+class Deposited(hf.Message):
+    amount: int
+
+
+class Watch(hf.Message[None]):
+    account: hf.ActorRef[hf.Actor]
+
+
+class Report(hf.Message[str]): ...
 
 
 class Account(hf.Actor):
@@ -28,23 +36,32 @@ class Account(hf.Actor):
     @hf.on(Deposit)
     async def deposit(self, message: Deposit) -> int:
         self.balance += message.amount
-        await self.ctx.publish("/deposits", message)
+        await self.ctx.publish("/deposits", Deposited(message.amount))
         return self.balance
 
 
 class Audit(hf.Actor):
-    """An actor of another system, which hears of all deposits."""
+    """An actor of another system: it hears of all deposits, and whether the bank can be reached."""
 
     def __init__(self) -> None:
-        self.heard = 0
+        self.deposits = 0
+        self.lost = ""
 
-    @hf.on(Deposit)
-    def hear(self, message: Deposit) -> None:
-        self.heard += 1
+    @hf.on(Watch)
+    def watch(self, message: Watch) -> None:
+        self.ctx.monitor(message.account)
 
-    @hf.on(Count)
-    def count(self, message: Count) -> int:
-        return self.heard
+    @hf.on(Deposited)
+    def hear(self, message: Deposited) -> None:
+        self.deposits += 1
+
+    def on_down(self, source: hf.ActorRef[hf.Actor], reason: hf.ExitReason, recovering: bool) -> None:
+        if isinstance(reason, hf.NoConnection):  # It may well live on: nobody here can say.
+            self.lost = reason.node
+
+    @hf.on(Report)
+    def report(self, message: Report) -> str:
+        return f"{self.deposits} deposit, {self.lost or 'nothing'} lost"
 
 
 async def lead(store: str) -> None:
@@ -74,9 +91,21 @@ async def listen(store: str) -> None:
     async with hf.ActorSystem("office", log=False) as office:
         audit = await office.start(hf.child("audit", hf.start(Audit)))
         async with hf.connect(store, within=office) as bank:
+            account = bank.ref("/bank/account", Account)
             bank.subscribe("/deposits", audit)
-            print(await bank.ref("/bank/account", Account).ask(Deposit(5)))  # 115
-            print(await audit.ask(Count()))  # 1
+            await audit.ask(Watch(account))
+            print(await account.ask(Deposit(5)))  # 115
+            print(await audit.ask(Report()))  # 1 deposit, nothing lost
+        print(await audit.ask(Report()))  # 1 deposit, bank lost
+        print(await balance(bank))  # None
+
+
+async def balance(bank: hf.Connection) -> int | None:
+    """What is in the account, if the bank can be reached."""
+    try:
+        return await bank.ref("/bank/account", Account).ask(Deposit(0))
+    except hf.Unreachable:  # Nothing was sent.
+        return None
 
 
 async def main() -> None:
