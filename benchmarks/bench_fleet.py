@@ -15,6 +15,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections import deque
 from collections.abc import AsyncGenerator
 from pathlib import Path
 from typing import NamedTuple
@@ -26,6 +27,8 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 import holdfast as hf
+from holdfast.cluster.leadership import Follower
+from holdfast.cluster.log_records import CHANGES, FORMAT, EpochBegun, RecordMaker, encode_changes
 from holdfast.cluster.nats.access import access_of, connect_options
 from holdfast.cluster.nats.nats_engine import NatsEngine, open_engine
 
@@ -174,6 +177,36 @@ async def standby(run: Run) -> None:
             program.kill()
             await program.wait()
     run.bound("a standby's processor time beside its leader's", 100.0 * spent[1] / spent[0], unit="%", target=15.0)
+
+
+async def lag(run: Run) -> None:
+    """From the acknowledgement of a record until a follower has it, at 500 records a second."""
+    async with servers(1) as made:
+        access = access_of(made.store(made.new_system()))
+        engine, other = await open_engine(access), await open_engine(access)
+        follower = Follower(other)
+        following = asyncio.ensure_future(follower.follow())
+        maker = RecordMaker(1, 0)
+        last = await engine.log.append(maker.beginning(EpochBegun("bench", "bench", FORMAT, 0.0)), 0)
+        known: deque[tuple[int, float]] = deque()
+        lags: list[float] = []
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        for number in range(run.size(5_000)):
+            maker.after = last
+            note = encode_changes([("note", (f"key {number % 100}", RECORD))])
+            (record,) = maker.parts(CHANGES, note)
+            last = await engine.log.append(record, last)
+            known.append((last, loop.time()))
+            await asyncio.sleep(max(0.0, began + number / 500 - loop.time()))
+            while known and known[0][0] <= follower.reader.at:
+                lags.append(loop.time() - known.popleft()[1])
+        following.cancel()
+        await asyncio.wait([following])
+        await follower.begin_anew()
+        await engine.close()
+        await other.close()
+    run.bound("a standby's lag, p99", 1e3 * sorted(lags)[int(0.99 * len(lags))], unit="ms", target=100.0)
 
 
 class Neighbour(NamedTuple):
@@ -353,4 +386,4 @@ if __name__ == "__main__":
         store, does = sys.argv[2], sys.argv[3:]
         hf.run(_neighbour(store) if "neighbour" in does else _lead(store, loads="load" in does))
     else:
-        main([asks, takeover, standby, lines])
+        main([asks, takeover, standby, lag, lines])

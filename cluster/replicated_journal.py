@@ -25,7 +25,7 @@ from ..checkpoint.journal import DamagedStore, Entry, SafeAt, Saved, StaleEpoch,
 from ..checkpoint.snapshot.shared_blocks import Segment
 from .engine_thread import EngineLoop, end_tasks
 from .leadership import Leading
-from .log_writer import Deposed, LogWrite, LogWriter
+from .log_writer import Deposed, LogWrite, LogWriter, insist
 from .ports import Engine, Unanswered
 from .store_contents import Change
 from .write_progress import BlobsUnderWay, Tell, WriteProgress
@@ -385,9 +385,11 @@ class ReplicatedJournal:
         if unsent is not None:
             return unsent
         try:
-            return self._loop.wait(self._engine.blobs.get(name), READ_SECONDS)
-        except (Unanswered, TimeoutError) as error:
-            raise StoreFailed(self.path, f"{error or 'no answer'}; try again") from error
+            # Again and again: at a takeover servers may be choosing a leader, and who cannot read cannot lead.
+            return self._loop.wait(insist(lambda: self._engine.blobs.get(name)), READ_SECONDS)
+        except TimeoutError as error:
+            problem = f"no server has answered for {READ_SECONDS:g} s with a large snapshot; start the program again"
+            raise StoreFailed(self.path, problem) from error
 
     def packs(self, address: str) -> set[int]:
         """Return the packs of an address; see `Journal`."""

@@ -35,6 +35,7 @@ from .wire import (
     FollowActor,
     InspectActor,
     NextEvents,
+    OrderRepair,
     Overview,
     RestartActor,
     SettleQuarantined,
@@ -121,6 +122,10 @@ class ClientSession:
                 from .diagnosed import diagnosed  # only now: few systems have diagnosis, and all have an endpoint
 
                 return await diagnosed(system, request.path, min(request.timeout, LONGEST))
+            case OrderRepair():
+                from .diagnosed import order_repair
+
+                return await order_repair(system, request.verb, request.words, min(request.timeout, LONGEST))
             case _:
                 assert_never(request)
 

@@ -45,7 +45,9 @@ from .wire import (
     FollowActor,
     InspectActor,
     NextEvents,
+    OrderRepair,
     Overview,
+    RepairVerb,
     RestartActor,
     SettleQuarantined,
     Transact,
@@ -334,6 +336,25 @@ class RemoteSystem:
         check_seconds("diagnosis", "timeout", timeout)
         path = None if target is None else text_of(target)
         found: list[dict[str, Any]] = await self.call(AskDiagnosis(path, timeout), timeout)
+        return found
+
+    async def order_repair(
+        self, verb: RepairVerb, words: tuple[str, ...] = (), *, timeout: float = 5.0
+    ) -> list[dict[str, Any]]:
+        """Give an order to repair, and ask how it stands then: one answer for each repairer, as plain data.
+
+        Args:
+            verb: "status", or "approve" or "deny" with a case (and why), "retry" with components, "set" with a stance.
+            words: what belongs to the verb.
+            timeout: seconds in which each repairer has to answer.
+
+        Raises:
+            NotDiagnosed: no repair runs. NobodyWaits: no plan of this case waits. SpecError: this is a dry run.
+        """
+        check_seconds("repair", "timeout", timeout)
+        if self._dry_run and verb != "status":
+            raise SpecError("repair", "in a dry run repair is given no orders")
+        found: list[dict[str, Any]] = await self.call(OrderRepair(verb, words, timeout), timeout)
         return found
 
     # -- orders to one actor ------------------------------------------------------------------------------------------

@@ -296,6 +296,18 @@ class AskDiagnosis(ControlRequest, tag="diagnosis", frozen=True):
     timeout: float
 
 
+RepairVerb = Literal["status", "approve", "deny", "retry", "set"]
+"""What can be ordered of repair."""
+
+
+class OrderRepair(ControlRequest, tag="repair", frozen=True):
+    """Ask how repair stands, after an order to it: approve or deny a case, retry components, set how far it goes."""
+
+    verb: RepairVerb
+    words: tuple[str, ...]
+    timeout: float
+
+
 class DeclareTree(ControlRequest, tag="declare", frozen=True):
     """Have the tree be as a file says; `name` is what it is called in errors."""
 
@@ -320,6 +332,7 @@ AnyRequest = (
     | AskQuarantined
     | SettleQuarantined
     | AskDiagnosis
+    | OrderRepair
     | Tree
     | Whereis
     | ControlActor

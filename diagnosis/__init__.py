@@ -2,7 +2,7 @@
 
     from holdfast import diagnosis
 
-    watching = await diagnosis.watch(system, repair=True)
+    watching = await diagnosis.watch(system, repair="on")
     print(await watching.diagnosis())
 
 `tree(...)` is the same in single parts, as the supervision tree that a user adds to a system.
@@ -19,6 +19,7 @@ from .messages import (
     OBSERVATIONS,
     REPAIR,
     ROS_DIAGNOSTICS,
+    TOUCHED,
     Explained,
     GetDiagnosis,
     GetExplanation,
@@ -66,6 +67,7 @@ __all__ = [
     "ROS_DIAGNOSTICS",
     "RollBackModel",
     "RosDiagnostics",
+    "TOUCHED",
     "Touched",
     "ValidateModel",
     "Watch",

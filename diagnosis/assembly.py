@@ -43,9 +43,10 @@ def tree(
     observers: Iterable[ChildSpec] = (),
     *,
     name: str = "diagnosis",
-    quiet: float = 0.05,
+    quiet: float = 0.02,
     limit: int = 1000,
     seconds: float = 1.0,
+    explaining: float = 1.0,
     recent: float = 30.0,
     trust: Mapping[str, float] | None = None,
     repairer: ChildSpec | None = None,
@@ -57,7 +58,7 @@ def tree(
         model: checked here; it, and what it becomes, outlives restarts of its server.
         observers: from `observer(...)`.
         name: of the supervisor, the last part of its address.
-        quiet, limit, seconds, recent, trust: see `DiagnoserActor`.
+        quiet, limit, seconds, explaining, recent, trust: see `DiagnoserActor`.
         repairer: from `repair.repairer(...)`; it is started last.
         others: further children, such as `child("board", start(BoardActor, "tcp://..."))`; they are started first.
 
@@ -65,7 +66,8 @@ def tree(
         ModelError: something is wrong with the model.
     """
     history = model if isinstance(model, History) else History(model)
-    options = {"quiet": quiet, "limit": limit, "seconds": seconds, "recent": recent, "trust": dict(trust or {})}
+    limits = {"quiet": quiet, "limit": limit, "seconds": seconds, "explaining": explaining}
+    options = {**limits, "recent": recent, "trust": dict(trust or {})}
     watchers = supervisor("observers", intensity=RESTARTS, period=PERIOD, restart="permanent", children=observers)
     return supervisor(
         name,

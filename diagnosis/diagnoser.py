@@ -10,6 +10,7 @@ from ..actors.kernel.actor import Actor, on, subscribe
 from ..actors.kernel.envelope import ReplyHandle
 from ..actors.kernel.message import Message
 from .engine import Diagnoser, Diagnosis, State
+from .engine.breath import beside_a_loop
 from .literals import BadLiteral, Literal
 from .messages import (
     DIAGNOSIS,
@@ -17,9 +18,9 @@ from .messages import (
     GRACE,
     MODEL,
     OBSERVATIONS,
-    REPAIR,
     ROS_DIAGNOSTICS,
     STARTS,
+    TOUCHED,
     ComponentsStarted,
     Explained,
     GetDiagnosis,
@@ -39,6 +40,8 @@ SERVER: Final = "model"
 """The last part of the model server's address; the rest is that of the diagnoser's supervisor."""
 TICK: Final = 0.001
 """Seconds: a literal is unknown after its last moment, not in it."""
+FIRST: Final = 0.05
+"""Seconds after which the candidates that are known by then are told, before all are."""
 MOST_QUIET: Final = 4
 """Times `quiet` that a diagnosis may be put off by further changes."""
 REFUSED: Final = 100
@@ -56,26 +59,36 @@ class _Expire(Message):
 
 
 class _Thought(Message):
-    """Tells the diagnoser that its thread has made a diagnosis."""
+    """Tells the diagnoser that its thread has made a diagnosis, of what was observed."""
 
     diagnosis: Diagnosis
+    observed: Observed
+    repaired: frozenset[str]
+    is_last: bool
+    """Nothing more is to be found in the time there is."""
+
+
+class _Understood(Message):
+    """Tells the diagnoser that its thread has explained a diagnosis."""
+
     explained: Explained
 
 
 class DiagnoserActor(Actor):
     """Diagnoses when something has changed, not all the time (D42), beside the event loop.
 
-    `/diagnosis` is told of each diagnosis that differs from the last one, healthy ones too; `/explanation` why, and
-    what to observe next.
+    `/diagnosis` is told of each diagnosis that differs from the last one, healthy ones too: first of the candidates
+    that are known at once, and of all when they are. `/explanation` is told afterwards why, and what to observe next.
 
     Args:
         quiet: seconds without a change before a diagnosis is made, so that changes that come together are one. While
             there are changes all the time, one is made after four times as long.
         limit: candidates that are listed at most.
         seconds: for one diagnosis.
+        explaining: seconds for one explanation.
         recent: seconds for which what was repaired is suspected last among equals.
         trust: how much each source is worth. Of two that contradict each other, the one that is worth less is not
-            believed; between equals there is no diagnosis until they agree (T49).
+            believed; between equals, what they contradict each other on is unknown until they agree (T49).
     """
 
     deterministic = False
@@ -83,19 +96,24 @@ class DiagnoserActor(Actor):
     def __init__(
         self,
         *,
-        quiet: float = 0.05,
+        quiet: float = 0.02,
         limit: int = 1000,
         seconds: float = 1.0,
+        explaining: float = 1.0,
         recent: float = 30.0,
         trust: Mapping[str, float] | None = None,
     ) -> None:
-        self._quiet, self._limit, self._seconds, self._recent = quiet, limit, seconds, recent
+        self._quiet, self._limit, self._recent = quiet, limit, recent
+        self._seconds, self._explaining = seconds, explaining
         self._trust = dict(trust or {})
         self._repaired: dict[str, float] = {}
         self._refused: dict[tuple[str, str], str] = {}
         self._newest: Diagnosis | None = None
         self._explained = Explained("nothing was observed so far")
         self._waiting: list[ReplyHandle[Any]] = []
+        self._curious: list[ReplyHandle[Any]] = []
+        self._unexplained: _Thought | None = None
+        self._is_explaining = False
         self._is_due = self._is_busy = False
         self._changed = self._first = float("-inf")
         self._known: object = None
@@ -141,7 +159,7 @@ class DiagnoserActor(Actor):
         self._refused.clear()
         self._due()
 
-    @subscribe(REPAIR)
+    @subscribe(TOUCHED)
     @on(Touched)
     async def _touched(self, message: Touched) -> None:
         until = message.time + self._recent
@@ -167,8 +185,12 @@ class DiagnoserActor(Actor):
             return handle
         return self._newest or Diagnosis(State.BLIND, components=tuple(self._engine.model.components))
 
-    @on(GetExplanation, readonly=True)
-    def _why(self, message: GetExplanation) -> Explained:
+    @on(GetExplanation)
+    def _why(self, message: GetExplanation) -> Any:
+        if self._is_due or self._is_busy or self._is_explaining:
+            handle = self.ctx.reply_handle()
+            self._curious.append(handle)
+            return handle
         return self._explained
 
     @on(GetObserved, readonly=True)
@@ -220,7 +242,7 @@ class DiagnoserActor(Actor):
             self._rest()
             return
         self._known, self._is_busy = known, True
-        self.ctx.pipe_to_self(self._diagnose(self._engine, observed, repaired), lambda thought: thought)
+        self.ctx.pipe_to_self(self._soon(self._engine, observed, repaired), lambda thought: thought)
 
     def _believed(self, now: float) -> Observed:
         """What is known, where one side of a contradiction is worth less without that side."""
@@ -236,20 +258,32 @@ class DiagnoserActor(Actor):
 
     # -- thinking ---------------------------------------------------------------------------------------------------
 
-    async def _diagnose(self, engine: Diagnoser, observed: Observed, repaired: frozenset[str]) -> _Thought:
-        diagnosis = await engine.diagnose(observed, repaired=repaired)
-        return _Thought(diagnosis, await asyncio.to_thread(self._explain, engine, observed, diagnosis))
+    async def _soon(self, engine: Diagnoser, observed: Observed, repaired: frozenset[str]) -> _Thought:
+        """What is known soon."""
+        diagnosis = await engine.diagnose(observed, repaired=repaired, seconds=min(FIRST, self._seconds))
+        is_last = "time" not in diagnosis.truncated or self._seconds <= FIRST
+        return _Thought(diagnosis, observed, repaired, is_last)
+
+    async def _rest_of(self, engine: Diagnoser, first: _Thought) -> _Thought:
+        """All that is known in the time for a diagnosis; parts that were thought through are remembered."""
+        diagnosis = await engine.diagnose(first.observed, repaired=first.repaired)
+        return _Thought(diagnosis, first.observed, first.repaired, True)
+
+    async def _understand(self, engine: Diagnoser, thought: _Thought) -> _Understood:
+        return _Understood(await asyncio.to_thread(self._explain, engine, thought.observed, thought.diagnosis))
 
     def _explain(self, engine: Diagnoser, observed: Observed, diagnosis: Diagnosis) -> Explained:
         """Say why a diagnosis was made; this is run in a thread."""
         refused = tuple(self._refused.values())
+        aside = [f"{source} contradicts several others, and is not believed" for source in diagnosis.set_aside]
+        torn = [*map(str, diagnosis.contradictions), *aside]
         if diagnosis.state is not State.FAULTY:
-            text = "\n".join(map(str, diagnosis.contradictions)) or _STATES[diagnosis.state]
-            return Explained(text, refused=refused)
-        why = engine.explain(observed)
-        probes = engine.next_observations(observed, diagnosis)[:SUGGESTED]
+            return Explained("\n".join(torn) or _STATES[diagnosis.state], refused=refused)
+        with beside_a_loop():
+            why = engine.explain(observed, seconds=self._explaining)
+            probes = engine.next_observations(observed, diagnosis, seconds=self._explaining)[:SUGGESTED]
         return Explained(
-            str(why),
+            "\n".join([str(why), *torn]),
             tuple(map(str, why.conflicts)),
             tuple(map(str, why.consequences)),
             tuple(NextBest(probe.atom, probe.gain) for probe in probes),
@@ -258,27 +292,53 @@ class DiagnoserActor(Actor):
 
     @on(_Thought)
     async def _conclude(self, message: _Thought) -> None:
+        is_of_now = message.diagnosis.version == self._engine.model.version  # Else the model has changed meanwhile.
+        if is_of_now:
+            await self._tell(message.diagnosis)
+        if is_of_now and not message.is_last and not self._is_due:
+            self.ctx.pipe_to_self(self._rest_of(self._engine, message), lambda thought: thought)
+            return
         self._is_busy = False
-        if message.diagnosis.version == self._engine.model.version:  # Else the model has changed meanwhile.
-            await self._tell(message)
+        if is_of_now:
+            self._unexplained = message
+            self._begin_to_explain()
         if self._is_due:
             self.ctx.tell_after(self._quiet, _Think())
         else:
             self._rest()
 
-    async def _tell(self, message: _Thought) -> None:
-        before, self._newest = self._newest, message.diagnosis
+    async def _tell(self, diagnosis: Diagnosis) -> None:
+        before, self._newest = self._newest, diagnosis
+        if before is None or _content(before) != _content(diagnosis):
+            await self.ctx.publish(DIAGNOSIS, diagnosis)
+            await self.ctx.publish(ROS_DIAGNOSTICS, RosDiagnostics(diagnosis.ros(self.ctx.now())))
+
+    def _begin_to_explain(self) -> None:
+        """One explanation at a time: of several diagnoses that come meanwhile, the newest is explained."""
+        thought = self._unexplained
+        if thought is not None and not self._is_explaining:
+            self._unexplained, self._is_explaining = None, True
+            self.ctx.pipe_to_self(self._understand(self._engine, thought), lambda understood: understood)
+
+    @on(_Understood)
+    async def _understood(self, message: _Understood) -> None:
+        self._is_explaining = False
         self._explained = message.explained
-        if before is None or _content(before) != _content(message.diagnosis):
-            await self.ctx.publish(DIAGNOSIS, message.diagnosis)
-            await self.ctx.publish(ROS_DIAGNOSTICS, RosDiagnostics(message.diagnosis.ros(self.ctx.now())))
         await self.ctx.publish(EXPLANATION, message.explained)
+        self._begin_to_explain()
+        self._rest()
 
     def _rest(self) -> None:
-        """Answer those who waited for the diagnosis of all that is known."""
+        """Answer those who waited for the diagnosis of all that is known, or for why."""
+        if self._is_due or self._is_busy:
+            return
         waiting, self._waiting = self._waiting, []
         for handle in waiting:
             handle.reply(self._newest or Diagnosis(State.BLIND, components=tuple(self._engine.model.components)))
+        if not self._is_explaining:
+            curious, self._curious = self._curious, []
+            for handle in curious:
+                handle.reply(self._explained)
 
     async def _refuse(self, message: Observation, error: Exception) -> None:
         """Say it loudly, but once: a literal that the model does not know must not be lost in silence (T53)."""
@@ -308,6 +368,8 @@ def _content(diagnosis: Diagnosis) -> object:
     """What a diagnosis says, without when and how fast it was made."""
     torn = tuple(one.literals for one in diagnosis.contradictions)
     return (
+        diagnosis.convicted,
+        diagnosis.set_aside,
         diagnosis.state,
         diagnosis.components,
         diagnosis.candidates,

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
-from typing import Any, Protocol
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import Any, Protocol, TypeVar
 
 import msgspec
 
@@ -18,17 +18,21 @@ from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import Node, cell_kind
 from ..actors.kernel.ref import ActorRef
 from ..supervision.spec import ChildSpec
+from ..supervision.supervisor import Supervisor
 from .assembly import observer
-from .literals import ok
-from .messages import DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, ROS_DIAGNOSTICS
+from .literals import crashes, made_atom, progress, replies, room, waits_for
+from .messages import DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, ROS_DIAGNOSTICS, STARTS
 from .model import Component, Declaration, Expectation, Kind
-from .observers.general import GeneralObserver, Learned
+from .observers.flow import Baselines, FlowObserver, Made
 from .observers.hearing import Heard, listen
 from .observers.node_observer import NodeObserver
 from .observers.observer import Manner, Observer
+from .observers.runtime import RuntimeObserver
 from .observers.verdicts import Agreement
 
-OURS = frozenset({DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, ROS_DIAGNOSTICS})
+T = TypeVar("T")
+
+OURS = frozenset({DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, ROS_DIAGNOSTICS, STARTS})
 """Topics of diagnosis itself."""
 
 
@@ -60,6 +64,8 @@ class Wired(msgspec.Struct, frozen=True, kw_only=True):
     subscribes: tuple[str, ...] = ()
     bound: dict[str, str] = {}
     """Port to component."""
+    asks: tuple[str, ...] = ()
+    """Whom it was seen to ask."""
 
 
 class Generated(msgspec.Struct, frozen=True):
@@ -67,7 +73,7 @@ class Generated(msgspec.Struct, frozen=True):
 
     Attributes:
         declaration: each actor is a component. A topic depends on the publisher's subscriptions and, through replies
-            (`NAME:replies`), on those it is bound to.
+            (`replies(NAME)`), on those it is bound to or was seen to ask.
         addresses: component to address.
         wiring: component to how it is connected.
         left_out: dependencies that would close a circle; a fault goes round in it, so one has to be cut.
@@ -100,7 +106,66 @@ async def generate(
         out = [*leave_out, cell.path]
         cell.request_stop()
         await cell.ended()
-    return declared(_wiring(node, heard, out))
+    return declared(_wiring(node, heard, out, {}))
+
+
+class LiveWiring:
+    """Holds how a running system is connected, as observers see it and go by it; it outlives their lives.
+
+    Attributes:
+        addresses: component to address.
+        made: topic to how it comes about.
+        heard: address to the topics on which it was heard.
+        asked: component to those that it was seen to ask.
+    """
+
+    def __init__(self, found: Generated, leave_out: Collection[str] = ()) -> None:
+        self.addresses: dict[str, str] = {}
+        self.made: dict[str, Made] = {}
+        self.heard = {wired.path: set(wired.publishes) for wired in found.wiring.values()}
+        self.asked: dict[str, set[str]] = {}
+        self._out = leave_out
+        self.use(found)
+
+    def use(self, found: Generated) -> None:
+        """Have observers go by this from their next look on."""
+        self._wiring = found.wiring
+        _replace(self.addresses, found.addresses)
+        _replace(self.made, _made(found.wiring, set().union(*self.heard.values())))
+
+    def look_again(self, node: Node) -> Generated | None:
+        """What the system is like now; None if it is as before."""
+        wiring = _wiring(node, self.heard, self._out, self.asked)
+        for name, wired in self._wiring.items():
+            if name not in wiring and _is_missed(node, wired):
+                wiring[name] = wired  # It has failed for good: that is no change of what the system should be.
+        return None if wiring == self._wiring else declared(wiring)
+
+
+def _is_missed(node: Node, wired: Wired) -> bool:
+    """Whether an actor that is not there should be: nobody has taken it away from its supervisor."""
+    above = None if wired.supervisor is None else node.find(wired.supervisor)
+    if above is None or above.is_dead:
+        return True  # Its supervisor has given up.
+    name, keeper = wired.path.rpartition("/")[2], above.actor
+    is_kept = isinstance(keeper, Supervisor) and name in keeper._children  # It was stopped, and may be started again.
+    return is_kept or name in (above.children or {})
+
+
+def _replace(old: dict[str, T], new: Mapping[str, T]) -> None:
+    old.clear()
+    old.update(new)
+
+
+def _made(wiring: Mapping[str, Wired], known: Collection[str]) -> dict[str, Made]:
+    """How each topic comes about; what was ever heard is an input also while nobody publishes it any more."""
+    published = {topic for wired in wiring.values() for topic in wired.publishes}
+    made: dict[str, Made] = {}
+    for topic in sorted(published):
+        makers = [wired for wired in wiring.values() if topic in wired.publishes]
+        inputs = {one for wired in makers for one in wired.subscribes if one in known and one != topic}
+        made[topic] = Made(tuple(wired.path for wired in makers), tuple(sorted(inputs)))
+    return made
 
 
 class TopicListener(Actor):
@@ -122,13 +187,15 @@ class TopicListener(Actor):
             self._publishers.setdefault(message.sender, set()).add(message.topic)
 
 
-def _wiring(node: Node, heard: dict[str, set[str]], out: Collection[str]) -> dict[str, Wired]:
+def _wiring(
+    node: Node, heard: dict[str, set[str]], out: Collection[str], asked: Mapping[str, set[str]]
+) -> dict[str, Wired]:
     root = node.root
     if root is None:
         return {}
     cells = [cell for cell in _below(root, out) if not _is_ours(cell)]
     names = {cell.path: cell.path[len(root.path) + 1 :] for cell in cells}
-    return {names[cell.path]: _wired(cell, names, heard) for cell in cells}
+    return {names[cell.path]: _wired(cell, names, heard, asked) for cell in cells}
 
 
 def _below(cell: Cell, out: Collection[str]) -> Iterator[Cell]:
@@ -151,7 +218,7 @@ def _is_ours(cell: Cell) -> bool:
     return module.startswith(BASE) and not module.startswith(f"{__package__}.board.")
 
 
-def _wired(cell: Cell, names: dict[str, str], heard: dict[str, set[str]]) -> Wired:
+def _wired(cell: Cell, names: dict[str, str], heard: dict[str, set[str]], asked: Mapping[str, set[str]]) -> Wired:
     more, kind = cell.more, cell_kind(cell)
     bound = more.bindings if more is not None else {}
     return Wired(
@@ -161,20 +228,19 @@ def _wired(cell: Cell, names: dict[str, str], heard: dict[str, set[str]]) -> Wir
         publishes=tuple(sorted(heard.get(cell.path, ()))),
         subscribes=tuple(sorted(set(more.belongings.topics) - OURS if more is not None else ())),
         bound={port: names[target.path] for port, target in sorted(bound.items()) if target.path in names},
+        asks=tuple(sorted(asked.get(names[cell.path], set()) & set(names.values()))),
     )
 
 
 def declared(wiring: dict[str, Wired]) -> Generated:
     """The declaration that follows from the wiring."""
     inputs: dict[str, list[str]] = {}  # what an actor publishes or replies is made from these
-    served = {name for wired in wiring.values() for name in wired.bound.values()}
     published = {topic for wired in wiring.values() for topic in wired.publishes}
     for name, wired in wiring.items():
         heard = [topic for topic in wired.subscribes if topic in published and topic not in wired.publishes]
-        inputs[name] = [*heard, *(_replies(other) for other in dict.fromkeys(wired.bound.values()) if other != name)]
-    outputs = {
-        name: [*wired.publishes, *([_replies(name)] if name in served else [])] for name, wired in wiring.items()
-    }
+        needed = dict.fromkeys((*wired.bound.values(), *wired.asks))
+        inputs[name] = [*heard, *(str(replies(other)) for other in needed if other != name and other in wiring)]
+    outputs = {name: [*wired.publishes, str(replies(name))] for name, wired in wiring.items()}
     left_out = _cut_circles(inputs, outputs)
     makers = Counter(out for outs in outputs.values() for out in outs)
     components = tuple(
@@ -189,17 +255,37 @@ def declared(wiring: dict[str, Wired]) -> Generated:
     # What several publish is as it should be while all of them work, not while any of them does.
     shared = tuple(_shared(out, inputs, outputs) for out, count in makers.items() if count > 1)
     addresses = {name: wired.path for name, wired in wiring.items()}
-    return Generated(Declaration(components=components, expectations=shared), addresses, wiring, left_out)
+    waits = [(name, other) for name, wired in wiring.items() for other in (*wired.bound.values(), *wired.asks)]
+    made = evident(Declaration(components=components, expectations=shared), wiring, waits)
+    return Generated(made, addresses, wiring, left_out)
+
+
+def evident(declaration: Declaration, components: Iterable[str], waits: Iterable[tuple[str, str]] = ()) -> Declaration:
+    """Return the declaration with what the runtime itself sees of these components, if they are actors.
+
+    Args:
+        declaration: the model.
+        components: those with an address; others of the model are left as they are.
+        waits: who may wait for whom.
+    """
+    known = {component.name for component in declaration.components}
+    actors = [name for name in components if name in known]
+    outs = {out for component in declaration.components for out in component.out}
+    expected = [Expectation(str(atom(name)), (name,)) for name in actors for atom in (progress, room)]
+    expected += [Expectation(str(replies(name)), (name,)) for name in actors if str(replies(name)) not in outs]
+    seen = [str(crashes(name)) for name in actors]
+    seen += [str(waits_for(one, other)) for one, other in dict.fromkeys(waits) if one in known and other in known]
+    return msgspec.structs.replace(
+        declaration,
+        expectations=(*declaration.expectations, *expected),
+        propositions=(*declaration.propositions, *seen),
+    )
 
 
 def _shared(topic: str, inputs: dict[str, list[str]], outputs: dict[str, list[str]]) -> Expectation:
     publishers = tuple(name for name, outs in outputs.items() if topic in outs)
-    given = dict.fromkeys(str(ok(wanted)) for name in publishers for wanted in inputs[name])
-    return Expectation(str(ok(topic)), publishers, tuple(given))
-
-
-def _replies(name: str) -> str:
-    return f"{name}:replies"
+    given = dict.fromkeys(str(made_atom(wanted)) for name in publishers for wanted in inputs[name])
+    return Expectation(str(made_atom(topic)), publishers, tuple(given))
 
 
 def _cut_circles(inputs: dict[str, list[str]], outputs: dict[str, list[str]]) -> tuple[str, ...]:
@@ -231,27 +317,33 @@ def _cut_circles(inputs: dict[str, list[str]], outputs: dict[str, list[str]]) ->
 
 
 def observers_for(
-    generated: Generated, *, window: float = 2.0, hung_after: float | None = None, manner: Manner | None = None
+    generated: Generated,
+    *,
+    window: float = 2.0,
+    hung_after: float | None = None,
+    manner: Manner | None = None,
+    wiring: LiveWiring | None = None,
+    baselines: Baselines | None = None,
 ) -> tuple[ChildSpec, ...]:
-    """Describe an observer for all actors that were found, and for each topic one that learns its rate.
+    """Describe an observer of whether the actors live, one of what the runtime knows of them, and one of all topics.
 
     Args:
         generated: what was found.
-        window: seconds over which messages are counted; several should come within it.
+        window: seconds of silence of a topic that are never too long.
         hung_after: see `NodeObserver`.
-        manner: of all of them; by default two of three looks must agree, so that a restart is no fault yet.
+        manner: of the first and the last; by default two of three looks must agree, so that a restart is no fault yet.
+        wiring: what they go by; it follows the system if a `ModelFollower` has it, too.
+        baselines: what is usual of each topic, if that is to outlive the program.
     """
     manner = manner or Manner(agreement=Agreement(2, 3))
-    topics = dict.fromkeys(topic for wired in generated.wiring.values() for topic in wired.publishes)
-    nodes = observer("nodes", Start(NodeObserver, (generated.addresses,), {"hung_after": hung_after, "manner": manner}))
-    rates = (
-        observer(
-            child_name("rate of", topic),
-            Start(GeneralObserver, (topic,), {"window": window, "learned": Learned(), "manner": manner}),
-        )
-        for topic in topics
+    wiring = wiring or LiveWiring(generated)
+    nodes = {"hung_after": hung_after, "manner": manner}
+    flow = {"heard": wiring.heard, "leave_out": OURS, "patience": window, "baselines": baselines or Baselines()}
+    return (
+        observer("nodes", Start(NodeObserver, (wiring.addresses,), nodes)),
+        observer("runtime", Start(RuntimeObserver, (wiring.addresses,), {"asked": wiring.asked})),
+        observer("topics", Start(FlowObserver, (wiring.made,), {**flow, "manner": manner})),
     )
-    return (nodes, *rates)
 
 
 def child_name(what: str, name: str) -> str:

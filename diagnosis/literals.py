@@ -16,8 +16,21 @@ import msgspec
 
 from ..actors.errors import HoldfastError
 
-ARITIES: Final = {"ok": 1, "running": 1, "on": 1, "matched": 2, "inc": 1, "dec": 1, "const": 1}
-"""The paper's predicates, with their numbers of arguments."""
+ARITIES: Final = {
+    "ok": 1,
+    "running": 1,
+    "on": 1,
+    "matched": 2,
+    "inc": 1,
+    "dec": 1,
+    "const": 1,
+    "replies": 1,
+    "progress": 1,
+    "room": 1,
+    "crashes": 1,
+    "waits_for": 2,
+}
+"""The paper's predicates and those of the runtime, with their numbers of arguments."""
 
 TRENDS: Final = ("inc", "dec", "const")
 """Of one value at most one of these holds at a time."""
@@ -73,6 +86,43 @@ def running(component: str) -> Literal:
 def on(device: str) -> Literal:
     """The literal that a device has power."""
     return Literal("on", (device,))
+
+
+def replies(component: str) -> Literal:
+    """Whoever asks a component gets an answer in time."""
+    return Literal("replies", (component,))
+
+
+def progress(component: str) -> Literal:
+    """A component gets on with what it is to handle, as far as that is its own affair."""
+    return Literal("progress", (component,))
+
+
+def room(component: str) -> Literal:
+    """The bounded mailbox of a component takes messages."""
+    return Literal("room", (component,))
+
+
+def crashes(component: str) -> Literal:
+    """A component crashes again and again, for reasons of its own."""
+    return Literal("crashes", (component,))
+
+
+def waits_for(component: str, other: str) -> Literal:
+    """The turn of a component waits for an answer of another one, for longer than is usual."""
+    return Literal("waits_for", (component, other))
+
+
+def made_atom(word: str) -> Literal:
+    """The atom of something that a component makes, or makes it from: `replies(cache)`, or a topic that is ok.
+
+    Raises:
+        BadLiteral: the word has brackets, and is no literal.
+
+    >>> str(made_atom("/prices")), str(made_atom("replies(cache)"))
+    ('ok(/prices)', 'replies(cache)')
+    """
+    return parse(word) if "(" in word else ok(word)
 
 
 def matched(one: str, other: str) -> Literal:

@@ -27,7 +27,9 @@ GRACE: Final = "/grace"
 STARTS: Final = "/starts"
 """`ComponentsStarted`, from whoever sees that a component has begun a new life."""
 REPAIR: Final = "/repair"
-"""`Touched`, and whatever else repair tells."""
+"""Whatever repair tells of its cases."""
+TOUCHED: Final = "/touched"
+"""`Touched`, after each action: a topic of its own, since the diagnoser hears nothing else of what repair tells."""
 
 
 class Grace(Message):
@@ -120,6 +122,7 @@ __all__ = [
     "REPAIR",
     "ROS_DIAGNOSTICS",
     "STARTS",
+    "TOUCHED",
     "ComponentsStarted",
     "Explained",
     "GetDiagnosis",

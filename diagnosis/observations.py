@@ -7,13 +7,18 @@ its time to live is forgotten: unknown is not `not ok` (T50). When nothing is kn
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Final
 
 import msgspec
 
 from ..actors.kernel.message import Message
 from .literals import TRENDS, Literal, Vocabulary
+
+MOST_LIARS: Final = 3
+"""Sources of one dispute that are taken to lie together at most; with more, nobody is set aside."""
 
 
 class Observation(Message, gc=False):
@@ -55,6 +60,8 @@ class Observed(msgspec.Struct, frozen=True):
     negative: frozenset[Literal] = frozenset()
     contradictions: tuple[Contradiction, ...] = ()
     sources: Mapping[Literal, tuple[Observation, ...]] = {}
+    set_aside: tuple[str, ...] = ()
+    """Sources that are not believed: what they say is left out."""
 
     @property
     def is_blind(self) -> bool:
@@ -129,9 +136,17 @@ class ObservationSet:
         return min(ends, default=None)
 
     def current(self, now: float) -> Observed:
-        """What is known at `now`."""
+        """What is known at `now`; a source that alone explains why others are contradicted is set aside."""
+        observed = self._without(frozenset(), now)
+        liars = liars_in(observed.contradictions) if observed.contradictions else frozenset[str]()
+        if not liars:
+            return observed
+        return msgspec.structs.replace(self._without(liars, now), set_aside=tuple(sorted(liars)))
+
+    def _without(self, liars: Collection[str], now: float) -> Observed:
         sources = {
-            atom: tuple(seen for seen in words.values() if seen.is_current(now)) for atom, words in self._seen.items()
+            atom: tuple(seen for seen in words.values() if seen.is_current(now) and seen.source not in liars)
+            for atom, words in self._seen.items()
         }
         sources = {atom: seen for atom, seen in sources.items() if seen}
         said = Observed.of(seen.literal for words in sources.values() for seen in words)
@@ -175,6 +190,49 @@ class ObservationSet:
             words.pop(source, None)
             if not words:
                 del self._seen[atom]
+
+
+def liars_in(contradictions: Sequence[Contradiction]) -> frozenset[str]:
+    """The sources that must be wrong if as few sources as possible are.
+
+    In each contradiction all sources but those of one side are wrong. Between two that only contradict each other
+    nothing can be said; one that contradicts two others that do not contradict each other is it.
+
+    >>> said = {name: Observation(Literal("ok", ("x",), name == "liar"), 0.0, name) for name in ("a", "b", "liar")}
+    >>> liars_in([Contradiction((), (said["a"], said["b"], said["liar"]))])
+    frozenset({'liar'})
+    """
+    disputes = [sides for torn in contradictions if len(sides := _sides(torn)) > 1]
+    found: set[str] = set()
+    while disputes:
+        group, disputes = [disputes[0]], disputes[1:]
+        names = set().union(*group[0])
+        while near := [one for one in disputes if not names.isdisjoint(set().union(*one))]:
+            group += near
+            names = names.union(*itertools.chain.from_iterable(near))
+            disputes = [one for one in disputes if one not in near]
+        found |= _least(group, sorted(names))
+    return frozenset(found)
+
+
+def _sides(torn: Contradiction) -> list[frozenset[str]]:
+    sides: dict[Literal, set[str]] = {}
+    for seen in torn.observations:
+        sides.setdefault(seen.literal, set()).add(seen.source)
+    return [frozenset(side) for side in sides.values()]
+
+
+def _least(group: list[list[frozenset[str]]], names: list[str]) -> frozenset[str]:
+    """Who is in each of the smallest sets that leave one side of each dispute."""
+    for size in range(1, min(MOST_LIARS, len(names) - 1) + 1):
+        explaining = [
+            wrong
+            for wrong in map(frozenset, itertools.combinations(names, size))
+            if all(sum(not side <= wrong for side in sides) <= 1 for sides in group)
+        ]
+        if explaining:
+            return frozenset.intersection(*explaining)
+    return frozenset()
 
 
 def _check_times(observation: Observation) -> None:

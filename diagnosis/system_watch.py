@@ -2,26 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final
 
 import msgspec
 
 from ..actors.kernel.actor import Start
 from ..actors.kernel.node import Node
 from ..actors.kernel.ref import ActorRef
-from ..supervision.spec import ChildSpec
+from ..supervision.spec import ChildSpec, child
 from .assembly import observer, tree
-from .diagnoser import DiagnoserActor
+from .diagnoser import SERVER, DiagnoserActor
 from .engine import Diagnosis
-from .generate import Generated, WatchedSystem, child_name, generate, observers_for
+from .generate import Generated, LiveWiring, WatchedSystem, child_name, evident, generate, observers_for
 from .literals import ok
 from .messages import DIAGNOSER, Explained, GetDiagnosis, GetExplanation, GetObserved
 from .model import Declaration, Expectation, History, System
+from .model_follower import ModelFollower
 from .observations import Observed
-from .observers import Bound, Limits, Manner, NodeObserver, Property, PropertyObserver
-from .repair import Policy, RepairAction, repairer, restart_child, restart_subtree
+from .observers import Baselines, Bound, Limits, Manner, NodeObserver, Property, PropertyObserver, RuntimeObserver
+from .repair import (
+    Approver,
+    GetRepairStatus,
+    Policy,
+    RepairAction,
+    Repairer,
+    RepairStatus,
+    SetStance,
+    Stance,
+    repairer,
+    restart_child,
+    restart_subtree,
+)
+from .repair.policy import check_stance
 
+REPAIRER: Final = "repairer"
+"""The last part of the repairer's address."""
 LimitsOf = Mapping[str, Mapping[Property, Limits]]
 """What is good, for each property of some components."""
 
@@ -42,6 +58,11 @@ class Watch:
         self._node = node
 
     @property
+    def repairer(self) -> ActorRef[Repairer]:
+        """Return a ref to the actor that repairs, or advises. Raises NoSuchActor if repair is "off"."""
+        return self._node.find_ref(f"{self.tree.path}/{REPAIRER}", Repairer)
+
+    @property
     def diagnoser(self) -> ActorRef[DiagnoserActor]:
         """Return a ref to the actor that diagnoses. Raises NoSuchActor if it does not run."""
         return self._node.find_ref(f"{self.tree.path}/{DIAGNOSER}", DiagnoserActor)
@@ -49,6 +70,14 @@ class Watch:
     async def diagnosis(self) -> Diagnosis:
         """Ask for the present diagnosis of the system."""
         return await self.diagnoser.ask(GetDiagnosis())
+
+    async def set_repair(self, stance: Stance) -> None:
+        """Have repair go as far as this from now on: "off", "advise", "ask" or "on". Raises BadStance, NoSuchActor."""
+        await self.repairer.ask(SetStance(stance))
+
+    async def repair_status(self) -> RepairStatus:
+        """Ask how repair stands, and how good its advice was. Raises NoSuchActor if repair was never on."""
+        return await self.repairer.ask(GetRepairStatus())
 
     async def why(self) -> Explained:
         """Ask why the diagnosis is what it is, and what to look at next."""
@@ -66,16 +95,19 @@ async def watch(
     *,
     addresses: Mapping[str, str] | None = None,
     limits: LimitsOf | None = None,
-    repair: Policy | bool = False,
+    repair: Stance = "advise",
+    policy: Policy | None = None,
     actions: Iterable[RepairAction] = (),
+    approve: Approver | None = None,
     manner: Manner | None = None,
     seconds: float = 3.0,
     window: float = 2.0,
     hung_after: float | None = None,
+    baselines: Baselines | None = None,
     name: str = "diagnosis",
     **options: Any,
 ) -> Watch:
-    """Diagnose a running system from now on, and repair it too, if that is wanted.
+    """Diagnose a running system from now on, and say how it could be repaired, or repair it.
 
     Args:
         system: an `ActorSystem`.
@@ -86,13 +118,18 @@ async def watch(
             generated model they are known.
         limits: what is good of their properties, such as `{"ledger": {Property.GROWTH: Limits(high=1e6)}}`; the atom
             `ok(ledger.growth)` is added to the model.
-        repair: True or a policy: what is faulty is repaired by `actions` and, for actors that are supervised, by a
-            restart of the actor, or if that does not help of the supervisor above it.
+        repair: "advise" says what it would do, and keeps the score of whether that would have been right. "ask" has a
+            person approve each plan: by `approve`, or by `holdfast repair approve CASE`. "on" repairs: by `actions`
+            and, for actors that are supervised, by a restart of the actor; what is dangerous, such as a restart of the
+            supervisor above it, still waits for a person, unless the policy allows it by its name. "off": neither.
+        policy: the rules of repair.
+        approve: is asked to approve a plan, besides people; whoever answers first decides.
         actions: what else can be done, such as `repair.run_command(...)`; with the name "restart_child" or
             "restart_subtree" in place of that one.
         manner: of the observers that are made here.
         seconds: see `model`.
-        window: of a generated model: seconds over which rates are counted, and five times as long learned.
+        window: of a generated model: seconds of silence of a topic that are never too long.
+        baselines: of a generated model: what is usual of its topics, such as `Baselines("usual.json")`, which is kept.
         hung_after: seconds after which an actor that is still in the same turn counts as not running, such as one that
             others ask in vain. None: nothing takes too long.
         name: of the supervisor that is started.
@@ -100,27 +137,46 @@ async def watch(
 
     Raises:
         ModelError: something is wrong with the model. StartFailed, AlreadyStarted: see `ActorSystem.start`.
+        ValueError: there is no such stance of repair.
     """
+    check_stance(repair)
     generated = await generate(system, seconds=seconds) if model is None else None
     watchers = [*observers]
     if generated is not None:
         declaration = generated.declaration
-        watchers += observers_for(generated, window=window, hung_after=hung_after, manner=manner)
+        live = LiveWiring(generated)
+        watchers += observers_for(
+            generated, window=window, hung_after=hung_after, manner=manner, wiring=live, baselines=baselines
+        )
+        follower = child("follower", Start(ModelFollower, (live, SERVER, _with_limits(limits))))
+        options["others"] = (*options.get("others", ()), follower)
     else:
         assert model is not None
         declaration = model.declaration() if isinstance(model, System) else model
     where = (dict(generated.addresses) if generated is not None else {}) | dict(addresses or {})
     if generated is None and where:
         watchers.append(observer("nodes", Start(NodeObserver, (where,), {"hung_after": hung_after, "manner": manner})))
+        watchers.append(observer("runtime", Start(RuntimeObserver, (where,))))
+        declaration = evident(declaration, where)
     if limits:
         declaration = expecting(declaration, limits)
         watchers += property_observers(limits, where, manner)
     mend = None
-    if repair is not False:
-        policy = None if repair is True else repair
-        mend = repairer(declaration, _actions(system._node, where, actions), policy, addresses=where)
+    if repair != "off":
+        ways = _actions(system._node, where, actions)
+        mend = repairer(declaration, ways, policy, name=REPAIRER, addresses=where, stance=repair, approve=approve)
     started = await system.start(tree(History(declaration), watchers, name=name, repairer=mend, **options))
     return Watch(started, system._node, where, generated)
+
+
+def _with_limits(limits: LimitsOf | None) -> Callable[[Generated], Generated]:
+    """What is added to each model that is generated anew; limits of components that have gone are left out."""
+
+    def adapt(found: Generated) -> Generated:
+        kept = {name: some for name, some in (limits or {}).items() if name in found.addresses}
+        return msgspec.structs.replace(found, declaration=expecting(found.declaration, kept))
+
+    return adapt
 
 
 def expecting(declaration: Declaration, limits: LimitsOf) -> Declaration:

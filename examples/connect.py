@@ -1,4 +1,4 @@
-"""A bank, and programs that use it over NATS: they keep their refs when its leader is killed and another one leads.
+"""A bank, and programs that use it over NATS: their refs stay good when its leader is killed and another one leads.
 
 `python connect.py` starts a server and two programs of the bank, each in a process of its own, and kills the one that
 leads. The server is that of `standby.py`.
@@ -7,7 +7,7 @@ leads. The server is that of `standby.py`.
 import asyncio
 import sys
 
-from standby import nats_server
+from standby import nats_server  # type: ignore[import-not-found]  # it lies beside this file
 
 import holdfast as hf
 
@@ -16,7 +16,7 @@ class Deposit(hf.Message[int]):
     amount: int
 
 
-class Deposited(hf.Message):
+class Deposited(hf.Message[None]):
     amount: int
 
 

@@ -200,7 +200,8 @@ async def look_after(system: hf.ActorSystem) -> None:
             diagnosis.observer("latency", hf.start(DiagnosticObserver, "/confirmations", [fast], manner=manner))
         ],
         limits={"shop/ledger": {Property.MEMORY: Limits(high=150e6)}},
-        repair=Policy(settle=1.0),
+        repair="on",
+        policy=Policy(settle=1.0),
         manner=manner,
         seconds=1.0,
         window=1.0,

@@ -215,6 +215,8 @@ def care(url: str) -> hf.ChildSpec:
         *(observer(f"rate of {topic[1:]}", rate) for topic, rate in zip(OBSERVED, rates, strict=True)),
     ]
     board = "/robot/diagnosis/board"
+    # The robot switches its own power: nobody is there to approve it.
+    policy = repair.Policy(settle=0.5, allow=frozenset({"power_up", "shutdown"}))
     actions = [
         repair.power_up(board, CHANNELS, grace=GRACE),
         repair.shutdown(board, CHANNELS),
@@ -226,7 +228,7 @@ def care(url: str) -> hf.ChildSpec:
         observers,
         others=[hf.child("board", hf.start(BoardActor, url, interval=0.02))],
         # Nothing is repaired before the whole robot is known.
-        repairer=repair.repairer(model(), actions, repair.Policy(settle=0.5), addresses=addresses, mode=repair.SAFE),
+        repairer=repair.repairer(model(), actions, policy, addresses=addresses, mode=repair.SAFE),
     )
 
 

@@ -157,7 +157,8 @@ class RestartChild(RuntimeOrder[Any]):
     """Start a stopped child again; the reply is its ref, or None if it did not want to be started.
 
     With `fresh` what was recorded of it (of a supervisor: of all below it) is erased first. With `running` a child that
-    runs is stopped first: from there to its start it is one call, which goes on if whoever has asked ends meanwhile.
+    runs is stopped first: from there to its start it is one call, which goes on if whoever has asked ends meanwhile. If
+    that start fails, the caller is told so, and the supervisor tries on as after a crash.
     With `unless_parked` a child that was stopped by order is refused (ChildParked): so asks repair. With `older` it
     begins with its snapshot before the newest; if there is none, one that ran goes on as it was, and the reply is
     ControlFailed.

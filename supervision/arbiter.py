@@ -21,7 +21,7 @@ from typing import Final
 
 from ..actors.errors import HoldfastError
 from ..actors.events import ChildRestarted, Event, SupervisorGaveUp
-from ..actors.kernel.cell import DOWN, ENDING, Cell
+from ..actors.kernel.cell import DOWN, ENDING, GONE, Cell
 from ..actors.kernel.node import Node
 from .children import RECOVERING, RESTARTING, STOPPED, UP
 from .supervisor import Supervisor
@@ -100,6 +100,7 @@ class Arbiter:
         self._clock, self._node = clock, node
         self._grants: dict[int, tuple[Grant, Callable[[str], None] | None]] = {}
         self._epochs = itertools.count(1)
+        self._escalating: dict[str, tuple[Cell, int]] = {}
         if node is not None:
             node.events.add_sink(self._heard)
 
@@ -191,6 +192,9 @@ class Arbiter:
         if isinstance(event, ChildRestarted):
             self._is_at(event.address, f"its supervisor restarts {event.address}: {event.reason}")
         elif isinstance(event, SupervisorGaveUp):
+            cell = None if self._node is None else self._node.find(event.address)
+            if cell is not None:
+                self._escalating[event.address] = cell, cell.life
             self._is_at(event.address, f"{event.address} gives up")
 
     def _is_at(self, address: str, reason: str) -> None:
@@ -203,7 +207,19 @@ class Arbiter:
         """Who at, above or below the address is in its supervisor's hands, or was stopped by order."""
         if self._node is None:
             return None
+        if (above := self._escalation(address)) is not None:
+            return InOtherHands(above, SUPERVISOR, "it gives up, and all below it end")
         return self._covered(address) or next(_below(self._node.find(address)), None)
+
+    def _escalation(self, address: str) -> str | None:
+        """The supervisor at, above or below the address that has given up, and whose life is not over yet."""
+        assert self._node is not None
+        for where, (cell, life) in list(self._escalating.items()):
+            if self._node.find(where) is not cell or cell.life != life or cell.state in (DOWN, GONE):
+                del self._escalating[where]  # From here on its own supervisor says what it does with it.
+            elif covers(where, address) or covers(address, where):
+                return where
+        return None
 
     def _covered(self, address: str) -> InOtherHands | None:
         node, at = self._node, ""
@@ -214,6 +230,11 @@ class Arbiter:
             if (busy := _in_hands(node.find(above), name)) is not None:
                 return busy
         return None
+
+    def has_parked(self, address: str) -> bool:
+        """Whether it, somebody above it or somebody below it was stopped by order, and not started since."""
+        below = None if self._node is None else self._node.find(address)
+        return self.is_parked(address) or any(busy.hand == OPERATOR for busy in _below(below))
 
     def is_parked(self, address: str) -> bool:
         """Whether it, or a supervisor above it, was stopped by order, and not started since."""

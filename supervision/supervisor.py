@@ -641,7 +641,7 @@ class Supervisor(Inquiries):
         return await self._start_by_hand(one, self._enlist, self._unlist, fresh=message.fresh)
 
     async def _start_by_hand(
-        self, one: Child, enlist: Callable[[Child], None], undo: Callable[[Child], None], *, fresh: bool
+        self, one: Child, enlist: Callable[[Child], None], undo: Callable[[Child, HoldfastError], None], *, fresh: bool
     ) -> Any:
         """Start a child that somebody waits for; its ref, or None if it did not want to be started."""
         row = StartRow((one,), STARTING)
@@ -650,14 +650,14 @@ class Supervisor(Inquiries):
             if fresh:
                 await self._erase(one)
             is_up = await self._come_up_in(row, one) if one.row is row else None
-        except HoldfastError:
-            undo(one)
+        except HoldfastError as error:
+            undo(one, error)
             raise
         if is_up is None:  # Whoever has stopped it says what becomes of it.
             raise StartFailed(self._path_of(one), "it was stopped while it started")
         return one.cell.ref if is_up and one.cell is not None else None
 
-    def _unlist(self, one: Child) -> None:
+    def _unlist(self, one: Child, error: HoldfastError) -> None:
         """A child could not be started for the first time."""
         if one.cell is not None:
             lifecycle.retire(one.cell, "it could not be started")
@@ -754,7 +754,8 @@ class Supervisor(Inquiries):
         if message.unless_parked and message.id in self._parked:
             raise ChildParked(message.id)
         self._parked.discard(message.id)
-        if message.running and one.state == UP:
+        has_run = message.running and one.state == UP
+        if has_run:
             row = StartRow((one,), RESTARTING)
             await self._stop(one, row=row, by=by, because="it was restarted by order")
             if one.row is not row:  # Whoever has it now says what becomes of it.
@@ -775,8 +776,11 @@ class Supervisor(Inquiries):
             if one.state != STOPPED or self._children.get(message.id) is not one:
                 raise StartFailed(self._path_of(one), "it was started or deleted by somebody else meanwhile")
 
-        def undo(one: Child) -> None:
-            self._give_up_address(one, "it could not be started")
+        def undo(one: Child, error: HoldfastError) -> None:
+            if has_run and one.spec.restart != "temporary":
+                self._again(one, crash(error))  # It was to run before and is to run now: as if it had crashed.
+            else:
+                self._give_up_address(one, "it could not be started")
 
         started = await self._start_by_hand(one, lambda one: None, undo, fresh=message.fresh)
         if problem is not None:

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from ..actors.errors import SpecError
 from ..cluster.leadership import LeadershipLost
+from .init_process import leave_init
 
 T = TypeVar("T")
 
@@ -30,6 +31,9 @@ def run(
     Where there is no uvloop it is run on asyncio's own loop. Where loops handle no signals, which is on Windows, SIGINT
     cancels it, too, and SIGTERM ends the process at once.
 
+    As PID 1, the first process of a container, it goes on in a child process, and PID 1 passes signals on and reaps
+    orphans; if other threads run already it does not, and gives a RuntimeWarning.
+
     Raises:
         SpecError: an event loop runs in this thread already, as in a notebook; or `again` was given a coroutine, which
             can run only once.
@@ -44,6 +48,7 @@ def run(
             main.close()
         problem = "an event loop runs here already (a notebook, or another framework's): await the coroutine there"
         raise SpecError("hf.run", problem)
+    leave_init()
     stopped_by: list[int] = []
 
     async def guarded() -> T:

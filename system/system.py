@@ -249,6 +249,34 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             raise
         return self
 
+    async def open(self) -> ActorSystem:
+        """Start the system without `async with`, as in a notebook, whose cells are tasks of their own.
+
+        End it with `shutdown`. If the tree fails nobody is cancelled: the log says so, `has_failed` is true, and asks
+        end with ActorStopped.
+
+        Raises:
+            HoldfastError, StoreInUse, SpecError: as on entering it.
+        """
+        await self.__aenter__()
+        self._body = None  # This task goes on with something else.
+        return self
+
+    @property
+    def has_failed(self) -> bool:
+        """Tell whether the root supervisor gave up, or another program has come to lead in its place."""
+        return self._failure is not None
+
+    def store_problem(self, *, for_good: bool = False) -> str:
+        """Say why the store takes nothing at the moment; an empty text if it does.
+
+        Args:
+            for_good: only what does not pass, so that a new program is needed; a full disk is not.
+        """
+        journal = self._homes.journal
+        error = journal.stopped if for_good else journal.stopped or journal.blocked
+        return f"the store takes nothing: {error}" if error is not None else ""
+
     async def _open_store(self, node: Node) -> StoreEngine:
         """The journal of the store; of one on several machines, once this program leads the system."""
         options = self._options
@@ -268,8 +296,12 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
 
     def _deposed(self, by: Deposed) -> None:
         """Another program leads: the tree ends, and the body hears of it."""
+        if self._closing is None:
+            self._fail(LeadershipLost(self.name, by.leader, by.current))
+
+    def _fail(self, failure: TreeFailed | LeadershipLost) -> None:
+        self._failure = failure
         if self._body is not None:
-            self._failure = LeadershipLost(self.name, by.leader, by.current)
             self._body.cancel()
 
     async def __aexit__(
@@ -415,7 +447,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
 
     def _root_ended(self, done: asyncio.Future[ExitReason]) -> None:
         """The root supervisor is gone: if nobody asked for that, the body must hear of it."""
-        if self._body is None or done.cancelled():
+        if self._closing is not None or done.cancelled():
             return
         reason, last = done.result(), self._node.gave_up
         if isinstance(reason, Shutdown) and reason.detail:
@@ -424,8 +456,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             why = f"its root has ended, {reason}"
             if last is not None:
                 why += f"; the last to end was {last.address}/{last.child}: {last.reason}"
-        self._failure = TreeFailed(self.name, why)
-        self._body.cancel()
+        self._fail(TreeFailed(self.name, why))
 
     # -- starting and finding actors --------------------------------------------------------------------------------
 

@@ -76,6 +76,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--holdfast-seeds", type=_count, default=None, help="run so many seeds, whatever a test says")
     group.addoption("--holdfast-replay", metavar="FILE", default=None, help="run only the schedule in this file")
     group.addoption(
+        "--holdfast-record",
+        metavar="FOLDER",
+        default=None,
+        help="keep of each failing test its seed, schedule, time line and text there, as an artefact of CI",
+    )
+    group.addoption(
         "--holdfast-real",
         action="store_true",
         default=None,

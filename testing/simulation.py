@@ -19,6 +19,7 @@ import os
 import random
 import sys
 import tempfile
+import traceback
 import warnings
 from collections.abc import Callable, Coroutine, Iterable
 from pathlib import Path
@@ -598,8 +599,10 @@ class ScheduleSearch:
                 if not _is_failure(error):
                     raise
                 again = error.__simulation__  # type: ignore[attr-defined]
-            failure.add_note(_head(seed, None, self._is_of_seed()))
-            failure.add_note(str(_difference(first, again) or f"the run of seed {seed} fails only sometimes"))
+            difference = _difference(first, again) or f"the run of seed {seed} fails only sometimes"
+            note = f"{_head(seed, None, self._is_of_seed())}\n{difference}"
+            for line in (note, *self._record(failure, as_text(seed, taken), recorder, note)):
+                failure.add_note(line)
             return failure
         if not _in_hypothesis():  # It shrinks what it has given, and calls again for each.
             taken = shrink(self._translated(seed, taken), fails)
@@ -613,7 +616,7 @@ class ScheduleSearch:
         else:
             shown = failure
         last: Simulation = shown.__simulation__  # type: ignore[attr-defined]
-        shown.add_note(self._note(last, taken, recorder))
+        shown.add_note(self._note(shown, last, taken, recorder))
         return shown
 
     def _translated(self, seed: int, taken: Taken) -> Taken:
@@ -631,7 +634,7 @@ class ScheduleSearch:
     def _is_of_seed(self) -> bool:
         return self._named in ("mixed", "random", "pct")
 
-    def _note(self, simulation: Simulation, taken: Taken, recorder: Recorder) -> str:
+    def _note(self, failure: BaseException, simulation: Simulation, taken: Taken, recorder: Recorder) -> str:
         seed, text = simulation.seed, as_text(simulation.seed, taken)
         lines = [_head(seed, text, self._is_of_seed())]
         count = size(taken)
@@ -642,14 +645,17 @@ class ScheduleSearch:
         )
         lines += [f"struck: {strike}" for strike in simulation.faults.strikes]
         lines += [f"not the seed's: {what}" for what in simulation.escaped]
-        folder = None if self._failures is None else self._failures.folder()
         chart = chart_as_text(recorder.rows)
         if chart:
             lines.append(chart)
-        if folder is not None and self._failures is not None:
+        if self._failures is not None:
             self._failures.add(text)
-            lines += _written(folder, text, recorder, "\n".join(lines), self._wanted.nodeid)
-        return "\n".join(lines)
+        return "\n".join([*lines, *self._record(failure, text, recorder, "\n".join(lines))])
+
+    def _record(self, failure: BaseException, text: str, recorder: Recorder, note: str) -> list[str]:
+        """Write what there is of a failure into files, if there is a folder for them; returns lines that name them."""
+        folder = None if self._failures is None else self._failures.folder()
+        return [] if folder is None else _written(folder, failure, text, recorder, note, self._wanted.nodeid)
 
     def _check_repeats(self, simulation: Simulation) -> None:
         """Make a run again by its choices.
@@ -673,9 +679,19 @@ class ScheduleSearch:
             raise difference
 
 
-def _written(folder: Path, text: str, recorder: Recorder, note: str, nodeid: str) -> list[str]:
-    """Write the schedule and the chart beside each other, and say where."""
+def _written(folder: Path, failure: BaseException, text: str, recorder: Recorder, note: str, nodeid: str) -> list[str]:
+    """Write the schedule, the chart, and what failed with all turns as text beside each other, and say where."""
     folder.mkdir(parents=True, exist_ok=True)
+    turns = [f"{row.at:.6f}\t{row.sender or '-'}\t{row.path}\t{row.what}\t{row.change}" for row in recorder.rows]
+    said = [
+        nodeid,
+        *traceback.format_exception_only(failure),
+        note,
+        "",
+        "seconds\tsender\tactor\tmessage\tchange",
+        *turns,
+    ]
+    (folder / "failure.txt").write_text("\n".join(said) + "\n", encoding="utf-8")
     schedule, chart = folder / "schedule.txt", folder / "chart.html"
     schedule.write_text(text + "\n", encoding="utf-8")
     chart.write_text(chart_as_html(recorder.rows, nodeid, note), encoding="utf-8")

@@ -152,7 +152,8 @@ def test_blocks_run(document: Path, tmp_path: Path) -> None:
     text = program(list(python_blocks(document.read_text("utf-8"))))
     if not text:
         return
-    script, met = tmp_path / f"{document.stem.lower()}.py", tmp_path / "met"
+    # A page of the name of a library must not be imported in its place.
+    script, met = tmp_path / f"page_{document.stem.lower()}.py", tmp_path / "met"
     met.mkdir()
     script.write_text(marking(text, met), "utf-8")
     code, output = run(script)

@@ -286,7 +286,8 @@ class Cell(_Hot):
             uplink.require_granted(self.path, type_name(type(message)))
         if not self.table.knows(type(message)):
             require_message(self.path, message)
-            raise UnknownMessage(self.path, type_name(type(message)))
+            name = type_name(type(message))
+            raise UnknownMessage(self.path, name, any(type_name(known) == name for known in self.table))
 
     def outgoing(self, item: Any) -> Any:
         """What is sent to this address in place of a message or an envelope: that itself, unless the node is traced."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ..seconds import check_seconds
@@ -18,6 +19,7 @@ class Deadlines:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._queues: dict[float, _Queue] = {}
+        self.watcher: Callable[[Ask, BaseException], None] | None = None  # is told of each ask that fails
 
     def add(self, ask: Ask) -> None:
         """Set the deadline of an ask by its time-out, and see to it that it has an outcome then.

@@ -250,6 +250,8 @@ class Ask(Item, msgspec.Struct, eq=False):
         """End the wait with a typed failure."""
         if not self.future.done():
             self.future.set_exception(error)
+            if self.to is not None and (watcher := self.to.node.deadlines.watcher) is not None:
+                watcher(self, error)
 
     def expire(self) -> None:
         """The deadline has passed; a turn that has not begun will not begin."""

@@ -134,8 +134,19 @@ class FromOwnWorker(Leaving):
         move = self.move
         self.taken: asyncio.Future[None] = move.node.loop.create_future()
         move.hear(self.worker, self.heard)
+        self.worker.on_death(self._died_before_rest)
         move.say_now(self.worker, "take", stays=move.stays)
-        await move.within(self.taken, move.timeout, lambda: BUSY)
+        try:
+            await move.within(self.taken, move.timeout, lambda: BUSY)
+        except BaseException:
+            if move.transit is None:  # It never was at rest, and is the place's as before.
+                self.worker.on_death(self.place.died)
+            raise
+
+    def _died_before_rest(self, cell: Cell, reason: ExitReason) -> None:
+        """The process ends while the life still is the place's, which deals with that; nobody else tells the move."""
+        self.move.give_up(f"its process has died ({reason})")
+        self.place.died(cell, reason)
 
     def heard(self, step: str, told: dict[str, Any]) -> None:
         """A word of the process."""

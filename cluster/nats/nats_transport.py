@@ -14,7 +14,7 @@ from nats.aio.msg import Msg
 
 from ..engine_thread import end_tasks
 from .access import NatsAccess, connect_options
-from .nats_engine import CONNECT_SECONDS, answering
+from .nats_engine import CONNECT_SECONDS, EngineClient, answering
 
 
 class NatsTransport:
@@ -91,7 +91,7 @@ async def open_transport(access: NatsAccess) -> NatsTransport:
         SpecError: a file of secrets or certificates must not be used.
         Unanswered: no server can be reached.
     """
-    client = Client()
+    client = EngineClient()
     options: dict[str, Any] = {**connect_options(access), "error_cb": _pass_over}
     with answering(access.name):
         try:

@@ -6,12 +6,14 @@ import asyncio
 import json
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Any
 
+import msgspec
 import typer
 
-from .reaching import Json, Socket, System, complete_path, reached, show_json
-from .remembering import print_lines
+from .reaching import FAILED, Json, Socket, System, complete_path, ended, reached, show_json
+from .remembering import moment, print_lines
 
 
 def diagnose(
@@ -25,10 +27,14 @@ def diagnose(
     socket: Socket = None,
     watch: Annotated[bool, typer.Option("--watch", help="Go on when it changes, until Ctrl+C.")] = False,
     seconds: Annotated[float, typer.Option(min=0.1, max=3600.0, help="With --watch: between two looks.")] = 1.0,
+    png: Annotated[
+        Path | None, typer.Option("--png", help="Draw the time line of the newest case, or of that of --case.")
+    ] = None,
+    case: Annotated[int | None, typer.Option(min=1, help="With --png: the number of the case.")] = None,
     timeout: Annotated[float, typer.Option(min=0.1, max=3600.0, help="Seconds that a diagnosis may take.")] = 5.0,
     as_json: Json = False,
 ) -> None:
-    """Say what the diagnosis of a running system says now: what is suspected, why, and what to look at next.
+    """Say what is wrong with a running system, since when and why, what would be done, and what was done.
 
     Exit status 0: it has said something, good or bad. 1: no diagnosis runs, or it knows nobody there. 2: no system.
     """
@@ -37,6 +43,8 @@ def diagnose(
         with reached("diagnose", system, socket) as remote:
             while True:
                 found = asyncio.run(remote.diagnosis(path, timeout=timeout))
+                if png is not None:
+                    _draw(found, case, png)
                 if found != last:
                     _show(found, is_line=watch, as_json=as_json)
                 last = found
@@ -45,6 +53,23 @@ def diagnose(
                 time.sleep(seconds)
     except KeyboardInterrupt:
         return  # This is how one ends it.
+
+
+def _draw(found: list[dict[str, Any]], case: int | None, path: Path) -> None:
+    """Draw a case. Raises typer.Exit: there is none, or it cannot be drawn."""
+    from ...diagnosis.repair import Story  # only now: no other command needs the planner
+    from ...diagnosis.repair.timeline import draw_story
+
+    told = [story for one in found if one["repair"] for story in one["repair"]["stories"]]
+    stories = [msgspec.convert(story, Story) for story in told if case in (None, story["case"])]
+    if not stories:
+        raise ended("diagnose", "there is no such case to draw: `holdfast diagnose` lists them", FAILED)
+    try:
+        draw_story(stories[-1], path)
+    except ImportError as error:
+        raise ended("diagnose", "a picture needs matplotlib: pip install 'holdfast[programs]'", FAILED) from error
+    except OSError as error:
+        raise ended("diagnose", f"{path} cannot be written: {error.strerror or error}", FAILED) from error
 
 
 def _show(found: list[dict[str, Any]], *, is_line: bool, as_json: bool) -> None:
@@ -64,8 +89,20 @@ def diagnosis_lines(one: dict[str, Any]) -> Iterator[str]:
     for suspect in one["suspects"]:
         where = f" at {suspect['address']}" if suspect["address"] else ""
         yield f"{'faulty' if suspect['is_certain'] else 'perhaps faulty'}: {suspect['component']}{where}"
+        if suspect["now"]:
+            yield f"  {suspect['now']}"
     if not one["suspects"]:
         yield f"none of {one['components']} components is suspected"
     yield from (f"why: {line}" for line in one["why"].splitlines() if line.strip())
     yield from (f"look next at: {each['atom']} ({each['gain_bits']:.2f} bits)" for each in one["next_best"])
     yield from (f"not understood: {each}" for each in one["refused"])
+    if one["repair"]:
+        yield from case_lines(one["repair"])
+
+
+def case_lines(repair: dict[str, Any]) -> Iterator[str]:
+    """How far repair goes, and what it has told of the newest case, each sentence with its time."""
+    yield f"repair: {repair['stance']}"
+    for story in repair["stories"][-1:]:
+        yield f"case {story['case']}, since {moment(story['entries'][0]['time'])}:"
+        yield from (f"  {moment(entry['time'])} {entry['text']}" for entry in story["entries"])

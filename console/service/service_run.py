@@ -26,6 +26,7 @@ from ..declare.tree_plan import actor_places, change_to, declare, other_code
 from ..declare.wanted_tree import WantedSpecs
 from ..endpoint import control_endpoint
 from ..operate.reaching import FAILED, UNUSABLE, ended
+from .health import Service
 from .notify import Notifier
 from .reloading import ProjectModules
 
@@ -119,28 +120,28 @@ async def _replace_codes(system: ActorSystem, names: set[str]) -> list[str]:
     return _words(change)
 
 
-async def serve(program: ServedProgram, make: Callable[[], ActorSystem], notifier: Notifier) -> None:
+async def serve(program: ServedProgram, service: Service) -> None:
     """Run the program until it is told to stop, or its main has returned."""
-    system = make()
-    async with system, control_endpoint(system) as socket:
+    async with service, control_endpoint(service.system) as socket:
+        system = service.system
         await program.begin(system)
         modules = None if program.is_file else ProjectModules(program.target.partition(":")[0])
         async with _reloads() as asked:
             main: asyncio.Future[Any] | None = None
             if program.main is not None:
                 main = asyncio.ensure_future(program.main(system))
-            notifier.ready(f"{system.name} runs")
+            service.up()
             tell(f"{system.name} runs, control endpoint {socket}")
             try:
                 while main is None or not main.done():
                     waiting = asyncio.create_task(asked.get())
                     await asyncio.wait({waiting, *([main] if main is not None else [])}, return_when="FIRST_COMPLETED")
                     if not waiting.cancel():
-                        await _reload(program, system, modules, notifier)
+                        await _reload(program, system, modules, service.notifier)
                 if main is not None:
                     main.result()
             finally:
-                notifier.stopping()
+                service.stopping()  # Now: the main may take a while to end.
                 if main is not None and not main.done():
                     main.cancel()
                     if not (await asyncio.wait({main}, timeout=MAIN_TIMEOUT))[0]:
@@ -205,6 +206,9 @@ def run(
             "--key-file", envvar="HOLDFAST_STORE_KEY_FILE", help="Of an encrypted store: the file with its key."
         ),
     ] = None,
+    probes: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Where /livez and /readyz are answered over HTTP.")
+    ] = None,
 ) -> None:
     """Run a system until it is told to stop: its control endpoint is open, and the service manager is told how it is.
 
@@ -218,16 +222,11 @@ def run(
     except HoldfastError as error:
         raise ended("run", error, UNUSABLE) from error
 
-    def make() -> ActorSystem:
-        chosen: Durability | None = durability  # type: ignore[assignment]  # it is looked at where it is used
-        return ActorSystem(name, store=store, store_key=key_file, durability=chosen, recovery=recovery)
-
-    notifier = Notifier()
     try:
-        run_loop(serve(program, make, notifier))
+        chosen: Durability | None = durability  # type: ignore[assignment]  # it is looked at where it is used
+        system = ActorSystem(name, store=store, store_key=key_file, durability=chosen, recovery=recovery)
+        run_loop(serve(program, Service(system, probes=probes)))
     except HoldfastError as error:
         raise ended("run", error, FAILED) from error
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
-    finally:
-        notifier.close()

@@ -48,16 +48,20 @@ class BoardActor(Actor):
         url: `tcp://host:port`.
         interval: seconds between two measurements.
         timeout: seconds for a request; no other is handled meanwhile.
+        token: see `Board`.
     """
 
     deterministic = False
 
-    def __init__(self, url: str, *, interval: float = 1.0, timeout: float = 2.0) -> None:
+    def __init__(self, url: str, *, interval: float = 1.0, timeout: float = 2.0, token: str | None = None) -> None:
+        self._token = token
         self._url, self._interval, self._timeout = url, interval, timeout
 
     async def on_start(self, restored: bool) -> None:
         """Begin to connect; whether there is a board shows later."""
-        self._board = Board(self._url, timeout=self._timeout, broadcast=self._interval, rng=self.ctx.random)
+        self._board = Board(
+            self._url, timeout=self._timeout, broadcast=self._interval, rng=self.ctx.random, token=self._token
+        )
         entered: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self.ctx.create_task(self._publish(entered))
         await entered

@@ -27,6 +27,8 @@ LARGEST: Final = 1024
 """Bytes of a body."""
 LONGEST_NAME: Final = 32
 """Bytes of a channel's name."""
+LONGEST_TOKEN: Final = 128
+"""Bytes of a token."""
 LONGEST_REASON: Final = 200
 """Bytes of the reason of a refusal."""
 FASTEST, SLOWEST = 10, 3_600_000
@@ -73,6 +75,12 @@ class SetDefaults(msgspec.Struct, frozen=True):
     channels: frozenset[int]
 
 
+class AuthenticateFrame(msgspec.Struct, frozen=True):
+    """Says the token, before anything else, to a board that has one."""
+
+    token: str
+
+
 class ChannelSpecification(msgspec.Struct, frozen=True):
     """A channel: what it is called, its voltage, and the current it may draw."""
 
@@ -113,7 +121,7 @@ class RefusedFrame(msgspec.Struct, frozen=True):
     why: str
 
 
-Request: TypeAlias = AskSpecification | AskMeasurements | SwitchFrame | Broadcast | SetDefaults
+Request: TypeAlias = AskSpecification | AskMeasurements | SwitchFrame | Broadcast | SetDefaults | AuthenticateFrame
 Answer: TypeAlias = Specification | Measurements | DoneFrame | RefusedFrame
 Frame: TypeAlias = Request | Answer
 
@@ -123,6 +131,7 @@ KINDS: Final[dict[int, type[Frame]]] = {
     0x03: SwitchFrame,
     0x04: Broadcast,
     0x05: SetDefaults,
+    0x06: AuthenticateFrame,
     0x81: Specification,
     0x82: Measurements,
     0x83: DoneFrame,
@@ -227,6 +236,8 @@ def _body(frame: Frame) -> bytes:
             return _MILLISECONDS.pack(milliseconds)
         case SetDefaults(channels):
             return _MASK.pack(_mask(channels))
+        case AuthenticateFrame(token):
+            return _token(token)
         case Specification(channels, defaults):
             _ten(channels)
             parts = [_MASK.pack(_mask(defaults))]
@@ -253,6 +264,8 @@ def _frame(kind: type[Frame], body: bytes) -> Frame:
         return Broadcast(*_MILLISECONDS.unpack(body))
     if kind is SetDefaults:
         return SetDefaults(_channels(*_MASK.unpack(body)))
+    if kind is AuthenticateFrame:
+        return AuthenticateFrame(body.decode())
     if kind is Specification:
         return _specification(body)
     if kind is Measurements:
@@ -281,6 +294,13 @@ def _channel(number: int) -> int:
     if not 0 <= number < CHANNELS:
         raise BadBoardFrame(f"there is no channel {number}: they are 0 to {CHANNELS - 1}")
     return number
+
+
+def _token(token: str) -> bytes:
+    body = token.encode()
+    if not 0 < len(body) <= LONGEST_TOKEN:
+        raise BadBoardFrame(f"a token has 1 to {LONGEST_TOKEN} bytes, not {len(body)}")
+    return body
 
 
 def _flag(value: int) -> bool:

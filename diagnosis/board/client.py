@@ -17,6 +17,7 @@ from .board_frames import (
     Answer,
     AskMeasurements,
     AskSpecification,
+    AuthenticateFrame,
     BadBoardFrame,
     BoardDecoder,
     Broadcast,
@@ -83,6 +84,7 @@ class Board:
         broadcast: seconds between two broadcasts, asked for with each new connection; 0 is none.
         backoff: between two attempts to connect.
         rng: for the jitter of the back-off.
+        token: is said first over each connection; None: the board has none.
     """
 
     def __init__(
@@ -93,6 +95,7 @@ class Board:
         broadcast: float = 0.0,
         backoff: Backoff | None = None,
         rng: random.Random | None = None,
+        token: str | None = None,
     ) -> None:
         parts = urlsplit(url)
         if parts.scheme != "tcp" or not parts.hostname or not parts.port or parts.path or parts.query:
@@ -101,7 +104,7 @@ class Board:
             raise ValueError(f"timeout must be > 0 seconds, not {timeout!r}")
         self.url, self._host, self._port = url, parts.hostname, parts.port
         self._timeout, self._backoff, self._rng = timeout, backoff or Backoff(), rng or random.Random()
-        self._milliseconds = _milliseconds(broadcast)
+        self._milliseconds, self._token = _milliseconds(broadcast), token
         self._keeper: asyncio.Task[None] | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._connected = asyncio.Event()
@@ -224,6 +227,11 @@ class Board:
         self._writer.write(encode(self._sequence, request))
         return self._sequence, answer
 
+    def _send_unasked(self, request: Request) -> None:
+        """Send what nobody waits for."""
+        sequence, answer = self._send(request)
+        answer.add_done_callback(lambda done: self._waiting.pop(sequence, None))
+
     async def _keep(self) -> None:
         """Connect again whenever the connection is lost, with growing delays."""
         attempt = 0
@@ -243,12 +251,13 @@ class Board:
         """One connection, until it ends. Whether the board has said anything that made sense."""
         self._writer, self._silent = writer, 0
         has_spoken = False
-        self._connected.set()
         self._problem = "the connection was lost"
         try:
+            if self._token is not None:  # Frames are answered in order: what is sent behind it finds us known.
+                self._send_unasked(AuthenticateFrame(self._token))
             if self._milliseconds:
-                sequence, answer = self._send(Broadcast(self._milliseconds))
-                answer.add_done_callback(lambda done: self._waiting.pop(sequence, None))
+                self._send_unasked(Broadcast(self._milliseconds))
+            self._connected.set()
             decoder = BoardDecoder()
             while data := await self._read(reader):
                 decoder.feed(data)

@@ -104,6 +104,7 @@ class BoardSimulator(Actor):
         loads: what hangs on its channels; by default the paper's robot.
         defaults: channels that are on after its power-up; by default the PC.
         port: 0 is any that is free; `GetBoard` tells which.
+        token: see `BoardServer`.
     """
 
     deterministic = False
@@ -115,7 +116,9 @@ class BoardSimulator(Actor):
         defaults: tuple[int, ...] = (1,),
         host: str = "127.0.0.1",
         port: int = 0,
+        token: str | None = None,
     ) -> None:
+        self._token = token
         self._loads, self._defaults, self._host, self._port = loads, defaults, host, port
         self._refusals = 0
 
@@ -128,7 +131,7 @@ class BoardSimulator(Actor):
             rng=self.ctx.random,
             changed=self._changed,
         )
-        self._server = BoardServer(self._board, self._host, self._port)
+        self._server = BoardServer(self._board, self._host, self._port, self._token)
         listens: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self.ctx.create_task(self._listen(listens))
         await listens

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hmac
 import socket
 from typing import Protocol
 
@@ -12,6 +13,7 @@ from .board_frames import (
     Answer,
     AskMeasurements,
     AskSpecification,
+    AuthenticateFrame,
     BadBoardFrame,
     BoardDecoder,
     Broadcast,
@@ -26,7 +28,7 @@ from .board_frames import (
 )
 
 MOST_CLIENTS = 8
-"""Connections at a time; further ones are told so and closed."""
+"""Connections at a time; of those that hear no broadcasts, the longest silent one gives its seat to a new one."""
 IDLE = 3600.0
 """Seconds a client may say nothing."""
 PATIENCE = 5.0
@@ -59,17 +61,25 @@ class Device(Protocol):
 class BoardServer:
     """Serves a device.
 
+    Args:
+        device: what is behind it.
+        host, port: where it listens.
+        token: what a client has to say before anything else; None: nothing. It is not encrypted: it keeps out who can
+            reach the port, and nobody who can listen on the way.
+
     Attributes:
         delay: seconds by which each answer comes later than it could.
         is_mute: no answer comes, and no broadcast.
         is_deaf: new connections are closed at once.
     """
 
-    def __init__(self, device: Device, host: str = "127.0.0.1", port: int = 0) -> None:
+    def __init__(self, device: Device, host: str = "127.0.0.1", port: int = 0, token: str | None = None) -> None:
         self._device, self._host, self._port = device, host, port
         self._socket: socket.socket | None = None
         self._listener: Listener | None = None
         self._clients: dict[asyncio.Task[None], asyncio.StreamWriter] = {}
+        self._silent: dict[asyncio.Task[None], None] = {}  # those that hear nothing either, the longest first
+        self._token = token
         self.delay = 0.0
         self.is_mute = self.is_deaf = False
 
@@ -118,9 +128,9 @@ class BoardServer:
             writer.transport.abort()
             return
         self._clients[task] = writer
-        client = _Client(self, self._device, reader, writer)
+        client = _Client(self, self._device, reader, writer, self._token)
         try:
-            if len(self._clients) > MOST_CLIENTS:
+            if len(self._clients) > MOST_CLIENTS and not self._free_seat(task):
                 await client.send(0, RefusedFrame(f"there are {MOST_CLIENTS} connections already"))
             else:
                 await client.run()
@@ -130,26 +140,52 @@ class BoardServer:
             pass  # We drop it: this task is its own, and nobody waits for its outcome.
         finally:
             del self._clients[task]
+            self._silent.pop(task, None)
             writer.close()
+
+    def _free_seat(self, newcomer: asyncio.Task[None]) -> bool:
+        """Have the client go that has said and heard nothing for the longest time; False: all of them are at work."""
+        task = next((one for one in self._silent if one is not newcomer), None)
+        if task is None:
+            return False
+        del self._silent[task]
+        self._clients[task].transport.abort()
+        task.cancel()
+        return True
+
+    def note_silence(self, task: asyncio.Task[None], is_silent: bool) -> None:
+        """A client says and hears nothing from now on, or does again."""
+        self._silent.pop(task, None)
+        if is_silent:
+            self._silent[task] = None
 
 
 class _Client:
     """One connection of a client, with what is read and written over it."""
 
     def __init__(
-        self, server: BoardServer, device: Device, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+        self,
+        server: BoardServer,
+        device: Device,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        token: str | None,
     ) -> None:
+        self._token, self._is_known = token, token is None
         self._server, self._device, self._reader, self._writer = server, device, reader, writer
         self._broadcasts: asyncio.Task[None] | None = None
 
     async def run(self) -> None:
         """From its first frame to its end."""
         decoder, clock = BoardDecoder(), asyncio.get_running_loop().time
-        ends = clock() + IDLE
+        ends, task = clock() + IDLE, asyncio.current_task()
+        assert task is not None
         try:
             while True:
+                self._server.note_silence(task, self._broadcasts is None)
                 async with asyncio.timeout_at(ends):
                     data = await self._reader.read(PIECE)
+                self._server.note_silence(task, False)
                 if not data:
                     return
                 was_inside = decoder.is_inside
@@ -178,7 +214,14 @@ class _Client:
         return True
 
     async def _answer(self, frame: Frame) -> Answer:
+        if not self._is_known and not isinstance(frame, AuthenticateFrame):
+            return RefusedFrame("say the token first: Board(url, token=...)")
         match frame:
+            case AuthenticateFrame(token):
+                self._is_known = self._token is None or hmac.compare_digest(token.encode(), self._token.encode())
+                if not self._is_known:
+                    raise BadBoardFrame("this is not the token", is_fatal=True)
+                return DoneFrame()
             case AskSpecification():
                 return self._device.specification()
             case AskMeasurements():

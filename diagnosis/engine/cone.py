@@ -84,8 +84,16 @@ class Index:
                 users[atom].append(step)
         self.users = tuple(map(tuple, users))
         """By atom, the rules that need it."""
+        busy = {one for step in self.steps if self.is_work(step.head) for one in step.needs}
+        self.only_run = frozenset(range(len(self.names))) - busy
+        """Components of which nothing else follows than that they run."""
         self.unconditional = tuple(step for step in self.steps if not step.needs)
         """Rules that hold whoever is faulty: they can make observations contradict the model."""
+
+    def is_work(self, atom: int) -> bool:
+        """Whether an atom says something of the work of a component: more than that it runs, and has room."""
+        literal = self.atoms[atom]
+        return literal is not None and literal.name not in ("running", "room")
 
     def numbers(self, atoms: Collection[Literal]) -> frozenset[int]:
         """The numbers of atoms.

@@ -6,11 +6,14 @@ nobody in it can be left out.
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Iterator
 
 import msgspec
 
 from ..literals import Literal
+from .breath import breathe
 from .cone import Index, RuleStep, cone_of
 
 
@@ -29,8 +32,11 @@ class Conflict(msgspec.Struct, frozen=True):
             blamed = f"{self.components[0]} is faulty"
         else:
             blamed = f"at least one of {_listed(self.components, 'and')} is faulty"
+        given = _listed(tuple(map(str, self.given)), "and") if self.given else ""
+        if self.symptom is None and given:
+            return f"{given}: {blamed}"
         failed = str(self.symptom) if self.symptom is not None else "this cannot be"
-        while_ = f" while {_listed(tuple(map(str, self.given)), 'and')}" if self.given else ""
+        while_ = f" while {given}" if given else ""
         return f"{failed}{while_}: {blamed}"
 
 
@@ -52,36 +58,63 @@ class Explanation(msgspec.Struct, frozen=True):
 
     conflicts: tuple[Conflict, ...] = ()
     consequences: tuple[Consequence, ...] = ()
+    left_out: int = 0
+    """Symptoms that were not explained in the time there was."""
 
     def __str__(self) -> str:
-        return "\n".join(map(str, (*self.conflicts, *self.consequences)))
+        left = [f"{self.left_out} more symptoms were not explained in time"] if self.left_out else []
+        return "\n".join(map(str, (*self.conflicts, *self.consequences, *left)))
 
 
-def explain(index: Index, positive: frozenset[int], negative: frozenset[int]) -> Explanation:
-    """One minimal conflict for each rule that ends in a failure, and the failures that need none."""
+def explain(index: Index, positive: frozenset[int], negative: frozenset[int], until: float = math.inf) -> Explanation:
+    """One minimal conflict for each rule that ends in a failure, and the failures that need none.
+
+    Args:
+        index: the model.
+        positive: atoms that hold.
+        negative: atoms that do not.
+        until: of the monotonic clock; no more conflicts are begun after it.
+    """
     cone = cone_of(index, positive, negative)
     conflicts = [_conflict(index, {step.needs[0]}, [step], step.head, positive) for step in cone.convicted]
-    for part in cone.parts:
+    left_out = 0
+    for part in sorted(cone.parts, key=lambda part: len(part.steps) + len(part.denials)):
         makers: dict[int, list[RuleStep]] = {}
         for step in part.steps:
             makers.setdefault(step.head, []).append(step)
-        found = (_minimal(denial, part.denials, makers) for denial in part.denials)
-        conflicts += (_conflict(index, needs, steps, denial.head, positive) for denial, needs, steps in found)
+        for first in part.denials:
+            found = _minimal(first, part.denials, makers, until) if time.monotonic() < until else None
+            if found is None:
+                left_out += 1
+                continue
+            denial, needs, steps = found
+            conflicts.append(_conflict(index, needs, steps, denial.head, positive))
     explained = {step.head for step in cone.convicted}
     explained |= {denial.head for part in cone.parts for denial in part.denials}
     left = sorted(negative - explained)
-    consequences = tuple(_consequence(index, failure, positive, negative, cone.faulty) for failure in left)
-    return Explanation(tuple({one.components: one for one in conflicts}.values()), consequences)
+    consequences: list[Consequence] = []
+    for failure in left:
+        if time.monotonic() < until:
+            consequences.append(_consequence(index, failure, positive, negative, cone.faulty))
+        else:
+            left_out += 1
+    return Explanation(tuple({one.components: one for one in conflicts}.values()), tuple(consequences), left_out)
 
 
 def _minimal(
-    denial: RuleStep, denials: tuple[RuleStep, ...], makers: dict[int, list[RuleStep]]
-) -> tuple[RuleStep, set[int], list[RuleStep]]:
-    """A minimal conflict that begins with a denial: the denial it ends with, its components, and the rules used."""
+    denial: RuleStep, denials: tuple[RuleStep, ...], makers: dict[int, list[RuleStep]], until: float
+) -> tuple[RuleStep, set[int], list[RuleStep]] | None:
+    """A minimal conflict that begins with a denial: the denial it ends with, its components, and the rules used.
+
+    None if there was no time to make it minimal.
+    """
     used = _derivation([denial], makers, None)
     assert used is not None  # the cone holds only rules that can apply
     needs = {component for step in used for component in step.needs}
     for component in sorted(needs):
+        if time.monotonic() > until:
+            return None
+        breathe()
         fewer = _any_derivation(denials, makers, needs - {component})
         if fewer is not None:
             used = fewer

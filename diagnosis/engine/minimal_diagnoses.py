@@ -114,11 +114,16 @@ class Diagnoser:
             return Observed.of(given)
         return observations
 
-    def explain(self, observations: Observations) -> Explanation:
-        """Why there is something to repair: minimal conflicts, and failures that follow from others."""
-        index, observed = self._index, self.observed(observations)
-        positive, negative = index.numbers(observed.positive), index.numbers(observed.negative)
-        return explain(index, positive, negative)
+    def explain(self, observations: Observations, *, seconds: float = math.inf) -> Explanation:
+        """Why there is something to repair: minimal conflicts, and failures that follow from others.
+
+        Args:
+            observations: those of the diagnosis.
+            seconds: after which no more conflicts are looked for; `left_out` then says how many symptoms have none.
+        """
+        index = self._index
+        positive, negative, _ = self._believed(self.observed(observations))
+        return explain(index, positive, negative, time.monotonic() + seconds)
 
     def next_observations(
         self,
@@ -127,6 +132,7 @@ class Diagnoser:
         *,
         can_be_seen: Iterable[Literal] | None = None,
         costs: Mapping[Literal, float] | None = None,
+        seconds: float = math.inf,
     ) -> tuple[Probe, ...]:
         """What to look at next to tell the candidates apart, the most telling first; empty if nothing would.
 
@@ -135,11 +141,13 @@ class Diagnoser:
             diagnosis: the candidates.
             can_be_seen: atoms that could be observed; every atom unless given.
             costs: of observing an atom; 1 unless given. The gain is divided by it.
+            seconds: after which no more atoms are looked into.
         """
-        index, observed = self._index, self.observed(observations)
-        positive, negative = index.numbers(observed.positive), index.numbers(observed.negative)
+        index = self._index
+        positive, negative, _ = self._believed(self.observed(observations))
         seen = index.numbers(tuple(can_be_seen)) if can_be_seen is not None else None
-        return probes(index, positive, negative, diagnosis.candidates, seen, costs or {})
+        until = time.monotonic() + seconds
+        return probes(index, positive, negative, diagnosis.candidates, seen, costs or {}, until)
 
     def _beside(self, observations: Observations, repaired: frozenset[str], budget: SearchBudget) -> Diagnosis:
         with beside_a_loop():
@@ -149,9 +157,17 @@ class Diagnoser:
         began = time.perf_counter()
         with self._lock, contextlib.closing(budget):
             observed = self.observed(observations)
-            positive, negative = self._index.numbers(observed.positive), self._index.numbers(observed.negative)
-            excluded = self._state_of(observed, positive, negative)
-            made = excluded or self._solved(positive, negative, repaired, budget)
+            made = Diagnosis(State.BLIND)
+            if not observed.is_blind:
+                positive, negative, torn = self._believed(observed)
+                contested = self._contested(torn)
+                made = self._solved(positive, negative, repaired, budget, contested)
+                if torn:  # What is contested is unknown; of the rest there is a diagnosis all the same.
+                    is_faulty = made.state is State.FAULTY and bool(made.candidates)
+                    state = State.FAULTY if is_faulty else State.CONTRADICTORY
+                    candidates = made.candidates if is_faulty else ()
+                    made = msgspec.structs.replace(made, state=state, candidates=candidates, contradictions=torn)
+                made = msgspec.structs.replace(made, unknown=self._unknown(positive), set_aside=observed.set_aside)
             return msgspec.structs.replace(
                 made,
                 components=self._index.names,
@@ -159,40 +175,73 @@ class Diagnoser:
                 seconds=time.perf_counter() - began,
             )
 
-    def _state_of(self, observed: Observed, positive: frozenset[int], negative: frozenset[int]) -> Diagnosis | None:
-        """The answer where there can be no diagnosis."""
-        if observed.is_blind:
-            return Diagnosis(State.BLIND)
+    def _believed(self, observed: Observed) -> tuple[frozenset[int], frozenset[int], tuple[Contradiction, ...]]:
+        """The atoms that hold and those that do not, without what the model excludes whoever is faulty."""
+        positive, negative = self._index.numbers(observed.positive), self._index.numbers(observed.negative)
         torn = list(observed.contradictions)
-        if not torn:
-            literals = contradiction(self._index, positive, negative)
-            if literals:
-                said = [seen for literal in literals for seen in observed.sources.get(literal.atom, ())]
-                torn.append(Contradiction(literals, tuple(said), "the model excludes this whatever is faulty"))
-        return Diagnosis(State.CONTRADICTORY, contradictions=tuple(torn)) if torn else None
+        while literals := contradiction(self._index, positive, negative):
+            said = [seen for literal in literals for seen in observed.sources.get(literal.atom, ())]
+            torn.append(Contradiction(literals, tuple(said), "the model excludes this whatever is faulty"))
+            contested = self._index.numbers([literal.atom for literal in literals])
+            positive, negative = positive - contested, negative - contested
+        return positive, negative, tuple(torn)
+
+    def _contested(self, torn: Iterable[Contradiction]) -> frozenset[int]:
+        """The components that account for what is contested: to blame or to clear one of them would be a guess."""
+        atoms = self._index.numbers([literal.atom for one in torn for literal in one.literals])
+        return frozenset(one for atom in atoms for step in self._index.makers[atom] for one in step.needs)
+
+    def _unknown(self, positive: frozenset[int]) -> tuple[str, ...]:
+        """The components of whose work nothing is seen; that one runs says nothing of its work, if it has any."""
+        index, seen = self._index, set[int]()
+        for atom in positive:
+            is_work = index.is_work(atom)
+            for step in index.makers[atom]:
+                seen.update(one for one in step.needs if is_work or one in index.only_run)
+        return tuple(name for number, name in enumerate(index.names) if number not in seen)
 
     def _solved(
-        self, positive: frozenset[int], negative: frozenset[int], repaired: frozenset[str], budget: SearchBudget
+        self,
+        positive: frozenset[int],
+        negative: frozenset[int],
+        repaired: frozenset[str],
+        budget: SearchBudget,
+        contested: frozenset[int],
     ) -> Diagnosis:
         cone = cone_of(self._index, positive, negative)
         if not cone.convicted and not cone.parts:
             return Diagnosis(State.HEALTHY, candidates=(Candidate(()),), found=1)
+        clear = [part for part in cone.parts if contested.isdisjoint(part.components)]
         ranking = Ranking(self._index.components, repaired)
-        parts = [solved for part in cone.parts for solved in self._part(part, budget)]
+        # The smallest first: what is certain is mostly there, and a large part may take all the time there is.
+        order = sorted(clear, key=lambda part: len(part.denials) + len(part.steps))
+        every = [solved for part in order for solved in self._part(part, budget)]
+        parts = [solved for solved in every if solved.sets]  # Others have run out of time: candidates lack them.
         breathe()
         rows = [self._ranked(solved, ranking) for solved in parts]
         certain = [ranking.set(sorted(cone.faulty))] if cone.faulty else []
-        ranked = merged([products([certain, *rows] if certain else rows)], self.limit)
-        found = math.prod(part.found for part in parts)
+        choices = [certain, *rows] if certain else rows
+        ranked = merged([products(choices)], self.limit) if choices else []
+        found = math.prod(part.found for part in parts) if choices else 0
         by_count = found > self.limit or any(part.by_count for part in parts)
-        by_time = any(part.by_time for part in parts)
+        by_time = any(part.by_time for part in every)
         return Diagnosis(
             State.FAULTY,
             candidates=self._candidates(ranked),
             symptoms=self._symptoms(cone),
+            convicted=self._convicted(cone, parts),
             found=found,
-            truncated=(*["count"] * by_count, *["time"] * by_time),
+            truncated=(*["count"] * by_count, *["time"] * by_time, *["contested"] * (len(clear) < len(cone.parts))),
         )
+
+    def _convicted(self, cone: Cone, parts: list[Solved]) -> tuple[str, ...]:
+        """Who is in each diagnosis, also in those that are not listed."""
+        sure = set(cone.faulty)
+        for part in parts:
+            if not (part.by_count or part.by_time):
+                shared = set.intersection(*map(set, part.sets))
+                sure.update(one for one in shared if len(part.classes[one]) == 1)
+        return tuple(self._index.names[one] for one in sorted(sure))
 
     def _ranked(self, solved: Solved, ranking: Ranking) -> list[Ranked]:
         """The best sets of a part, with classes written out."""

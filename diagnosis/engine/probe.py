@@ -7,12 +7,14 @@ could not be. Else it says nothing, and either outcome is taken to be as likely 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
 from typing import Final
 
 import msgspec
 
 from ..literals import Literal
+from .breath import breathe
 from .cone import FALSE, Index, RuleStep
 from .result import Candidate
 
@@ -40,14 +42,18 @@ def probes(
     candidates: Sequence[Candidate],
     can_be_seen: frozenset[int] | None,
     costs: Mapping[Literal, float],
+    until: float = math.inf,
 ) -> tuple[Probe, ...]:
-    """The probes that tell something, best first."""
+    """The probes that tell something, best first; none is looked into after `until`, on the monotonic clock."""
     told = candidates[:CANDIDATES]
     if len(told) < 2:
         return ()
     worlds = [_World(index, positive, negative, frozenset(index.number[name] for name in one.bad)) for one in told]
     found: list[Probe] = []
     for atom in _worth_asking(index, positive, negative, told, can_be_seen):
+        if time.monotonic() > until:
+            break
+        breathe()
         literal = index.atoms[atom]
         assert literal is not None
         may_hold = [world.may_hold(atom) for world in worlds]

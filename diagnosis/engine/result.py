@@ -19,7 +19,7 @@ class State(enum.Enum):
     HEALTHY = "healthy"
     FAULTY = "faulty"
     CONTRADICTORY = "contradictory"
-    """The observations cannot all be true: there is no diagnosis, and no repair may start."""
+    """The observations cannot all be true, and the rest shows no fault: no repair may start."""
     BLIND = "blind"
     """Nothing is observed: nothing is known, and no repair may start."""
 
@@ -33,7 +33,10 @@ class Candidate(Message, gc=False):
 
 
 class Diagnosis(Message):
-    """All minimal diagnoses within the limits, best first; what observers and repair act on."""
+    """All minimal diagnoses within the limits, best first; what observers and repair act on.
+
+    If "time" or "contested" is in `truncated`, candidates are what is known so far: of the rest nothing is in any.
+    """
 
     state: State
     components: tuple[str, ...] = ()
@@ -44,16 +47,28 @@ class Diagnosis(Message):
     found: int = 0
     """Minimal diagnoses that were found; `candidates` may hold fewer."""
     truncated: tuple[str, ...] = ()
-    """"count" and "time": what kept further ones from being listed; empty if these are all."""
+    """"count", "time" and "contested" (sources contradict each other on a suspect): what kept further ones from being
+    listed; empty if these are all."""
     version: int = 1
     """Of the model."""
     seconds: float = 0.0
+    convicted: tuple[str, ...] = ()
+    """Components that are faulty whatever else is: known even where `truncated` says that candidates are missing."""
+    unknown: tuple[str, ...] = ()
+    """Components of whose work nothing is seen at the moment: that they are healthy is not said."""
+    set_aside: tuple[str, ...] = ()
+    """Sources of observations that are not believed, because they contradict several others that agree."""
 
     def __str__(self) -> str:
         """In words: `faulty: ja, or jn`."""
         words = ", or ".join(" and ".join(one.bad) for one in self.candidates if one.bad)
         more = f", or others ({' and '.join(self.truncated)} ran out)" if self.truncated else ""
-        return f"{self.state.value}: {words}{more}" if words else self.state.value
+        if words:
+            return f"{self.state.value}: {words}{more}"
+        if self.state is State.FAULTY:
+            return f"{self.state.value}: no candidate yet ({' and '.join(self.truncated)} ran out)"
+        some = self.state is State.HEALTHY and self.unknown
+        return f"{self.state.value}, as far as is known: {len(self.unknown)} unknown" if some else self.state.value
 
     @property
     def is_complete(self) -> bool:
@@ -67,10 +82,10 @@ class Diagnosis(Message):
 
     @property
     def certain(self) -> tuple[str, ...]:
-        """The components that are faulty in each candidate; nothing is certain while candidates may be missing."""
-        if not self.is_complete or not self.candidates:
-            return ()
-        shared = set.intersection(*(set(candidate.bad) for candidate in self.candidates))
+        """The components that are faulty in each diagnosis; while candidates are missing, those that are convicted."""
+        shared = set(self.convicted)
+        if self.is_complete and self.candidates:
+            shared |= set.intersection(*(set(candidate.bad) for candidate in self.candidates))
         return tuple(name for name in self.components if name in shared)
 
     def good(self, candidate: Candidate) -> tuple[str, ...]:
@@ -89,20 +104,25 @@ class Diagnosis(Message):
             stamp: seconds since 1970.
         """
         certain, suspects = set(self.certain), set(self.suspects)
-        is_known = self.state in (State.HEALTHY, State.FAULTY)
+        is_known, unknown = self.state in (State.HEALTHY, State.FAULTY), set(self.unknown)
         nanoseconds = round(stamp * 1e9)
         return {
             "header": {"stamp": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}, "frame_id": ""},
-            "status": [self._status(name, is_known, name in certain, name in suspects) for name in self.components],
+            "status": [
+                self._status(name, is_known, name in certain, name in suspects, name in unknown)
+                for name in self.components
+            ],
         }
 
-    def _status(self, name: str, is_known: bool, is_certain: bool, is_suspect: bool) -> Plain:
+    def _status(self, name: str, is_known: bool, is_certain: bool, is_suspect: bool, is_unseen: bool) -> Plain:
         if not is_known:
             level, message = 3, f"unknown: the observations are {self.state.value}"
         elif is_certain:
             level, message = 2, "faulty"
         elif is_suspect:
             level, message = 1, "perhaps faulty"
+        elif is_unseen:
+            level, message = 3, "unknown: nothing is seen of its work"
         else:
             level, message = 0, "works"
         chance = sum(one.probability for one in self.candidates if name in one.bad) if is_suspect else 0.0

@@ -151,7 +151,7 @@ def _searched(
     part: RulePart, options: Sequence[str], limit: int, budget: SearchBudget, *, is_short: bool
 ) -> tuple[Solved, bool]:
     """What was found, and whether that is all that was asked for."""
-    control = clingo.Control(list(options))
+    control = clingo.Control(list(options), logger=_say_nothing)
     is_optimising = _OPTIMISING in options
     components = _build(control, part, is_optimising=is_optimising)
     sets: list[tuple[int, ...]] = []
@@ -169,6 +169,10 @@ def _searched(
 
     is_done = budget.run(control, take, is_short=is_short)
     return Solved(sets, {}, by_count=is_more, by_time=not is_done), is_done
+
+
+def _say_nothing(code: clingo.MessageCode, text: str) -> None:
+    """Keep clingo from writing to stderr: what it would say there (that it was interrupted) is in the result."""
 
 
 def _build(control: clingo.Control, part: RulePart, *, is_optimising: bool) -> dict[clingo.Symbol, int]:

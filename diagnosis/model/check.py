@@ -10,11 +10,12 @@ from typing import Final
 import msgspec
 
 from ...actors.errors import HoldfastError
-from ..literals import ARITIES, BadLiteral, Literal, Vocabulary, ok, on, parse, running
+from ..literals import ARITIES, BadLiteral, Literal, Vocabulary, made_atom, on, parse, running
 from .clauses import BadClause, Rule, read_clause, rules_of
 from .declaration import Component, Declaration, Kind, System, settle_kinds
 
 _NAME: Final = re.compile(r"[^\s(),]+\Z")
+_FORM: Final = re.compile(r"[A-Za-z_]\w*\([^\s()]+\)\Z")  # what is made may be another atom than that of a topic
 
 
 class ModelProblem(msgspec.Struct, frozen=True):
@@ -124,9 +125,8 @@ def _of_component(component: Component, known: dict[str, Component]) -> Iterator
             yield ModelProblem(where, f"{name} drives {_unknown(device, known)}")
         elif not known[device].kind.is_hardware:
             yield ModelProblem(where, f"{name} drives {device}, which is no device")
-    yield from _bad_words(
-        where, [*component.out, *(topic for made_from in component.out.values() for topic in made_from)]
-    )
+    made = [*component.out, *(topic for made_from in component.out.values() for topic in made_from)]
+    yield from _bad_words(where, [word for word in made if not _FORM.match(word)])
 
 
 def _bad_words(where: str, words: Iterable[str]) -> Iterator[ModelProblem]:
@@ -165,12 +165,12 @@ def _rules(declared: Declaration, problems: list[ModelProblem]) -> Iterator[Rule
 
 def _inputs(declared: Declaration) -> Iterator[ModelProblem]:
     """Topics that are needed and published by nobody: most often a slip of the pen."""
-    known = {f"ok({topic})" for component in declared.components for topic in component.out}
+    known = {str(made_atom(topic)) for component in declared.components for topic in component.out}
     known |= set(declared.propositions) | {expectation.atom for expectation in declared.expectations}
     for component in declared.components:
         for topic, inputs in component.out.items():
             for wanted in inputs:
-                if f"ok({wanted})" not in known:
+                if str(made_atom(wanted)) not in known:
                     topics = [atom[3:-1] for atom in known if atom.startswith("ok(")]
                     what = f"{topic} of {component.name} is made from {_unknown(wanted, topics, 'topic')}"
                     yield ModelProblem(component.where, f"{what}; if it comes from outside, declare it as external")
@@ -258,7 +258,7 @@ def _atoms(declared: Declaration, rules: Iterable[Rule]) -> Iterator[Literal]:
     yield from map(parse, declared.propositions)
     for component in declared.components:
         if component.is_implied:
-            yield from (ok(topic) for topic in component.out)
+            yield from map(made_atom, component.out)
             if component.kind is Kind.SWITCHABLE:
                 yield on(component.name)
             elif not component.kind.is_hardware:

@@ -19,7 +19,7 @@ from typing import Final
 
 import msgspec
 
-from ..literals import BadLiteral, Literal, matched, ok, on, parse, running
+from ..literals import BadLiteral, Literal, made_atom, matched, on, parse, running
 from .declaration import Clause, Component, Declaration, Expectation, Kind, Relation, Spelling
 
 _SEPARATOR: Final = re.compile(r",(?![^()]*\))|\s+and\s+|∧|&")
@@ -74,8 +74,8 @@ def _of_component(component: Component) -> Iterator[Rule]:
         case Kind.NODE:
             origin = "clause 4"
     for topic, inputs in component.out.items():
-        body = tuple(ok(wanted) for wanted in dict.fromkeys(inputs))
-        yield Rule(_unique(name, *component.on), body, ok(topic), origin, where)
+        body = tuple(made_atom(wanted) for wanted in dict.fromkeys(inputs))
+        yield Rule(_unique(name, *component.on), body, made_atom(topic), origin, where)
     yield Rule((name,), (), running(name), "clause 5", where)
 
 
@@ -84,7 +84,7 @@ def _of_relation(relation: Relation, by_name: dict[str, Component], topics: dict
     publishers = [(by_name[one], topics.get(first)), (by_name[other], topics.get(second))]
     needs = [name for component, _ in publishers for name in (component.name, *component.on)]
     inputs = [wanted for component, topic in publishers for wanted in _made_from(component, topic)]
-    body = tuple(ok(wanted) for wanted in dict.fromkeys(inputs))
+    body = tuple(made_atom(wanted) for wanted in dict.fromkeys(inputs))
     return Rule(_unique(*needs), body, matched(first, second), "clause 6", relation.where)
 
 

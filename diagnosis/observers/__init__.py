@@ -5,6 +5,7 @@ A new one is one class: derive from `Observer`, override `hear` or `look`, and c
 
 from .binary import BinaryQualitativeObserver, Source
 from .diagnostic import Check, DiagnosticObserver
+from .flow import Baselines, FlowObserver
 from .general import GeneralObserver, Learned
 from .hardware import Channel, HardwareObserver
 from .multiple import ConditionedObserver, TriggeredObserver
@@ -13,12 +14,14 @@ from .observer import Look, Manner, Observer
 from .property import Bound, Property, PropertyObserver
 from .qualitative import QualitativeObserver, trend
 from .regression import Fit, Regression
+from .runtime import RuntimeObserver
 from .score import ScoreObserver
 from .timeout import TimeoutObserver
 from .verdicts import Agreement, Debounce, Limits, Median, Smooth
 
 __all__ = [
     "Agreement",
+    "Baselines",
     "BinaryQualitativeObserver",
     "Bound",
     "Channel",
@@ -27,6 +30,7 @@ __all__ = [
     "Debounce",
     "DiagnosticObserver",
     "Fit",
+    "FlowObserver",
     "GeneralObserver",
     "HardwareObserver",
     "Learned",
@@ -40,6 +44,7 @@ __all__ = [
     "PropertyObserver",
     "QualitativeObserver",
     "Regression",
+    "RuntimeObserver",
     "ScoreObserver",
     "Smooth",
     "Source",

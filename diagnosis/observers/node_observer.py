@@ -9,6 +9,7 @@ from typing import Final
 from ...actors.control.orders import Status, status_of
 from ...actors.control.orders_lane import ask_status
 from ...actors.errors import HoldfastError, SpecError
+from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.process.process_host import WorkerPlace
 from ...actors.process.wire.peer import OutsideHost, Peer
@@ -29,7 +30,7 @@ class NodeObserver(Observer):
     """Looks whether actors live; they need not know of it. One that is suspended is unknown.
 
     Args:
-        actors: component to address.
+        actors: component to address; it may change.
         hung_after: seconds; an actor whose turn takes longer, or whose process does not answer so long, counts as not
             running. None: nothing takes too long.
         settling: seconds after somebody has started an actor again in which nothing that is seen of it, or of what
@@ -46,7 +47,7 @@ class NodeObserver(Observer):
         manner: Manner | None = None,
     ) -> None:
         super().__init__(manner=manner)
-        self._actors = {running(component): path for component, path in actors.items()}
+        self._actors = actors
         self._hung_after, self._settling = hung_after, settling
         self._lives: dict[Literal, tuple[Cell, int]] = {}
         self._starts: dict[Literal, tuple[float, ...]] = {}
@@ -58,11 +59,12 @@ class NodeObserver(Observer):
 
     async def look(self) -> None:
         """Look them all up; those that have to be asked are asked at the same time."""
-        if started := [atom.args[0] for atom, path in self._actors.items() if self._is_new(atom, path)]:
+        actors = {running(component): path for component, path in self._actors.items()}
+        if started := [atom.args[0] for atom, path in actors.items() if self._is_new(atom, path)]:
             await self.ctx.publish(STARTS, ComponentsStarted(tuple(started), self._settling))
         asked: list[Literal] = []
         answers: list[Awaitable[bool | None]] = []
-        for atom, path in self._actors.items():
+        for atom, path in actors.items():
             seen = self._runs(self.ctx._cell.node.find(path))
             if seen is None or isinstance(seen, bool):
                 self.verdict(atom, seen)
@@ -112,7 +114,7 @@ class NodeObserver(Observer):
         return status.state == "running" and (self._hung_after is None or status.turn_seconds <= self._hung_after)
 
 
-def at_root(observer: Observer) -> None:
-    """Refuse an observer that sees only its own process. Raises SpecError."""
+def at_root(observer: Actor) -> None:
+    """Refuse an actor that looks at others and sees only its own process. Raises SpecError."""
     if observer.ctx._cell.node.ports.uplink is not None:
         raise SpecError(observer.ctx.path, f"{type(observer).__name__} must be in the system's own process: a task")

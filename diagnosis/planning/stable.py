@@ -131,7 +131,9 @@ def _solve(facts: str, horizon: int, budget: Budget) -> tuple[list[int], bool] |
     """
     import clingo
 
-    control = clingo.Control([*OPTIONS, "-c", f"horizon={horizon}"])
+    control = clingo.Control(
+        [*OPTIONS, "-c", f"horizon={horizon}"], logger=lambda code, text: None
+    )  # no words on stderr
     control.add("base", [], PROGRAM + facts)
     control.ground([("base", [])])
     best: list[tuple[int, int]] = []

@@ -3,18 +3,24 @@
 `Repairer` is the actor; `action` makes a coroutine an action; `stock` has those that come with holdfast.
 """
 
-from .actions import Act, ActionFailed, RepairAction, Repertoire, action
-from .executor import DENIED, DONE, FAILED, LOST, SKIPPED, UNVERIFIED
+from .actions import Act, ActionFailed, RepairAction, Repertoire, Undo, action
+from .advice import Score
+from .approvals import Approver
+from .executor import DONE, FAILED, LOST, SKIPPED, UNVERIFIED
 from .ledger import Memory
 from .notices import (
     TOPIC,
     ActionBegan,
     ActionEnded,
+    AdviceScored,
     ApprovalWanted,
     Approve,
+    BadStance,
+    CaseStories,
     Deny,
     GaveUp,
     GetRepairStatus,
+    GetStories,
     Held,
     NobodyWaits,
     Planned,
@@ -22,11 +28,16 @@ from .notices import (
     Repaired,
     RepairGaveUp,
     RepairStatus,
+    RepairTold,
     RetryRepair,
     SetMode,
+    SetStance,
+    Story,
+    StoryEntry,
     Touched,
+    Undone,
 )
-from .policy import NORMAL, SAFE, Policy
+from .policy import NORMAL, SAFE, STANCES, Policy, Stance
 from .repairer import Repairer
 from .setup import repairer
 from .stock import (
@@ -45,7 +56,6 @@ from .stock import (
 )
 
 __all__ = [
-    "DENIED",
     "DONE",
     "FAILED",
     "LOST",
@@ -58,11 +68,16 @@ __all__ = [
     "ActionBegan",
     "ActionEnded",
     "ActionFailed",
+    "AdviceScored",
     "ApprovalWanted",
     "Approve",
+    "Approver",
+    "BadStance",
+    "CaseStories",
     "Deny",
     "GaveUp",
     "GetRepairStatus",
+    "GetStories",
     "Held",
     "Memory",
     "NobodyWaits",
@@ -72,12 +87,21 @@ __all__ = [
     "RepairBegan",
     "RepairGaveUp",
     "RepairStatus",
+    "RepairTold",
     "Repaired",
     "Repairer",
     "Repertoire",
     "RetryRepair",
+    "STANCES",
+    "Score",
     "SetMode",
+    "SetStance",
+    "Stance",
+    "Story",
+    "StoryEntry",
     "Touched",
+    "Undo",
+    "Undone",
     "action",
     "bind_port",
     "change_mechanism",

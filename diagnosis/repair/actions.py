@@ -54,8 +54,10 @@ class ActionFailed(HoldfastError, text="{action}: {why}"):
     why: str
 
 
-Run = Callable[..., Awaitable[None]]
-"""`async def run(act, *names)`."""
+Undo = Callable[[], Awaitable[None]]
+"""Takes back what an action has done, when it is seen that it has not helped."""
+Run = Callable[..., Awaitable[Undo | None]]
+"""`async def run(act, *names)`; it returns how to undo it, or None if that cannot be."""
 
 
 def everyone(component: str) -> bool:
@@ -77,7 +79,8 @@ class RepairAction:
         attempts: on a component, until it is given up; None is what the policy says.
         grace: seconds after its end in which observers blame neither the component nor what depends on it; 0 if its
             effect is that something does not hold.
-        is_dangerous: a person has to approve.
+        is_dangerous: a person has to approve, unless the policy allows the action by its name.
+        is_restart: it ends a life: whoever answers is restarted only when the diagnosis stands, and once.
         takes: whether it can be done to a component, its first parameter.
         reach: the address it acts on; None is the component's own.
     """
@@ -91,6 +94,7 @@ class RepairAction:
     attempts: int | None = None
     grace: float = 0.0
     is_dangerous: bool = False
+    is_restart: bool = False
     takes: Callable[[str], bool] = everyone
     reach: Callable[[str], str | None] | None = None
 
@@ -101,9 +105,9 @@ class RepairAction:
         if self.attempts is not None and self.attempts < 1:
             raise ValueError(f"{self.name}: attempts must be >= 1")
 
-    async def __call__(self, act: Act, *names: str) -> None:
+    async def __call__(self, act: Act, *names: str) -> Undo | None:
         """Do it, as the coroutine itself would."""
-        await self.run(act, *names)
+        return await self.run(act, *names)
 
 
 def action(pddl: str, **options: Any) -> Callable[[Run], RepairAction]:

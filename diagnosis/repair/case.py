@@ -9,6 +9,8 @@ from typing import NamedTuple
 from ...supervision.arbiter import covers
 from ..literals import Literal
 from ..planning import Step
+from .actions import Undo
+from .advice import Advice
 
 
 class Verifying(NamedTuple):
@@ -38,7 +40,13 @@ class HeldByMode(NamedTuple):
     mode: str
 
 
-Phase = Verifying | Finishing | Unclear | HeldByMode
+class Watching(NamedTuple):
+    """It was said what would be done for `bad`, and repair looks on until the fault has gone, or it is switched on."""
+
+    bad: tuple[str, ...]
+
+
+Phase = Verifying | Finishing | Unclear | HeldByMode | Watching
 
 
 @dataclasses.dataclass(slots=True)
@@ -51,6 +59,13 @@ class Case:
         hopeless: candidates for which there is no plan, each with the reason.
         blamed: whom the present plan is for.
         midway: whom it has begun to act on.
+        before_plan: how many actions there were before the present plan.
+        undos: how the present plan can be taken back, newest last.
+        advised: the advice for each candidate.
+        others: when each component was started by somebody else.
+        awaited: whom its supervisor was at work on when repair last looked.
+        held: what repair waits for, as it was last told.
+        doubted: since when a candidate is blamed although its actors answer.
     """
 
     number: int
@@ -65,6 +80,13 @@ class Case:
     phase: Phase | None = None
     blamed: frozenset[str] = frozenset()
     midway: set[str] = dataclasses.field(default_factory=set[str])
+    before_plan: int = 0
+    undos: list[tuple[Step, Undo]] = dataclasses.field(default_factory=list[tuple[Step, Undo]])
+    advised: dict[tuple[str, ...], Advice] = dataclasses.field(default_factory=dict[tuple[str, ...], Advice])
+    others: dict[str, float] = dataclasses.field(default_factory=dict[str, float])
+    held: str = ""
+    awaited: set[str] = dataclasses.field(default_factory=set[str])
+    doubted: dict[tuple[str, ...], float] = dataclasses.field(default_factory=dict[tuple[str, ...], float])
 
     @property
     def reason(self) -> str:
@@ -77,11 +99,22 @@ class Case:
             self.began = now
         self.phase = phase
 
+    def has_heard(self, why: str) -> bool:
+        """Whether it was told already that this keeps repair waiting; it is from now on."""
+        was, self.held = self.held, why
+        return was == why
+
     def begin_plan(self, bad: tuple[str, ...]) -> None:
         """A plan for a candidate is carried out from now on."""
         self.rounds += 1
+        self.before_plan = len(self.actions)
         self.tried[bad] = self.tried.get(bad, 0) + 1
-        self.blamed, self.midway = frozenset(bad), set()
+        self.blamed, self.midway, self.undos = frozenset(bad), set(), []
+
+    def take_carried_out(self) -> tuple[Step, ...]:
+        """The steps of the present plan that were begun, once: then they are judged."""
+        steps, self.before_plan = tuple(self.actions[self.before_plan :]), len(self.actions)
+        return steps
 
     def take_back_plan(self, bad: tuple[str, ...]) -> None:
         """Nothing of the plan was tried, so it does not count."""

@@ -8,17 +8,20 @@ In each phase `decide` says what comes next, until it says `Close` or `GiveUp`; 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Mapping, Sequence
+from typing import Final, NamedTuple
 
 from ..engine import State
 from ..model import Model
 from ..planning import Plan, Step, TimedOut, Unsolvable
-from .case import Case, Finishing, HeldByMode, Phase, Unclear, Verifying
+from .case import Case, Finishing, HeldByMode, Phase, Unclear, Verifying, Watching
 from .choice import CaseView, remaining, symptoms_held
-from .executor import DENIED, DONE, SKIPPED, Result
+from .executor import DONE, SKIPPED, Result
 from .outlook import Outlook
 from .policy import Policy
+
+SOON: Final = 1.0
+"""Seconds until it is looked again whether a supervisor has done its work."""
 
 
 class Wait(NamedTuple):
@@ -80,6 +83,10 @@ def decide(case: Case, at: CaseView, policy: Policy) -> Decision:
         case HeldByMode(mode):
             is_held = at.mode == mode and at.diagnosis.state is State.FAULTY
             return Wait(math.inf, wakes=True) if is_held else Enter()
+        case Watching(bad):
+            is_same = at.stance == "advise" and at.bad in (None, bad, *case.advised)
+            is_same = is_same and at.diagnosis.state is not State.HEALTHY
+            return Wait(math.inf, wakes=True) if is_same else Enter()
 
 
 def _decide_round(case: Case, at: CaseView, policy: Policy) -> Decision:
@@ -100,7 +107,7 @@ def _decide_round(case: Case, at: CaseView, policy: Policy) -> Decision:
 def _decide_nothing_left(case: Case, at: CaseView) -> Decision:
     """No candidate is open: what is left was given up before, cannot be planned for, or is not ours to touch."""
     if not case.hopeless:
-        return Close(is_repaired=not at.was_planned_dry or case.rounds > 0)
+        return Close(is_repaired=True)
     suspects = (name for bad in case.hopeless for name in bad if name not in at.given_up)
     return GiveUp(tuple(dict.fromkeys(suspects)), next(iter(case.hopeless.values())))
 
@@ -161,11 +168,38 @@ def judge_no_plan(
     return Dismiss(bad, f"{why}; {case.failures[-1]}" if case.failures else why)
 
 
+def judge_pings(
+    case: Case,
+    bad: tuple[str, ...],
+    pings: Mapping[str, bool | None],
+    at: CaseView,
+    policy: Policy,
+) -> Decision | None:
+    """What to do instead of restarting actors on suspicion; None: restart them.
+
+    Who does not answer is restarted at once. Who answers is restarted when the diagnosis has stood for a while, and
+    never because somebody says that it does not run: that word is seen to be wrong.
+
+    Args:
+        pings: whether their actors answer; None: suspended by order. Of one that is no actor nothing is known.
+    """
+    if suspended := [name for name, answer in pings.items() if answer is None]:
+        return Dismiss(bad, f"{', '.join(suspended)} was suspended by order")
+    alive = [name for name, answer in pings.items() if answer]
+    if not alive or len(alive) < len(pings):
+        case.doubted.pop(bad, None)
+        return None
+    since = case.doubted.setdefault(bad, at.now)
+    if at.now - since < policy.confirm:
+        return Wait(since + policy.confirm - at.now)
+    down = {one.args[0] for one in at.diagnosis.symptoms if one.name == "running" and not one.positive}
+    if wrong := [name for name in alive if name in down]:
+        return Dismiss(bad, f"{', '.join(wrong)} runs and answers, although it is said not to run")
+    return None
+
+
 def judge_results(bad: tuple[str, ...], plan: Plan, results: Sequence[Result], now: float, policy: Policy) -> Decision:
     """What follows when a plan was carried out."""
-    if denied := [result for result in results if result.outcome == DENIED]:
-        # Who says no to this does not say yes to what would be tried in its place.
-        return GiveUp(bad, f"{denied[0].step} was not allowed: {denied[0].why}")
     if any(result.outcome == DONE for result in results):
         touched = frozenset(name for step in plan.steps for name in step.args[:1])
         return Enter(Verifying(touched, now, now + policy.verify))

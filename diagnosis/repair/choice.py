@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import NamedTuple
 
 from ..engine import Candidate, Diagnosis, State
@@ -18,9 +18,9 @@ from ..model import Kind, Model
 from ..observations import Observed
 from ..planning import Problem, repair_problem
 from ..planning.language import PlanLiteral as Goal
-from .actions import Repertoire
+from .actions import RepairAction, Repertoire
 from .ledger import Ledger
-from .policy import Policy
+from .policy import Policy, Stance
 
 
 class CaseView(NamedTuple):
@@ -31,7 +31,7 @@ class CaseView(NamedTuple):
         settles: until when no plan is made.
         bad: the candidate to act on.
         given_up: components that are beyond repair.
-        was_planned_dry: a plan was told of that is not carried out.
+        stance: how far repair goes.
         is_unsure: something that depends on whom the case has touched is not seen to hold yet.
     """
 
@@ -43,7 +43,7 @@ class CaseView(NamedTuple):
     settles: float = -math.inf
     bad: tuple[str, ...] | None = None
     given_up: Collection[str] = ()
-    was_planned_dry: bool = False
+    stance: Stance = "on"
     is_unsure: bool = False
 
 
@@ -87,8 +87,12 @@ def problem_for(
     at: CaseView,
     bad: Collection[str],
     alone: Collection[str],
+    is_free: Callable[[RepairAction, str], bool],
 ) -> Problem:
-    """The problem of making `bad` good, without a touch on those to leave alone or on what has no attempts left."""
+    """The problem of making `bad` good, without a touch on those to leave alone or on what has no attempts left.
+
+    `is_free` says whether an action reaches nobody at or below a component's address who is to be left alone.
+    """
     kinds = {name: component.kind for name, component in model.components.items()}
     hardware = [name for name, kind in kinds.items() if kind is Kind.SWITCHABLE]
     nodes = [name for name, kind in kinds.items() if not kind.is_hardware]
@@ -109,7 +113,9 @@ def problem_for(
         restart_drivers=policy.restart_drivers,
         facts=repertoire.allowed(
             touchable,
-            lambda action, name: policy.may(action.name, at.mode) and ledger.is_left(action, name, at.now),
+            lambda action, name: (
+                policy.may(action.name, at.mode) and ledger.is_left(action, name, at.now) and is_free(action, name)
+            ),
         ),
     )
     # Who is left alone is neither good nor bad: nobody can rely on it, and nobody is to mend it.

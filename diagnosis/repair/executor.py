@@ -19,13 +19,12 @@ from ..literals import Literal
 from ..planning import Plan, Problem, Simulator, Step
 from ..planning.language import Atom
 from ..planning.language import PlanLiteral as Effect
-from .actions import Act, RepairAction
+from .actions import Act, RepairAction, Undo
 
 DONE: Final = "done"
 FAILED: Final = "failed"
 UNVERIFIED: Final = "unverified"
 SKIPPED: Final = "skipped"
-DENIED: Final = "denied"
 LOST: Final = "lost"
 
 
@@ -36,6 +35,7 @@ class Result:
     step: Step
     outcome: str
     why: str = ""
+    undo: Undo | None = None
 
 
 class RepairWorld(Protocol):
@@ -57,10 +57,6 @@ class RepairWorld(Protocol):
         """Why the step is not to be done any more; empty if it is."""
         ...
 
-    async def approve(self, step: Step) -> str:
-        """Why a dangerous step must not be done; empty if a person allows it."""
-        ...
-
     async def began(self, step: Step, epoch: int) -> None:
         """Note and tell that a step begins."""
         ...
@@ -78,7 +74,6 @@ class Executor:
         arbiter: is asked for each actor before it is touched.
         address: of a step: what it acts on.
         actions: by name.
-        is_dangerous: whether a person has to approve.
         make: the execution that a coroutine is given.
         reason: why, in words.
     """
@@ -90,12 +85,11 @@ class Executor:
         *,
         address: Callable[[Step], str],
         actions: Callable[[str], RepairAction],
-        is_dangerous: Callable[[RepairAction], bool],
         make: Callable[[Step, int, str, Callable[[], None]], Act],
         reason: str,
     ) -> None:
         self._world, self._arbiter, self._address, self._actions = world, arbiter, address, actions
-        self._is_dangerous, self._make, self._reason = is_dangerous, make, reason
+        self._make, self._reason = make, reason
         self._put: dict[Atom, float] = {}
 
     async def execute(self, problem: Problem, plan: Plan) -> list[Result]:
@@ -122,13 +116,7 @@ class Executor:
     async def _tried(self, step: Step, effects: list[Effect]) -> Result:
         if why := self._missing(step):
             return Result(step, SKIPPED, why)
-        action = self._actions(step.action)
-        if self._is_dangerous(action):
-            if why := await self._world.approve(step):
-                return Result(step, DENIED, why)
-            if why := self._missing(step):  # The world did not wait for the person.
-                return Result(step, SKIPPED, why)
-        return await self._granted(step, action, effects)
+        return await self._granted(step, self._actions(step.action), effects)
 
     async def _granted(self, step: Step, action: RepairAction, effects: list[Effect]) -> Result:
         """With the actor in our hands; if somebody else takes it, the action is cancelled at once."""
@@ -164,7 +152,7 @@ class Executor:
         scope = asyncio.timeout(action.timeout)
         try:
             async with scope:
-                await action.run(act, *step.args)
+                undo = await action.run(act, *step.args)
         except GrantLost as error:
             return Result(step, LOST, str(error))
         except InOtherHands as error:  # Whoever has it in another process says so himself.
@@ -178,8 +166,8 @@ class Executor:
         since = {effect: ended if before[effect] is effect.value else started for effect in effects}
         unseen = await self._verified(since, ended + action.effect_timeout)
         if unseen is not None:
-            return Result(step, UNVERIFIED, f"{unseen} was not observed within {action.effect_timeout:g} s")
-        return Result(step, DONE)
+            return Result(step, UNVERIFIED, f"{unseen} was not observed within {action.effect_timeout:g} s", undo)
+        return Result(step, DONE, undo=undo)
 
     async def _verified(self, since: dict[Effect, float], deadline: float) -> Effect | None:
         """Wait until all effects are observed; the first that is not in time. What nobody observes is believed."""

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
+from typing import Final
 
 from ..model import Model
 from ..planning import Step
 from .actions import RepairAction
-from .policy import NORMAL, Policy
+from .advice import Score
+from .policy import NORMAL, Policy, Stance
+from .story import Stories
 
+HOUR: Final = 3600.0
+"""Seconds in which the actions of all cases together are counted."""
 Key = tuple[str, str]
 """Action and component."""
 
@@ -20,18 +25,28 @@ class Memory:
 
     Attributes:
         tried: when each action was tried on each component.
-        denied: what a person forbids.
+        vain: until when a restart that has changed nothing is not tried again.
+        denied: components that a person forbids to touch, each with the reason, until it is withdrawn.
         given_up: components that are beyond repair, each with the reason.
         mode: of the system.
+        stance: how far repair goes.
         cases: how many there were.
+        useless: plans that were carried out and have not helped.
+        score: how good the advice was.
+        stories: what was told of each of the last cases.
         model: as it was changed at run time; None if it was not.
     """
 
     tried: dict[Key, list[float]] = dataclasses.field(default_factory=dict[Key, list[float]])
-    denied: set[Key] = dataclasses.field(default_factory=set[Key])
+    vain: dict[Key, float] = dataclasses.field(default_factory=dict[Key, float])
+    denied: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
     given_up: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
     mode: str = NORMAL
+    stance: Stance = "on"
     cases: int = 0
+    useless: int = 0
+    score: Score = dataclasses.field(default_factory=Score)
+    stories: Stories = dataclasses.field(default_factory=Stories)
     model: Model | None = None
 
 
@@ -45,15 +60,25 @@ class Ledger:
         """A step is being tried."""
         self._memory.tried.setdefault(_key(step), []).append(now)
 
-    def deny(self, step: Step) -> None:
-        """A person forbids it: it is not planned again before `pardon`."""
-        self._memory.denied.add(_key(step))
+    def note_vain(self, step: Step, now: float) -> None:
+        """A restart was seen to change nothing: it is not tried again within the window."""
+        self._memory.vain[_key(step)] = now + self._policy.window
+
+    def deny(self, components: Iterable[str], why: str) -> None:
+        """A person forbids to touch these: nothing is planned for them before `pardon`, by whatever action."""
+        self._memory.denied |= dict.fromkeys(components, why)
 
     def is_left(self, action: RepairAction, component: str, now: float) -> bool:
         """Whether there are attempts left."""
-        most = action.attempts or self._policy.attempts
-        key = (action.name, component)
-        return key not in self._memory.denied and len(self._recent(key, now)) < most
+        most, policy = action.attempts or self._policy.attempts, self._policy
+        if now < self._memory.vain.get((action.name, component), now):
+            return False
+        if component in self._memory.denied or len(self._recent((action.name, component), now)) >= most:
+            return False
+        return self.tries(component, now) < policy.component_actions and self._in_hour(now) < policy.hour_actions
+
+    def _in_hour(self, now: float) -> int:
+        return sum(now - when < HOUR for times in self._memory.tried.values() for when in times)
 
     def wait(self, steps: Iterable[Step], actions: dict[str, RepairAction], now: float) -> float:
         """Seconds until all of these have cooled down."""
@@ -68,7 +93,8 @@ class Ledger:
         """Forget what was tried on these."""
         freed, memory = set(components), self._memory
         memory.tried = {key: times for key, times in memory.tried.items() if key[1] not in freed}
-        memory.denied = {key for key in memory.denied if key[1] not in freed}
+        memory.vain = {key: until for key, until in memory.vain.items() if key[1] not in freed}
+        memory.denied = {name: why for name, why in memory.denied.items() if name not in freed}
 
     def tries(self, component: str, now: float) -> int:
         """How often anything was tried on a component."""
@@ -76,12 +102,12 @@ class Ledger:
 
     def _recent(self, key: Key, now: float) -> list[float]:
         tried = self._memory.tried
-        times = [when for when in tried.get(key, ()) if now - when < self._policy.window]
-        if times:
-            tried[key] = times
+        kept = [when for when in tried.get(key, ()) if now - when < max(self._policy.window, HOUR)]
+        if kept:
+            tried[key] = kept
         else:
             tried.pop(key, None)
-        return times
+        return [when for when in kept if now - when < self._policy.window]
 
 
 def _key(step: Step) -> Key:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import msgspec
+
 from ...actors.events import Event
 from ...actors.kernel.message import Message, Refusal, RuntimeOrder
 from ..literals import Literal
@@ -40,7 +42,7 @@ class ActionBegan(Message):
 
 
 class ActionEnded(Message):
-    """An action has ended. `outcome`: done, failed, unverified, skipped, denied or lost; `why` in words."""
+    """An action has ended. `outcome`: done, failed, unverified, skipped or lost; `why` in words."""
 
     case: int
     step: Step
@@ -50,12 +52,31 @@ class ActionEnded(Message):
 
 
 class ApprovalWanted(Message):
-    """A dangerous action waits for `Approve` or `Deny` with this number, for so many seconds."""
+    """The plan of this case waits for `Approve` or `Deny`, for so many seconds; `steps` are all it would do."""
 
-    number: int
-    step: Step
+    case: int
+    steps: tuple[Step, ...]
     reason: str
     seconds: float
+
+
+class Undone(Message):
+    """An action has not helped and was taken back, or could not be: `why` in words."""
+
+    case: int
+    step: Step
+    why: str
+
+
+class AdviceScored(Message):
+    """A fault has gone for which repair had only advised: `verdict` is right, wrong or needless.
+
+    `seconds_saved`: how long the advice came before somebody did what it said.
+    """
+
+    case: int
+    verdict: str
+    seconds_saved: float
 
 
 class Held(Message):
@@ -76,7 +97,7 @@ class Repaired(Message):
 class GaveUp(Message):
     """These components are beyond repair; `actions`: all that was tried. They are left alone from now on.
 
-    They are tried again after `RetryRepair`, or when a diagnosis has found them good.
+    They are tried again after `RetryRepair`, or when a diagnosis has found them good. `plan`: what a person should try.
     """
 
     case: int
@@ -85,34 +106,57 @@ class GaveUp(Message):
     why: str
     actions: tuple[Step, ...]
     seconds: float
+    plan: tuple[str, ...] = ()
 
 
 class RepairGaveUp(Event, frozen=True, eq=False):
-    """Repair has given components up: a person has to look at them."""
+    """Repair has given components up: a person has to look at them, and `plan` says what to try."""
 
     components: tuple[str, ...]
     why: str
+    plan: tuple[str, ...] = ()
+
+
+class RepairTold(Event, frozen=True, eq=False):
+    """What repair has told of a case, as one sentence; `what` is the kind of the notice, such as "Planned"."""
+
+    case: int
+    what: str
+    text: str
 
 
 class Approve(RuntimeOrder[None]):
-    """A person allows a dangerous action. Refused with NobodyWaits."""
+    """A person allows the plan of a case. Refused with NobodyWaits."""
 
-    number: int
+    case: int
 
 
 class Deny(RuntimeOrder[None]):
-    """A person forbids a dangerous action. Refused with NobodyWaits."""
+    """A person forbids the plan of a case: nobody whom it is for is touched before `RetryRepair`.
 
-    number: int
+    Refused with NobodyWaits.
+    """
+
+    case: int
     why: str = "a person said no"
 
 
-class NobodyWaits(
-    Refusal, text="no action waits for approval under the number {number}: it was decided, or its case is over"
-):
-    """No action waits under this number."""
+class NobodyWaits(Refusal, text="no plan of case {case} waits for approval: it was decided, or the case is over"):
+    """No plan of this case waits for approval."""
 
-    number: int
+    case: int
+
+
+class SetStance(RuntimeOrder[None]):
+    """How far repair goes from now on: "off", "advise", "ask" or "on". Refused with BadStance."""
+
+    stance: str
+
+
+class BadStance(Refusal, text="{problem}"):
+    """There is no such stance."""
+
+    problem: str
 
 
 class SetMode(RuntimeOrder[None]):
@@ -122,33 +166,91 @@ class SetMode(RuntimeOrder[None]):
 
 
 class RetryRepair(RuntimeOrder[None]):
-    """Try components again that were given up: the cause was seen to. All of them, if none are named."""
+    """Try components again that were given up or denied: the cause was seen to. All of them, if none are named."""
 
     components: tuple[str, ...] = ()
 
 
+class StoryEntry(msgspec.Struct, frozen=True):
+    """One thing that happened: `time` in Unix seconds, `what` is the kind of the notice, `text` a sentence."""
+
+    time: float
+    what: str
+    text: str
+    components: tuple[str, ...] = ()
+
+
+class Story(msgspec.Struct, frozen=True):
+    """A case with all that happened in it, oldest first."""
+
+    case: int
+    entries: tuple[StoryEntry, ...]
+
+
+class CaseStories(Message):
+    """The last cases, the oldest first, each with all that was told of it."""
+
+    stories: tuple[Story, ...]
+
+
+class GetStories(Message[CaseStories]):
+    """Asks for what was told of the last cases, as plain sentences."""
+
+
 class RepairStatus(Message):
-    """Tells how repair stands: mode, cases, and whom it has given up."""
+    """Tells how repair stands: stance, mode, cases, whom it has given up or is forbidden to touch, and its score.
+
+    `waiting` is the case whose plan waits for approval, 0: none. `useless` counts plans that have not helped. The score
+    is of advice: how many were right, wrong or needless, what was missed, and by how many seconds advice came first.
+    """
 
     mode: str
     is_repairing: bool
     given_up: tuple[str, ...]
     cases: int
+    stance: str = "on"
+    denied: tuple[str, ...] = ()
+    waiting: int = 0
+    useless: int = 0
+    right: int = 0
+    wrong: int = 0
+    needless: int = 0
+    missed: int = 0
+    seconds_saved: float = 0.0
 
 
 class GetRepairStatus(Message[RepairStatus]):
     """Asks how repair stands at the moment."""
 
 
+CaseNotice = (
+    RepairBegan
+    | Planned
+    | ActionBegan
+    | ActionEnded
+    | ApprovalWanted
+    | Undone
+    | AdviceScored
+    | Held
+    | Repaired
+    | GaveUp
+)
+"""What repair tells of a case; each has its number."""
+
 __all__ = [
     "TOPIC",
     "ActionBegan",
     "ActionEnded",
+    "AdviceScored",
     "ApprovalWanted",
     "Approve",
+    "BadStance",
+    "CaseNotice",
+    "CaseStories",
     "Deny",
     "GaveUp",
     "GetRepairStatus",
+    "GetStories",
     "Held",
     "Message",
     "NobodyWaits",
@@ -156,8 +258,13 @@ __all__ = [
     "RepairBegan",
     "RepairGaveUp",
     "RepairStatus",
+    "RepairTold",
     "Repaired",
     "RetryRepair",
     "SetMode",
+    "SetStance",
+    "Story",
+    "StoryEntry",
     "Touched",
+    "Undone",
 ]

@@ -10,12 +10,18 @@ import math
 from collections.abc import Iterable
 from typing import Final
 
+from ...supervision.intensity import admit_restart
 from ..engine import Diagnosis, State
 from ..literals import Literal, Vocabulary
 from ..observations import ObservationSet
 
 OURS: Final = 5.0
 """Seconds after an action in which a start that is seen is taken for its work."""
+
+
+FREE: Final = 3
+"""Lives within `WITHIN` seconds after which a start is given no more time."""
+WITHIN: Final = 10.0
 
 
 @dataclasses.dataclass(slots=True)
@@ -28,6 +34,7 @@ class Outlook:
         settles: until when no plan is made: somebody else has started something.
         looks_until: until when repair only looks.
         ours: when each component was touched by repair.
+        lives: when the last lives of each component began.
         theirs: until when each component counts as just started by somebody else.
     """
 
@@ -39,6 +46,7 @@ class Outlook:
     looks_until: float = -math.inf
     ours: dict[str, float] = dataclasses.field(default_factory=dict[str, float])
     theirs: dict[str, float] = dataclasses.field(default_factory=dict[str, float])
+    lives: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict[str, tuple[float, ...]])
 
     def set_diagnosis(self, diagnosis: Diagnosis, now: float) -> None:
         """Take a new diagnosis for the present one."""
@@ -68,6 +76,18 @@ class Outlook:
             self.settles = max(self.settles, now + seconds)
             self.graced = max(self.graced, self.settles)
         return bool(theirs)
+
+    def note_life(self, components: Iterable[str], seconds: float, now: float) -> bool:
+        """A life of these has begun; False if repair began it, or if it is one of too many to be given time.
+
+        Who is started again and again has a fault that a start does not mend.
+        """
+        for name in components:
+            window = admit_restart(self.lives.get(name, ()), now, intensity=FREE, period=WITHIN)
+            if window is None:
+                return False
+            self.lives[name] = window
+        return self.note_start(components, seconds, now)
 
     def note_touch(self, components: Iterable[str], now: float, grace: float = 0.0) -> None:
         """Repair touches components; for `grace` seconds nobody counts as found bad."""

@@ -4,10 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping
-from typing import Final
+from typing import Final, Literal
 
 NORMAL: Final = "normal"
 SAFE: Final = "safe"
+
+Stance = Literal["off", "advise", "ask", "on"]
+"""How far repair goes: it does nothing, says what it would do, has a person approve each plan, or acts."""
+STANCES: Final[tuple[Stance, ...]] = ("off", "advise", "ask", "on")
+
+
+def check_stance(stance: str) -> Stance:
+    """Return the stance itself. Raises ValueError: it is none of "off", "advise", "ask" and "on"."""
+    for one in STANCES:
+        if stance == one:
+            return one
+    raise ValueError(f"repair is one of {', '.join(map(repr, STANCES))}, not {stance!r}; rules are given by policy=")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -28,9 +40,14 @@ class Policy:
         optional: components that are given up first (T66).
         restart_drivers: what drives a bad device is restarted in the same plan, not after a second diagnosis.
         dangerous: names of actions that a person has to approve, besides those marked so.
-        approval: seconds a person has for that.
+        allow: names of dangerous actions that need nobody's approval: each is opted into by its name.
+        approval: seconds a person has to approve a plan.
+        component_actions: actions of any kind on one component within `window` seconds.
+        hour_actions: actions of all cases together within an hour.
+        confirm: seconds for which a diagnosis must stand before an actor that answers is restarted.
+        ping: seconds an actor has to answer, or to get on with its turn, before it is restarted.
+        grace: seconds after anybody has started a component in which no plan is made.
         modes: the actions that may be done in a mode; all of them in a mode that is not here (T65).
-        is_dry: plan, tell, and do nothing.
     """
 
     attempts: int = 2
@@ -47,22 +64,31 @@ class Policy:
     optional: frozenset[str] = frozenset()
     restart_drivers: bool = False
     dangerous: frozenset[str] = frozenset()
+    allow: frozenset[str] = frozenset()
     approval: float = 60.0
+    component_actions: int = 6
+    hour_actions: int = 60
+    confirm: float = 1.0
+    ping: float = 0.25
+    grace: float = 1.5
     modes: Mapping[str, Collection[str]] = dataclasses.field(default_factory=lambda: {SAFE: ()})
-    is_dry: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("attempts", "rounds"):
+        for name in ("attempts", "rounds", "component_actions", "hour_actions"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be >= 1, not {getattr(self, name)!r}")
-        for name in ("window", "seconds", "verify", "unknown", "plan_seconds", "approval"):
+        for name in ("window", "seconds", "verify", "unknown", "plan_seconds", "approval", "ping"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} must be a finite number of seconds > 0, not {getattr(self, name)!r}")
-        for name in ("cool_down", "settle", "look"):
+        for name in ("cool_down", "settle", "look", "confirm", "grace"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} must be a finite number of seconds >= 0, not {getattr(self, name)!r}")
         if self.settle > self.verify:
             raise ValueError(f"settle ({self.settle} s) must not be longer than verify ({self.verify} s)")
+
+    def is_dangerous(self, action: str, is_marked: bool) -> bool:
+        """Whether a person has to approve an action; `is_marked`: the action itself says so."""
+        return (is_marked or action in self.dangerous) and action not in self.allow
 
     def may(self, action: str, mode: str) -> bool:
         """Whether an action may be done in a mode."""

@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Final
 
 from ...actors.errors import HoldfastError
+from ...actors.events import ActorStarted, ChildRestarted, Event
 from ...actors.kernel.actor import Actor, on, subscribe
 from ...actors.kernel.message import Message
-from ...supervision.arbiter import Arbiter, arbiter_of
+from ...supervision.arbiter import SUPERVISOR, Arbiter, Hand, arbiter_of, covers
 from ..engine import Diagnosis, State
 from ..literals import BadLiteral, Literal
 from ..messages import (
@@ -26,6 +27,7 @@ from ..messages import (
     MODEL,
     OBSERVATIONS,
     STARTS,
+    TOUCHED,
     ComponentsStarted,
     GetDiagnosis,
     GetObserved,
@@ -37,15 +39,23 @@ from ..planning import ClingoPlanner, Plan, Planner, Step, find_plan
 from . import case_decisions as deciding
 from . import notices as say
 from .actions import Act, RepairAction, Repertoire
-from .case import Case, base_of, reached
+from .advice import Advice, judge_advice
+from .approvals import Approvals, Approver
+from .case import Case, Finishing, Verifying, Watching, base_of, reached
 from .choice import CaseView, choose, components_of, problem_for
-from .executor import DENIED, DONE, SKIPPED, Executor, Result
+from .executor import DONE, SKIPPED, UNVERIFIED, Executor, Result
 from .ledger import Ledger, Memory
-from .outlook import Outlook
-from .policy import Policy
+from .outlook import OURS, Outlook
+from .ping import answers
+from .policy import Policy, check_stance
+from .story import about, sentence
 
 MOMENT: Final = 0.001
 """Seconds: a timer may come a little early."""
+
+
+class _Started(Message):
+    """Somebody has started a component, a moment ago."""
 
 
 class _GraceIsOver(Message):
@@ -67,6 +77,7 @@ class Repairer(Actor):
             they change, and a life that begins later would not know of one. Unless given, it is looked for beside
             this actor; then all that lives there is part of the base.
         memory: what outlives this actor's lives; see `repairer`.
+        approve: is asked for approval besides people; see `Approver`.
     """
 
     deterministic = False
@@ -82,6 +93,7 @@ class Repairer(Actor):
         planner: Planner | None = None,
         diagnoser: str | None = None,
         memory: Memory | None = None,
+        approve: Approver | None = None,
     ) -> None:
         self._memory = memory or Memory()
         self._model, self._policy = self._memory.model or model, policy or Policy()
@@ -92,10 +104,9 @@ class Repairer(Actor):
         self._ledger = Ledger(self._policy, self._memory)
         self._outlook = Outlook(ObservationSet(self._model.vocabulary))
         self._case: Case | None = None
-        self._numbers = itertools.count(1)
-        self._waiting: dict[int, asyncio.Future[str]] = {}
+        self._approvals = Approvals(approve)
         self._wakers: list[asyncio.Future[None]] = []
-        self._dry: tuple[str, ...] | None = None
+        self._restarted: dict[str, float] = {}
 
     def on_start(self, restored: bool) -> None:
         """Ask for the present diagnosis."""
@@ -105,7 +116,43 @@ class Repairer(Actor):
             self._base = (*self._base, above)
         if self.ctx.life == 1:
             self._outlook.looks_until = self.now() + self._policy.look
+        self.ctx.create_task(self._listen())
         self.ctx.create_task(self._catch_up(diagnoser))
+
+    async def _listen(self) -> None:
+        """Hear of each start at once, until this life ends: who looks from time to time hears of it too late."""
+        events = self.ctx._cell.node.events
+        events.add_sink(self._heard)
+        try:
+            await asyncio.get_running_loop().create_future()
+        finally:
+            events.remove_sink(self._heard)
+
+    def _heard(self, event: Event) -> None:
+        """A life of a component has begun: nobody plans for it before it was seen to work, or not to."""
+        if self.ctx._closed:
+            return
+        if isinstance(event, ChildRestarted):
+            self._restarted[event.address.rpartition("/")[0]] = self.now()
+        elif isinstance(event, ActorStarted) and event.life > 1:
+            names = tuple(name for name, address in self._addresses.items() if address == event.address)
+            if names and self._outlook.note_life(names, self._policy.grace, self.now()):
+                self._note_others(names, event.address)
+                self.ctx.ref.tell(_Started())
+
+    def _note_others(self, names: Iterable[str], address: str) -> None:
+        """Somebody else has started components: with a case open it is noted, without one a person had to act."""
+        now = self.now()
+        self._restarted = {above: when for above, when in self._restarted.items() if now - when < OURS}
+        if self._case is not None:
+            self._case.others |= dict.fromkeys(names, now)
+        elif not any(covers(above, address) for above in self._restarted):
+            self._memory.score.missed += 1
+
+    @on(_Started)
+    def _wait_for_grace(self, message: _Started) -> None:
+        self.ctx.tell_after(self._policy.grace + MOMENT, _GraceIsOver())
+        self._wake()
 
     async def _catch_up(self, diagnoser: str) -> None:
         """What is known, and what it means; a later life must not plan as if nothing were known."""
@@ -165,39 +212,60 @@ class Repairer(Actor):
         self._model = self._memory.model = model
         self._outlook.set_vocabulary(model.vocabulary)
 
+    @on(say.SetStance)
+    def _set_stance(self, message: say.SetStance) -> None:
+        try:
+            self._memory.stance = check_stance(message.stance)
+        except ValueError as error:
+            raise say.BadStance(str(error)) from error
+        self._wake()
+        self._begin()
+
     @on(say.RetryRepair)
     def _retry(self, message: say.RetryRepair) -> None:
         names = message.components or tuple(self._model.components)
         self._ledger.pardon(names)
         for name in names:
             self._memory.given_up.pop(name, None)
-        self._dry = None
         self._begin()
 
     @on(say.Approve)
     def _approved(self, message: say.Approve) -> None:
-        self._answer(message.number, "")
+        self._approvals.answer(message.case, "")
 
     @on(say.Deny)
     def _denied(self, message: say.Deny) -> None:
-        self._answer(message.number, message.why or "denied")
-
-    def _answer(self, number: int, why_not: str) -> None:
-        waiting = self._waiting.pop(number, None)
-        if waiting is None or waiting.done():
-            raise say.NobodyWaits(number)
-        waiting.set_result(why_not)
+        self._approvals.answer(message.case, message.why or "denied")
 
     @on(say.GetRepairStatus)
     def _status(self, message: say.GetRepairStatus) -> say.RepairStatus:
-        given_up = tuple(sorted(self._memory.given_up))
-        return say.RepairStatus(self._memory.mode, self._case is not None, given_up, self._memory.cases)
+        memory, wanted = self._memory, self._approvals.wanted
+        score = memory.score
+        return say.RepairStatus(
+            memory.mode,
+            self._case is not None,
+            tuple(sorted(memory.given_up)),
+            memory.cases,
+            memory.stance,
+            tuple(sorted(memory.denied)),
+            0 if wanted is None else wanted.case,
+            memory.useless,
+            score.right,
+            score.wrong,
+            score.needless,
+            score.missed,
+            score.seconds_saved,
+        )
+
+    @on(say.GetStories)
+    def _stories(self, message: say.GetStories) -> say.CaseStories:
+        return say.CaseStories(self._memory.stories.told())
 
     # -- a case -----------------------------------------------------------------------------------------------------
 
     def _begin(self) -> None:
         """Open a case, if there is something to repair and none is open."""
-        if self.now() < max(self._outlook.looks_until, self._outlook.settles):
+        if self._memory.stance == "off" or self.now() < max(self._outlook.looks_until, self._outlook.settles):
             return
         if self._case is None and self._chosen(Case(0, 0.0)) is not None:
             self._memory.cases += 1
@@ -213,13 +281,22 @@ class Repairer(Actor):
             tried=case.tried,
             tries=case.tries,
         )
-        return None if found is None or found.bad == self._dry else found.bad
+        return None if found is None else found.bad
 
     def _alone(self) -> set[str]:
         """Whom nobody is to touch."""
         ours = (self.ctx.path, *self._base)
         parked = (name for name, address in self._addresses.items() if self._arbiter.is_parked(address))
-        return {*self._policy.exclude, *base_of(self._addresses, ours), *self._memory.given_up, *parked}
+        memory = self._memory
+        return {*self._policy.exclude, *base_of(self._addresses, ours), *memory.given_up, *memory.denied, *parked}
+
+    def _is_free(self, action: RepairAction, component: str) -> bool:
+        """Whether an action reaches nobody whom an operator has stopped or forbidden to touch."""
+        address = action.reach(component) if action.reach is not None else None
+        if address is None:
+            return True
+        denied = (self._addresses.get(name, "") for name in self._memory.denied)
+        return not any(covers(address, one) for one in denied if one) and not self._arbiter.has_parked(address)
 
     def _moment(self, case: Case) -> CaseView:
         """What is known now, for the next decision of a case."""
@@ -234,7 +311,7 @@ class Repairer(Actor):
             settles=outlook.settles,
             bad=self._chosen(case),
             given_up=self._memory.given_up,
-            was_planned_dry=self._dry is not None,
+            stance=self._memory.stance,
             is_unsure=is_healthy and deciding.is_unsure(case, self._model, outlook, now),
         )
 
@@ -248,7 +325,11 @@ class Repairer(Actor):
                 decision = await self._carry_out(
                     case, decision or deciding.decide(case, self._moment(case), self._policy)
                 )
-            if decision.is_repaired:
+            if decision.is_repaired and case.advised and not case.rounds:
+                verdict, saved = judge_advice(list(case.advised.values())[-1], case.others)
+                self._memory.score.add(verdict, saved)
+                await self._tell(say.AdviceScored(case.number, verdict, saved))
+            elif decision.is_repaired:
                 await self._tell(say.Repaired(case.number, tuple(case.actions), self.now() - case.began))
         finally:
             self._case = None
@@ -260,6 +341,8 @@ class Repairer(Actor):
             case deciding.Wait(seconds, wakes):
                 await self._sleep(seconds, wakes=wakes)
             case deciding.Enter(phase, held):
+                if isinstance(case.phase, (Verifying, Finishing)) and self._outlook.diagnosis.state is State.FAULTY:
+                    await self._take_back(case)
                 case.enter(phase, self.now())
                 if held:
                     await self._tell(say.Held(case.number, held))
@@ -278,7 +361,13 @@ class Repairer(Actor):
         """Plan for a candidate, and carry the plan out; what follows from that."""
         at, policy = self._moment(case), self._policy
         case.add_symptoms(at.diagnosis.symptoms)
-        problem = problem_for(self._model, self._actions, policy, self._ledger, at, bad, self._alone())
+        if (busy := self._busy(bad)) is not None:
+            case.awaited |= set(bad)
+            return deciding.Wait(deciding.SOON, wakes=False) if case.has_heard(busy) else deciding.Enter(held=busy)
+        if back := tuple(sorted(case.awaited & set(bad))):
+            await self._give_time(case, back)
+            return deciding.Enter()
+        problem = problem_for(self._model, self._actions, policy, self._ledger, at, bad, self._alone(), self._is_free)
         outcome = await find_plan(self._planner, problem, timeout=policy.plan_seconds, degrade=True)
         if not isinstance(outcome, Plan) or not outcome.stages:
             return deciding.judge_no_plan(case, bad, outcome, at.mode, policy)
@@ -287,17 +376,101 @@ class Repairer(Actor):
             return deciding.Wait(wait)
         if self._outlook.diagnosis is not at.diagnosis and self._chosen(case) != bad:
             return deciding.Enter()  # The world did not wait for the planner.
-        unmet = components_of(outcome.unmet)
-        await self._tell(say.Planned(case.number, bad, outcome.stages, unmet, policy.is_dry))
-        if policy.is_dry:
-            self._dry = bad
-            return deciding.Close(is_repaired=False)
+        if (doubt := await self._doubt(case, bad, outcome)) is not None:
+            return doubt
+        is_dry = self._memory.stance in ("advise", "off")
+        if not (is_dry and bad in case.advised):
+            unmet = components_of(outcome.unmet)
+            await self._tell(say.Planned(case.number, bad, outcome.stages, unmet, is_dry))
+        if is_dry:
+            case.advised.setdefault(bad, Advice(self.now(), outcome.steps))
+            return deciding.Enter(Watching(bad))
+        if (answered := await self._approved_by(case, bad, outcome)) is not None:
+            return answered
         case.begin_plan(bad)
         results = await self._executor(case).execute(problem, outcome)
         case.failures += [f"{result.step} {result.outcome}: {result.why}" for result in results if result.why]
+        case.undos = [(result.step, result.undo) for result in results if result.undo is not None]
+        if all(result.outcome in (UNVERIFIED, SKIPPED) for result in results):
+            await self._take_back(case)  # Nobody sees its effect: that is no reason to do it again.
         if deciding.was_skipped(results):
             case.take_back_plan(bad)
         return deciding.judge_results(bad, outcome, results, self.now(), policy)
+
+    async def _give_time(self, case: Case, names: tuple[str, ...]) -> None:
+        """Their supervisor has done its work just now: what was seen while it did says nothing of what has begun."""
+        case.awaited -= set(names)
+        grace = self._policy.grace
+        self._outlook.note_start(names, grace, self.now())
+        await self.ctx.publish(TOUCHED, say.Touched(names, "restart by its supervisor", self.now(), grace))
+        self.ctx.tell_after(grace + MOMENT, _GraceIsOver())
+
+    def _busy(self, bad: tuple[str, ...]) -> str | None:
+        """Why those who are blamed are left to their supervisors for now."""
+        for name in bad:
+            if (address := self._addresses.get(name)) is not None:
+                busy = self._arbiter.in_the_way(address, Hand.REPAIR)
+                if busy is not None and busy.hand == SUPERVISOR:
+                    return f"{busy.address} is left to its supervisor"
+        return None
+
+    async def _doubt(self, case: Case, bad: tuple[str, ...], plan: Plan) -> deciding.Decision | None:
+        """What to do instead of a plan that restarts who answers; None: the plan stands."""
+        steps = [step for step in plan.steps if self._actions[step.action].is_restart and step.args]
+        targets = {step.args[0]: address for step in steps if (address := self._addresses.get(step.args[0]))}
+        node, seconds = self.ctx._cell.node, self._policy.ping
+        said = await asyncio.gather(*(answers(node, address, seconds) for address in targets.values()))
+        at = self._moment(case)
+        if at.diagnosis.state is State.FAULTY and at.bad != bad:
+            return deciding.Enter()  # The world did not wait for the ping.
+        pings = dict(zip(targets, said, strict=True))
+        return deciding.judge_pings(case, bad, pings, at, self._policy)
+
+    async def _approved_by(self, case: Case, bad: tuple[str, ...], plan: Plan) -> deciding.Decision | None:
+        """Have a person approve, if that is needed; what follows if nobody does, None: go on."""
+        policy, actions = self._policy, self._actions
+        marked = {step: actions[step.action].is_dangerous for step in plan.steps}
+        dangerous = [step for step in plan.steps if policy.is_dangerous(step.action, marked[step])]
+        if self._memory.stance != "ask" and not dangerous:
+            return None
+        what = ", ".join(map(str, plan.steps))
+        reason = f"{', '.join(bad)} {'is' if len(bad) == 1 else 'are'} diagnosed"
+        wanted = say.ApprovalWanted(case.number, plan.steps, reason, policy.approval)
+        why = await self._approvals.ask(wanted, self._tell)
+        if why is None and self._chosen(case) != bad:
+            return deciding.Enter()  # Nobody was needed.
+        if why is None:
+            return deciding.GiveUp(bad, f"nobody has approved {what} within {policy.approval:g} s")
+        if why:
+            # Who says no to this does not say yes to what would be tried in its place, neither now nor later.
+            self._ledger.deny(bad, why)
+            return deciding.GiveUp(bad, f"{what} was not allowed: {why}")
+        return None
+
+    async def _take_back(self, case: Case) -> None:
+        """If the plan has not helped, count it, and undo of it what can be undone, the newest first."""
+        suspects = set(self._outlook.diagnosis.suspects)
+        steps = case.take_carried_out()  # Of a plan that was skipped there are none.
+        if not steps or not suspects & case.midway:
+            return  # It was judged before, or others are blamed now: it may have helped.
+        self._memory.useless += 1
+        node, now = self.ctx._cell.node, self.now()
+        for step in steps:
+            address = self._addresses.get(step.args[0]) if step.args and step.args[0] in suspects else None
+            if address is None or not self._actions[step.action].is_restart:
+                continue
+            if await answers(node, address, self._policy.ping):
+                self._ledger.note_vain(step, now)  # It lives, and is as it was: once more would not be better.
+        undos, case.undos = case.undos, []
+        for step, undo in reversed(undos):
+            try:
+                with self._arbiter.held(self._address(step), Hand.REPAIR, f"{step} has not helped"):
+                    async with asyncio.timeout(self._actions[step.action].timeout):
+                        await undo()
+                why = "it has not helped"
+            except Exception as error:  # Whatever a user's undo raises is told, and the case goes on.
+                why = f"it has not helped, and to undo it has failed ({type(error).__name__}: {error})"
+            await self._tell(say.Undone(case.number, step, why))
 
     def _executor(self, case: Case) -> Executor:
         return Executor(
@@ -305,7 +478,6 @@ class Repairer(Actor):
             self._arbiter,
             address=self._address,
             actions=self._actions.__getitem__,
-            is_dangerous=lambda one: one.is_dangerous or one.name in self._policy.dangerous,
             make=self._act,
             reason=case.reason,
         )
@@ -329,8 +501,26 @@ class Repairer(Actor):
         names = tuple(name for name in components if name not in self._memory.given_up)
         self._memory.given_up |= dict.fromkeys(names, why)
         symptoms, seconds = self._outlook.diagnosis.symptoms, self.now() - case.began
-        self.ctx._cell.node.emit(say.RepairGaveUp(self.ctx.path, names, why))
-        await self._tell(say.GaveUp(case.number, names, symptoms, why, tuple(case.actions), seconds))
+        plan = tuple(self._for_people(case, names))
+        self.ctx._cell.node.emit(say.RepairGaveUp(self.ctx.path, names, why, plan))
+        await self._tell(say.GaveUp(case.number, names, symptoms, why, tuple(case.actions), seconds, plan))
+
+    def _for_people(self, case: Case, names: Iterable[str]) -> Iterator[str]:
+        """What a person should try: what repair was not to do or has not tried, and whose word it all rests on."""
+        for name in names:
+            if name in self._memory.denied:
+                yield f"allow {name} to be repaired again, by `holdfast repair retry {name}`"
+            for action in self._actions.actions.values():
+                step = Step(action.name, (name,))
+                if action.is_restart and action.takes(name) and step not in case.actions:
+                    yield str(step)
+        words = {
+            word.source: word.literal
+            for symptom in case.symptoms
+            for word in self._outlook.observations.words(symptom.atom)
+            if word.literal == symptom
+        }
+        yield from (f"look whether {source} is right to say {literal}" for source, literal in words.items())
 
     # -- what the executor sees and tells ---------------------------------------------------------------------------
 
@@ -357,24 +547,6 @@ class Repairer(Actor):
         assert self._case is not None
         return deciding.why_overtaken(step, self._case, self._outlook, self._policy, self._memory.mode, self.now())
 
-    async def approve(self, step: Step) -> str:
-        """Ask a person; why a dangerous step must not be done, empty if it may."""
-        number, case = next(self._numbers), self._case
-        reason = f"case {case.number}: {', '.join(sorted(case.blamed))}" if case is not None else ""
-        answer: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        self._waiting[number] = answer
-        await self._tell(say.ApprovalWanted(number, step, reason, self._policy.approval))
-        try:
-            async with asyncio.timeout(self._policy.approval):
-                why = await answer
-        except TimeoutError:
-            why = f"nobody has approved within {self._policy.approval:g} s"
-        finally:
-            self._waiting.pop(number, None)
-        if why:
-            self._ledger.deny(step)
-        return why
-
     async def began(self, step: Step, epoch: int) -> None:
         """Note and tell that a step begins."""
         assert self._case is not None
@@ -387,19 +559,23 @@ class Repairer(Actor):
         """Note and tell that a step has ended, and how."""
         assert self._case is not None
         step = result.step
-        if result.outcome not in (SKIPPED, DENIED):
+        if result.outcome != SKIPPED:
             others = reached(self._addresses, self._address(step))
             names = tuple(dict.fromkeys((*step.args[:1], *others)))
             grace = self._actions[step.action].grace if result.outcome == DONE else 0.0
             self._outlook.note_touch(names, self.now(), grace)
             if grace > 0:
                 self.ctx.tell_after(grace + MOMENT, _GraceIsOver())
-            await self._tell(say.Touched(names, step.action, self.now(), grace))
+            await self.ctx.publish(TOUCHED, say.Touched(names, step.action, self.now(), grace))
         await self._tell(say.ActionEnded(self._case.number, step, result.outcome, result.why, self.now()))
 
     # -- small things -----------------------------------------------------------------------------------------------
 
-    async def _tell(self, message: say.Message) -> None:
+    async def _tell(self, message: say.CaseNotice) -> None:
+        if text := sentence(message):
+            what = type(message).__name__
+            self._memory.stories.add(message.case, say.StoryEntry(time.time(), what, text, about(message)))
+            self.ctx._cell.node.emit(say.RepairTold(self.ctx.path, message.case, what, text))
         await self.ctx.publish(say.TOPIC, message)
 
     def _wake(self) -> None:

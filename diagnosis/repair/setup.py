@@ -10,8 +10,9 @@ from ...supervision.spec import ChildSpec, child
 from ..model import Declaration, Model, System
 from ..planning import Planner
 from .actions import RepairAction, Repertoire
+from .approvals import Approver
 from .ledger import Memory
-from .policy import NORMAL, Policy
+from .policy import NORMAL, Policy, Stance, check_stance
 from .repairer import Repairer
 
 
@@ -26,6 +27,8 @@ def repairer(
     planner: Planner | None = None,
     diagnoser: str | None = None,
     mode: str = NORMAL,
+    stance: Stance = "on",
+    approve: Approver | None = None,
 ) -> ChildSpec:
     """The spec of a repairer, for `tree(..., repairer=...)`.
 
@@ -35,8 +38,11 @@ def repairer(
         model, actions, policy, addresses, base, planner, diagnoser: see `Repairer`.
         name: the last part of its address.
         mode: at first; `SetMode` changes it.
+        stance: how far repair goes at first: "off", "advise", "ask" or "on"; `SetStance` changes it.
+        approve: is asked for approval, besides people; whoever answers first decides.
 
     Raises:
+        ValueError: there is no such stance.
         ModelError: something is wrong with the model. PlanningError: with the actions.
     """
     made = model if isinstance(model, Model) else Model(model)
@@ -46,6 +52,7 @@ def repairer(
         "base": tuple(base),
         "planner": planner,
         "diagnoser": diagnoser,
-        "memory": Memory(mode=mode),
+        "memory": Memory(mode=mode, stance=check_stance(stance)),
+        "approve": approve,
     }
     return child(name, Start(Repairer, (made, repertoire, policy), options), backoff=Backoff(initial=0.1))

@@ -20,7 +20,7 @@ from ...actors.kernel.ref import ActorRef
 from ...supervision.admin import ChildBusy, ChildParked, RestartChild, TerminateChild
 from ...supervision.arbiter import OPERATOR, InOtherHands
 from ..board import SwitchChannel
-from .actions import Act, ActionFailed, RepairAction, Run
+from .actions import Act, ActionFailed, RepairAction, Run, Undo
 
 PATIENCE: Final = 10.0
 """Seconds for a supervisor or a board to answer."""
@@ -61,7 +61,7 @@ def restart_child(
 ) -> RepairAction:
     """`restart_child(n)`: have its supervisor stop it and start it, in one call that nothing can cut in two."""
     run = functools.partial(_restart, addresses=addresses, timeout=timeout)
-    more = {"grace": 1.0, "timeout": 2 * timeout} | options
+    more = {"grace": 1.0, "timeout": 2 * timeout, "is_restart": True} | options
     return _action(name, run, addresses, more, pddl=_restart_text(name, cost))
 
 
@@ -75,6 +75,8 @@ def restart_subtree(
 ) -> RepairAction:
     """`restart_subtree(n)`: stop and start the supervisor above a component, with all below it.
 
+    A person has to approve it, unless `Policy(allow={"restart_subtree"})` does.
+
     Args:
         addresses: of each component the supervisor that is restarted: itself a child of a supervisor. What lives below
             it is touched too, and is in our hands meanwhile.
@@ -83,7 +85,8 @@ def restart_subtree(
         timeout: seconds for each half.
         options: those of `RepairAction`.
     """
-    return restart_child(addresses, name=name, cost=cost, timeout=timeout, **options)
+    more = {"is_dangerous": True} | options
+    return restart_child(addresses, name=name, cost=cost, timeout=timeout, **more)
 
 
 def roll_back(
@@ -96,10 +99,11 @@ def roll_back(
 ) -> RepairAction:
     """`roll_back(n)`: have a recorded actor stopped and started with its snapshot before the newest, in one such call.
 
-    If there is no older snapshot the action has failed, and the actor goes on as it was.
+    If there is no older snapshot the action has failed, and the actor goes on as it was. A person has to approve it,
+    unless the policy allows it.
     """
     run = functools.partial(_restart, addresses=addresses, timeout=timeout, older=True)
-    more = {"grace": 1.0, "timeout": 2 * timeout} | options
+    more = {"grace": 1.0, "timeout": 2 * timeout, "is_dangerous": True, "is_restart": True} | options
     return _action(name, run, addresses, more, pddl=_restart_text(name, cost))
 
 
@@ -107,6 +111,8 @@ def bind_port(
     bindings: Mapping[str, tuple[str, str, str]], *, name: str = "rebind", cost: int = 2, **options: Any
 ) -> RepairAction:
     """`rebind(n)`: point a binding of an actor elsewhere, such as from a failed provider to its stand-in.
+
+    If that does not help, the binding is put back.
 
     Args:
         bindings: of each component (its address, the port, the address the port shall lead to).
@@ -157,10 +163,19 @@ async def _restart(act: Act, node: str, *, addresses: Mapping[str, str], timeout
         raise InOtherHands(address, "its supervisor", f"it is {error.state}") from error
 
 
-async def _bind(act: Act, node: str, *, bindings: Mapping[str, tuple[str, str, str]]) -> None:
+async def _bind(act: Act, node: str, *, bindings: Mapping[str, tuple[str, str, str]]) -> Undo | None:
     address, port, target = bindings[node]
     here = act.ctx._cell.node
-    here.bind(here.find_ref(address, Actor)._cell, port, here.find_ref(target, Actor)._cell)
+    owner = here.find_ref(address, Actor)._cell
+    before = owner.more.bindings.get(port) if owner.more is not None else None
+    here.bind(owner, port, here.find_ref(target, Actor)._cell)
+    if before is None:
+        return None
+
+    async def undo() -> None:
+        here.bind(here.find_ref(address, Actor)._cell, port, here.find_ref(before.path, Actor)._cell)
+
+    return undo
 
 
 def _keeper(act: Act, address: str) -> tuple[ActorRef[Any], str]:
@@ -191,7 +206,7 @@ def _mend_text(name: str, cost: int, kind: str = "component") -> str:
 
 
 def power_up(board: str, channels: Mapping[str, int], *, timeout: float = PATIENCE, **options: Any) -> RepairAction:
-    """`power_up(h)`: switch the device's channel on.
+    """`power_up(h)`: switch the device's channel on; a person has to approve it, unless the policy allows it.
 
     Args:
         board: the address of the `BoardActor`.
@@ -204,13 +219,13 @@ def power_up(board: str, channels: Mapping[str, int], *, timeout: float = PATIEN
 
 
 def shutdown(board: str, channels: Mapping[str, int], *, timeout: float = PATIENCE, **options: Any) -> RepairAction:
-    """`shutdown(h)`: switch the device's channel off."""
+    """`shutdown(h)`: switch the device's channel off; a person has to approve it, unless the policy allows it."""
     run = functools.partial(_switch, board=board, channels=channels, on=False, timeout=timeout)
     return _channel("shutdown", run, channels, {"timeout": timeout} | options)
 
 
 def _channel(name: str, run: Run, channels: Mapping[str, int], options: Mapping[str, Any]) -> RepairAction:
-    known: dict[str, Any] = {"takes": channels.__contains__}
+    known: dict[str, Any] = {"takes": channels.__contains__, "is_dangerous": True}
     return RepairAction(name, run, **(known | dict(options)))
 
 

@@ -57,15 +57,16 @@ def demo(
         plan = DemoPlan(log or killian_court(), kills, seed, method.value, interval, speed)
         report = run_demo(plan, Console(), picture=picture, as_json=as_json)
     except (LogError, OSError) as error:
-        raise _failed(error, UNUSABLE) from error
+        raise failed("demo", error, UNUSABLE) from error
     except HoldfastError as error:
-        raise _failed(error, DIFFERS) from error
+        raise failed("demo", error, DIFFERS) from error
     if not report.is_good:
         raise typer.Exit(DIFFERS)
 
 
-def _failed(error: Exception, status: int) -> typer.Exit:
-    typer.echo(f"demo: {error}", err=True)
+def failed(what: str, error: Exception, status: int) -> typer.Exit:
+    """Say on stderr why it has failed, and return what ends the command with that status."""
+    typer.echo(f"{what}: {error}", err=True)
     return typer.Exit(status)
 
 

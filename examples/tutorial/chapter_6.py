@@ -112,7 +112,7 @@ async def look_after(system: hf.ActorSystem) -> diagnosis.Watch:
     ]
     addresses = {"market": "/bank/branch/market", "exchange": "/bank/branch/exchange"}
     return await diagnosis.watch(
-        system, model, observers, addresses=addresses, repair=Policy(settle=0.5), manner=manner
+        system, model, observers, addresses=addresses, repair="on", policy=Policy(settle=0.5), manner=manner
     )
 
 

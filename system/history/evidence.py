@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections import Counter
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from ...actors.control.orders import Status, status_of
 from ...actors.kernel.cell import GONE
-from ...actors.kernel.envelope import Ask, Item, message_in
-from ...actors.process.process_host import Outlet
+from ...actors.kernel.envelope import Item, message_in
+from ...actors.process.open_asks import items_at, open_asks
 from ...ftm.group.protected import ProtectionStatus, protection_of
 from ...supervision.children import STOPPED
 from ...supervision.intensity import recent_restarts
@@ -281,7 +279,7 @@ def _waiting(cell: Cell) -> Waiting | None:
     """What waits most in the mailbox, as far as that is in this process."""
     counts: Counter[str] = Counter()
     senders: dict[str, str] = {}
-    for item in _items(cell, MOST_LOOKED_AT):
+    for item in items_at(cell, MOST_LOOKED_AT):
         name = message_type(message_in(item))
         counts[name] += 1
         if isinstance(item, Item) and item.sender is not None:
@@ -301,32 +299,12 @@ def put_aside(one: QuarantinedMessage, *, payloads: bool = False) -> PutAside:
 def outstanding(node: Node, address: str) -> list[Outstanding]:
     """The asks of an actor that have no answer yet, the oldest first."""
     now = node.loop.time()
-    asks = {id(ask): (ask.to.path, ask) for ask in node.deadlines.waiting()}
-    asks.update((id(ask), (path, ask)) for path, ask in _in_mailboxes(node))
     found = [
-        Outstanding(to, message_type(message_in(ask)), max(0.0, now - (ask.deadline - ask.timeout)))
-        for to, ask in asks.values()
+        Outstanding(to.path, message_type(message_in(ask)), max(0.0, now - (ask.deadline - ask.timeout)))
+        for to, ask in open_asks(node, MOST_LOOKED_AT)
         if ask.sender is not None and ask.sender.path == address
     ]
     return sorted(found, key=lambda one: -one.seconds)
-
-
-def _in_mailboxes(node: Node) -> Iterator[tuple[str, Ask]]:
-    """The asks that actors have in hand or in their mailboxes, also those that go from one process to another."""
-    left, cells = MOST_LOOKED_AT, [] if node.root is None else [node.root]
-    while cells and left > 0:
-        cell = cells.pop()
-        cells.extend((cell.children or {}).values())
-        items = [cell.item, *_items(cell, left)]
-        left -= len(items)
-        yield from ((cell.path, item) for item in items if isinstance(item, Ask) and not item.is_done)
-
-
-def _items(cell: Cell, most: int) -> list[Any]:
-    """What waits at an actor in this process, or was handed to its own and has no answer yet."""
-    outlet = cell.more.outlet if cell.more is not None else None
-    sent = [item for _, item in outlet.flight] if isinstance(outlet, Outlet) else []
-    return list(itertools.islice(itertools.chain(sent, cell.queue or ()), most))
 
 
 def _allowance(cell: Cell) -> Allowance | None:

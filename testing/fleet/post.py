@@ -90,16 +90,17 @@ class SimTransport:
 
     Attributes:
         is_cut: whether nothing goes out or comes in at the moment.
+        is_mute: whether nothing goes out.
     """
 
     def __init__(self, post: SimPost, place: str) -> None:
         self._post, self._place = post, place
         self._takes: list[Callable[[bytes, str], None]] = []
-        self.is_cut = False
+        self.is_cut = self.is_mute = False
 
     def post(self, to: str, data: bytes, back: str) -> None:
         """Send bytes to a place; see `Transport`."""
-        if not self.is_cut:
+        if not self.is_cut and not self.is_mute:
             self._post.post(self._place, to, data, back)
 
     async def hear(self, at: str, take: Callable[[bytes, str], None]) -> None:

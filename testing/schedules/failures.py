@@ -19,6 +19,8 @@ class Failures:
 
     def __init__(self, config: pytest.Config, nodeid: str) -> None:
         self._cache: Any = getattr(config, "cache", None)
+        record: str | None = config.getoption("holdfast_record", None)
+        self._record = None if record is None else config.invocation_params.dir / record
         self._nodeid = nodeid
 
     def texts(self) -> list[str]:
@@ -49,8 +51,8 @@ class Failures:
         self._cache.set(KEY, kept)
 
     def folder(self) -> Path | None:
-        """Where the files of this test's failure are to be written."""
-        if self._cache is None:
+        """Where the files of this test's failure are written: below `--holdfast-record`, else in pytest's cache."""
+        if self._record is None and self._cache is None:
             return None
         name = re.sub(r"[^\w.\[\]-]+", "_", self._nodeid)[-120:]
-        return cast("Path", self._cache.mkdir("holdfast-schedules")) / name
+        return (self._record or cast("Path", self._cache.mkdir("holdfast-schedules"))) / name

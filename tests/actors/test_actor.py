@@ -1,6 +1,7 @@
 """Actor classes: what `@on` checks, which handler gets a message, what a life has (DESIGN 3)."""
 
 import functools
+import types
 from typing import Any, cast
 
 import pytest
@@ -304,3 +305,13 @@ async def test_a_derived_class_inherits_its_bindings(system: hf.ActorSystem) -> 
     more = system.spawn(hf.start(More))
     system.bind(more, "counter", system.spawn(hf.start(Counter, 1)))
     assert await more.ask(Add(1)) == 2
+
+
+async def test_a_message_whose_class_was_defined_anew_is_told_apart(system: hf.ActorSystem) -> None:
+    """As in a notebook, whose cell runs again: the actor knows the class of before."""
+    counter = system.spawn(hf.start(Counter))
+    names = {"__module__": Add.__module__, "__qualname__": Add.__qualname__}
+    anew = types.new_class("Add", (hf.Message[int],), {}, lambda body: body.update(names))
+    with pytest.raises(hf.UnknownMessage, match=r"Add of before: .*Add was defined anew") as unknown:
+        counter.tell(anew())
+    assert unknown.value.is_anew

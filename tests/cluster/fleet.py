@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tests.cluster.servers import PATIENCE
@@ -24,13 +25,19 @@ class Programs:
         self.folder, self.command = folder, command
         self.processes: list[asyncio.subprocess.Process] = []
 
-    async def start(self) -> asyncio.subprocess.Process:
-        """Start another program; it stands by, or leads."""
-        command = self.command or ("-m", "tests.cluster.bank", self.store, str(self.socket), self.isolation)
+    async def start(self, *before: str, environ: Mapping[str, str] | None = None) -> asyncio.subprocess.Process:
+        """Start another program; it stands by, or leads.
+
+        Args:
+            before: the command that the program is run by, if there is one.
+            environ: what its environment has beside that of the tests.
+        """
+        bank = ("-m", "tests.cluster.bank", self.store, str(self.socket), self.isolation)
+        command = [*before, sys.executable, *(self.command or bank)]
         errors = (self.folder / f"program-{len(self.processes)}.err").open("wb")
         with errors:
             process = await asyncio.create_subprocess_exec(
-                sys.executable, *command, stdout=asyncio.subprocess.PIPE, stderr=errors
+                *command, stdout=asyncio.subprocess.PIPE, stderr=errors, env={**os.environ, **(environ or {})}
             )
         self.processes.append(process)
         return process

@@ -15,7 +15,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -25,6 +25,7 @@ from nats.aio.client import Client
 
 from holdfast.cluster.nats.access import NatsAccess, access_of, connect_options
 from holdfast.cluster.nats.server_file import ServerPlan, TlsFiles, UserRole, seed_file, write_server_files
+from tests.cluster.machines.namespaces import Network
 
 PATIENCE = 60.0
 """Seconds for servers to answer, on a machine that is busy with other things; usually it takes a fraction of one."""
@@ -47,10 +48,30 @@ def server_binary() -> str:
 
 
 class NatsServers:
-    """One or three servers; they are numbered from 0. With a certificate they, and who uses them, show it."""
+    """One or three servers; they are numbered from 0. With a certificate they, and who uses them, show it.
 
-    def __init__(self, folder: Path, count: int = 1, tls: TlsFiles | None = None) -> None:
+    Args:
+        folder: where their files are.
+        count: how many there are.
+        tls: their certificate.
+        network: has a machine for each of them, of its name: n0, n1, n2. Without, all are on the loopback interface.
+        stores: a folder for the store of each; by default one in `folder`.
+        advertise: whether they tell who connects where the others are.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        count: int = 1,
+        tls: TlsFiles | None = None,
+        *,
+        network: Network | None = None,
+        stores: Sequence[Path] = (),
+        advertise: bool = True,
+    ) -> None:
         self.folder, self.count, self.tls = folder, count, tls
+        self._advertise = advertise
+        self._network, self._stores = network, [*stores] or [folder / f"store-{number}" for number in range(count)]
         self.plans: list[ServerPlan] = []
         self._systems: Iterator[str] = iter(())
         self._processes: dict[int, subprocess.Popen[bytes]] = {}
@@ -64,9 +85,10 @@ class NatsServers:
         assert found is not None, f"more than {SYSTEMS} tests share these servers: raise SYSTEMS"
         return found
 
-    def store(self, system: str, role: UserRole = UserRole.NODE) -> str:
-        """What `store=` is for a system on these servers, with the key of that role."""
-        hosts = ",".join(f"{plan.host}:{plan.port}" for plan in self.plans)
+    def store(self, system: str, role: UserRole = UserRole.NODE, *, ports: Sequence[int] = ()) -> str:
+        """What `store=` is for a system on these servers, with the key of that role; by these ports, if given."""
+        taken = [*ports] or [plan.port for plan in self.plans]
+        hosts = ",".join(f"{plan.host}:{port}" for plan, port in zip(self.plans, taken, strict=True))
         nkey = f"nkey={seed_file(self.folder, system, role)}"
         if self.tls is None:
             return f"nats://{hosts}/{system}?{nkey}"
@@ -110,6 +132,10 @@ class NatsServers:
                 return
             self.close()  # A port was taken meanwhile: others are chosen.
 
+    def pid(self, number: int) -> int:
+        """The process of a server."""
+        return self._processes[number].pid
+
     def kill(self, number: int) -> None:
         """End a server with SIGKILL."""
         process = self._processes.pop(number)
@@ -148,8 +174,8 @@ class NatsServers:
         self.plans = [
             ServerPlan(
                 name=f"n{number}",
-                host="127.0.0.1",
-                store_dir=str(self.folder / f"store-{number}"),
+                host="127.0.0.1" if self._network is None else self._network.address(f"n{number}"),
+                store_dir=str(self._stores[number]),
                 port=next(ports),
                 cluster_port=next(ports),
                 monitor_port=next(ports),
@@ -158,12 +184,17 @@ class NatsServers:
             for number in range(self.count)
         ]
         systems = [f"app{number}" for number in range(SYSTEMS)]
-        write_server_files(self.folder, self.plans, systems, force=True)
+        files = write_server_files(self.folder, self.plans, systems, force=True)
+        if not self._advertise:
+            for file in files[: self.count]:
+                file.write_text(file.read_text().replace("\ncluster {\n", "\ncluster {\n  no_advertise: true\n"))
         self._systems = iter(systems)
 
     def _start(self, number: int) -> None:
         file = self.folder / f"{self.plans[number].name}.conf"
         command = [sys.executable, "-ISc", BEHIND, str(os.getpid()), server_binary(), "-c", str(file)]
+        if self._network is not None:
+            command = self._network.command(self.plans[number].name, *command)
         with (self.folder / f"{number}.log").open("ab") as log:
             self._processes[number] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
 
@@ -188,7 +219,7 @@ class NatsServers:
         writer = None
         try:
             async with asyncio.timeout(1.0):
-                reader, writer = await asyncio.open_connection("127.0.0.1", self.plans[number].monitor_port)
+                reader, writer = await self._monitor(self.plans[number])
                 writer.write(f"GET {path} HTTP/1.0\r\n\r\n".encode())
                 answer = await reader.read()
         except (OSError, TimeoutError):
@@ -200,6 +231,19 @@ class NatsServers:
                     await writer.wait_closed()
         body = answer.partition(b"\r\n\r\n")[2]
         return json.loads(body) if body else {}
+
+    async def _monitor(self, plan: ServerPlan) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        if self._network is None:
+            return await asyncio.open_connection("127.0.0.1", plan.monitor_port)
+        with self._network.on(plan.name):
+            own = socket.socket()
+        own.setblocking(False)
+        try:
+            await asyncio.get_running_loop().sock_connect(own, ("127.0.0.1", plan.monitor_port))
+        except BaseException:
+            own.close()
+            raise
+        return await asyncio.open_connection(sock=own)
 
 
 def free_ports(count: int) -> list[int]:

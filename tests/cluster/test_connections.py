@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncGenerator, Callable, Coroutine
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -91,7 +91,7 @@ class Reach:
         return self.transports[-1], f"inbox of {at}", at
 
     @asynccontextmanager
-    async def bank_stack(self, store: Path) -> AsyncIterator[Bank]:
+    async def bank_stack(self, store: Path) -> AsyncGenerator[Bank]:
         """A bank that can end and begin anew."""
         made = Bank(self, store)
         await made.begin()
@@ -99,7 +99,7 @@ class Reach:
         await made.end()
 
     @asynccontextmanager
-    async def bank(self, store: Path | None = None) -> AsyncIterator[hf.ActorSystem]:
+    async def bank(self, store: Path | None = None) -> AsyncGenerator[hf.ActorSystem]:
         """A system with a plain account and a recorded one."""
         kept = None if store is None else f"sqlite:{store}"
         async with hf.ActorSystem("bank", store=kept, reachable="bank", log=False) as system:
@@ -214,7 +214,7 @@ def test_another_program_leads_and_only_what_is_kept_goes_on(tmp_path: Path) -> 
                 bank = await connected.__aenter__()
                 plain, kept = bank.ref("/bank/plain", Account), bank.ref("/bank/kept", Account)
                 assert await kept.ask(Add(5)) == 5
-                reach.transports[0].is_cut = True  # The machine of the bank is cut off, and then ends.
+                reach.transports[0].is_mute = True  # The bank does what it is asked, nobody hears of it, and it ends.
                 lost = plain.ask(Add(1), timeout=600.0)
                 again = kept.ask(Add(1), timeout=600.0)
                 await asyncio.sleep(1.0)
@@ -268,8 +268,8 @@ class Watcher(hf.Actor):
     def on_start(self, restored: bool) -> None:
         self.ctx.monitor(self.whom)
 
-    def on_down(self, ref: hf.ActorRef[Any], reason: hf.ExitReason, recovering: bool) -> None:
-        self.heard.append(f"{ref.path}: {reason}")
+    def on_down(self, source: hf.ActorRef[Any], reason: hf.ExitReason, recovering: bool) -> None:
+        self.heard.append(f"{source.path}: {reason}")
 
     @hf.on(News)
     def news(self, message: News) -> None:
@@ -316,7 +316,7 @@ class Looped(hf.Actor):
 
     @hf.on(Add)
     async def add(self, message: Add) -> int:
-        return await self.whom.ask(message, timeout=60.0)  # type: ignore[no-any-return]
+        return await self.whom.ask(message, timeout=60.0)
 
 
 def test_two_systems_that_reach_each_other_see_a_deadlock_at_once() -> None:
@@ -354,8 +354,9 @@ def test_one_system_may_not_order_another_about() -> None:
             far.connection.send(frames.Offer(key, "/bank", name, body))  # type: ignore[arg-type]
             with pytest.raises(hf.UnknownMessage):
                 await answer
-            far.command("/bank/plain", "kill", {})
             assert await account.ask(Add(1)) == 1
+            far.command("/bank/plain", "kill", {})
+            assert await account.ask(Add(1)) == 2
 
     run(work)
 
@@ -411,7 +412,7 @@ class Clerk(hf.Actor):
 
 
 @asynccontextmanager
-async def shop_of(store: Path, name: str = "kept") -> AsyncIterator[hf.ActorRef[Clerk]]:
+async def shop_of(store: Path, name: str = "kept") -> AsyncGenerator[hf.ActorRef[Clerk]]:
     """A system whose recorded clerk pays into an account of the bank."""
     async with (
         hf.ActorSystem("shop", store=f"sqlite:{store}", log=False) as shop,
@@ -483,5 +484,44 @@ def test_what_a_recorded_actor_asks_another_system_waits_for_the_next_connection
             async with hf.connect("bank", within=shop):
                 assert await paid == 3
                 assert await system.ref("/bank/kept", Account).ask(Total()) == 3
+
+    run(work)
+
+
+class Slow(hf.Actor):
+    """Recorded: its first turn ends when it is let go."""
+
+    go: asyncio.Event
+
+    def __init__(self) -> None:
+        self.total = 0
+
+    @hf.on(Add)
+    async def add(self, message: Add) -> int:
+        await self.go.wait()
+        self.total += message.amount
+        return self.total
+
+
+def test_what_was_asked_and_waits_at_the_end_of_a_program_is_answered_by_the_next(tmp_path: Path) -> None:
+    """One ask is in hand when the system is stopped, others wait behind it: the next program does them all, once."""
+
+    async def work(reach: Reach) -> None:
+        @asynccontextmanager
+        async def bank() -> AsyncGenerator[hf.ActorSystem]:
+            async with hf.ActorSystem("bank", store=f"sqlite:{tmp_path}/b.db", reachable="bank", log=False) as system:
+                await system.start(hf.child("slow", hf.start(Slow), recovery=hf.hybrid(), shutdown=1.0))
+                yield system
+
+        Slow.go = asyncio.Event()
+        async with AsyncExitStack() as stack:
+            async with bank():
+                connected = await stack.enter_async_context(hf.connect("bank"))
+                slow = connected.ref("/bank/slow", Slow)
+                asked = [slow.ask(Add(1), timeout=600.0) for _ in range(5)]
+                await asyncio.sleep(1.0)
+            Slow.go.set()
+            async with bank():
+                assert await asyncio.gather(*asked) == [1, 2, 3, 4, 5]
 
     run(work)

@@ -350,3 +350,24 @@ async def test_a_transaction_keeps_nobody_waiting() -> None:
 
     assert await asyncio.to_thread(transact) == snapshot
     await asyncio.to_thread(journal.close)
+
+
+@pytest.mark.asyncio(loop_factories=["asyncio"])
+async def test_a_large_snapshot_is_asked_for_again_until_it_comes() -> None:
+    """At a takeover servers may be choosing a leader: one request that fails is no reason not to lead."""
+    thread = EngineThread("simulated servers")
+    engine = SimEngine(SimBroker(latency=(0.0, 0.0)))
+    journal = ReplicatedJournal(engine, thread, await thread.run(lead(engine, "first", standby="cold")))
+    snapshot = b"x" * (1 << 20)
+    await asyncio.to_thread(journal.cut, A, snapshot, [], turn=1)
+    await asyncio.to_thread(journal.sync)
+    read, failures = engine.blobs.get, iter([Unanswered("servers", "no leader"), Unanswered("servers", "no leader")])
+
+    async def get(name: str) -> bytes | None:
+        for failure in failures:
+            raise failure
+        return await read(name)
+
+    engine.blobs.get = get  # type: ignore[method-assign]
+    assert (await asyncio.to_thread(journal.load, A)).snapshot == snapshot
+    await asyncio.to_thread(journal.close)

@@ -13,6 +13,27 @@ LEADERSHIP = "tests/cluster/test_leadership.py"
 FLEETS = "tests/cluster/test_takeover.py"
 
 CHECKS = {
+    "a silent connection is not closed in good order": Check(
+        "cluster/nats/nats_engine.py",
+        "            transport._io_writer.transport.abort()\n",
+        "            pass\n",
+        "tests/cluster/test_engine_on_nats.py",
+        "silent_is_let_go_of_at_once",
+    ),
+    "a large snapshot is asked for again while servers do not answer": Check(
+        "cluster/replicated_journal.py",
+        "self._loop.wait(insist(lambda: self._engine.blobs.get(name)), READ_SECONDS)",
+        "self._loop.wait(self._engine.blobs.get(name), READ_SECONDS)",
+        LEADERSHIP,
+        "asked_for_again_until_it_comes",
+    ),
+    "a blob whose parts are late is not taken for one that is not there": Check(
+        "cluster/nats/nats_engine.py",
+        'raise Unanswered(self._name, f"{wanted - len(parts)} parts of {name} do not come") from error',
+        "return None",
+        "tests/cluster/test_engine_on_nats.py",
+        "whose_parts_do_not_come",
+    ),
     "a reader sees that a record is missing": Check(
         "cluster/log_records.py",
         "if part.previous != self.at and not begins:",

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import datetime
-import ipaddress
 import stat
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
@@ -13,9 +11,6 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.errors import Error as NatsError
@@ -40,6 +35,7 @@ from holdfast.cluster.nats.server_file import (
     write_server_files,
 )
 from holdfast.errors import SpecError
+from tests.cluster.certificates import certificates
 from tests.cluster.servers import PATIENCE, NatsServers
 
 ONE = ServerPlan(name="n0", host="127.0.0.1", store_dir="/var/lib/nats")
@@ -210,29 +206,6 @@ async def test_servers_with_certificates_are_used_with_one_only(tmp_path: Path) 
 
 async def _unheard(error: Exception) -> None:
     """What the client reports is raised, too."""
-
-
-def certificates(folder: Path) -> TlsFiles:
-    """A certificate of 127.0.0.1 that has signed itself, for both ends."""
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "holdfast test")])
-    now = datetime.datetime.now(datetime.UTC)
-    addresses = x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))])
-    made = (
-        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(hours=1))
-        .not_valid_after(now + datetime.timedelta(hours=24))
-        .add_extension(addresses, critical=False)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .sign(key, hashes.SHA256())
-    )
-    pem, own = folder / "cert.pem", folder / "key.pem"
-    pem.write_bytes(made.public_bytes(serialization.Encoding.PEM))
-    own.touch(0o600)
-    own.write_bytes(
-        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    )
-    return TlsFiles(str(pem), str(own), str(pem))
 
 
 def test_all_files_are_for_their_owner_alone_and_keys_stay(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import asyncio
 import sys
 
 import holdfast as hf
-from tests.cluster.bank import Account, Add
+from tests.cluster.bank import Account, Gain
 
 
 class Pay(hf.Message[int]):
@@ -29,9 +29,9 @@ class Clerk(hf.Actor):
     async def pay(self, message: Pay) -> int:
         self.paid += message.amount
         if self._how == "tell":
-            self._account.tell(Add(message.amount))
+            self._account.tell(Gain(message.amount))
         else:
-            await self._account.ask(Add(message.amount), timeout=300.0)
+            await self._account.ask(Gain(message.amount), timeout=300.0)
         return self.paid
 
 

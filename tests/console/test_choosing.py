@@ -1,15 +1,20 @@
 """The commands that choose a mechanism, and the one that says what diagnosis says now."""
 
+import asyncio
 import json
 from pathlib import Path
 
 import holdfast as hf
 from holdfast import diagnosis
+from holdfast.actors.events import EventStream
 from holdfast.diagnosis.literals import parse
 from holdfast.diagnosis.observations import Observation
+from holdfast.diagnosis.observers import Manner
+from holdfast.diagnosis.repair import Policy, RepairTold
 from tests.console.commands import holdfast
 
 DONE, FAILED, UNUSABLE = 0, 1, 2
+QUICK = Manner(every=0.1, time_to_live=2.0)
 
 
 async def test_coverage_is_what_the_mechanisms_declare() -> None:
@@ -67,3 +72,40 @@ async def test_diagnose_tells_suspects_with_their_addresses(system: hf.ActorSyst
         assert (status, "no component of the diagnosis is at /app/nowhere" in errors) == (FAILED, True)
     finally:
         await system.stop(watching.tree)
+
+
+async def test_repair_waits_for_an_approval_from_the_command_line_and_tells_its_case(
+    system: hf.ActorSystem, path: Path, tmp_path: Path
+) -> None:
+    watching = await diagnosis.watch(
+        system, seconds=0.0, repair="ask", policy=Policy(look=0.0, settle=0.1, verify=1.0), manner=QUICK
+    )
+    with system.events() as events:
+        component = next(name for name, where in watching.addresses.items() if where == "/app/left/a")
+        await watching.diagnosis()
+        await system.ref("/app/left", hf.Supervisor).ask(hf.TerminateChild("a", parks=False))
+        await told_of(events, "ApprovalWanted")
+        status, output, _ = await holdfast("diagnose", "--socket", path)
+        assert (status, "holdfast repair approve 1" in output) == (DONE, True)
+        assert f"{component} is suspected" in output
+        assert "`/app/left/a` does not run" in output
+        status, output, errors = await holdfast("repair", "approve", "1", "--socket", path, "--json")
+        assert (status, errors, json.loads(output)[0]["stance"]) == (DONE, "", "ask")
+        await told_of(events, "Repaired")
+    picture = tmp_path / "case.png"
+    status, output, errors = await holdfast("diagnose", "--socket", path, "--png", picture)
+    assert (status, errors, picture.read_bytes()[:4]) == (DONE, "", b"\x89PNG")
+    status, output, _ = await holdfast("repair", "set", "advise", "--socket", path)
+    assert (status, "repair is advise" in output) == (DONE, True)
+    assert (await watching.repair_status()).stance == "advise"
+    await system.stop(watching.tree)
+    status, _, errors = await holdfast("repair", "status", "--socket", path)
+    assert (status, "no repair of app runs" in errors) == (FAILED, True)
+
+
+async def told_of(events: EventStream, what: str) -> None:
+    """Wait until repair has told something of this kind."""
+    async with asyncio.timeout(60.0):
+        async for event in events:
+            if isinstance(event, RepairTold) and event.what == what:
+                return

@@ -12,8 +12,73 @@ OPERATE = "tests/console/test_operate.py"
 DECLARE = "tests/console/test_declare.py"
 SERVICE = "tests/console/test_service.py"
 APPLY = "tests/console/test_apply.py"
+HEALTH = "tests/console/test_health.py"
+EMBEDDED = "tests/examples/embedding/test_surroundings.py"
 
 CHECKS = {
+    "a server ends when its tree fails": Check(
+        "console/service/health.py",
+        "        if self._ends_server and system.has_failed:",
+        "        if False:",
+        HEALTH,
+        "test_if_the_tree_fails_the_server_ends",
+    ),
+    "a worker waits for a store that is becoming free": Check(
+        "console/service/health.py",
+        "if number == self._workers - 1 and time.monotonic() > until:",
+        "if number == self._workers - 1:",
+        HEALTH,
+        "test_each_worker_has_a_store",
+    ),
+    "a worker does not say that it is the main process": Check(
+        "console/service/health.py",
+        "Notifier(environment if workers == 1 else {})",
+        "Notifier(environment)",
+        HEALTH,
+        "test_only_the_master",
+    ),
+    "a store that takes nothing makes a program not ready": Check(
+        "console/service/health.py",
+        "        problems = [blocked] if blocked else []",
+        "        problems = list[str]()",
+        HEALTH,
+        "test_a_store_that_is_full",
+    ),
+    "a store that has failed makes a program not live": Check(
+        "console/service/health.py",
+        "        if stopped:\n",
+        "        if False:\n",
+        HEALTH,
+        "test_a_store_that_is_full",
+    ),
+    "a probe has an end": Check(
+        "console/service/probes.py",
+        "            async with asyncio.timeout(LONGEST):",
+        "            async with asyncio.timeout(None):",
+        HEALTH,
+        "test_a_probe_that_says_nothing",
+    ),
+    "there are only so many probes at a time": Check(
+        "console/service/probes.py",
+        "        if len(self._tasks) >= MOST_PROBES:",
+        "        if False:",
+        HEALTH,
+        "test_a_probe_that_says_nothing",
+    ),
+    "PID 1 reaps orphans": Check(
+        "system/run.py",
+        "    leave_init()\n",
+        "",
+        EMBEDDED,
+        "test_as_pid_1",
+    ),
+    "PID 1 passes signals on": Check(
+        "system/init_process.py",
+        "                os.kill(program, number)",
+        "                pass",
+        EMBEDDED,
+        "test_as_pid_1",
+    ),
     "nobody else may look into the folder of sockets": Check(
         "console/runtime_folder.py",
         "    if info.st_mode & (stat.S_IRWXG | stat.S_IRWXO):",

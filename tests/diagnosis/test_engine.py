@@ -214,15 +214,16 @@ def test_fewer_faults_come_before_likelier_ones() -> None:
     assert [one.bad for one in said.candidates] == [("supply",), ("d0", "d1")]
 
 
-def test_sources_that_contradict_each_other_leave_no_diagnosis() -> None:
+def test_sources_that_contradict_each_other_cost_only_what_they_contradict_each_other_on() -> None:
     """O5, T49."""
     seen = ObservationSet(Vocabulary(Model(paper_robot()).vocabulary))
     seen.add(Observation(running("hm"), 1.0, "node"))
     seen.add(Observation(~running("hm"), 1.5, "process"))
     seen.add(Observation(~ok("/odom"), 1.5, "rate"))
     said = Diagnoser(paper_robot()).diagnose_now(seen.current(2.0))
-    assert said.state is State.CONTRADICTORY
-    assert said.candidates == ()
+    assert [one.bad for one in said.candidates] == [("jn",), ("ja",)]
+    assert said.state is State.FAULTY
+    assert running("hm") not in {symptom.atom for symptom in said.symptoms}
     assert "node says running(hm)" in str(said.contradictions[0])
 
 
@@ -265,3 +266,57 @@ async def test_names_the_model_does_not_know_are_refused_across_the_thread() -> 
 def test_limits_that_allow_nothing_are_refused(limit: int, seconds: float) -> None:
     with pytest.raises(ValueError, match="greater than 0"):
         Diagnoser(paper_robot(), limit=limit, seconds=seconds)
+
+
+def test_nobody_is_blamed_by_a_guess_where_sources_contradict_each_other_on_a_suspect() -> None:
+    said = Diagnoser(paper_robot()).diagnose_now(["on(ja)", "not on(ja)", "not ok(/odom)", "not running(hm)"])
+    assert [one.bad for one in said.candidates] == [("hm",)]
+    assert said.truncated == ("contested",)
+    said = Diagnoser(paper_robot()).diagnose_now(["on(ja)", "not on(ja)", "not ok(/odom)"])
+    assert (said.state, said.candidates) == (State.CONTRADICTORY, ())
+
+
+def test_what_is_certain_is_known_though_another_part_runs_out_of_time() -> None:
+    system, symptoms = ladder(5)
+    system.node("dead")
+    said = Diagnoser(system, seconds=1e-9).diagnose_now([*symptoms, "not running(dead)"])
+    assert said.truncated == ("time",)
+    assert [one.bad for one in said.candidates] == [("dead",)]
+    assert said.certain == said.convicted == ("dead",)
+
+
+def test_ten_thousand_components_with_fifty_faults_name_what_is_certain_at_once() -> None:
+    system = System()
+    for number in range(10_000):
+        system.node(f"n{number}", out={f"/t{number}": [f"/t{number - 1}"] if number % 100 else []})
+    engine = Diagnoser(system)
+    faulty = range(0, 10_000, 200)
+    seen = [f"not running(n{number})" for number in faulty] + [f"not ok(/t{number + 50})" for number in faulty]
+    said = engine.diagnose_now(seen, seconds=0.05)
+    assert set(said.certain) == {f"n{number}" for number in faulty}
+
+
+def test_an_explanation_ends_with_its_time_and_says_how_much_is_left() -> None:
+    system, symptoms = ladder(5)
+    engine = Diagnoser(system)
+    assert engine.explain(symptoms).left_out == 0
+    why = engine.explain(symptoms, seconds=-1.0)
+    assert why.left_out > 0
+    assert f"{why.left_out} more symptoms were not explained in time" in str(why)
+
+
+def test_a_component_of_whose_work_nothing_is_seen_is_unknown() -> None:
+    """Healthy is a claim that needs evidence."""
+    system = System()
+    system.node("feed", out=["/prices"])
+    system.node("watcher")
+    said = Diagnoser(system).diagnose_now(["running(feed)", "running(watcher)"])
+    assert (said.state, said.unknown) == (State.HEALTHY, ("feed",))
+    assert str(said) == "healthy, as far as is known: 1 unknown"
+    assert Diagnoser(system).diagnose_now(["ok(/prices)", "running(watcher)"]).unknown == ()
+
+
+def test_clingo_writes_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    system, symptoms = ladder(12)
+    Diagnoser(system, seconds=0.01).diagnose_now(symptoms)
+    assert capfd.readouterr() == ("", "")

@@ -159,3 +159,35 @@ def test_bare_literals_with_both_signs_are_a_contradiction() -> None:
 def test_an_observation_crosses_a_wire() -> None:
     sent = saw(~ODOM, 1.5)
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(sent), type=Observation) == sent
+
+
+def test_who_alone_contradicts_several_others_is_set_aside_also_where_nobody_contradicts_it(
+    seen: ObservationSet,
+) -> None:
+    seen.add(saw(HM, 1.0, "node"))
+    seen.add(saw(ODOM, 1.0, "rate"))
+    seen.add(saw(~HM, 1.0, "liar"))
+    seen.add(saw(~ODOM, 1.0, "liar"))
+    seen.add(saw(RISES, 1.0, "liar"))
+    now = seen.current(1.0)
+    assert now.set_aside == ("liar",)
+    assert now.positive == {HM, ODOM}
+    assert not now.negative
+    assert not now.contradictions
+    seen.add(saw(HM, 2.0, "liar"))  # It agrees again, but for one: nobody can say who of the two is wrong.
+    now = seen.current(2.0)
+    assert not now.set_aside
+    assert now.positive == {HM, RISES}
+
+
+def test_of_two_disputes_that_have_nothing_to_do_with_each_other_each_is_settled_by_itself(
+    seen: ObservationSet,
+) -> None:
+    for source in ("a", "b"):
+        seen.add(saw(HM, 1.0, source))
+    seen.add(saw(~HM, 1.0, "c"))
+    seen.add(saw(ODOM, 1.0, "d"))
+    seen.add(saw(~ODOM, 1.0, "e"))
+    now = seen.current(1.0)
+    assert now.set_aside == ("c",)
+    assert [torn.literals for torn in now.contradictions] == [(~ODOM, ODOM)]

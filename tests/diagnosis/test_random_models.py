@@ -3,7 +3,7 @@
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from holdfast.diagnosis.engine import Diagnoser, State
+from holdfast.diagnosis.engine import Diagnoser
 from holdfast.diagnosis.literals import Literal
 from holdfast.diagnosis.model import Model, System
 from holdfast.diagnosis.observations import Observed
@@ -15,7 +15,7 @@ Case = tuple[Model, frozenset[Literal], frozenset[Literal]]
 def found_by_engine(case: Case, diagnoser: Diagnoser | None = None) -> set[frozenset[str]] | None:
     model, positive, negative = case
     said = (diagnoser or Diagnoser(model, seconds=60.0)).diagnose_now(Observed(positive, negative))
-    if said.state is State.CONTRADICTORY:
+    if said.contradictions:
         return None
     assert said.is_complete
     sets = [frozenset(candidate.bad) for candidate in said.candidates]
@@ -68,9 +68,9 @@ def test_what_is_remembered_between_calls_changes_no_answer(case: Case, data: st
 def test_contradictory_observations_are_named_without_one_too_many(case: Case) -> None:
     model, positive, negative = case
     said = Diagnoser(model).diagnose_now(Observed(positive, negative))
-    if said.state is not State.CONTRADICTORY:
+    if not said.contradictions:
         return
-    (torn,) = said.contradictions
+    torn, *_ = said.contradictions
     literals = set(torn.literals)
     assert literals <= positive | {~atom for atom in negative}
     for left_out in [None, *literals]:
@@ -94,3 +94,22 @@ def layered() -> Case:
 
 def test_a_topic_with_two_sources_needs_both_to_fail() -> None:
     assert found_by_engine(layered()) == {frozenset({"s"}), frozenset({"r"}), frozenset({"p", "q"})}
+
+
+@given(cases())
+@settings(max_examples=200)
+def test_a_contradiction_costs_only_the_atoms_concerned(case: Case) -> None:
+    model, positive, negative = case
+    said = Diagnoser(model, seconds=60.0).diagnose_now(Observed(positive, negative))
+    contested = {literal.atom for torn in said.contradictions for literal in torn.literals}
+    rest = positive - contested, negative - contested
+    if not (rest[0] or rest[1]):
+        return
+    found = found_by_engine((model, *rest))
+    assert found is not None
+    assert all(set(said.convicted) <= one for one in found)
+    for candidate in said.candidates:
+        assert any(set(candidate.bad) <= one for one in found)
+    if not said.contradictions:
+        assert said.truncated == ()
+        assert {frozenset(one.bad) for one in said.candidates} == found

@@ -71,7 +71,6 @@ class Repair:
             arbiter_of(self._system._node),
             address=lambda step: ALICE,
             actions=lambda name: self._one,
-            is_dangerous=lambda one: False,
             make=lambda step, epoch, reason, check: Act(step, epoch, reason, actor.ctx, check),
             reason="a test",
         )

@@ -30,6 +30,13 @@ ORDERS = "tests/effects/test_orders_while_resting.py"
 EFFECTS = "tests/effects/test_effect_processes.py"
 
 CHECKS = {
+    "a move hears that the process has died which the actor was to leave": Check(
+        "actors/migration/worker.py",
+        "        self.worker.on_death(self._died_before_rest)\n",
+        "",
+        "tests/migration/test_dying_processes.py",
+        "dies_before_its_actor_is_at_rest",
+    ),
     "a replaced state has the variables of the one before": Check(
         "actors/control/live_state.py",
         "    if lacks or adds:\n",

@@ -6,7 +6,8 @@ Nothing here knows of crashes, processes or recovery; those are words in the chi
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterable
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -129,10 +130,11 @@ class LogRead(Message):
 
 
 class ReadLog(Message[LogRead]):
-    """Publish a log at `speed` times the pace it was recorded at; 0: as fast as it is taken."""
+    """Publish a log from behind scan `after`, at `speed` times the pace of its recording; 0: as fast as it is taken."""
 
     file: str
     speed: float
+    after: int = 0
 
 
 class Reader(Actor):
@@ -140,9 +142,9 @@ class Reader(Actor):
 
     @on(ReadLog)
     async def read(self, request: ReadLog) -> LogRead:
-        number = 0
+        number = request.after
         try:
-            async for scan in _paced(Path(request.file), request.speed):
+            async for scan in _paced(islice(read_scans(Path(request.file)), number, None), request.speed):
                 number += 1
                 # Returns when every subscriber's mailbox has taken it: a slow mapper slows the reader.
                 await self.ctx.publish(TOPIC, _message(number, scan))
@@ -237,11 +239,11 @@ def _message(number: int, scan: LaserScan) -> Scan:
     )
 
 
-async def _paced(file: Path, speed: float) -> AsyncIterator[LaserScan]:
-    """The scans of a log, each not before its time."""
+async def _paced(scans: Iterable[LaserScan], speed: float) -> AsyncIterator[LaserScan]:
+    """The scans, each not before its time."""
     clock = asyncio.get_running_loop().time
     due, before = clock(), None
-    for scan in read_scans(file):
+    for scan in scans:
         if speed and before is not None:
             due += min(max(scan.time - before, 0.0) / speed, LONGEST_PAUSE)
         before = scan.time

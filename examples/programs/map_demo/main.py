@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeAlias
 
 from rich.console import Console
 
@@ -12,11 +14,23 @@ from holdfast import run
 from .demo_runs import DemoPlan, compare
 from .picture import draw, save
 from .report import DemoReport
-from .show import watcher_for
+from .show import Watcher, watcher_for
+
+Comparison: TypeAlias = Callable[[DemoPlan, Watcher], Coroutine[None, None, DemoReport]]
+"""Makes the runs of a demo."""
 
 
-def run_demo(plan: DemoPlan, console: Console, *, picture: Path, as_json: bool) -> DemoReport:
+def run_demo(
+    plan: DemoPlan, console: Console, *, picture: Path, as_json: bool, compared: Comparison = compare
+) -> DemoReport:
     """Run the plan and show it: live on a terminal, as lines elsewhere, or as one JSON object.
+
+    Args:
+        plan: what to do.
+        console: where it is shown.
+        picture: the file that both maps are drawn into.
+        as_json: whether only one JSON object is printed.
+        compared: makes the runs, and compares them.
 
     Raises:
         LogError: there is not one scan to run on.
@@ -27,7 +41,7 @@ def run_demo(plan: DemoPlan, console: Console, *, picture: Path, as_json: bool) 
         raise NotADirectoryError(f"{picture}: there is no folder {picture.resolve().parent} to put the picture into")
     watcher = watcher_for(console, as_json_object=as_json)
     try:
-        report = with_picture(run(compare(plan, watcher)), picture)
+        report = with_picture(run(compared(plan, watcher)), picture)
         watcher.finish(report)
     finally:
         watcher.close()

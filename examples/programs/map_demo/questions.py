@@ -5,24 +5,40 @@ from __future__ import annotations
 import asyncio
 import random
 from collections.abc import Awaitable, Callable
+from typing import Protocol, TypeVar
 
-from holdfast import ActorRef, HoldfastError
+from holdfast import HoldfastError, Message
 
-from .actors import IsWayFree, LookAt, Mapper, Planner, Seen, WayAnswer
+from .actors import IsWayFree, LookAt, Seen, WayAnswer
 from .log import Survey
 
 PATIENCE = 60.0  # seconds; a question outlives any recovery
 EVERY = 0.005  # seconds from one question to the next
 PLANNER_SHARE = 10  # every tenth question goes through the planner
 FAILURES_KEPT = 5
+R = TypeVar("R")
 WAY = 8.0  # metres: how far apart the ends of a way are at most
+
+
+class Asker(Protocol):
+    """Something that can be asked: a ref, or the way to whoever leads a fleet."""
+
+    def ask(self, message: Message[R], timeout: float) -> Awaitable[R]:
+        """Ask it; `timeout` is in seconds."""
+        ...
 
 
 class Questions:
     """Asks mapper and planner about random places until told to stop; each question is waited for by a task."""
 
     def __init__(
-        self, mapper: ActorRef[Mapper], planner: ActorRef[Planner], survey: Survey, seed: int, learn: Callable[[], None]
+        self,
+        mapper: Asker,
+        planner: Asker,
+        survey: Survey,
+        seed: int,
+        learn: Callable[[], None],
+        every: float = EVERY,
     ) -> None:
         self.sent = 0
         self.answers: dict[int, int] = {}
@@ -30,6 +46,7 @@ class Questions:
         self.last_scan = 0
         self._mapper, self._planner, self._survey, self._learn = mapper, planner, survey, learn
         self._random = random.Random(seed)
+        self._every = every
         self._waiting: set[asyncio.Task[None]] = set()
 
     @property
@@ -41,7 +58,7 @@ class Questions:
         """Ask at a steady rate, whether answers come or not, until cancelled."""
         while True:
             self.ask_one()
-            await asyncio.sleep(EVERY)
+            await asyncio.sleep(self._every)
 
     def ask_one(self) -> asyncio.Task[None]:
         """Send the next question; the task ends with its answer, or with its failure."""

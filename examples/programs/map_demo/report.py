@@ -10,6 +10,8 @@ from .grid import OccupancyGrid, differing
 from .planner import Position, length
 
 PHASES = ("detect", "isolate", "restart", "restore", "replay", "release")
+TAKEOVER = "takeover"
+"""Of a fleet: from a kill to the first answer to what was asked behind it."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ def recovery_ms(recoveries: Sequence[MapperRecovery]) -> dict[str, float]:
     if not recoveries:
         return {}
     each = [recovery.phases for recovery in recoveries]
-    known = [phase for phase in PHASES if any(phase in phases for phases in each)]
+    known = [phase for phase in (*PHASES, TAKEOVER) if any(phase in phases for phases in each)]
     medians = {phase: median(phases.get(phase, 0.0) for phases in each) for phase in known}
     medians["total"] = median(sum(phases.get(phase, 0.0) for phase in known) for phases in each)
     return {phase: round(1000 * seconds, 3) for phase, seconds in medians.items()}

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 from rich.tree import Tree
 
-from .report import PHASES, DemoReport, MapperKill, MapperRecovery, as_json, as_lines
+from .report import PHASES, TAKEOVER, DemoReport, MapperKill, MapperRecovery, as_json, as_lines
 
 REFRESH = 0.1  # seconds between two pictures of the live display
 TENTHS = 10  # plain text: lines of progress in one run
@@ -23,7 +23,7 @@ TENTHS = 10  # plain text: lines of progress in one run
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run is. `pid` is the mapper's process, None while it has none."""
+    """How far a run is. `pid` is the mapper's process, or the leading node, None while there is none."""
 
     run: str
     scans: int
@@ -32,6 +32,7 @@ class Progress:
     answered: int
     waiting: int
     pid: int | None
+    machines: Sequence[str] = ()
 
 
 class Watcher(Protocol):
@@ -192,6 +193,10 @@ def _tree(now: Progress) -> Tree:
     robot.add("reader  task, publishes /scan")
     robot.add(Text(f"mapper  {mapper}", style="green" if alive else "red"))
     robot.add("planner  task")
+    if now.machines:
+        fleet = tree.add("fleet")
+        for machine in now.machines:
+            fleet.add(machine)
     return tree
 
 
@@ -206,11 +211,12 @@ def _bar(now: Progress) -> Table:
 def _table(kills: Sequence[MapperKill], recoveries: Sequence[MapperRecovery]) -> Table:
     """One row a kill; two kills in one recovery share the row of the first, so rows may stay open."""
     table = Table(title="recovery, ms", title_justify="left")
-    for heading in ("SIGKILL", "after scan", *PHASES):
+    known = [phase for phase in (*PHASES, TAKEOVER) if any(phase in one.phases for one in recoveries)] or PHASES
+    for heading in ("SIGKILL", "after scan", *known):
         table.add_column(heading, justify="right")
     for row, kill in enumerate(kills):
         phases: Mapping[str, float] = recoveries[row].phases if row < len(recoveries) else {}
-        times = (f"{1000 * phases[phase]:.1f}" if phase in phases else "" for phase in PHASES)
+        times = (f"{1000 * phases[phase]:.1f}" if phase in phases else "" for phase in known)
         table.add_row(str(kill.pid), f"{kill.last_scan:,}", *times)
     return table
 

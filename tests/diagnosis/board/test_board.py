@@ -1,7 +1,9 @@
 """Client, server and simulated board together, on the loopback; and the ways in which a board fails."""
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator
+from urllib.parse import urlsplit
 from zlib import crc32
 
 import pytest
@@ -40,6 +42,7 @@ from holdfast.diagnosis.board import tcp_server as board_server
 from holdfast.diagnosis.board.board_frames import (
     HEAD,
     AskMeasurements,
+    AuthenticateFrame,
     BoardDecoder,
     Frame,
     RefusedFrame,
@@ -328,10 +331,39 @@ async def test_too_many_clients_are_told_so(
     simulator: hf.ActorRef[BoardSimulator], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(board_server, "MOST_CLIENTS", 1)
-    async with await client(simulator) as board:
+    async with await client(simulator, broadcast=0.05) as board:
         await board.measure()
         assert await spoken_to(simulator) == ([(0, RefusedFrame("there are 1 connections already"))], True)
         await board.measure()
+
+
+async def test_silent_clients_give_their_seats_to_those_who_come(simulator: hf.ActorRef[BoardSimulator]) -> None:
+    where = urlsplit((await state(simulator)).url)
+    silent = [await asyncio.open_connection(where.hostname, where.port) for _ in range(board_server.MOST_CLIENTS)]
+    try:
+        async with await client(simulator) as board:
+            await board.measure()
+        async with asyncio.timeout(LONG):
+            with contextlib.suppress(ConnectionResetError):
+                assert await silent[0][0].read() == b""
+    finally:
+        for _, writer in silent:
+            writer.close()
+
+
+async def test_without_the_token_nothing_is_done(system: hf.ActorSystem) -> None:
+    guarded = system.spawn(hf.start(BoardSimulator, token="sesame"))
+    url = (await state(guarded)).url
+    async with Board(url, timeout=LONG, backoff=QUICK) as board:
+        with pytest.raises(BoardRefused, match="say the token first"):
+            await board.switch(BASE, True)
+    assert BASE not in (await state(guarded)).on
+    async with Board(url, timeout=LONG, backoff=QUICK, token="sesame", broadcast=0.01) as board:
+        await board.switch(BASE, True)
+        await first(board)
+    assert BASE in (await state(guarded)).on
+    guess = encode(3, AuthenticateFrame("guess"))
+    assert await spoken_to(guarded, guess) == ([(0, RefusedFrame("this is not the token"))], True)
 
 
 async def test_a_killed_simulator_hangs_up(system: hf.ActorSystem, simulator: hf.ActorRef[BoardSimulator]) -> None:

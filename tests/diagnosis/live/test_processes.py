@@ -1,11 +1,13 @@
 """What actors in processes of their own publish is heard, and who they are is known."""
 
+import asyncio
 from collections.abc import AsyncIterator
 
 import pytest
 
 import holdfast as hf
-from holdfast.diagnosis import OBSERVATIONS, generate, observer
+from holdfast.diagnosis import DIAGNOSIS, OBSERVATIONS, generate, observer, watch
+from holdfast.diagnosis.engine import Diagnosis, State
 from holdfast.diagnosis.observations import Observation
 from holdfast.diagnosis.observers import Manner, TimeoutObserver
 from holdfast.testing import probe
@@ -63,3 +65,39 @@ async def test_who_publishes_from_a_process_is_known(system: hf.ActorSystem) -> 
             found = await generate(system, seconds=1.0)
     assert found.wiring["heart"].publishes == ("/beat",)
     assert found.wiring["other"].subscribes == ("/beat",)
+
+
+class Wanted(hf.Message[int]):
+    is_last: bool = False
+
+
+class Oracle(hf.Actor):
+    @hf.on(Wanted)
+    async def _answer(self, message: Wanted) -> int:
+        if message.is_last:
+            await asyncio.Event().wait()
+        return 1
+
+
+class Client(hf.Actor):
+    @hf.on(Wanted)
+    async def _ask(self, message: Wanted) -> int:
+        return await self.ctx.find("/t/oracle", Oracle).ask(message, timeout=600.0)
+
+
+async def test_a_frozen_callee_in_a_process_is_certain_behind_who_asks_it_from_another(system: hf.ActorSystem) -> None:
+    await system.start(hf.child("oracle", hf.start(Oracle), isolation="process"))
+    client = await system.start(hf.child("client", hf.start(Client), isolation="process"))
+    heard = probe(system)
+    heard.subscribe(DIAGNOSIS)
+    watching = await watch(system, seconds=0.5)
+    for _ in range(60):  # Until its usual turns are known, only a time-out would accuse it.
+        assert await client.ask(Wanted()) == 1
+        await asyncio.sleep(0.05)
+    asking = asyncio.ensure_future(client.ask(Wanted(is_last=True), timeout=600.0))
+    found = await heard.expect(Diagnosis, timeout=60.0)
+    while found.state is not State.FAULTY:
+        found = await heard.expect(Diagnosis, timeout=60.0)
+    assert [one.bad for one in found.candidates] == [("oracle",)]
+    asking.cancel()
+    await system.stop(watching.tree)

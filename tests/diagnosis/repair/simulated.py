@@ -18,6 +18,7 @@ from holdfast.diagnosis.observers import Agreement, Channel, GeneralObserver, Ha
 from holdfast.diagnosis.repair import (
     ActionBegan,
     ActionEnded,
+    AdviceScored,
     ApprovalWanted,
     GaveUp,
     GetRepairStatus,
@@ -29,7 +30,8 @@ from holdfast.diagnosis.repair import (
     Repaired,
     Repairer,
     Repertoire,
-    Touched,
+    Stance,
+    Undone,
     power_up,
     repairer,
     shutdown,
@@ -151,7 +153,7 @@ class World:
 
     def power_up(self, **options: Any) -> RepairAction:
         """The action, for this robot."""
-        return power_up(BOARD, self.channels, **({"effect_timeout": EFFECT} | options))
+        return power_up(BOARD, self.channels, **({"effect_timeout": EFFECT, "is_dangerous": False} | options))
 
     def start_node(self, **options: Any) -> RepairAction:
         """The action, for this robot."""
@@ -159,7 +161,7 @@ class World:
 
     def actions(self) -> Repertoire:
         """The four of the paper."""
-        off = shutdown(BOARD, self.channels, effect_timeout=EFFECT)
+        off = shutdown(BOARD, self.channels, effect_timeout=EFFECT, is_dangerous=False)
         stop = stop_node(self.addresses, effect_timeout=EFFECT)
         return Repertoire([self.power_up(), off, self.start_node(), stop])
 
@@ -284,7 +286,8 @@ class Secretary(hf.Actor):
         self.ctx.subscribe(REPAIR)
         self.ctx.subscribe(DIAGNOSIS)
 
-    @hf.on(Touched)
+    @hf.on(AdviceScored)
+    @hf.on(Undone)
     @hf.on(RepairBegan)
     @hf.on(Planned)
     @hf.on(ActionBegan)
@@ -396,6 +399,7 @@ async def scene(
     pace: float = 1.0,
     noise: float = 0.0,
     before: Callable[[World], object] = lambda world: None,
+    stance: Stance = "on",
     actions: Callable[[World], Repertoire] = World.actions,
     addresses: dict[str, str] | None = None,
     base: tuple[str, ...] = (),
@@ -419,6 +423,6 @@ async def scene(
     system.spawn(hf.start(Secretary, told, times, news), name="secretary")
     rules = policy or Policy(verify=6.0, settle=1.0, cool_down=0.5)
     where = world.addresses | (addresses or {})
-    mend = repairer(world.model, actions(world), rules, addresses=where, base=base)
+    mend = repairer(world.model, actions(world), rules, addresses=where, base=base, stance=stance)
     await system.start(tree(world.robot, world.observers(), recent=recent, repairer=mend))
     return Scene(system, world, told, times, news)

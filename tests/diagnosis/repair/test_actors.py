@@ -8,15 +8,29 @@ import pytest
 
 import holdfast as hf
 from holdfast import diagnosis
+from holdfast.actors.errors import NoSuchActor
+from holdfast.actors.events import DeadLetter
 from holdfast.diagnosis.engine import State
+from holdfast.diagnosis.literals import ok, running
 from holdfast.diagnosis.model import System
+from holdfast.diagnosis.observations import Observation
 from holdfast.diagnosis.observers import GeneralObserver, Limits, Manner, NodeObserver, Property
-from holdfast.diagnosis.repair import ActionBegan, ApprovalWanted, Deny, GaveUp, Policy, Repaired, Repairer
+from holdfast.diagnosis.repair import (
+    ActionBegan,
+    ApprovalWanted,
+    Deny,
+    GaveUp,
+    Planned,
+    Policy,
+    Repaired,
+    Repairer,
+    RepairTold,
+)
 from tests.diagnosis.repair.simulated import M, Secretary
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 
-POLICY = Policy(verify=8.0, settle=1.0)
+POLICY = Policy(verify=8.0, settle=1.0, allow=frozenset({"restart_subtree"}))
 NAMES = ("feed", "matcher")
 
 
@@ -140,7 +154,7 @@ async def shop() -> AsyncIterator[Shop]:
 
 @pytest.mark.parametrize("culprit", NAMES)
 async def test_any_system_is_watched_and_repaired_in_one_line(shop: Shop, culprit: str) -> None:
-    watching = await diagnosis.watch(shop.system, repair=POLICY)
+    watching = await diagnosis.watch(shop.system, repair="on", policy=POLICY)
     assert set(watching.addresses) == {"shop/feed", "shop/matcher", "desk"}
     await asyncio.sleep(20.0)  # rates are learned
     assert (await watching.diagnosis()).state is State.HEALTHY
@@ -158,7 +172,7 @@ async def test_a_system_is_watched_by_a_model_of_ones_own(shop: Shop) -> None:
     model.node("matcher", out={"/matches": ["/prices"]})
     rates = [diagnosis.observer(topic[1:], hf.start(GeneralObserver, topic, 5.0)) for topic in ("/prices", "/matches")]
     addresses = {name: f"/t/shop/{name}" for name in NAMES}
-    watching = await diagnosis.watch(shop.system, model, rates, addresses=addresses, repair=POLICY)
+    watching = await diagnosis.watch(shop.system, model, rates, addresses=addresses, repair="on", policy=POLICY)
     await asyncio.sleep(5.0)
     shop.part("feed").tell(Freeze())
     await shop.hear(Repaired)
@@ -187,7 +201,7 @@ async def test_properties_are_watched_by_their_limits(shop: Shop) -> None:
         await asyncio.sleep(1.0)
     await asyncio.sleep(3.0)
     found = await watching.diagnosis()
-    assert "not ok(shop/feed.restarts)" in set(map(str, found.symptoms))
+    assert "ok(shop/feed.restarts)" in set(map(str, (await watching.observed()).negative))
     assert str(found) == "faulty: shop/feed"
 
 
@@ -197,22 +211,22 @@ async def test_what_a_restart_does_not_help_is_restarted_with_its_supervisor_and
     model.node("feed", out=["/news"])  # nobody publishes that
     model.external("/prices")
     rate = diagnosis.observer("news", hf.start(GeneralObserver, "/news", 5.0))
-    await diagnosis.watch(shop.system, model, [rate], addresses={"feed": "/t/shop/feed"}, repair=POLICY)
+    await diagnosis.watch(shop.system, model, [rate], addresses={"feed": "/t/shop/feed"}, repair="on", policy=POLICY)
     over = await shop.hear(GaveUp)
     assert over.components == ("feed",)
-    assert shop.done() == ["restart_child(feed)"] * 2 + ["restart_subtree(feed)"] * 2
+    assert shop.done() == ["restart_child(feed)", "restart_subtree(feed)"]
 
 
 @pytest.mark.parametrize("says", ["no", "nothing"])
 async def test_what_is_not_allowed_is_not_done_in_another_way(shop: Shop, says: str) -> None:
     policy = Policy(verify=8.0, settle=1.0, dangerous=frozenset({"restart_child"}), approval=20.0)
-    watching = await diagnosis.watch(shop.system, repair=policy)
+    watching = await diagnosis.watch(shop.system, repair="on", policy=policy)
     await asyncio.sleep(20.0)
     shop.part("feed").tell(Freeze())
     wanted = await shop.hear(ApprovalWanted)
     repairer = shop.system.ref(f"{watching.tree.path}/repairer", Repairer)
     if says == "no":
-        await repairer.ask(Deny(wanted.number, "we look at it"))
+        await repairer.ask(Deny(wanted.case, "we look at it"))
     over = await shop.hear(GaveUp)
     assert over.components == ("shop/feed",)
     assert ("we look at it" if says == "no" else "nobody has approved") in over.why
@@ -222,7 +236,7 @@ async def test_what_is_not_allowed_is_not_done_in_another_way(shop: Shop, says: 
 
 @pytest.mark.parametrize("how", ["by its supervisor", "by the system"])
 async def test_what_an_operator_stops_is_not_repaired_before_an_operator_starts_it(shop: Shop, how: str) -> None:
-    await diagnosis.watch(shop.system, repair=POLICY)
+    await diagnosis.watch(shop.system, repair="on", policy=POLICY)
     await asyncio.sleep(20.0)
     keeper = shop.system.ref("/t/shop", hf.Supervisor)
     if how == "by the system":
@@ -265,7 +279,8 @@ async def test_who_was_restarted_by_its_supervisor_is_not_restarted_by_repair(sh
         model,
         [*rates, diagnosis.observer("lives", nodes)],
         addresses=addresses,
-        repair=policy,
+        repair="on",
+        policy=policy,
         manner=manner,
     )
     await asyncio.sleep(10.0)
@@ -286,9 +301,125 @@ async def test_who_is_asked_in_vain_is_repaired(shop: Shop) -> None:
     await keeper.ask(hf.StartChild(hf.child("cache", hf.start(Cache))))
     asker = hf.child("asker", hf.start(Asker), bindings={"cache": "/t/shop/cache"})
     await keeper.ask(hf.StartChild(asker))
-    await diagnosis.watch(shop.system, repair=POLICY, hung_after=2.0)
+    await diagnosis.watch(shop.system, repair="on", policy=POLICY, hung_after=2.0)
     await asyncio.sleep(20.0)
     shop.system.ref("/t/shop/cache", Cache).tell(Hang())
     await shop.hear(Repaired)
     assert "restart_child(shop/cache)" in shop.done()
     assert await shop.system.ref("/t/shop/cache", Cache).ask(Quote()) == 1
+
+
+async def nobody_looks(shop: Shop) -> None:
+    """End all observers for good: only the liar is left."""
+    keeper = shop.system.ref("/t/diagnosis/observers", hf.Supervisor)
+    for one in await keeper.ask(hf.WhichChildren()):
+        await keeper.ask(hf.TerminateChild(one.id))
+
+
+async def test_an_observer_that_lies_about_who_runs_costs_no_restart(shop: Shop) -> None:
+    # The ping sees it: the feed runs and answers, whatever is said of it.
+    await diagnosis.watch(shop.system, repair="on", policy=POLICY)
+    await asyncio.sleep(20.0)
+    await nobody_looks(shop)
+    lie = Observation(~running("shop/feed"), shop.system._node.loop.time(), "liar", 1000.0)
+    await shop.system.publish(diagnosis.OBSERVATIONS, lie)
+    over = await shop.hear(GaveUp)
+    assert over.why == "shop/feed runs and answers, although it is said not to run"
+    assert "look whether liar is right to say not running(shop/feed)" in over.plan
+    await asyncio.sleep(60.0)
+    assert shop.done() == []
+
+
+async def test_an_observer_that_lies_about_an_output_costs_one_restart_and_no_second(shop: Shop) -> None:
+    watching = await diagnosis.watch(shop.system, repair="on", policy=Policy(verify=8.0))
+    await asyncio.sleep(20.0)
+    await nobody_looks(shop)
+    lie = Observation(~ok("/prices"), shop.system._node.loop.time(), "liar", 1000.0)
+    await shop.system.publish(diagnosis.OBSERVATIONS, lie)
+    over = await shop.hear(GaveUp)
+    assert "look whether liar is right to say not ok(/prices)" in over.plan
+    await asyncio.sleep(100.0)
+    assert shop.done() == ["restart_child(shop/feed)"]
+    status = await watching.repair_status()
+    assert (status.useless, status.given_up) == (1, ("shop/feed",))
+
+
+async def test_by_default_repair_only_advises_and_the_program_can_switch_it_on(shop: Shop) -> None:
+    watching = await diagnosis.watch(shop.system, policy=POLICY)
+    await asyncio.sleep(20.0)
+    shop.part("feed").tell(Freeze())
+    plan = await shop.hear(Planned)
+    await asyncio.sleep(30.0)
+    assert (plan.is_dry, shop.done()) == (True, [])
+    await watching.set_repair("on")
+    await shop.hear(Repaired)
+    assert shop.done() == ["restart_child(shop/feed)"]
+
+
+async def test_with_repair_off_there_is_nobody_to_repair(shop: Shop) -> None:
+    watching = await diagnosis.watch(shop.system, repair="off", seconds=0.0)
+    with pytest.raises(NoSuchActor):
+        await watching.repair_status()
+
+
+async def test_a_stance_that_there_is_not_is_refused_before_anything_is_started(shop: Shop) -> None:
+    with pytest.raises(ValueError, match="'advise'"):
+        await diagnosis.watch(shop.system, repair="true")  # type: ignore[arg-type]
+    assert shop.system._node.find("/t/diagnosis") is None
+
+
+@pytest.mark.parametrize("says", [True, False, "not before noon", RuntimeError("no network")])
+async def test_a_callable_of_the_program_approves_or_denies(shop: Shop, says: bool | str | Exception) -> None:
+    async def approve(wanted: ApprovalWanted) -> bool | str:
+        assert [str(step) for step in wanted.steps] == ["restart_child(shop/feed)"]
+        if isinstance(says, Exception):
+            raise says
+        return says
+
+    watching = await diagnosis.watch(shop.system, repair="ask", policy=POLICY, approve=approve)
+    await asyncio.sleep(20.0)
+    shop.part("feed").tell(Freeze())
+    if says is True:
+        await shop.hear(Repaired)
+        return
+    over = await shop.hear(GaveUp)
+    assert (str(says) if says else "the program said no") in over.why
+    assert (await watching.repair_status()).denied == ("shop/feed",)
+    assert shop.done() == []
+
+
+async def test_a_denied_restart_of_an_actor_is_no_leave_to_restart_all_around_it(shop: Shop) -> None:
+    watching = await diagnosis.watch(shop.system, repair="ask", policy=POLICY)
+    await asyncio.sleep(20.0)
+    shop.part("feed").tell(Freeze())
+    wanted = await shop.hear(ApprovalWanted)
+    await watching.repairer.ask(Deny(wanted.case, "we look at it"))
+    await shop.hear(GaveUp)
+    await watching.set_repair("on")
+    keeper = shop.system.ref("/t/shop", hf.Supervisor)
+    await keeper.ask(hf.TerminateChild("matcher", parks=False))  # as if it had ended for good by itself
+    await asyncio.sleep(60.0)
+    assert set(shop.done()) == {"restart_child(shop/matcher)"}
+
+
+async def test_what_repair_tells_is_no_dead_letter_and_an_event_in_plain_words(shop: Shop) -> None:
+    await diagnosis.watch(shop.system, repair="on", policy=POLICY)
+    await asyncio.sleep(20.0)
+    with shop.system.events() as events:
+        shop.part("feed").tell(Freeze())
+        await shop.hear(Repaired)
+        await asyncio.sleep(5.0)
+        told = events.take()
+    assert [one for one in told if isinstance(one, DeadLetter)] == []
+    sentences = [one.text for one in told if isinstance(one, RepairTold)]
+    assert "For shop/feed repair will do restart_child(shop/feed)." in sentences
+    assert any(text.startswith("The symptoms went by restart_child(shop/feed)") for text in sentences)
+
+
+async def test_who_is_suspended_by_order_is_not_restarted(shop: Shop) -> None:
+    await diagnosis.watch(shop.system, repair="on", policy=POLICY)
+    await asyncio.sleep(20.0)
+    await shop.system.suspend(shop.part("feed"))
+    over = await shop.hear(GaveUp)
+    assert "shop/feed was suspended by order" in over.why
+    assert "restart_child(shop/feed)" not in shop.done()

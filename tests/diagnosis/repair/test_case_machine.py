@@ -10,7 +10,7 @@ from holdfast.diagnosis.engine import Candidate, Diagnosis, State
 from holdfast.diagnosis.literals import Literal, ok
 from holdfast.diagnosis.observations import Observed
 from holdfast.diagnosis.planning import Plan, Step, TimedOut, Unsolvable
-from holdfast.diagnosis.repair import DENIED, DONE, FAILED, NORMAL, SAFE, SKIPPED, Policy
+from holdfast.diagnosis.repair import DONE, FAILED, NORMAL, SAFE, SKIPPED, Policy
 from holdfast.diagnosis.repair.case import Case
 from holdfast.diagnosis.repair.case_decisions import (
     Close,
@@ -142,7 +142,7 @@ class Repair(RuleBasedStateMachine):
     @precondition(lambda self: self.case is not None)
     @rule(
         found=st.sampled_from(("plan", "plan", "none", "late")),
-        outcome=st.sampled_from((DONE, FAILED, SKIPPED, DENIED)),
+        outcome=st.sampled_from((DONE, FAILED, SKIPPED)),
         share=st.sampled_from((0.1, 1.0)),
         helps=st.booleans(),
         slow=st.sampled_from((0.0, 0.0, 40.0)),

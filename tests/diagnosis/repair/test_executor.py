@@ -62,7 +62,6 @@ async def carry_out(seen: Seen, *, takes: float = 1.0) -> list[Result]:
         Arbiter(seen.now),
         address=str,
         actions=lambda name: RepairAction(name, run),
-        is_dangerous=lambda one: False,
         make=lambda step, epoch, reason, check: Act(step, epoch, reason, None, check),  # type: ignore[arg-type]
         reason="a test",
     )

@@ -13,7 +13,6 @@ from holdfast.diagnosis.messages import MODEL, OBSERVATIONS, ModelChanged
 from holdfast.diagnosis.observations import Observation
 from holdfast.diagnosis.planning import find_plan
 from holdfast.diagnosis.repair import (
-    DENIED,
     DONE,
     FAILED,
     LOST,
@@ -21,8 +20,10 @@ from holdfast.diagnosis.repair import (
     UNVERIFIED,
     ActionBegan,
     ActionEnded,
+    AdviceScored,
     ApprovalWanted,
     Approve,
+    BadStance,
     Deny,
     GaveUp,
     GetRepairStatus,
@@ -38,6 +39,8 @@ from holdfast.diagnosis.repair import (
     Repertoire,
     RetryRepair,
     SetMode,
+    SetStance,
+    Undone,
     action,
 )
 from holdfast.supervision.arbiter import Hand, arbiter_of
@@ -303,11 +306,11 @@ async def test_dangerous_actions_wait_for_a_person(system: hf.ActorSystem) -> No
     wanted = await here.hear(ApprovalWanted)
     await asyncio.sleep(30.0)
     assert here.done() == []
-    await here.repairer.ask(Approve(wanted.number))
+    await here.repairer.ask(Approve(wanted.case))
     await here.hear(Repaired)
     assert here.done()[0] == "power_up(hu)"
     with pytest.raises(NobodyWaits):
-        await here.repairer.ask(Approve(wanted.number))
+        await here.repairer.ask(Approve(wanted.case))
 
 
 async def test_who_got_well_while_a_person_was_asked_is_left_alone(system: hf.ActorSystem) -> None:
@@ -317,7 +320,7 @@ async def test_who_got_well_while_a_person_was_asked_is_left_alone(system: hf.Ac
     wanted = await here.hear(ApprovalWanted)
     await here.change(lambda world: world.hung.discard("hm"))
     await asyncio.sleep(5.0)
-    await here.repairer.ask(Approve(wanted.number))
+    await here.repairer.ask(Approve(wanted.case))
     ended = await here.hear(ActionEnded)
     assert (ended.outcome, ended.why) == (SKIPPED, "a new diagnosis finds hm good")
     await here.hear(Repaired)
@@ -330,20 +333,129 @@ async def test_what_a_person_does_not_allow_is_not_done(system: hf.ActorSystem, 
     await here.change(off("hu"))
     wanted = await here.hear(ApprovalWanted)
     if says == "no":
-        await here.repairer.ask(Deny(wanted.number, "somebody works on it"))
+        await here.repairer.ask(Deny(wanted.case, "somebody works on it"))
     over = await here.hear(GaveUp)
     await here.rest()
-    assert outcomes(here) == [("power_up(hu)", DENIED)]
-    assert ("somebody works on it" if says == "no" else "nobody has approved within 20 s") in over.why
+    assert outcomes(here) == []
+    assert ("somebody works on it" if says == "no" else "nobody has approved power_up(hu) within 20 s") in over.why
     assert here.done() == []
 
 
-async def test_a_dry_run_tells_the_plan_once_and_does_nothing(system: hf.ActorSystem) -> None:
-    here = await scene(system, Policy(is_dry=True, **QUICK))
+async def test_advice_is_told_once_and_nothing_is_done(system: hf.ActorSystem) -> None:
+    here = await scene(system, Policy(**QUICK), stance="advise")
     await here.change(off("hu"))
     plan = await here.hear(Planned)
+    await asyncio.sleep(30.0)
+    assert (len(here.planned()), here.done(), plan.is_dry) == (1, [], True)
+
+
+async def test_who_switches_repair_on_in_the_middle_of_a_case_has_it_repaired_at_once(system: hf.ActorSystem) -> None:
+    here = await scene(system, Policy(**QUICK), stance="advise")
+    await here.change(off("hu"))
+    await here.hear(Planned)
+    await here.repairer.ask(SetStance("on"))
+    await here.hear(Repaired)
+    assert here.world.is_healthy()
+    with pytest.raises(BadStance, match="'advise'"):
+        await here.repairer.ask(SetStance("loud"))
+
+
+async def test_advice_that_a_person_follows_is_right_and_its_lead_is_counted(system: hf.ActorSystem) -> None:
+    here = await scene(system, Policy(**QUICK), stance="advise")
+    await here.change(lambda world: world.hung.add("hm"))
+    await here.hear(Planned)
+    await asyncio.sleep(10.0)
+    await system.ref("/t/robot/hm", hf.Supervisor).ask(hf.RestartChild("node", running=True))
+    scored = await here.hear(AdviceScored)
+    status = await here.repairer.ask(GetRepairStatus())
+    assert (scored.verdict, status.right, status.missed) == ("right", 1, 0)
+    assert status.seconds_saved == scored.seconds_saved >= 10.0
+
+
+async def test_advice_for_what_goes_by_itself_is_needless(system: hf.ActorSystem) -> None:
+    here = await scene(system, Policy(**QUICK), stance="advise")
+    await here.change(lambda world: world.hung.add("hm"))
+    await here.hear(Planned)
+    await here.change(lambda world: world.hung.discard("hm"))
+    assert (await here.hear(AdviceScored)).verdict == "needless"
+
+
+async def test_a_restart_by_order_for_which_nothing_was_advised_is_missed(system: hf.ActorSystem) -> None:
+    here = await scene(system, Policy(**QUICK), stance="advise")
+    await here.rest(2.0)
+    await system.ref("/t/robot/hm", hf.Supervisor).ask(hf.RestartChild("node", running=True))
+    await here.rest(2.0)
+    assert (await here.repairer.ask(GetRepairStatus())).missed == 1
+
+
+async def test_when_asked_repair_waits_for_each_plan_and_goes_on_when_it_may(system: hf.ActorSystem) -> None:
+    here = await scene(system, Policy(**QUICK), stance="ask")
+    await here.change(lambda world: world.hung.add("hm"))
+    wanted = await here.hear(ApprovalWanted)
+    assert [str(step) for step in wanted.steps] == ["stop_node(hm)", "start_node(hm)"]
+    assert (await here.repairer.ask(GetRepairStatus())).waiting == wanted.case
+    await here.repairer.ask(Approve(wanted.case))
+    await here.hear(Repaired)
+    assert here.done() == ["stop_node(hm)", "start_node(hm)"]
+
+
+async def test_who_got_well_before_anybody_answered_is_not_given_up(system: hf.ActorSystem) -> None:
+    here = await scene(system, Policy(approval=20.0, **QUICK), stance="ask")
+    await here.change(lambda world: world.hung.add("hm"))
+    await here.hear(ApprovalWanted)
+    await here.change(lambda world: world.hung.discard("hm"))
+    await here.hear(Repaired)
+    assert (here.all(GaveUp), here.done()) == ([], [])
+
+
+async def test_what_was_denied_stays_so_in_later_cases_until_it_is_withdrawn(system: hf.ActorSystem) -> None:
+    here = await scene(system, Policy(**QUICK), stance="ask")
+    await here.change(lambda world: world.hung.add("hm"))
+    wanted = await here.hear(ApprovalWanted)
+    await here.repairer.ask(Deny(wanted.case, "we look at it"))
+    over = await here.hear(GaveUp)
+    assert "holdfast repair retry hm" in over.plan[0]
+    await here.change(lambda world: world.hung.discard("hm"))
     await here.rest()
-    assert (here.planned(), here.done(), plan.is_dry) == ([[["power_up(hu)"]]], [], True)
+    await here.change(lambda world: world.hung.add("hm"))
+    await here.rest()
+    assert (len(here.all(ApprovalWanted)), here.done()) == (1, [])
+    here.repairer.tell(RetryRepair(("hm",)))
+    await here.hear(ApprovalWanted, 2)
+
+
+async def test_no_more_actions_than_the_hour_allows(system: hf.ActorSystem) -> None:
+    here = await scene(system, Policy(hour_actions=1, **QUICK))
+    await here.change(stopped("hm"))
+    await here.hear(Repaired)
+    await here.change(stopped("lac"))
+    over = await here.hear(GaveUp)
+    assert (over.components, here.done()) == (("lac",), ["start_node(hm)"])
+
+
+async def test_what_has_not_helped_is_undone_and_counted(system: hf.ActorSystem) -> None:
+    undone: list[str] = []
+
+    def vain(world: World) -> Repertoire:
+        @action(
+            "(:action reset :parameters (?n - node) :precondition (and (bad ?n) (running ?n))"
+            " :effect (and (good ?n) (not (bad ?n))))",
+            attempts=1,
+        )
+        async def reset(act, n: str):
+            async def undo() -> None:
+                undone.append(n)
+
+            return undo
+
+        return Repertoire([reset])
+
+    here = await scene(system, Policy(**QUICK), actions=vain)
+    await here.change(lambda world: world.hung.add("hm"))
+    await here.hear(GaveUp)
+    assert [str(one.step) for one in here.all(Undone)] == ["reset(hm)"]
+    assert undone == ["hm"]
+    assert (await here.repairer.ask(GetRepairStatus())).useless == 1
 
 
 async def test_in_safe_mode_nothing_is_done_until_it_is_left(system: hf.ActorSystem) -> None:

@@ -72,3 +72,33 @@ def test_a_run_that_fails_tells_its_own_failure_and_schedule() -> None:
         simulate(wrong, replay="seed=3 hold=5000:1")()
     [note] = raised.value.__notes__
     assert re.search(r'@simulate\(replay="seed=3"\)', note)
+
+
+FAILS = """
+from holdfast.testing import simulate
+
+@simulate(seeds=3)
+async def test_it(system):
+    assert await system.spawn(hf.start(Counter)).ask(Add(1)) == 2
+"""
+
+
+def test_what_is_known_of_a_failure_is_kept_where_it_is_asked_for(pytester: pytest.Pytester) -> None:
+    result = run_suite(pytester, HEAD + FAILS, "--holdfast-record", "artefacts")
+    assert result.ret == 1
+    (folder,) = (pytester.path / "artefacts").iterdir()
+    assert sorted(file.name for file in folder.iterdir()) == ["chart.html", "failure.txt", "schedule.txt"]
+    schedule = (folder / "schedule.txt").read_text("utf-8").strip()
+    told = (folder / "failure.txt").read_text("utf-8").splitlines()
+    assert told[0].endswith("::test_it")
+    assert "AssertionError" in told[1]
+    assert any(line.startswith("seed=0: repeat it with") for line in told)
+    assert told[-1].split("\t")[2:] == ["/app/$1", "Add(n=1)", "total: 0 -> 1"]
+    again = run_suite(pytester, HEAD + FAILS, "--holdfast-replay", str(folder / "schedule.txt"))
+    assert again.ret == 1
+    assert f'replay="{schedule}"' in str(again.stdout)
+
+
+def test_where_nothing_fails_nothing_is_kept(pytester: pytest.Pytester) -> None:
+    assert run_suite(pytester, HEAD + FAILS.replace("== 2", "== 1"), "--holdfast-record", "artefacts").ret == 0
+    assert not (pytester.path / "artefacts").exists()

@@ -1,0 +1,51 @@
+"""Keeps a generated model true while the system changes: children that are added, moved, or taken away."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from ..actors.kernel.actor import Actor, on
+from ..actors.kernel.message import Message
+from .generate import Generated, LiveWiring
+from .model import Replace
+from .model_server import ChangeModel, ModelServer
+from .observers.node_observer import at_root
+
+EVERY: Final = 1.0
+"""Seconds between two looks at the tree."""
+
+
+class _LookAgain(Message):
+    """It is time to compare the model with the tree."""
+
+
+class ModelFollower(Actor):
+    """Compares the generated model with the live tree each second, and changes it where they differ.
+
+    Args:
+        wiring: what observers note, and what they go by.
+        server: the last part of the model server's address, beside this actor.
+        adapt: completes a generated declaration, such as by limits.
+    """
+
+    deterministic = False
+
+    def __init__(self, wiring: LiveWiring, server: str, adapt: Callable[[Generated], Generated]) -> None:
+        self._wiring, self._server, self._adapt = wiring, server, adapt
+
+    def on_start(self, restored: bool) -> None:
+        """Begin to look. Raises SpecError in a process of its own."""
+        at_root(self)
+        self.ctx.every(EVERY, _LookAgain())
+
+    @on(_LookAgain)
+    async def _look(self, message: _LookAgain) -> None:
+        found = self._wiring.look_again(self.ctx._cell.node)
+        if found is None:
+            return
+        path = f"{self.ctx.path.rpartition('/')[0]}/{self._server}"
+        declaration = self._adapt(found).declaration
+        change = ChangeModel((Replace(declaration),), "the system has changed")
+        await self.ctx.find(path, ModelServer).ask(change)
+        self._wiring.use(found)

@@ -1,0 +1,242 @@
+"""An observer of whether topics flow as they did, measured by what they are made from: more is never a fault."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from ...actors.kernel.actor import on
+from ..literals import ok
+from .hearing import Heard, listen
+from .observer import Manner, Observer
+
+ENOUGH: Final = 20
+"""Messages after which something is known of a topic."""
+LONGER: Final = 4.0
+"""Times the longest silence so far, after which a topic that should flow is silent for too long."""
+REGULAR: Final = 3.0
+"""A topic whose longest silence was at most so many times its mean one goes by a clock."""
+BLOCK: Final = 200
+"""Messages that come in over which those that go out are counted."""
+BLOCKS: Final = 5
+"""Blocks from which it is known how much goes out at least."""
+HOURS: Final = 24
+
+
+class Usual(msgspec.Struct):
+    """What was learned of a topic; it goes on being learned.
+
+    Attributes:
+        count: messages.
+        mean_gap: seconds between two of them on average, of late.
+        longest_gap: seconds of the longest silence.
+        most_in: most that came in between two messages.
+        blocks: blocks of inputs that were counted.
+        least_out: the smallest part of what came in that went out, of all blocks.
+    """
+
+    count: int = 0
+    mean_gap: float = 0.0
+    longest_gap: float = 0.0
+    most_in: int = 0
+    blocks: int = 0
+    least_out: float = 1.0
+
+    def take(self, gap: float, came_in: int) -> None:
+        """Learn of one more message."""
+        self.count += 1
+        self.mean_gap += (gap - self.mean_gap) / min(self.count, 1000)
+        self.longest_gap = max(self.longest_gap, gap)
+        self.most_in = max(self.most_in, came_in)
+
+    def take_block(self, part: float) -> None:
+        """Learn of one more block of inputs, of which `part` has gone out."""
+        self.least_out = min(self.least_out, part) if self.blocks else part
+        self.blocks += 1
+
+
+class Baselines:
+    """What is usual of each topic. Given to an observer it outlives its lives, and with a file the program's.
+
+    Args:
+        path: where it is kept; None: nowhere.
+        by_hour: learn each hour of the day by itself, in local time.
+
+    Raises:
+        ValueError: the file is no such file.
+    """
+
+    def __init__(self, path: str | Path | None = None, *, by_hour: bool = False) -> None:
+        self._path, self._by_hour = None if path is None else Path(path), by_hour
+        self._known: dict[str, Usual] = {}
+        if self._path is not None and self._path.exists():
+            try:
+                self._known = msgspec.json.decode(self._path.read_bytes(), type=dict[str, Usual])
+            except msgspec.DecodeError as error:
+                raise ValueError(f"{self._path} has no baselines ({error}); remove it to learn anew") from error
+
+    def of(self, topic: str, wall: float) -> Usual:
+        """What is known of a topic at a Unix time; nothing at first."""
+        key = f"{topic}@{time.localtime(wall).tm_hour}" if self._by_hour else topic
+        learned = self._known.get(key)
+        if learned is None:
+            learned = self._known[key] = Usual()
+        return learned
+
+    async def save(self) -> None:
+        """Write what is known to the file, if there is one: whole, or not at all."""
+        if self._path is not None:
+            await asyncio.to_thread(_write, self._path, msgspec.json.encode(self._known))
+
+
+def _write(path: Path, data: bytes) -> None:
+    beside = path.with_name(f"{path.name}.new")
+    beside.write_bytes(data)
+    beside.replace(path)
+
+
+class Made(msgspec.Struct, frozen=True):
+    """How a topic comes about: the addresses of its publishers, and the topics that all they publish is made from."""
+
+    publishers: tuple[str, ...]
+    inputs: tuple[str, ...] = ()
+
+
+class _Flow:
+    """What is seen of one topic."""
+
+    __slots__ = ("came_in", "in_block", "last", "marks", "out_of_block", "poor")
+
+    def __init__(self, now: float) -> None:
+        self.marks: tuple[object, ...] = ()
+        self.begin(now)
+
+    def begin(self, now: float) -> None:
+        """Nothing that came before counts."""
+        self.last: float | None = None
+        self.came_in = self.in_block = self.out_of_block = self.poor = 0
+
+
+class FlowObserver(Observer):
+    """Says `ok(topic)` while a topic flows, and that it does not where it should.
+
+    A topic should flow while its inputs come; one without inputs, while its publishers have turns, or if it goes by a
+    clock. It is silent for too long after four times what came in, and after four times what has passed, between two
+    messages at most so far. Of what comes in, at least half of the usual part must go out. Until enough was heard, and
+    while nothing comes in, nothing is known.
+
+    Args:
+        made: topic to how it comes about; it may change.
+        heard: where to note who publishes what, by address.
+        leave_out: topics that are not listened to.
+        patience: seconds of silence that are never too long.
+        baselines: what is usual.
+        manner: see `Observer`.
+    """
+
+    def __init__(
+        self,
+        made: Mapping[str, Made],
+        *,
+        heard: dict[str, set[str]] | None = None,
+        leave_out: Collection[str] = (),
+        patience: float = 2.0,
+        baselines: Baselines | None = None,
+        manner: Manner | None = None,
+    ) -> None:
+        super().__init__(manner=manner or Manner(every=0.2))
+        if not patience > 0:
+            raise ValueError(f"patience is {patience!r}; it must be > 0 seconds")
+        self._made, self._heard_of = made, {} if heard is None else heard
+        self._leave_out, self._patience = frozenset(leave_out), patience
+        self._baselines = baselines or Baselines()
+        self._flows: dict[str, _Flow] = {}
+        self._users: dict[str, list[_Flow]] = {}
+        self._ears: set[str] = set()
+        self._saved = 0.0
+
+    @on(Heard)
+    def _heard(self, message: Heard) -> Any:
+        if message.sender is not None:
+            self._heard_of.setdefault(message.sender, set()).add(message.topic)
+        self.hear(message.topic, message.message)
+
+    def hear(self, topic: str, message: Any) -> None:
+        """Learn how long the topic was silent, and how much has come in meanwhile."""
+        flow = self._flows.get(topic)
+        if flow is not None:
+            if flow.last is not None:
+                self._learned(topic).take(self.now - flow.last, flow.came_in)
+            flow.last, flow.came_in = self.now, 0
+            flow.out_of_block += 1
+        for user in self._users.get(topic, ()):
+            user.came_in += 1
+            user.in_block += 1
+
+    def afresh(self) -> None:
+        """What came before somebody acted says nothing of after."""
+        for flow in self._flows.values():
+            flow.begin(self.now)
+
+    async def look(self) -> None:
+        """Listen to topics that are new, and say which flow."""
+        node = self.ctx._cell.node
+        for topic in {*node.topics.names(), *self._made} - self._ears - self._leave_out:
+            self._ears.add(topic)
+            listen(self, topic)
+        if self._flows.keys() != self._made.keys():
+            for gone in self._flows.keys() - self._made.keys():
+                del self._flows[gone]
+            for new in self._made.keys() - self._flows.keys():
+                self._flows[new] = _Flow(self.now)
+        self._users = {}
+        for topic, made in self._made.items():
+            for wanted in made.inputs:
+                self._users.setdefault(wanted, []).append(self._flows[topic])
+        for topic, made in self._made.items():
+            self.verdict(ok(topic), self._flows_well(topic, made))
+        if self.now - self._saved > 60.0:
+            self._saved = self.now
+            await self._baselines.save()
+
+    async def on_stop(self, reason: Any) -> None:
+        """Keep what was learned."""
+        await self._baselines.save()
+
+    def _learned(self, topic: str) -> Usual:
+        return self._baselines.of(topic, self.ctx._cell.node.clock.wall())
+
+    def _flows_well(self, topic: str, made: Made) -> bool | None:
+        flow, now = self._flows[topic], self.now
+        learned = self._learned(topic)
+        if not made.inputs:  # Its publishers' turns are what comes in.
+            cells = [self.ctx._cell.node.find(path) for path in made.publishers]
+            marks = tuple(None if cell is None else cell.item for cell in cells)
+            had_turns = len(marks) == len(flow.marks) and any(
+                one is not old for one, old in zip(marks, flow.marks, strict=True)
+            )
+            flow.came_in, flow.marks = flow.came_in + had_turns, marks
+        if flow.last is None:
+            return None
+        silent = now - flow.last
+        if learned.count < ENOUGH:
+            return True if silent < self._patience else None
+        is_long = silent > max(self._patience, LONGER * learned.longest_gap)
+        is_due = flow.came_in > ENOUGH // 2 + LONGER * learned.most_in
+        is_by_clock = not made.inputs and learned.longest_gap <= REGULAR * learned.mean_gap
+        if (is_due and silent > self._patience) or (is_by_clock and is_long):
+            return False
+        if made.inputs and flow.in_block >= BLOCK:
+            part, flow.in_block, flow.out_of_block = flow.out_of_block / flow.in_block, 0, 0
+            is_poor = learned.blocks >= BLOCKS and part < learned.least_out / 2
+            flow.poor = flow.poor + 1 if is_poor else 0
+            if not is_poor:
+                learned.take_block(part)
+        if flow.poor > 1:
+            return False
+        return True if silent < max(self._patience, LONGER * learned.mean_gap) else None

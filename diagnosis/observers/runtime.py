@@ -1,0 +1,320 @@
+"""An observer of what the runtime knows of its actors, without a word of theirs: who gets on, who waits for whom."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
+
+from ...actors.errors import AskTimeout
+from ...actors.events import ActorCrashed, EventStream
+from ...actors.exit_reasons import Crash
+from ...actors.kernel.cell import RUNNING, Cell
+from ...actors.kernel.envelope import Ask, chain_of
+from ...actors.kernel.message import Refusal
+from ...actors.kernel.node import Node
+from ...actors.process.open_asks import open_asks, outlet_of
+from ...supervision.intensity import recent_restarts
+from ..literals import Literal, crashes, progress, replies, room, waits_for
+from .node_observer import at_root
+from .observer import Manner, Observer
+
+LOOKS: Final = 20
+"""Looks in which an actor must have got on before a long turn of it says anything: until then only time-outs do."""
+LONGER: Final = 4.0
+"""Times the longest turn that was seen to end, after which one that others wait for is too long."""
+MOST: Final = 2_000
+"""Cells and mailbox items that are looked at for asks between processes."""
+SHARE: Final = 50.0
+"""Times the length of a look that passes between two looks at least: looking takes a fiftieth of the time at most."""
+LOOP: Final = 3
+"""Crashes within `WITHIN` seconds that are a crash loop."""
+WITHIN: Final = 10.0
+USUAL: Final = 10
+"""Looks of which the last ones say whom an actor waits for as a rule."""
+
+
+@dataclasses.dataclass(slots=True)
+class _Seen:
+    """What was seen of one actor so far."""
+
+    life: int = 0
+    mark: object = None
+    """What it had in hand at the last look; another one means that it has got on."""
+    since: float = 0.0
+    """When it was seen to get on for the last time."""
+    turns: int = 0
+    """Looks in which it had got on."""
+    longest: float = 0.0
+    """Seconds of the longest turn that was seen to end."""
+    full: float | None = None
+    """Since when its mailbox takes nothing more."""
+    unanswered: deque[tuple[float, float]] = dataclasses.field(default_factory=lambda: deque(maxlen=16))
+    """When asks of it have failed, and when they were made."""
+    crashes: tuple[float, ...] = ()
+    waited: deque[str] = dataclasses.field(default_factory=lambda: deque(maxlen=USUAL))
+    """Whom it waited for at the last looks."""
+
+
+class RuntimeObserver(Observer):
+    """Says who gets on, who answers, who crashes again and again, whose mailbox is full, and who waits for whom.
+
+    An actor is late if asks of it were not answered in time, or if others wait for it longer than the longest turn it
+    was seen to need, four times over. Who is late because it waits for another one is not accused: the last one in that
+    row is. If the row leads back to its beginning, all in the circle are. Of an actor that nobody has asked anything
+    nothing is said.
+
+    Args:
+        actors: component to address; it may change, and what is in it at a look is looked at.
+        patience: seconds; what takes no longer is not too long.
+        asked: where to note who was seen to ask whom, by component.
+        manner: see `Observer`; `every` is stretched, so that looking takes no more than a fiftieth of the time.
+    """
+
+    def __init__(
+        self,
+        actors: Mapping[str, str],
+        *,
+        patience: float = 1.0,
+        asked: dict[str, set[str]] | None = None,
+        manner: Manner | None = None,
+    ) -> None:
+        super().__init__(manner=manner or Manner(every=0.1))
+        if not patience > 0:
+            raise ValueError(f"patience is {patience!r}; it must be > 0 seconds")
+        self._actors, self._patience = actors, patience
+        self._asked = {} if asked is None else asked
+        self._known: dict[str, _Seen] = {}
+        self._failed: list[tuple[Ask, BaseException]] = []
+        self._stream: EventStream | None = None
+        self._rests_until = 0.0
+        self._loops: set[str] = set()  # who crashes again and again
+        self._let_down: dict[str, float] = {}  # when an ask of theirs has failed
+        self._waiting: set[Literal] = set()
+
+    def on_start(self, restored: bool) -> None:
+        """Begin to listen for failures. Raises SpecError in a process of its own."""
+        at_root(self)
+        super().on_start(restored)
+        self._stream = self._node.events.listen()
+        self._node.deadlines.watcher = self._note
+
+    def on_stop(self, reason: Any) -> None:
+        """Listen no more: it costs nothing from then on."""
+        self._end()
+
+    def on_restart(self, reason: Any) -> None:
+        """A life that has crashed listens no more."""
+        self._end()
+
+    def _end(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+        if self._node.deadlines.watcher == self._note:
+            self._node.deadlines.watcher = None
+
+    @property
+    def _node(self) -> Node:
+        return self.ctx._cell.node
+
+    def _note(self, ask: Ask, error: BaseException) -> None:
+        if len(self._failed) < MOST:
+            self._failed.append((ask, error))
+
+    def spares(self, grace: Any, about: Literal) -> bool:
+        """How often it crashes is just what is to be known."""
+        return self._loops.isdisjoint(about.args) and super().spares(grace, about)
+
+    def afresh(self) -> None:
+        """What was late before somebody acted says nothing of after."""
+        for seen in self._known.values():
+            seen.unanswered.clear()
+            seen.waited.clear()
+            seen.full = None
+
+    # -- looking ----------------------------------------------------------------------------------------------------
+
+    def look(self) -> None:
+        """Look at all actors, and say who gets on and who does not."""
+        now = self.now
+        if now < self._rests_until:
+            return
+        began = time.thread_time()  # What others compute meanwhile is not counted.
+        names = {path: component for component, path in self._actors.items()}
+        for gone in self._known.keys() - self._actors.keys():
+            del self._known[gone]
+        self._take_failures(names)
+        self._take_crashes(names)
+        waits, asked_since = self._waits(names, now)
+        late: dict[str, bool] = {}
+        for component, path in self._actors.items():
+            cell = self._node.find(path)
+            if cell is not None and cell.state is RUNNING and cell.host.is_up(cell):
+                late[component] = self._is_late(component, cell, asked_since.get(component), waits, now)
+            else:
+                self._seen(component).full = None
+                for atom in (progress(component), replies(component), room(component)):
+                    if component not in self._loops:
+                        self.verdict(atom, None)
+        self._tell(late, waits, now)
+        if self._node.clock.is_monotonic:
+            self._rests_until = now + (time.thread_time() - began) * SHARE
+
+    def _waits(self, names: Mapping[str, str], now: float) -> tuple[dict[str, set[str]], dict[str, float]]:
+        """Who waits for whom, and since when the oldest ask of each waits."""
+        waits: dict[str, set[str]] = {}
+        since: dict[str, float] = {}
+        for to, ask in open_asks(self._node, MOST):
+            callee = names.get(to.path)
+            if callee is None:
+                continue
+            since[callee] = min(since.get(callee, now), ask.deadline - ask.timeout)
+            asker = names.get(ask.sender.path) if ask.sender is not None else None
+            if asker is not None and asker != callee and ask.chain:
+                waits.setdefault(asker, set()).add(callee)
+                self._asked.setdefault(asker, set()).add(callee)
+        return waits, since
+
+    def _take_failures(self, names: Mapping[str, str]) -> None:
+        failed, self._failed = self._failed, []
+        for ask, error in failed:
+            callee = names.get(ask.to.path)
+            asker = names.get(ask.sender.path) if ask.sender is not None else None
+            if isinstance(error, Refusal):
+                continue  # That is an answer.
+            if callee is not None and isinstance(error, AskTimeout):
+                self._seen(callee).unanswered.append((self.now, self.now - ask.timeout))
+            if asker is not None and asker != callee:
+                self._let_down[asker] = self.now
+                if callee is not None and chain_of(ask):
+                    self._asked.setdefault(asker, set()).add(callee)
+
+    def _take_crashes(self, names: Mapping[str, str]) -> None:
+        """Crashes by themselves; who could not bear that another one did not answer is not to blame."""
+        assert self._stream is not None
+        for event in self._stream.take():
+            component = names.get(event.address) if isinstance(event, ActorCrashed) else None
+            if component is None or not isinstance(event, ActorCrashed) or not isinstance(event.reason, Crash):
+                continue
+            was_let_down = self.now - self._let_down.get(component, -math.inf) <= 2 * self.manner.every
+            if not (was_let_down or _is_anothers(event.reason)):
+                seen = self._seen(component)
+                seen.crashes = (*seen.crashes, self.now)
+        for seen in self._known.values():
+            seen.crashes = recent_restarts(seen.crashes, self.now, WITHIN)
+        self._loops = {component for component, seen in self._known.items() if len(seen.crashes) >= LOOP}
+
+    def _seen(self, component: str) -> _Seen:
+        seen = self._known.get(component)
+        if seen is None:
+            seen = self._known[component] = _Seen(since=self.now)
+        return seen
+
+    def _is_late(
+        self, component: str, cell: Cell, asked_since: float | None, waits: Mapping[str, set[str]], now: float
+    ) -> bool:
+        seen = self._seen(component)
+        mark, began = _in_hand(cell)
+        if seen.life != cell.life:
+            seen.life, seen.mark, seen.since = cell.life, mark, now
+            seen.unanswered.clear()
+        has_got_on = mark is not seen.mark
+        stood = now - seen.since
+        if has_got_on:
+            seen.longest = max(seen.longest, stood if began is not None or stood > self._patience else 0.0)
+            seen.mark, seen.since, seen.turns = mark, now if began is None else max(began, seen.since), seen.turns + 1
+        waits_now = sorted(waits.get(component, ()))
+        seen.waited.append(waits_now[0] if waits_now else "")
+        backlog = cell.host.backlog(cell)
+        limit = max(self._patience, LONGER * seen.longest) if seen.turns >= LOOKS else float("inf")
+        is_busy = began is not None or backlog > 0
+        is_wanted = asked_since is not None or backlog > 0
+        keeps = self.manner.time_to_live
+        while seen.unanswered and now - seen.unanswered[0][0] > keeps:
+            seen.unanswered.popleft()
+        stands = is_busy and is_wanted and now - seen.since > limit
+        # A turn that was under way when an ask of it ran out, and still is; or several asks that ran out.
+        unanswered = [at for at, made in seen.unanswered if is_busy and seen.since <= max(made, at - self._patience)]
+        is_late = stands or bool(unanswered) or len(seen.unanswered) > 1
+        seen.full = None if cell.has_room and not _is_full(cell) else now if seen.full is None else seen.full
+        is_full = seen.full is not None and now - seen.full >= self._patience
+        if cell.more is not None and cell.more.bound is not None and not is_full:
+            self.verdict(room(component), True)
+        if not is_late and not is_full and component not in self._loops:
+            answered = isinstance(cell.item, Ask) and cell.item.is_done and not seen.unanswered
+            self.verdict(
+                progress(component),
+                True if has_got_on else None if now - seen.since > keeps else self.said(progress(component)),
+            )
+            self.verdict(replies(component), True if has_got_on and answered else self.said(replies(component)))
+        return is_late or is_full
+
+    # -- blaming ----------------------------------------------------------------------------------------------------
+
+    def _tell(self, late: Mapping[str, bool], waits: Mapping[str, set[str]], now: float) -> None:
+        """Accuse whoever those who are late wait for in the end."""
+        accused: set[str] = set()
+        waiting: set[Literal] = set()
+        for component in (one for one, is_late in late.items() if is_late):
+            row = [component]
+            while (following := self._awaited(row[-1], waits)) is not None:
+                waiting.add(waits_for(row[-1], following))
+                if following in row:
+                    accused.update(row[row.index(following) :])
+                    break
+                row.append(following)
+            else:
+                accused.add(row[-1])
+        for component, is_late in late.items():
+            if component in accused:
+                full = self._seen(component).full
+                if full is not None and now - full >= self._patience:
+                    self.verdict(room(component), False)
+                self.verdict(progress(component), False)
+                self.verdict(replies(component), False)
+            elif is_late:
+                for atom in (progress(component), replies(component), room(component)):
+                    self.verdict(atom, None)
+        for over in self._waiting - waiting:
+            self.verdict(over, None)
+        self._waiting = waiting
+        for one in waiting:
+            self.verdict(one, True)
+        for component in self._known:
+            self.verdict(crashes(component), True if component in self._loops else None)
+            if component in self._loops:
+                self.verdict(progress(component), False)
+
+    def _awaited(self, component: str, waits: Mapping[str, Iterable[str]]) -> str | None:
+        """Whom an actor waits for now, or waited for at most of the last looks."""
+        now = sorted(one for one in waits.get(component, ()) if one in self._actors)
+        if now:
+            return now[0]
+        seen = self._known.get(component)
+        if seen is None or not seen.waited:
+            return None
+        usual, count = Counter(seen.waited).most_common(1)[0]
+        return usual if usual and 2 * count > len(seen.waited) and usual in self._actors else None
+
+
+def _in_hand(cell: Cell) -> tuple[object, float | None]:
+    """What an actor has in hand, or had last, and since when its turn waits; of one in a process what it was sent."""
+    outlet = outlet_of(cell)
+    if outlet is not None:
+        done = outlet.worker
+        return (outlet.flight[0][1] if outlet.flight else outlet.sent), (0.0 if outlet.flight and done else None)
+    turn = cell.more.turn if cell.more is not None else None
+    return cell.item, None if turn is None else turn.since
+
+
+def _is_full(cell: Cell) -> bool:
+    bound = cell.more.bound if cell.more is not None else None
+    return bound is not None and bound.count >= bound.capacity
+
+
+def _is_anothers(reason: Crash) -> bool:
+    """Whether an actor crashed because another one did not answer; of one in a process nothing else is known."""
+    return reason.type_name.rpartition(".")[2] in ("AskTimeout", "AskFailed", "RemoteCrash")

@@ -1,0 +1,93 @@
+"""One trial: a foreign system under traffic, perhaps with a fault, and what diagnosis says of it."""
+
+import asyncio
+import dataclasses
+import random
+
+import holdfast as hf
+from holdfast import diagnosis
+from holdfast.diagnosis import DIAGNOSIS
+from holdfast.diagnosis.engine import Diagnosis, State
+from tests.diagnosis.foreign.systems import Faults, Foreign, Item, Stage
+
+TRAFFICS = ("steady", "bursty", "doubled", "quiet")
+WARM = 40.0
+"""Seconds in which the usual traffic comes."""
+CHANGED = 20.0
+"""Seconds of the changed traffic before the fault."""
+WITHIN = 30.0
+"""Seconds in which a fault is to be named."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What was said: false alarms before the fault, who was named first, for certain or not, and after how long."""
+
+    false_alarms: tuple[str, ...]
+    first: tuple[str, ...] = ()
+    certain: tuple[str, ...] = ()
+    seconds: float = float("inf")
+
+
+class Listener(hf.Actor):
+    """Notes each diagnosis that names somebody, with its time."""
+
+    def __init__(self, said: list[tuple[float, Diagnosis]]) -> None:
+        self._said = said
+
+    @hf.subscribe(DIAGNOSIS)
+    @hf.on(Diagnosis)
+    def note(self, message: Diagnosis) -> None:
+        if message.state is State.FAULTY and message.candidates:
+            self._said.append((asyncio.get_running_loop().time(), message))
+
+
+async def _traffic(entry: hf.ActorRef[Stage], kind: str, rng: random.Random) -> None:
+    """Ten messages in a second, in bursts, twice as many, or a tenth."""
+    loop = asyncio.get_running_loop()
+    begin = loop.time()
+    number = 0
+    while True:
+        is_changed = loop.time() - begin > WARM
+        count, pause = 1, 0.1
+        if kind == "bursty":
+            count, pause = rng.randint(5, 40), rng.uniform(0.5, 3.0)
+        elif kind == "doubled" and is_changed:
+            pause = 0.05
+        elif kind == "quiet" and is_changed:
+            pause = 1.0
+        for _ in range(count):
+            number += 1
+            entry.tell(Item(number))
+        await asyncio.sleep(pause * rng.uniform(0.7, 1.3))
+
+
+async def trial(foreign: Foreign, fault: tuple[str, str] | None, kind: str, seed: int, healthy: float = 0.0) -> Outcome:
+    """Let a system run, change its traffic, and strike it; it is looked at `healthy` seconds longer before that."""
+    faults = Faults()
+    said: list[tuple[float, Diagnosis]] = []
+    loop = asyncio.get_running_loop()
+    async with hf.ActorSystem("app", log=False, seed=seed) as system:
+        await system.start(hf.supervisor("all", children=foreign.children(faults), intensity=1000, period=5.0))
+        system.spawn(hf.start(Listener, said))
+        entry = system.ref(f"/app/all/{foreign.entry}", Stage)
+        driving = asyncio.create_task(_traffic(entry, kind, random.Random(seed)))
+        try:
+            await diagnosis.watch(system, seconds=3.0)
+            await asyncio.sleep(WARM + CHANGED + healthy)
+            false_alarms = tuple(str(one) for _, one in said)
+            if fault is None:
+                return Outcome(false_alarms)
+            said.clear()
+            struck = loop.time()
+            faults.of[fault[0]] = fault[1]
+            while not said and loop.time() - struck < WITHIN:
+                await asyncio.sleep(0.1)
+            if not said:
+                return Outcome(false_alarms)
+            at, first = said[0]
+            names = tuple(name.rpartition("/")[2] for name in first.candidates[0].bad)
+            certain = tuple(name.rpartition("/")[2] for name in first.certain)
+            return Outcome(false_alarms, names, certain, at - struck)
+        finally:
+            driving.cancel()

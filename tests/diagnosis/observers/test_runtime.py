@@ -1,0 +1,209 @@
+"""What the runtime knows, as literals: no actor here says a word about itself."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast import diagnosis
+from holdfast.diagnosis.engine import State
+from holdfast.diagnosis.literals import crashes, progress, replies, room, waits_for
+from holdfast.diagnosis.observers import RuntimeObserver
+from holdfast.testing import advance
+
+pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
+
+
+class Go(hf.Message[int]):
+    """Do it; "ask ADDRESS", "freeze", "crash" or nothing."""
+
+    what: str = ""
+    timeout: float = 60.0
+
+
+class Worker(hf.Actor):
+    @hf.on(Go)
+    async def go(self, message: Go) -> int:
+        match message.what.split():
+            case ["ask", address]:
+                await self.ctx.find(address, Worker).ask(Go("", message.timeout), timeout=message.timeout)
+            case ["wrap", address]:
+                try:
+                    await self.ctx.find(address, Worker).ask(Go("crash"))
+                except hf.HoldfastError:
+                    raise ValueError("something of ours does not work") from None
+            case ["both", address]:
+                await asyncio.sleep(0.05)
+                await self.ctx.find(address, Worker).ask(Go("", message.timeout), timeout=message.timeout)
+            case ["freeze"]:
+                await asyncio.Event().wait()
+            case ["crash"]:
+                raise RuntimeError("broken")
+            case ["long", seconds]:
+                await asyncio.sleep(float(seconds))
+            case _:
+                pass
+        return 1
+
+
+@pytest.fixture
+async def system() -> AsyncIterator[hf.ActorSystem]:
+    async with hf.ActorSystem("t", log=False, seed=1) as running:
+        children = [hf.child(name, hf.start(Worker)) for name in ("a", "b", "c")]
+        full = hf.child("full", hf.start(Worker), mailbox=hf.bounded(3))
+        await running.start(hf.supervisor("all", intensity=100, period=1.0, children=[*children, full]))
+        yield running
+
+
+def worker(system: hf.ActorSystem, name: str) -> hf.ActorRef[Worker]:
+    return system.ref(f"/t/all/{name}", Worker)
+
+
+async def watched(system: hf.ActorSystem) -> diagnosis.Watch:
+    """Diagnosis, after everybody has got on for a while."""
+    watching = await diagnosis.watch(system, seconds=0.1)
+    for _ in range(40):
+        for name in ("a", "b", "c", "full"):
+            await worker(system, name).ask(Go())
+        await advance(0.1)
+    assert (await watching.diagnosis()).state is State.HEALTHY
+    return watching
+
+
+async def asked(*asks: Any) -> None:
+    """Wait for asks that come to nothing."""
+    await asyncio.gather(*asks, return_exceptions=True)
+
+
+async def test_a_frozen_callee_is_certain_behind_two_that_wait_for_it(system: hf.ActorSystem) -> None:
+    watching = await watched(system)
+    worker(system, "c").tell(Go("freeze"))
+    worker(system, "b").tell(Go("ask /t/all/c"))
+    worker(system, "a").tell(Go("ask /t/all/b"))
+    await advance(1.3)
+    found = await watching.diagnosis()
+    assert (found.certain, [one.bad for one in found.candidates]) == (("all/c",), [("all/c",)])
+    observed = await watching.observed()
+    assert {progress("all/c"), replies("all/c")} <= observed.negative
+    assert not {progress("all/a"), progress("all/b"), replies("all/a"), replies("all/b")} & observed.negative
+    await advance(1.5)  # The model has learned who asks whom.
+    assert waits_for("all/b", "all/c") in (await watching.observed()).positive
+    assert (await watching.diagnosis()).certain == ("all/c",)
+
+
+async def test_a_time_out_names_the_callee_though_it_was_never_seen_to_get_on(system: hf.ActorSystem) -> None:
+    watching = await diagnosis.watch(system, seconds=0.1)
+    worker(system, "c").tell(Go("freeze"))
+    await asked(worker(system, "c").ask(Go(), timeout=3.0))
+    await advance(0.3)
+    assert (await watching.diagnosis()).certain == ("all/c",)
+
+
+async def test_in_a_circle_of_asks_all_are_certain(system: hf.ActorSystem) -> None:
+    watching = await watched(system)
+    worker(system, "a").tell(Go("both /t/all/b"))
+    worker(system, "b").tell(Go("both /t/all/a"))
+    await advance(1.5)
+    assert set((await watching.diagnosis()).certain) == {"all/a", "all/b"}
+
+
+async def test_a_long_turn_that_nobody_waits_for_and_one_that_is_usual_are_no_fault(system: hf.ActorSystem) -> None:
+    watching = await watched(system)
+    worker(system, "a").tell(Go("long 30"))
+    await advance(10.0)
+    assert (await watching.diagnosis()).state is State.HEALTHY
+    await advance(25.0)
+    asking = asyncio.ensure_future(worker(system, "a").ask(Go("long 50"), timeout=90.0))
+    await advance(40.0)
+    assert (await watching.diagnosis()).state is State.HEALTHY
+    await advance(20.0)
+    assert await asking == 1
+
+
+async def test_a_crash_loop_is_certain_and_one_crash_is_none(system: hf.ActorSystem) -> None:
+    watching = await watched(system)
+    worker(system, "b").tell(Go("crash"))
+    await advance(1.5)
+    assert (await watching.diagnosis()).state is State.HEALTHY
+    for _ in range(2):
+        worker(system, "b").tell(Go("crash"))
+        await advance(1.0)
+    assert (await watching.diagnosis()).certain == ("all/b",)
+    assert crashes("all/b") in (await watching.observed()).positive
+    assert "not progress(all/b): all/b is faulty" in (await watching.why()).text
+
+
+async def test_who_crashes_because_another_one_does_not_answer_is_not_to_blame(system: hf.ActorSystem) -> None:
+    watching = await watched(system)
+    worker(system, "c").tell(Go("freeze"))
+    for _ in range(4):
+        worker(system, "a").tell(Go("ask /t/all/c", 0.5))
+        await advance(1.0)
+    found = await watching.diagnosis()
+    assert [one.bad for one in found.candidates] == [("all/c",)]
+
+
+@pytest.mark.parametrize("way", ["wrap /t/all/c", "ask /t/all/c"])
+async def test_a_callee_in_a_crash_loop_is_certain_whatever_its_callers_raise(system: hf.ActorSystem, way: str) -> None:
+    watching = await watched(system)
+    for _ in range(4):
+        if "ask" in way:
+            worker(system, "c").tell(Go("crash"))
+        worker(system, "b").tell(Go(way))
+        await advance(1.0)
+    found = await watching.diagnosis()
+    assert [one.bad for one in found.candidates] == [("all/c",)]
+
+
+async def test_a_full_mailbox_is_certain(system: hf.ActorSystem) -> None:
+    watching = await watched(system)
+    full = worker(system, "full")
+    full.tell(Go("long 3"))
+    for _ in range(200):  # It gets on, and still there is no room.
+        while (cell := full._cell).has_room and cell.more is not None and cell.more.bound is not None:
+            if cell.more.bound.count == cell.more.bound.capacity:
+                break
+            full.tell(Go("long 0.5"))
+        await advance(0.1)
+        if room("all/full") in (await watching.observed()).negative:
+            break
+    assert (await watching.diagnosis()).certain == ("all/full",)
+
+
+async def test_nothing_is_said_of_who_was_asked_nothing_and_it_is_unknown(system: hf.ActorSystem) -> None:
+    watching = await diagnosis.watch(system, seconds=0.1)
+    await worker(system, "a").ask(Go())
+    await advance(1.0)
+    found = await watching.diagnosis()
+    assert set(found.unknown) == {"all/b", "all/c", "all/full"}
+    assert str(found) == "healthy, as far as is known: 3 unknown"
+
+
+async def test_children_that_come_later_and_those_that_go_are_followed(system: hf.ActorSystem) -> None:
+    watching = await watched(system)
+    keeper = system.ref("/t/all", hf.Supervisor)
+    await keeper.ask(hf.StartChild(hf.child("late", hf.start(Worker))))
+    await advance(2.5)
+    assert "all/late" in (await watching.diagnosis()).components
+    worker(system, "late").tell(Go("freeze"))
+    await asked(worker(system, "late").ask(Go(), timeout=1.0))
+    await advance(0.5)
+    assert (await watching.diagnosis()).certain == ("all/late",)
+    await keeper.ask(hf.TerminateChild("late"), timeout=30.0)
+    await keeper.ask(hf.DeleteChild("late"))
+    await advance(7.0)
+    found = await watching.diagnosis()
+    assert "all/late" not in found.components
+    assert found.state is State.HEALTHY
+
+
+async def test_nothing_is_told_when_nobody_looks(system: hf.ActorSystem) -> None:
+    watching = await watched(system)
+    node = system._node
+    assert node.deadlines.watcher is not None
+    await system.stop(watching.tree)
+    assert node.deadlines.watcher is None
+    with pytest.raises(ValueError, match="patience"):
+        RuntimeObserver({}, patience=0.0)

@@ -1,0 +1,89 @@
+"""Each check that keeps repair from doing harm is there for a reason: take it out, and a test fails.
+
+`HOLDFAST_REMOVED=1 python -m pytest tests/diagnosis/repair/test_removed_repair.py` does so, in a copy; otherwise it is
+only looked whether the checks and the tests are where this table says.
+"""
+
+from __future__ import annotations
+
+from tests.removing import Check, as_tests
+
+WHOLE = "tests/diagnosis/repair/test_whole_restarts.py"
+ACTORS = "tests/diagnosis/repair/test_actors.py"
+LOOP = "tests/diagnosis/repair/test_loop.py"
+WORSE = "tests/diagnosis/repair/test_no_worse.py"
+
+CHECKS = {
+    "a restart by order whose start fails is tried on": Check(
+        "supervision/supervisor.py",
+        '            if has_run and one.spec.restart != "temporary":\n',
+        "            if False:\n",
+        WHOLE,
+        "test_a_restart_by_order_whose_start_fails",
+    ),
+    "nothing below a supervisor that gives up is granted": Check(
+        "supervision/arbiter.py",
+        "        if (above := self._escalation(address)) is not None:\n",
+        "        if (above := None) is not None:\n",
+        WHOLE,
+        "test_nothing_below_a_supervisor_that_escalates",
+    ),
+    "who answers is not restarted because somebody says that it does not run": Check(
+        "diagnosis/repair/case_decisions.py",
+        "    if wrong := [name for name in alive if name in down]:\n",
+        "    if wrong := list[str]():\n",
+        ACTORS,
+        "test_an_observer_that_lies_about_who_runs",
+    ),
+    "a restart that changes nothing is not tried again": Check(
+        "diagnosis/repair/ledger.py",
+        "        if now < self._memory.vain.get((action.name, component), now):\n",
+        "        if False:\n",
+        ACTORS,
+        "test_an_observer_that_lies_about_an_output",
+    ),
+    "who is suspended by order is not restarted": Check(
+        "diagnosis/repair/case_decisions.py",
+        "    if suspended := [name for name, answer in pings.items() if answer is None]:\n",
+        "    if suspended := list[str]():\n",
+        ACTORS,
+        "test_who_is_suspended_by_order",
+    ),
+    "a denial lasts": Check(
+        "diagnosis/repair/repairer.py",
+        "            self._ledger.deny(bad, why)\n",
+        "",
+        LOOP,
+        "test_what_was_denied_stays_so",
+    ),
+    "no more actions than the hour allows": Check(
+        "diagnosis/repair/ledger.py",
+        " and self._in_hour(now) < policy.hour_actions\n",
+        "\n",
+        LOOP,
+        "test_no_more_actions_than_the_hour_allows",
+    ),
+    "what its supervisor has just started is given time": Check(
+        "diagnosis/repair/repairer.py",
+        "        if back := tuple(sorted(case.awaited & set(bad))):\n",
+        "        if back := tuple[str, ...]():\n",
+        WORSE,
+        "test_repair_is_no_worse_than_supervision_alone and slow",
+    ),
+    "a client of the board that has said nothing for the longest time gives its seat to a new one": Check(
+        "diagnosis/board/tcp_server.py",
+        "        if len(self._clients) > MOST_CLIENTS and not self._free_seat(task):\n",
+        "        if len(self._clients) > MOST_CLIENTS:\n",
+        "tests/diagnosis/board/test_board.py",
+        "test_silent_clients_give_their_seats",
+    ),
+    "a board with a token serves nobody without it": Check(
+        "diagnosis/board/tcp_server.py",
+        "        if not self._is_known and not isinstance(frame, AuthenticateFrame):\n",
+        "        if False:\n",
+        "tests/diagnosis/board/test_board.py",
+        "test_without_the_token_nothing_is_done",
+    ),
+}
+
+test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)

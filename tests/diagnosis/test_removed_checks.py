@@ -1,0 +1,96 @@
+"""Each safety check of the evidence for diagnosis is there for a reason: take it out, and a test fails.
+
+`HOLDFAST_REMOVED=1 python -m pytest tests/diagnosis/test_removed_checks.py` does so, in a copy; otherwise it is only
+looked whether the checks and the tests are where this table says.
+"""
+
+from __future__ import annotations
+
+from tests.removing import Check, as_tests
+
+ENGINE = "tests/diagnosis/test_engine.py"
+OBSERVATIONS = "tests/diagnosis/test_observations.py"
+RUNTIME = "tests/diagnosis/observers/test_runtime.py"
+FLOW = "tests/diagnosis/observers/test_flow.py"
+
+CHECKS = {
+    "what is contested is unknown, and the rest is diagnosed": Check(
+        "diagnosis/engine/minimal_diagnoses.py",
+        "state = State.FAULTY if is_faulty else State.CONTRADICTORY",
+        "state = State.CONTRADICTORY",
+        ENGINE,
+        "nobody_is_blamed or cost_only_what",
+    ),
+    "nobody is blamed for what is contested": Check(
+        "diagnosis/engine/minimal_diagnoses.py",
+        "clear = [part for part in cone.parts if contested.isdisjoint(part.components)]",
+        "clear = list(cone.parts)",
+        ENGINE,
+        "nobody_is_blamed",
+    ),
+    "a part that ran out of time hides no other": Check(
+        "diagnosis/engine/minimal_diagnoses.py",
+        "parts = [solved for solved in every if solved.sets]",
+        "parts = every",
+        ENGINE,
+        "what_is_certain_is_known",
+    ),
+    "an explanation has a time": Check(
+        "diagnosis/engine/minimal_diagnoses.py",
+        "return explain(index, positive, negative, time.monotonic() + seconds)",
+        "return explain(index, positive, negative)",
+        ENGINE,
+        "an_explanation_ends",
+    ),
+    "that an actor runs says nothing of its work": Check(
+        "diagnosis/engine/cone.py",
+        'literal.name not in ("running", "room")',
+        "True",
+        ENGINE,
+        "is_unknown",
+    ),
+    "a liar is set aside as a whole": Check(
+        "diagnosis/observations.py",
+        "if seen.is_current(now) and seen.source not in liars",
+        "if seen.is_current(now)",
+        OBSERVATIONS,
+        "set_aside",
+    ),
+    "who waits for another one is not accused": Check(
+        "diagnosis/observers/runtime.py",
+        "while (following := self._awaited(row[-1], waits)) is not None:",
+        "while (following := None) is not None:",
+        RUNTIME,
+        "behind_two_that_wait",
+    ),
+    "who crashes because of another one is not to blame": Check(
+        "diagnosis/observers/runtime.py",
+        "if not (was_let_down or _is_anothers(event.reason)):",
+        "if True:",
+        RUNTIME,
+        "who_crashes_because",
+    ),
+    "a long turn that nobody waits for is no fault": Check(
+        "diagnosis/observers/runtime.py",
+        "stands = is_busy and is_wanted and now",
+        "stands = is_busy and now",
+        RUNTIME,
+        "a_long_turn",
+    ),
+    "nobody is told of failures when nobody looks": Check(
+        "diagnosis/observers/runtime.py",
+        "            self._node.deadlines.watcher = None",
+        "            pass",
+        RUNTIME,
+        "nothing_is_told",
+    ),
+    "silence without input is no fault": Check(
+        "diagnosis/observers/flow.py",
+        "is_by_clock = not made.inputs and learned",
+        "is_by_clock = learned",
+        FLOW,
+        "when_its_input_stops",
+    ),
+}
+
+test_the_table_is_true, test_somebody_misses_it = as_tests(CHECKS)
