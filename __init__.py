@@ -67,7 +67,7 @@ from holdfast.supervision.rules import rule
 from holdfast.supervision.spec import ChildSpec, Plan, child
 from holdfast.supervision.supervisor import Supervisor
 from holdfast.supervision.tree import supervisor
-from holdfast.system.connection import Connection, connect
+from holdfast.system.connection import connect
 from holdfast.system.run import run
 from holdfast.system.system import ActorSystem
 from holdfast.system.transaction.errors import TransactionFailed, TransactionRefused
@@ -85,7 +85,6 @@ __all__ = [
     "Backoff",
     "Binding",
     "ChildSpec",
-    "Connection",
     "Crash",
     "DeleteChild",
     "ExitReason",

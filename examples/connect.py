@@ -20,7 +20,11 @@ class Deposited(hf.Message[None]):
     amount: int
 
 
-class Count(hf.Message[int]): ...
+class Watch(hf.Message[None]):
+    account: hf.ActorRef[hf.Actor]
+
+
+class Report(hf.Message[str]): ...
 
 
 class Account(hf.Actor):
@@ -37,18 +41,27 @@ class Account(hf.Actor):
 
 
 class Audit(hf.Actor):
-    """An actor of another system, which hears of all deposits."""
+    """An actor of another system: it hears of all deposits, and whether the bank can be reached."""
 
     def __init__(self) -> None:
-        self.heard = 0
+        self.deposits = 0
+        self.lost = ""
+
+    @hf.on(Watch)
+    def watch(self, message: Watch) -> None:
+        self.ctx.monitor(message.account)
 
     @hf.on(Deposited)
     def hear(self, message: Deposited) -> None:
-        self.heard += 1
+        self.deposits += 1
 
-    @hf.on(Count)
-    def count(self, message: Count) -> int:
-        return self.heard
+    def on_down(self, source: hf.ActorRef[hf.Actor], reason: hf.ExitReason, recovering: bool) -> None:
+        if isinstance(reason, hf.NoConnection):  # It may well live on: nobody here can say.
+            self.lost = reason.node
+
+    @hf.on(Report)
+    def report(self, message: Report) -> str:
+        return f"{self.deposits} deposit, {self.lost or 'nothing'} lost"
 
 
 async def lead(store: str) -> None:
@@ -78,9 +91,21 @@ async def listen(store: str) -> None:
     async with hf.ActorSystem("office", log=False) as office:
         audit = await office.start(hf.child("audit", hf.start(Audit)))
         async with hf.connect(store, within=office) as bank:
+            account = bank.ref("/bank/account", Account)
             bank.subscribe("/deposits", audit)
-            print(await bank.ref("/bank/account", Account).ask(Deposit(5)))  # 115
-            print(await audit.ask(Count()))  # 1
+            await audit.ask(Watch(account))
+            print(await account.ask(Deposit(5)))  # 115
+            print(await audit.ask(Report()))  # 1 deposit, nothing lost
+        print(await audit.ask(Report()))  # 1 deposit, bank lost
+        print(await balance(bank))  # None
+
+
+async def balance(bank: hf.system.Connection) -> int | None:
+    """What is in the account, if the bank can be reached."""
+    try:
+        return await bank.ref("/bank/account", Account).ask(Deposit(0))
+    except hf.Unreachable:  # Nothing was sent.
+        return None
 
 
 async def main() -> None:

@@ -3,6 +3,7 @@
 from ..actors.control.live_state import Opaque
 from ..actors.control.orders import Status
 from ..actors.control.tracing import Statistics
+from .connection import Connection
 from .history.evidence import PutAside
 from .history.lives import PastLife
 from .history.pages import HistoryPage
@@ -13,6 +14,7 @@ from .transaction.operation import Operation, Step
 
 __all__ = [
     "Change",
+    "Connection",
     "HistoryPage",
     "Opaque",
     "Operation",

@@ -113,7 +113,7 @@ class Connection:
 
     @property
     def is_reachable(self) -> bool:
-        """Whether a program that leads the other system has answered within the last seconds."""
+        """Tell whether a program that leads the other system has answered within the last seconds."""
         return self._call is not None and self._call.far.line is not None and not self._call.far.is_lost
 
     @overload
