@@ -9,6 +9,7 @@ from .actors.errors import (
     BadMessage,
     BadReply,
     CannotMove,
+    ConnectionLost,
     ControlFailed,
     EffectFailed,
     EffectInDoubt,
@@ -59,6 +60,7 @@ from .checkpoint.snapshot.snapshot_groups import NoSuchGroup
 from .checkpoint.snapshot.snapshot_schedule import CheckpointFailed
 from .checkpoint.upgrade.mapping import NotMapped
 from .cluster.leadership import LeadershipLost
+from .cluster.lines.lines import LineTaken
 from .cluster.ports import AccessRefused, UnsafeServer
 from .ftm.group.reconfiguration import CannotAdapt
 from .ftm.mechanisms.rb import NotAccepted
@@ -101,6 +103,7 @@ __all__ = [
     "CheckpointFailed",
     "ChildBusy",
     "ChildParked",
+    "ConnectionLost",
     "ControlFailed",
     "DamagedStore",
     "EffectFailed",
@@ -112,6 +115,7 @@ __all__ = [
     "InOtherHands",
     "InputRefused",
     "LeadershipLost",
+    "LineTaken",
     "MailboxFull",
     "MaxChildren",
     "MechanismRefused",

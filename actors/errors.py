@@ -224,6 +224,10 @@ class AskFailed(HoldfastError, text="{actor} ended while it handled the message:
     reason: str
 
 
+class ConnectionLost(AskFailed, text="nobody knows whether {actor} has handled the message: {reason}"):
+    """Another program leads the receiver's system, or the connection to it has ended: the receiver may well live on."""
+
+
 class Unreachable(SendError, text="{actor} cannot be reached: {problem}; nothing was sent"):
     """The program that the receiver lives in is known to be cut off, or to have ended."""
 

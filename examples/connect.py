@@ -106,6 +106,8 @@ async def balance(bank: hf.system.Connection) -> int | None:
         return await bank.ref("/bank/account", Account).ask(Deposit(0))
     except hf.Unreachable:  # Nothing was sent.
         return None
+    except hf.errors.ConnectionLost:  # It may have been done, by an actor without recovery.
+        return None
 
 
 async def main() -> None:

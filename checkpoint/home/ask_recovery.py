@@ -236,6 +236,11 @@ class FarMail:
             batch.add(FAR, ("settled", *which), self._positions)
             batch.commit(self._homes.journal)
 
+    def forget_run(self, system: str, run: int) -> None:
+        """A run of another program is over: what it has asked, and not by a recorded actor, it does not ask again."""
+        for which in [one for one in self._answers if one.run == run and one.asker[1:].partition("/")[0] == system]:
+            del self._answers[which]
+
     # -- what is told to other systems ------------------------------------------------------------------------------
 
     def keeps(self, origin: str, out: Out, sender: str, batch: Batch) -> bool:

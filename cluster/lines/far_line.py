@@ -18,8 +18,9 @@ import msgspec
 
 from ...actors.control.trace_tail import enveloped
 from ...actors.errors import (
-    AskFailed,
     BadMessage,
+    BadReply,
+    ConnectionLost,
     HoldfastError,
     NotGranted,
     UnknownMessage,
@@ -43,7 +44,7 @@ from ...actors.process.wire.peer import (
     RemoteHome,
     obey,
 )
-from ...actors.process.wire.worker_gate import is_order
+from ...actors.process.wire.worker_gate import is_at_or_below, is_order
 from ...checkpoint.home.ask_recovery import LASTING, FarId, FarOut, RejoinedAsk, lasting_number, origin_asked_by
 from ...checkpoint.home.pending_asks import ACCEPTED, SwitchAsk
 from ...checkpoint.home.recorded_home import switch_of
@@ -67,6 +68,10 @@ COMMANDS: Final = frozenset(
     ("monitor", "demonitor", "link", "unlink", "exit", "down", "subscribe", "unsubscribe", "settled")
 )  # fmt: skip
 """What one system may want of the actors of another one."""
+SPEAKER: Final = {
+    "monitor": "watcher", "demonitor": "watcher", "link": "peer", "unlink": "peer", "exit": "source", "down": "source"
+}  # fmt: skip
+"""Where a command has the address of the actor that wants it, unless that is the one that it is addressed to."""
 _DECODER: Final[msgspec.msgpack.Decoder[frames.AnyFrame]] = msgspec.msgpack.Decoder(frames.AnyFrame)
 
 
@@ -112,9 +117,13 @@ class LineConnection:
         except Exception as error:  # Whatever a payload raises while it is encoded means that it cannot be.
             payload = frame.body if isinstance(frame, (frames.Tell, frames.Ask, frames.Reply)) else frame
             raise BadMessage(actor, type_name(type(payload)), unencodable(payload, error)) from error
-        if len(data) > MOST_BYTES:
-            problem = f"it has {len(data)} bytes, the limit between systems is {MOST_BYTES}; send it in parts"
-            raise BadMessage(actor, type_name(type(frame)), problem)
+        if len(data) > self._far.most:
+            match frame:
+                case frames.Tell() | frames.Ask() | frames.Offer() | frames.Publish():
+                    name = str(frame.name).replace(":", ".")
+                case _:
+                    name = type_name(type(frame))
+            raise BadMessage(actor, name, self._far.too_large(len(data)))
         self._far.put(frame, data)
 
     @property
@@ -234,6 +243,7 @@ class FarLine(Peer):
         is_lost: whether it has not answered for long.
         is_closed: whether nothing goes over any more.
         is_closing: whether this program ends: it takes in nothing new, and still answers.
+        most: the largest item that can be sent, in bytes.
         hand_back: is given the asks of recorded actors that are out when it is closed.
         await_actor: has something done when somebody is started at an address; None: nobody will be soon.
     """
@@ -252,6 +262,7 @@ class FarLine(Peer):
         self.is_lost = False
         self.is_closed = self.is_closing = False
         self.await_actor: Callable[[str, Callable[[], None]], bool] = lambda path, then: False
+        self.most = MOST_BYTES
         self.hand_back: Callable[[SwitchAsk], None] = lambda ask: None
         self._held: list[bytes] = []  # until the other program has answered
         self._held_bytes = 0
@@ -316,9 +327,14 @@ class FarLine(Peer):
             frame = frames.Reply(which.number, msgspec.Raw(answer.body))
         else:
             frame = frames.Failure(which.number, answer.kind, answer.name, msgspec.Raw(answer.body))
+        data = msgspec.msgpack.encode(frame)
+        if len(data) > self.most:
+            error = BadReply("the recorded actor", "what it was asked", self.too_large(len(data)))
+            kind, name, body = self.codec.encode_error(error)
+            data = msgspec.msgpack.encode(frames.Failure(which.number, kind, name, msgspec.Raw(body)))
         # A recorded asker says by itself when it has the outcome for good.
         arrived = None if which.run == LASTING else lambda: homes.far.settled(which)
-        line.put(NEW + msgspec.msgpack.encode(frame), arrived)
+        line.put(NEW + data, arrived)
 
     def _send_ask(self, cell: Cell, path: str, ask: Ask, number: int) -> None:
         if isinstance(ask, SwitchAsk):
@@ -364,6 +380,10 @@ class FarLine(Peer):
         frame = frames.Ask(key, ask.to.path, name, body, until, kind, sender, ask.chain)
         return msgspec.msgpack.encode(frame, enc_hook=encode_special)
 
+    def too_large(self, size: int) -> str:
+        """Why something cannot be sent that has so many bytes."""
+        return f"it has {size} bytes, the limit between systems is {self.most} here; send it in parts"
+
     def say(self, note: Note = "") -> None:
         """Post a batch without items: a greeting as long as the other program has not answered."""
         if self.line is not None:
@@ -402,7 +422,7 @@ class FarLine(Peer):
         self._suspect()
         for key, ask in list(self.pending.items()):
             if type(ask.message) is Accepted:
-                self.pending.pop(key).fail(AskFailed(f"/{self.name}", f"{why}; it may have been accepted"))
+                self.pending.pop(key).fail(ConnectionLost(f"/{self.name}", why))
 
     def lose(self) -> None:
         """The other program has not answered for long: whoever watches actors there is told of the suspicion, once."""
@@ -423,7 +443,7 @@ class FarLine(Peer):
             if isinstance(ask, SwitchAsk):  # It waits for the next connection, as long as its turn does.
                 del self.pending[key]
                 self.hand_back(ask)
-        self.fail_pending(AskFailed(f"/{self.name}", str(NoConnection(self.name))))
+        self.fail_pending(ConnectionLost(f"/{self.name}", str(NoConnection(self.name))))
 
     def _suspect(self) -> None:
         """Tell of the suspicion: EXIT over links, DOWN to monitors; and those there watch nobody here any more."""
@@ -470,9 +490,33 @@ class FarLine(Peer):
                 raise BadFrame(f"a {type(frame).__name__} on a line")
             if self.is_closing and isinstance(frame, (frames.Tell, frames.Ask, frames.Offer, frames.Publish)):
                 return  # Whoever asks, asks whoever leads this system next.
+            self._check_addresses(frame)
             take(frame, data[:1] == AGAIN)
         except (BadFrame, msgspec.MsgspecError) as error:
             self.node.dead_letter(self.stand_in(f"/{self.name}"), data, f"not understood: {error}")
+
+    def _check_addresses(self, frame: frames.Frame) -> None:
+        """See that the other program speaks for its own actors only, and to actors here: it is no way to others.
+
+        Raises:
+            BadFrame: it does not, or an address is missing.
+        """
+        if isinstance(frame, frames.Command):
+            speaks = SPEAKER.get(frame.verb)
+            self._check_within(frame.to, self._me if speaks else self.name)
+            if speaks:
+                self._check_within(frame.data.get(speaks), self.name)
+        elif isinstance(frame, (frames.Tell, frames.Ask, frames.Offer, frames.Publish)):
+            if not isinstance(frame, frames.Publish):
+                self._check_within(frame.to, self._me)
+            if frame.sender is not None:
+                self._check_within(frame.sender, self.name)
+            if isinstance(frame, frames.Ask) and math.isnan(frame.until):
+                raise BadFrame("an ask until nan")
+
+    def _check_within(self, path: object, system: str) -> None:
+        if not isinstance(path, str) or not is_at_or_below(path, f"/{system}"):
+            raise BadFrame(f"{path!r} is no address of {system}")
 
     def _receiver(self, to: frames.Name) -> Cell:
         """The actor here that something is for."""
@@ -512,7 +556,7 @@ class FarLine(Peer):
             if frame.number == TOLD:
                 self.connection.send(frames.Reply(frame.id, msgspec.Raw(ACCEPTED.body)))  # Once at most.
             else:
-                self._fail(frame, AskFailed(path, str(NoConnection(self._me))))
+                self._fail(frame, ConnectionLost(path, str(NoConnection(self._me))))
             return
         if homes is not None and (again or frame.number != PASSING):
             known = homes.far.outcome(which)

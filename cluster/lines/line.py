@@ -7,6 +7,7 @@ line joins two incarnations: what was sent to a program that was started anew si
 from __future__ import annotations
 
 import asyncio
+import sys
 from collections import deque
 from collections.abc import Callable
 from typing import Final, Literal, NamedTuple
@@ -15,6 +16,8 @@ import msgspec
 
 RESEND_SECONDS: Final = 0.5
 """After so long without a word that something has come, it is sent again."""
+MOST_RESEND_SECONDS: Final = 4.0
+"""That time doubles each time up to this."""
 ACK_SECONDS: Final = 0.02
 """How long what has come may wait to be acknowledged with what is sent anyway."""
 ACK_AT_ONCE: Final = 256
@@ -90,6 +93,7 @@ class Line:
         "_missed",
         "_owed",
         "_owing",
+        "_patience",
         "_post",
         "_resend",
         "_sent",
@@ -113,6 +117,7 @@ class Line:
         self._arrived = 0  # how many of all items so far the other end has said to have
         self._sent = 0  # how many of all items so far have been sent
         self._owed = 0  # items that have come and are not acknowledged
+        self._patience = RESEND_SECONDS
         self._missed = -1  # how many had come when it was last said that the next one had not
         self._bytes = 0
         self._flushing: asyncio.Handle | None = None
@@ -144,15 +149,16 @@ class Line:
         self._waiters.append(future)
         return future
 
-    def flush(self) -> None:
-        """Post what has not been sent yet."""
+    def flush(self, most: int = sys.maxsize) -> None:
+        """Post what has not been sent yet, in so many batches at most."""
         if self._flushing is not None:
             self._flushing.cancel()
             self._flushing = None
         if not self.is_open:
             return
         at = self._sent - self._arrived
-        while at < len(self._waiting):
+        while at < len(self._waiting) and most > 0:
+            most -= 1
             items: list[bytes] = []
             size = 0
             while at + len(items) < len(self._waiting) and (not items or size < BATCH_BYTES):
@@ -164,7 +170,7 @@ class Line:
             self._acknowledged()
             self._post(first, tuple(items), "")
         if self._waiting and self._resend is None:
-            self._resend = self._loop.call_later(RESEND_SECONDS, self._again)
+            self._resend = self._loop.call_later(self._patience, self._probe)
 
     def say(self, note: Note = "") -> None:
         """Post a batch without items: what has come, and a note."""
@@ -177,6 +183,13 @@ class Line:
         if self._owing is not None:
             self._owing.cancel()
             self._owing = None
+
+    def _probe(self) -> None:
+        """Nothing was said for long: send the oldest batch again. If it is only late, the rest is on its way."""
+        self._resend = None
+        self._patience = min(2.0 * self._patience, MOST_RESEND_SECONDS)
+        self._sent = self._arrived
+        self.flush(1)
 
     def _again(self) -> None:
         if self._resend is not None:
@@ -225,8 +238,9 @@ class Line:
             if item.arrived is not None:
                 item.arrived()
         self._sent = max(self._sent, self._arrived)
+        self._patience = RESEND_SECONDS
         if self._waiting:
-            self._resend = self._loop.call_later(RESEND_SECONDS, self._again)
+            self.flush()
         if self.has_room:
             self._release()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import secrets
 import time
 from collections.abc import Callable
@@ -11,10 +12,11 @@ from typing import TYPE_CHECKING, Final, Protocol
 import msgspec
 
 from ...actors.errors import HoldfastError, SpecError
+from ...actors.values.path_parts import check_path_part
 from ...checkpoint.home.ask_recovery import FarId, FarOut
 from ...checkpoint.home.pending_asks import SwitchAsk
 from ...checkpoint.protocol import Answer
-from .far_line import FarLine
+from .far_line import FarLine, run_number
 from .line import NOBODY, Batch, Boot
 
 if TYPE_CHECKING:
@@ -30,6 +32,12 @@ FORGET_SECONDS: Final = 30.0
 """After so long without a word whoever has called is forgotten."""
 STARTING_SECONDS: Final = 5.0
 """How long after its begin a system keeps what comes for actors that it has not started yet."""
+HEAD_BYTES: Final = 4096
+"""What a batch may have besides its items, in bytes."""
+MOST_CALLERS: Final = 10_000
+"""How many programs may have called at a time; further ones are not answered."""
+MOST_NAME: Final = 255
+"""The longest name of a program, in characters."""
 _DECODER: Final[msgspec.msgpack.Decoder[Batch]] = msgspec.msgpack.Decoder(Batch)
 
 
@@ -44,6 +52,11 @@ class Transport(Protocol):
 
     def post(self, to: str, data: bytes, back: str) -> None:
         """Send bytes to a place; `back` is where answers go. They may get lost."""
+        ...
+
+    @property
+    def most_bytes(self) -> int:
+        """The most that is carried at once, in bytes."""
         ...
 
     async def hear(self, at: str, take: Callable[[bytes, str], None]) -> None:
@@ -210,6 +223,15 @@ class Lines:
             far.say()
 
 
+def _is_sound(batch: Batch) -> bool:
+    """Whether a program may be called so, and its run has a number."""
+    try:
+        check_path_part("connect", "the system", batch.sender)
+    except SpecError:
+        return False
+    return len(batch.sender) <= MOST_NAME and re.fullmatch("[0-9a-f]{1,15}", batch.boot.token) is not None
+
+
 def _system(path: str) -> str:
     """The first part of an address: the program that it is of."""
     return path[1:].partition("/")[0]
@@ -239,18 +261,25 @@ class Gate:
             batch = _DECODER.decode(data)
         except msgspec.MsgspecError:
             return  # It comes from no program of ours.
+        if not back or not _is_sound(batch) or batch.sender == lines.name:
+            return
         far = lines.at(batch.sender)
         if far is not None and far not in self._back:
             return  # Its name is that of a system that this one has called.
         if batch.to == NOBODY:
+            if batch.note == "bye":
+                return  # It has given up before anybody answered.
             if far is not None and far.theirs != batch.boot:
                 if far.theirs.era > batch.boot.era:
                     return  # An earlier run, late.
-                self._drop(far)
+                self._forget(far)
                 far = None
+            if far is None and len(self._back) >= MOST_CALLERS:
+                return  # Whoever greets is not answered, as if nobody were here.
             if far is None:
                 far = lines.open(batch.sender, lambda data: self._post(batch.sender, data))
                 self._back[far] = back
+                far.most = min(far.most, self._transport.most_bytes - HEAD_BYTES)
                 far.begin(batch.boot)
             self._back[far] = back
             far.alive()
@@ -259,10 +288,18 @@ class Gate:
             answer = Batch(lines.name, lines.boot, batch.boot, 0, 1, (), "unknown")
             self._transport.post(back, msgspec.msgpack.encode(answer), "")
         elif batch.note == "bye":
-            self._drop(far)
+            far.hear(batch)  # It says what has come, too.
+            self._forget(far)
         else:
             self._back[far] = back
             far.hear(batch)
+
+    def _forget(self, far: FarLine) -> None:
+        """That run of the other program is over: nobody asks again what it has asked."""
+        theirs = far.theirs
+        self._drop(far)
+        if self._lines.homes is not None:
+            self._lines.homes.far.forget_run(far.name, run_number(theirs))
 
     def _drop(self, far: FarLine) -> None:
         self._lines.drop(far)
@@ -296,6 +333,7 @@ class Call:
         self._own = transport.own_place()
         self._newest = NOBODY
         self.far = lines.open(name, lambda data: transport.post(to, data, self._own))
+        self.far.most = min(self.far.most, transport.most_bytes - HEAD_BYTES)
         self._answered: asyncio.Future[None] = lines.node.loop.create_future()
 
     async def begin(self, seconds: float) -> None:

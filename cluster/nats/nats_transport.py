@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from collections import deque
 from collections.abc import Callable
+from typing import Final
 
 import nats.errors
 from nats.aio.client import Client
@@ -15,6 +16,9 @@ from ..engine_thread import end_tasks
 from .access import NatsAccess
 from .connecting import SystemClient, answering
 from .nats_engine import CONNECT_SECONDS
+
+INBOX: Final = "_INBOX."
+"""How subjects begin at which programs get answers."""
 
 
 class NatsTransport:
@@ -54,6 +58,8 @@ class NatsTransport:
         loop = asyncio.get_running_loop()
 
         async def taken(message: Msg) -> None:
+            if message.reply and not message.reply.startswith(INBOX):
+                return  # What is answered there would go where this program may write and whoever asks may not.
             try:
                 take(message.data, message.reply)
             except Exception as error:  # The client would keep it to itself.
@@ -62,6 +68,11 @@ class NatsTransport:
         with answering(self._name):
             await self._client.subscribe(at, cb=taken)
             await self._client.flush()
+
+    @property
+    def most_bytes(self) -> int:
+        """What the servers take; see `Transport`."""
+        return self._client.max_payload
 
     def own_place(self) -> str:
         """A subject of this client's own; see `Transport`."""

@@ -26,6 +26,8 @@ class PostFaults:
     late_seconds: float = 2.0
 
 
+MOST_BYTES: Final = 8 * 1024 * 1024
+"""What is carried at once, in bytes, unless a test says otherwise."""
 NO_POST_FAULTS: Final = PostFaults()
 
 
@@ -91,12 +93,14 @@ class SimTransport:
     Attributes:
         is_cut: whether nothing goes out or comes in at the moment.
         is_mute: whether nothing goes out.
+        most_bytes: the most that is carried at once, in bytes.
     """
 
     def __init__(self, post: SimPost, place: str) -> None:
         self._post, self._place = post, place
         self._takes: list[Callable[[bytes, str], None]] = []
         self.is_cut = self.is_mute = False
+        self.most_bytes = MOST_BYTES
 
     def post(self, to: str, data: bytes, back: str) -> None:
         """Send bytes to a place; see `Transport`."""

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 import holdfast as hf
-from holdfast.actors.errors import AskDeadlock, NotGranted
+from holdfast.actors.errors import AskDeadlock, BadMessage, BadReply, ConnectionLost, NotGranted
 from holdfast.actors.process.wire import frames
 from holdfast.cluster.lines.far_line import NEW
 from holdfast.cluster.lines.line import NOBODY, Batch, Boot
@@ -43,6 +43,10 @@ class Refuse(hf.Message[None]): ...
 class Crash(hf.Message[None]): ...
 
 
+class Large(hf.Message[bytes]):
+    data: bytes
+
+
 class News(hf.Message[None]):
     text: str
 
@@ -64,6 +68,10 @@ class Account(hf.Actor):
     async def wait(self, message: Wait) -> int:
         await asyncio.sleep(message.seconds)
         return self.total
+
+    @hf.on(Large)
+    def large(self, message: Large) -> bytes:
+        return message.data * 3
 
     @hf.on(Refuse)
     def refuse(self, message: Refuse) -> None:
@@ -219,7 +227,7 @@ def test_another_program_leads_and_only_what_is_kept_goes_on(tmp_path: Path) -> 
                 again = kept.ask(Add(1), timeout=600.0)
                 await asyncio.sleep(1.0)
             async with reach.bank(tmp_path / "bank.db"):
-                with pytest.raises(hf.AskFailed, match="no connection to bank"):
+                with pytest.raises(ConnectionLost, match="nobody knows whether /bank/plain has handled the message"):
                     await lost
                 assert await again == 6
                 assert await kept.ask(Total()) == 6
@@ -523,5 +531,63 @@ def test_what_was_asked_and_waits_at_the_end_of_a_program_is_answered_by_the_nex
             Slow.go.set()
             async with bank():
                 assert await asyncio.gather(*asked) == [1, 2, 3, 4, 5]
+
+    run(work)
+
+
+@pytest.mark.parametrize("who", ["plain", "kept"])
+def test_what_is_too_large_is_refused_and_the_line_goes_on(who: str) -> None:
+    async def work(reach: Reach) -> None:
+        async with reach.bank(), hf.connect("bank") as bank:
+            account = bank.ref(f"/bank/{who}", Account)
+            with pytest.raises(BadMessage, match=r"the limit between systems"):
+                account.ask(Large(bytes(8 * 1024 * 1024)))
+            with pytest.raises(BadReply, match=r"the limit between systems|send it in parts"):
+                await account.ask(Large(bytes(3 * 1024 * 1024)))
+            assert await account.ask(Add(1)) == 1
+
+    run(work)
+
+
+HOSTILE = {
+    "a tell in the name of an actor here": lambda: frames.Tell("/bank/plain", NAME, Add(7), 0, "/bank/kept"),  # type: ignore[arg-type]
+    "a tell in the name of a third system": lambda: frames.Tell("/bank/plain", NAME, Add(7), 0, "/shop/clerk"),  # type: ignore[arg-type]
+    "a tell through this system": lambda: frames.Tell("/shop/clerk", NAME, Add(7)),  # type: ignore[arg-type]
+    "the end of an actor here": lambda: frames.Command("/bank/plain", "exit", {"source": "/bank/kept", "reason": {}}),
+    "a link without an end": lambda: frames.Command("/bank/plain", "link", {}),
+    "a word about another's ask": lambda: frames.Command("/shop/clerk", "settled", {"number": 1}),
+    "an ask without an end": lambda: frames.Ask(1, "/bank/plain", NAME, Add(7), float("nan")),  # type: ignore[arg-type]
+}
+"""What a program may not say, though it is let in."""
+NAME = f"{__name__}:Add"
+
+
+@pytest.mark.parametrize("what", HOSTILE)
+def test_a_program_speaks_for_its_own_actors_and_to_actors_of_the_system(what: str) -> None:
+    async def work(reach: Reach) -> None:
+        async with reach.bank() as system, hf.connect("bank") as bank:
+            letters: list[str] = []
+            system._node.events.add_sink(lambda event: letters.append(str(event)))
+            account = bank.ref("/bank/plain", Account)
+            assert await account.ask(Add(1)) == 1
+            line = bank._call.far.line  # type: ignore[union-attr]
+            assert line is not None
+            line.put(NEW + msgspec.msgpack.encode(HOSTILE[what]()))
+            assert await account.ask(Add(1)) == 2  # The line goes on, and the account has not changed.
+            assert any("not understood" in one for one in letters), letters
+
+    run(work)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "bank", "x\0y", "n" * 300])
+def test_a_program_with_a_name_that_is_none_is_not_answered(name: str) -> None:
+    async def work(reach: Reach) -> None:
+        async with reach.bank() as system:
+            batch = Batch(name, Boot(5, "ff"), NOBODY, 0, 1, ())
+            reach.post.post("client", "inbox of bank", msgspec.msgpack.encode(batch), "client")
+            batch = Batch("good", Boot(5, "no number"), NOBODY, 0, 1, ())
+            reach.post.post("client", "inbox of bank", msgspec.msgpack.encode(batch), "client")
+            await asyncio.sleep(1.0)
+            assert not system.lines._lines
 
     run(work)

@@ -7,9 +7,11 @@ import random
 import signal
 from pathlib import Path
 
+import msgspec
 import pytest
 
 import holdfast as hf
+from holdfast.cluster.lines.line import NOBODY, Batch, Boot
 from holdfast.cluster.nats.server_file import UserRole
 from tests.cluster.bank import Account, Gain, Report
 from tests.cluster.fleet import Client, Programs
@@ -106,3 +108,19 @@ async def test_what_a_recorded_actor_pays_arrives_once_whoever_dies(
     finally:
         await till.close()
         await bank.close()
+
+
+async def test_nobody_has_a_leader_write_into_its_own_log(nats1: NatsServers) -> None:
+    """A client may not write there. Whoever says that answers go there is not answered."""
+    name = nats1.new_system()
+    async with hf.ActorSystem(name, store=nats1.store(name), log=False) as system:
+        account = await system.start(hf.child("account", hf.start(Account), recovery=hf.hybrid()))
+        client = await nats1.connect(name, UserRole.CLIENT)
+        greeting = msgspec.msgpack.encode(Batch("evil", Boot(1, "ff"), NOBODY, 0, 1, ()))
+        for reply in (f"hf.{name}.root.log", f"hf.{name}.root.lease", "$JS.API.INFO"):
+            await client.publish(f"hf.{name}.root.in", greeting, reply=reply)
+        await client.flush()
+        await client.close()
+        async with hf.connect(nats1.store(name, UserRole.CLIENT)) as bank:  # What came before is handled by now.
+            assert await bank.ref(account.path, Account).ask(Gain(1)) == 1
+        assert set(system.lines._lines) == set()
