@@ -549,6 +549,7 @@ def test_what_is_too_large_is_refused_and_the_line_goes_on(who: str) -> None:
     run(work)
 
 
+NAME = f"{__name__}:Add"
 HOSTILE = {
     "a tell in the name of an actor here": lambda: frames.Tell("/bank/plain", NAME, Add(7), 0, "/bank/kept"),  # type: ignore[arg-type]
     "a tell in the name of a third system": lambda: frames.Tell("/bank/plain", NAME, Add(7), 0, "/shop/clerk"),  # type: ignore[arg-type]
@@ -559,7 +560,6 @@ HOSTILE = {
     "an ask without an end": lambda: frames.Ask(1, "/bank/plain", NAME, Add(7), float("nan")),  # type: ignore[arg-type]
 }
 """What a program may not say, though it is let in."""
-NAME = f"{__name__}:Add"
 
 
 @pytest.mark.parametrize("what", HOSTILE)
