@@ -60,7 +60,6 @@ from .checkpoint.snapshot.snapshot_groups import NoSuchGroup
 from .checkpoint.snapshot.snapshot_schedule import CheckpointFailed
 from .checkpoint.upgrade.mapping import NotMapped
 from .cluster.leadership import LeadershipLost
-from .cluster.lines.lines import LineTaken
 from .cluster.ports import AccessRefused, UnsafeServer
 from .ftm.group.reconfiguration import CannotAdapt
 from .ftm.mechanisms.rb import NotAccepted
@@ -115,7 +114,6 @@ __all__ = [
     "InOtherHands",
     "InputRefused",
     "LeadershipLost",
-    "LineTaken",
     "MailboxFull",
     "MaxChildren",
     "MechanismRefused",

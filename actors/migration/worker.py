@@ -145,7 +145,7 @@ class FromOwnWorker(Leaving):
 
     def _died_before_rest(self, cell: Cell, reason: ExitReason) -> None:
         """The process ends while the life still is the place's, which deals with that; nobody else tells the move."""
-        self.move.give_up(f"its process has died ({reason})")
+        self.move.give_up("its life has ended" if reason.is_clean else f"its process has died ({reason})")
         self.place.died(cell, reason)
 
     def heard(self, step: str, told: dict[str, Any]) -> None:
@@ -180,7 +180,7 @@ class FromOwnWorker(Leaving):
         if reason == KILLED:
             self.move.give_up("it is killed")
         if not self.taken.done():
-            self.move.give_up(f"its process has died ({reason})")
+            self.move.give_up("its life has ended" if reason.is_clean else f"its process has died ({reason})")
 
     def retire(self) -> None:
         """What is left in the process ends; orders that it has not carried out come here."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Final
 
 import nats.errors
@@ -14,7 +14,7 @@ from nats.aio.msg import Msg
 
 from ..engine_thread import end_tasks
 from .access import NatsAccess
-from .connecting import SystemClient, answering
+from .connecting import ANSWER_SECONDS, SystemClient, answering
 from .nats_engine import CONNECT_SECONDS
 
 INBOX: Final = "_INBOX."
@@ -65,9 +65,17 @@ class NatsTransport:
             except Exception as error:  # The client would keep it to itself.
                 loop.call_exception_handler({"message": f"what came at {at} was not taken", "exception": error})
 
+        listening = asyncio.ensure_future(self._listen(at, taken))
+        try:
+            await asyncio.shield(listening)  # The client does not bear that what waits for its server is cancelled.
+        except asyncio.CancelledError:
+            await asyncio.wait((listening,), timeout=ANSWER_SECONDS)
+            raise
+
+    async def _listen(self, at: str, taken: Callable[[Msg], Awaitable[None]]) -> None:
         with answering(self._name):
             await self._client.subscribe(at, cb=taken)
-            await self._client.flush()
+            await self._client.flush(int(ANSWER_SECONDS))
 
     @property
     def most_bytes(self) -> int:

@@ -14,7 +14,7 @@ FLEETS = "tests/cluster/test_takeover.py"
 
 CHECKS = {
     "a silent connection is not closed in good order": Check(
-        "cluster/nats/nats_engine.py",
+        "cluster/nats/connecting.py",
         "            transport._io_writer.transport.abort()\n",
         "            pass\n",
         "tests/cluster/test_engine_on_nats.py",
