@@ -290,6 +290,7 @@ async def main() -> None:
         known = operator.ask(WhenSeen(tuple(f"ok({name})" for name in names)), timeout=50.0)
         await look_after(system)
         await known
+        await asyncio.sleep(2.0)  # How often prices come is learned from the first twenty of them.
 
         async def broken(name: str, kind: type[hf.Actor]) -> Case:
             case = operator.ask(NextCase(), timeout=50.0)

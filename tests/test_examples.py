@@ -15,9 +15,7 @@ EXAMPLES = [
 ]
 
 
-UNSEEN = pytest.mark.xfail(
-    reason="the flow observer does not see that the feed is silent: see the roadmap", strict=True
-)
+UNSEEN = pytest.mark.xfail(reason="who asks a silent database is suspected, too: see the roadmap", strict=True)
 
 
 @pytest.mark.parametrize(
