@@ -67,9 +67,9 @@ from holdfast.supervision.rules import rule
 from holdfast.supervision.spec import ChildSpec, Plan, child
 from holdfast.supervision.supervisor import Supervisor
 from holdfast.supervision.tree import supervisor
-from holdfast.system.connection import connect
 from holdfast.system.run import run
 from holdfast.system.system import ActorSystem
+from holdfast.system.system_connection import connect
 from holdfast.system.transaction.errors import TransactionFailed, TransactionRefused
 
 __version__ = "0.1.0"

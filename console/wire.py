@@ -65,17 +65,17 @@ class WrongUser(HoldfastError, text="the other end runs as the user with uid {ui
     expected: int
 
 
-class Peer(NamedTuple):
+class PeerProcess(NamedTuple):
     """Who is at the other end of a Unix socket: the process that has connected, or listens there, and its user."""
 
     pid: int
     uid: int
 
 
-def peer_of(sock: socket.socket) -> Peer:
+def peer_of(sock: socket.socket) -> PeerProcess:
     """Who is at the other end of a Unix socket, as the kernel says."""
     pid, uid, _ = CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
-    return Peer(pid, uid)
+    return PeerProcess(pid, uid)
 
 
 def check_user(uid: int, expected: int) -> None:

@@ -23,7 +23,7 @@ from .assembly import observer
 from .literals import crashes, made_atom, progress, replies, room, waits_for
 from .messages import DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, ROS_DIAGNOSTICS, STARTS
 from .model import Component, Declaration, Expectation, Kind
-from .observers.flow import Baselines, FlowObserver, Made
+from .observers.flow import Baselines, FlowObserver, FlowSource
 from .observers.hearing import Heard, listen
 from .observers.node_observer import NodeObserver
 from .observers.observer import Manner, Observer
@@ -121,7 +121,7 @@ class LiveWiring:
 
     def __init__(self, found: Generated, leave_out: Collection[str] = ()) -> None:
         self.addresses: dict[str, str] = {}
-        self.made: dict[str, Made] = {}
+        self.made: dict[str, FlowSource] = {}
         self.heard = {wired.path: set(wired.publishes) for wired in found.wiring.values()}
         self.asked: dict[str, set[str]] = {}
         self._out = leave_out
@@ -157,14 +157,14 @@ def _replace(old: dict[str, T], new: Mapping[str, T]) -> None:
     old.update(new)
 
 
-def _made(wiring: Mapping[str, Wired], known: Collection[str]) -> dict[str, Made]:
+def _made(wiring: Mapping[str, Wired], known: Collection[str]) -> dict[str, FlowSource]:
     """How each topic comes about; what was ever heard is an input also while nobody publishes it any more."""
     published = {topic for wired in wiring.values() for topic in wired.publishes}
-    made: dict[str, Made] = {}
+    made: dict[str, FlowSource] = {}
     for topic in sorted(published):
         makers = [wired for wired in wiring.values() if topic in wired.publishes]
         inputs = {one for wired in makers for one in wired.subscribes if one in known and one != topic}
-        made[topic] = Made(tuple(wired.path for wired in makers), tuple(sorted(inputs)))
+        made[topic] = FlowSource(tuple(wired.path for wired in makers), tuple(sorted(inputs)))
     return made
 
 

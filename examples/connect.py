@@ -100,7 +100,7 @@ async def listen(store: str) -> None:
         print(await balance(bank))  # None
 
 
-async def balance(bank: hf.system.Connection) -> int | None:
+async def balance(bank: hf.system.SystemConnection) -> int | None:
     """What is in the account, if the bank can be reached."""
     try:
         return await bank.ref("/bank/account", Account).ask(Deposit(0))

@@ -50,7 +50,6 @@ from ..supervision.patience import end_within
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor, kill_starting
-from .connection import serve
 from .controls import Controls
 from .full_collections import seldom_collected
 from .history.calls import HistoryCalls
@@ -64,6 +63,7 @@ from .recorded import Recorded
 from .recovery import RecoveryTree
 from .script import load_script
 from .specification import Specifications
+from .system_connection import serve
 from .transaction.transaction import Transaction, Transactions
 
 if TYPE_CHECKING:

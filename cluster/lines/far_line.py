@@ -48,9 +48,9 @@ from ...actors.process.wire.worker_gate import is_at_or_below, is_order
 from ...checkpoint.home.ask_recovery import LASTING, FarId, FarOut, RejoinedAsk, lasting_number, origin_asked_by
 from ...checkpoint.home.pending_asks import ACCEPTED, SwitchAsk
 from ...checkpoint.home.recorded_home import switch_of
-from ...checkpoint.inputs import Batch as Append
+from ...checkpoint.inputs import Batch
 from ...checkpoint.protocol import MESSAGE, REPLY, Answer
-from .line import MOST_BYTES, NOBODY, WINDOW_BYTES, Batch, Boot, Line, Note
+from .line import MOST_BYTES, NOBODY, WINDOW_BYTES, Boot, Line, LineBatch, Note
 
 if TYPE_CHECKING:
     import asyncio
@@ -393,7 +393,7 @@ class FarLine(Peer):
 
     def _post(self, first: int, items: tuple[bytes, ...], note: Note) -> None:
         got = 0 if self.line is None else self.line.got
-        batch = Batch(self._me, self._boot, self.theirs, got, first, items, note)
+        batch = LineBatch(self._me, self._boot, self.theirs, got, first, items, note)
         self._post_bytes(msgspec.msgpack.encode(batch))
 
     # -- whom it leads to -------------------------------------------------------------------------------------------
@@ -476,7 +476,7 @@ class FarLine(Peer):
 
     # -- in ---------------------------------------------------------------------------------------------------------
 
-    def hear(self, batch: Batch) -> None:
+    def hear(self, batch: LineBatch) -> None:
         """Take a batch of the incarnation that the line leads to."""
         self.alive()
         if self.line is not None:
@@ -592,7 +592,7 @@ class FarLine(Peer):
                 return
             if cell.table is not ANY:
                 cell.table.kind_named(name)
-            append = Append()
+            append = Batch()
             bound = switch.intake.bound
             if bound is None or bound.makes_room(None, name, body, sender.path):
                 source = switch.record(MESSAGE, name, body, sender.path, append)

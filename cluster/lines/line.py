@@ -44,7 +44,7 @@ Note = Literal["", "lost", "unknown", "bye"]
 """What a batch says besides: something before it has not come; whoever it answers is not known; the line ends."""
 
 
-class Batch(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
+class LineBatch(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
     """What is posted at once.
 
     Attributes:
@@ -66,7 +66,7 @@ class Batch(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=
     note: Note = ""
 
 
-class Item(NamedTuple):
+class Unarrived(NamedTuple):
     """What is kept until it has arrived, and what is done then."""
 
     data: bytes
@@ -113,7 +113,7 @@ class Line:
         self._loop, self._post, self._take = loop, post, take
         self.got = 0
         self.is_open = True
-        self._waiting: deque[Item] = deque()  # sent, and not known to have arrived; then what is not sent yet
+        self._waiting: deque[Unarrived] = deque()  # sent, and not known to have arrived; then what is not sent yet
         self._arrived = 0  # how many of all items so far the other end has said to have
         self._sent = 0  # how many of all items so far have been sent
         self._owed = 0  # items that have come and are not acknowledged
@@ -131,7 +131,7 @@ class Line:
         """Send an item with all others of this tick; `arrived` is called when the other end has said that it has it."""
         if not self.is_open:
             return
-        self._waiting.append(Item(data, arrived))
+        self._waiting.append(Unarrived(data, arrived))
         self._bytes += len(data)
         if self._flushing is None:
             self._flushing = self._loop.call_soon(self.flush)
@@ -200,7 +200,7 @@ class Line:
 
     # -- in ---------------------------------------------------------------------------------------------------------
 
-    def hear(self, batch: Batch) -> None:
+    def hear(self, batch: LineBatch) -> None:
         """Take a batch of the other end."""
         self._arrive(batch.got)
         if batch.note == "lost" and self._waiting:

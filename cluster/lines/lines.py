@@ -17,7 +17,7 @@ from ...checkpoint.home.ask_recovery import FarId, FarOut
 from ...checkpoint.home.pending_asks import SwitchAsk
 from ...checkpoint.protocol import Answer
 from .far_line import FarLine, run_number
-from .line import NOBODY, Batch, Boot
+from .line import NOBODY, Boot, LineBatch
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
@@ -38,7 +38,7 @@ MOST_CALLERS: Final = 10_000
 """How many programs may have called at a time; further ones are not answered."""
 MOST_NAME: Final = 255
 """The longest name of a program, in characters."""
-_DECODER: Final[msgspec.msgpack.Decoder[Batch]] = msgspec.msgpack.Decoder(Batch)
+_DECODER: Final[msgspec.msgpack.Decoder[LineBatch]] = msgspec.msgpack.Decoder(LineBatch)
 
 
 class LineTaken(HoldfastError, text="there is a connection to a system called {system} already: use that one"):
@@ -94,7 +94,7 @@ class Lines:
     def __init__(self, node: Node, name: str, boot: Boot, homes: Homes | None = None) -> None:
         self.node, self.name, self.boot, self.homes = node, name, boot, homes
         self._lines: dict[str, FarLine] = {}
-        self._gates: list[Gate] = []
+        self._gates: list[LineGate] = []
         self._began = node.loop.time()
         self._waiting: dict[str, list[Callable[[FarLine], None]]] = {}
         self._beat: asyncio.TimerHandle | None = None
@@ -133,9 +133,9 @@ class Lines:
             del self._lines[far.name]
         far.close()
 
-    def serve(self, transport: Transport) -> Gate:
+    def serve(self, transport: Transport) -> LineGate:
         """Answer whoever calls by this transport."""
-        gate = Gate(self, transport)
+        gate = LineGate(self, transport)
         self._gates.append(gate)
         return gate
 
@@ -223,7 +223,7 @@ class Lines:
             far.say()
 
 
-def _is_sound(batch: Batch) -> bool:
+def _is_sound(batch: LineBatch) -> bool:
     """Whether a program may be called so, and its run has a number."""
     try:
         check_path_part("connect", "the system", batch.sender)
@@ -243,7 +243,7 @@ def _ask(far: FarLine, path: str, ask: SwitchAsk, *, again: bool) -> None:
         far.ask_lasting(ask, again=again)
 
 
-class Gate:
+class LineGate:
     """Answers whoever calls this program."""
 
     def __init__(self, lines: Lines, transport: Transport) -> None:
@@ -285,7 +285,7 @@ class Gate:
             far.alive()
             far.say()
         elif batch.to != lines.boot or far is None or far.theirs != batch.boot:
-            answer = Batch(lines.name, lines.boot, batch.boot, 0, 1, (), "unknown")
+            answer = LineBatch(lines.name, lines.boot, batch.boot, 0, 1, (), "unknown")
             self._transport.post(back, msgspec.msgpack.encode(answer), "")
         elif batch.note == "bye":
             far.hear(batch)  # It says what has come, too.
@@ -311,7 +311,7 @@ class Gate:
             self._transport.post(self._back[far], data, "")
 
 
-class Call:
+class LineCaller:
     """Calls another program, and calls again when that is led by another one.
 
     Args:

@@ -82,7 +82,7 @@ class EncryptedTransport(TcpTransport):
             raise NotEncrypted("nats: the server offers no TLS")
 
 
-class Refusal(NamedTuple):
+class ServerRefusal(NamedTuple):
     """Why a server does not want this program, and what to do."""
 
     problem: str
@@ -104,7 +104,7 @@ class SystemClient(Client):
         self.access = access
         self._tried = ""
         self._failures: dict[str, str] = {}
-        self.refusals: dict[str, Refusal] = {}
+        self.refusals: dict[str, ServerRefusal] = {}
         self._hung_up: Counter[str] = Counter()
         self._denied: list[str] = []
         self._is_settled = asyncio.Event()
@@ -248,33 +248,33 @@ class SystemClient(Client):
         if self.refusals and not self.is_connected and len(self.refusals) >= len(self.access.servers):
             self._is_settled.set()
 
-    def _refusal(self, error: Exception, said: str) -> Refusal | None:
+    def _refusal(self, error: Exception, said: str) -> ServerRefusal | None:
         where, access = f"the server {self._tried}", self.access
         if isinstance(error, NotEncrypted):
-            return Refusal(
+            return ServerRefusal(
                 f"{where} offers no TLS, and what is sent there is to be encrypted (tls://, ca= or certificate=)",
                 "give the server its certificate, as `holdfast nats config --certificate` does, or write nats://",
             )
         if isinstance(error, ssl.SSLCertVerificationError):
-            return Refusal(
+            return ServerRefusal(
                 f"the certificate of {where} is not good: {error.verify_message}",
                 "name who has signed it with ca=, and the server by a name that stands in it",
             )
         if self._server_info.get("tls_verify") and self._is_turned_away(error):
             if access.certificate is None:
-                return Refusal(f"{where} asks for a certificate", "give certificate= and key=")
-            return Refusal(
+                return ServerRefusal(f"{where} asks for a certificate", "give certificate= and key=")
+            return ServerRefusal(
                 f"{where} does not take the certificate {access.certificate}",
                 "give one that is valid now and was signed by whom the server trusts (ca_file in its configuration)",
             )
         if any(one in said for one in _LET_IN):
             key = access.nkey or access.creds
             if key is None:
-                return Refusal(
+                return ServerRefusal(
                     f"{where} lets nobody in without a key ({said})",
                     f"give nkey=FILE, such as {access.system}-node.nk from `holdfast nats config`, or creds=FILE",
                 )
-            return Refusal(
+            return ServerRefusal(
                 f"{where} does not know the key {key} ({said})",
                 "give one that stands in its configuration; if it does, have the server reload that",
             )

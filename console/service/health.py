@@ -19,7 +19,7 @@ from ...supervision.admin import CountChildren
 from ...supervision.supervisor import Supervisor
 from ...system.system import ActorSystem
 from .notify import Notifier
-from .probes import ProbeServer
+from .probe_server import ProbeServer
 
 PROBE_TIMEOUT: Final = 2.0
 """Seconds that the root has to answer, unless somebody says otherwise."""
@@ -28,7 +28,7 @@ LOOK_AGAIN: Final = 0.1
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Verdict:
+class Health:
     """How a system is found: good, or with sentences that say what is wrong."""
 
     problems: tuple[str, ...] = ()
@@ -172,7 +172,7 @@ class Service:
             self._is_stopping = True
             self.notifier.stopping()
 
-    async def live(self, timeout: float = PROBE_TIMEOUT) -> Verdict:
+    async def live(self, timeout: float = PROBE_TIMEOUT) -> Health:
         """Say whether the program should go on: its loop turns, its root answers, and its store has not failed.
 
         If it is not good, only a new program helps. A full disk, or an actor that restarts, is no reason for that.
@@ -181,21 +181,21 @@ class Service:
             timeout: seconds that the root has to answer.
         """
         if self._system is None:  # It is being started, which may take a while.
-            return Verdict()
-        return Verdict(tuple(await self._fatal(self._system, timeout)))
+            return Health()
+        return Health(tuple(await self._fatal(self._system, timeout)))
 
-    async def ready(self, timeout: float = PROBE_TIMEOUT) -> Verdict:
+    async def ready(self, timeout: float = PROBE_TIMEOUT) -> Health:
         """Say whether requests should come here: all is up, is not stopping, accepts, and no child of the root is away.
 
         Args:
             timeout: seconds that the root has to answer.
         """
         if self._is_stopping or self._system is None or not self._is_up:
-            return Verdict(("the system is stopping" if self._is_stopping else "the system is being started",))
+            return Health(("the system is stopping" if self._is_stopping else "the system is being started",))
         problems = await self._fatal(self._system, timeout)
         if not problems:
             problems = await self._away(self._system, timeout)
-        return Verdict(tuple(problems))
+        return Health(tuple(problems))
 
     async def _fatal(self, system: ActorSystem, timeout: float) -> list[str]:
         """What only a new program mends."""

@@ -100,7 +100,7 @@ def _write(path: Path, data: bytes) -> None:
     beside.replace(path)
 
 
-class Made(msgspec.Struct, frozen=True):
+class FlowSource(msgspec.Struct, frozen=True):
     """How a topic comes about: the addresses of its publishers, and the topics that all they publish is made from."""
 
     publishers: tuple[str, ...]
@@ -141,7 +141,7 @@ class FlowObserver(Observer):
 
     def __init__(
         self,
-        made: Mapping[str, Made],
+        made: Mapping[str, FlowSource],
         *,
         heard: dict[str, set[str]] | None = None,
         leave_out: Collection[str] = (),
@@ -211,7 +211,7 @@ class FlowObserver(Observer):
     def _learned(self, topic: str) -> Usual:
         return self._baselines.of(topic, self.ctx._cell.node.clock.wall())
 
-    def _flows_well(self, topic: str, made: Made) -> bool | None:
+    def _flows_well(self, topic: str, made: FlowSource) -> bool | None:
         flow, now = self._flows[topic], self.now
         learned = self._learned(topic)
         if not made.inputs:  # Its publishers' turns are what comes in.

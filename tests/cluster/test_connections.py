@@ -15,9 +15,9 @@ import holdfast as hf
 from holdfast.actors.errors import AskDeadlock, BadMessage, BadReply, ConnectionLost, NotGranted
 from holdfast.actors.process.wire import frames
 from holdfast.cluster.lines.far_line import NEW
-from holdfast.cluster.lines.line import NOBODY, Batch, Boot
+from holdfast.cluster.lines.line import NOBODY, Boot, LineBatch
 from holdfast.cluster.lines.lines import FORGET_SECONDS, SILENT_SECONDS, LineTaken
-from holdfast.system import connection
+from holdfast.system import system_connection
 from holdfast.testing.fleet.post import NO_POST_FAULTS, PostFaults, SimPost, SimTransport
 from tests.cluster.fleets import simulate
 
@@ -92,7 +92,7 @@ class Reach:
     def __init__(self, patch: pytest.MonkeyPatch, seed: int, faults: PostFaults = NO_POST_FAULTS) -> None:
         self.post = SimPost(seed, faults)
         self.transports: list[SimTransport] = []
-        patch.setattr(connection, "open_lines", self._open)
+        patch.setattr(system_connection, "open_lines", self._open)
 
     async def _open(self, at: str, settings: object) -> tuple[SimTransport, str, str]:
         self.transports.append(self.post.transport())
@@ -385,7 +385,7 @@ def test_what_an_earlier_run_has_sent_is_refused_however_late() -> None:
             late = frames.Tell("/bank/plain", f"{__name__}:Add", Add(7))  # type: ignore[arg-type]
             items = (NEW + msgspec.msgpack.encode(late),)
             for to in (NOBODY, Boot(system.lines.boot.era, "abcd"), Boot(1, "00")):
-                batch = Batch("client", Boot(5, "ff"), to, 0, 1, items)
+                batch = LineBatch("client", Boot(5, "ff"), to, 0, 1, items)
                 reach.post.post("client", "inbox of bank", msgspec.msgpack.encode(batch), "client")
             reach.post.post("client", "inbox of bank", b"garbage", "client")
             await asyncio.sleep(5.0)
@@ -583,9 +583,9 @@ def test_a_program_speaks_for_its_own_actors_and_to_actors_of_the_system(what: s
 def test_a_program_with_a_name_that_is_none_is_not_answered(name: str) -> None:
     async def work(reach: Reach) -> None:
         async with reach.bank() as system:
-            batch = Batch(name, Boot(5, "ff"), NOBODY, 0, 1, ())
+            batch = LineBatch(name, Boot(5, "ff"), NOBODY, 0, 1, ())
             reach.post.post("client", "inbox of bank", msgspec.msgpack.encode(batch), "client")
-            batch = Batch("good", Boot(5, "no number"), NOBODY, 0, 1, ())
+            batch = LineBatch("good", Boot(5, "no number"), NOBODY, 0, 1, ())
             reach.post.post("client", "inbox of bank", msgspec.msgpack.encode(batch), "client")
             await asyncio.sleep(1.0)
             assert not system.lines._lines

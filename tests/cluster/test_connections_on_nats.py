@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 import holdfast as hf
-from holdfast.cluster.lines.line import NOBODY, Batch, Boot
+from holdfast.cluster.lines.line import NOBODY, Boot, LineBatch
 from holdfast.cluster.nats.server_file import UserRole
 from tests.cluster.bank import Account, Gain, Report
 from tests.cluster.fleet import Client, Programs
@@ -116,7 +116,7 @@ async def test_nobody_has_a_leader_write_into_its_own_log(nats1: NatsServers) ->
     async with hf.ActorSystem(name, store=nats1.store(name), log=False) as system:
         account = await system.start(hf.child("account", hf.start(Account), recovery=hf.hybrid()))
         client = await nats1.connect(name, UserRole.CLIENT)
-        greeting = msgspec.msgpack.encode(Batch("evil", Boot(1, "ff"), NOBODY, 0, 1, ()))
+        greeting = msgspec.msgpack.encode(LineBatch("evil", Boot(1, "ff"), NOBODY, 0, 1, ()))
         for reply in (f"hf.{name}.root.log", f"hf.{name}.root.lease", "$JS.API.INFO"):
             await client.publish(f"hf.{name}.root.in", greeting, reply=reply)
         await client.flush()

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from holdfast.cluster.lines import line as lines_of
-from holdfast.cluster.lines.line import NOBODY, Batch, Boot, Line, Note
+from holdfast.cluster.lines.line import NOBODY, Boot, Line, LineBatch, Note
 from holdfast.testing.fleet.post import PostFaults, SimPost, SimTransport
 from tests.cluster.fleets import simulate
 
@@ -28,11 +28,11 @@ class End:
 
     def post(self, first: int, items: tuple[bytes, ...], note: Note) -> None:
         self.batches += 1
-        batch = Batch(self.own, NOBODY, NOBODY, self.line.got, first, items, note)
+        batch = LineBatch(self.own, NOBODY, NOBODY, self.line.got, first, items, note)
         self.transport.post(self.other, msgspec.msgpack.encode(batch), "")
 
     def hear(self, data: bytes, back: str) -> None:
-        self.line.hear(msgspec.msgpack.decode(data, type=Batch))
+        self.line.hear(msgspec.msgpack.decode(data, type=LineBatch))
 
 
 async def two_ends(seed: int, faults: PostFaults) -> tuple[End, End]:

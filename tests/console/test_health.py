@@ -10,7 +10,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.checkpoint.sqlite import SqliteJournal
-from holdfast.console.service import probes
+from holdfast.console.service import probe_server
 from holdfast.console.service.health import Service
 from tests.system.trees import Add, Counter
 
@@ -68,9 +68,11 @@ async def test_what_is_no_probe_is_answered_too() -> None:
 
 async def test_a_probe_that_says_nothing_holds_up_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sixteen may say nothing at a time; a further one is closed at once, and they are after a while."""
-    monkeypatch.setattr(probes, "LONGEST", 0.2)
+    monkeypatch.setattr(probe_server, "LONGEST", 0.2)
     async with Service(system(), probes="127.0.0.1:0") as service, asyncio.timeout(30):
-        silent = [await asyncio.open_connection("127.0.0.1", service.probe_port) for _ in range(probes.MOST_PROBES + 1)]
+        silent = [
+            await asyncio.open_connection("127.0.0.1", service.probe_port) for _ in range(probe_server.MOST_PROBES + 1)
+        ]
         ends = [asyncio.create_task(reader.read()) for reader, _ in silent]
         done, _ = await asyncio.wait(ends, return_when="FIRST_COMPLETED")
         assert len(done) == 1

@@ -52,14 +52,14 @@ CHECKS = {
         "test_a_store_that_is_full",
     ),
     "a probe has an end": Check(
-        "console/service/probes.py",
+        "console/service/probe_server.py",
         "            async with asyncio.timeout(LONGEST):",
         "            async with asyncio.timeout(None):",
         HEALTH,
         "test_a_probe_that_says_nothing",
     ),
     "there are only so many probes at a time": Check(
-        "console/service/probes.py",
+        "console/service/probe_server.py",
         "        if len(self._tasks) >= MOST_PROBES:",
         "        if False:",
         HEALTH,

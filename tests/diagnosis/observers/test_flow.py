@@ -12,11 +12,11 @@ from holdfast.diagnosis import OBSERVATIONS, observer
 from holdfast.diagnosis.literals import Literal, ok
 from holdfast.diagnosis.observations import Observation
 from holdfast.diagnosis.observers import Baselines, FlowObserver
-from holdfast.diagnosis.observers.flow import Made
+from holdfast.diagnosis.observers.flow import FlowSource
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 
-MADE = {"/in": Made(()), "/out": Made(("/t/filter",), ("/in",))}
+MADE = {"/in": FlowSource(()), "/out": FlowSource(("/t/filter",), ("/in",))}
 
 
 class Item(hf.Message):

@@ -18,7 +18,7 @@ from ..actors.seconds import check_seconds
 from ..actors.values.path_parts import check_path_part
 from ..checkpoint.home.ask_recovery import PASSING
 from ..cluster.configuration import NatsSettings
-from ..cluster.lines.lines import Call, Lines, Transport, new_boot
+from ..cluster.lines.lines import LineCaller, Lines, Transport, new_boot
 from ..cluster.ports import Unanswered
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ async def open_lines(at: str, settings: NatsSettings) -> tuple[Transport, str, s
     return await open_transport(access), SubjectNames(access.system).inbox, access.system
 
 
-class Connection:
+class SystemConnection:
     """A connection to another system: refs to its actors, and its topics. Made by `connect`; an async context manager.
 
     It stays while the other system is led by one program after the other.
@@ -54,10 +54,10 @@ class Connection:
         self._own: Node | None = None
         self._lines: Lines | None = None
         self._transport: Transport | None = None
-        self._call: Call | None = None
+        self._call: LineCaller | None = None
         self._topics: dict[str, set[str]] = {}
 
-    async def __aenter__(self) -> Connection:
+    async def __aenter__(self) -> SystemConnection:
         if self._call is not None:
             raise HoldfastError(f"the connection to {self.system!r} was opened already; make a new one")
         try:
@@ -68,7 +68,7 @@ class Connection:
         self._system = self._system or kept
         try:
             lines = self._lines = self._lines_of(self._within)
-            call = self._call = Call(lines, transport, to, self._system, self._subscribe_again)
+            call = self._call = LineCaller(lines, transport, to, self._system, self._subscribe_again)
             await call.begin(self._seconds)
         except TimeoutError as error:
             await self.close()
@@ -174,7 +174,7 @@ class Connection:
             for path in paths:
                 self._call.far.command(path, "subscribe", {"topic": topic})
 
-    def _opened(self) -> Call:
+    def _opened(self) -> LineCaller:
         if self._call is None:
             raise HoldfastError(f"the connection to {self.system!r} is not open: async with hf.connect(...) as it")
         return self._call
@@ -182,7 +182,7 @@ class Connection:
 
 def connect(
     servers: str, *, system: str | None = None, within: ActorSystem | None = None, timeout: float = 5.0
-) -> Connection:
+) -> SystemConnection:
     """Describe a connection to another system; `async with` opens it.
 
     Args:
@@ -201,7 +201,7 @@ def connect(
     if system is not None:
         check_path_part("connect", "the system", system)
     check_seconds("connect", "timeout", timeout)
-    return Connection(servers, system, within, timeout)
+    return SystemConnection(servers, system, within, timeout)
 
 
 async def serve(lines: Lines, at: str, settings: NatsSettings) -> Transport:
