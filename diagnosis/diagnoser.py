@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable, Mapping
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from ..actors.kernel.actor import Actor, on, subscribe
 from ..actors.kernel.envelope import ReplyHandle
@@ -74,6 +74,14 @@ class _Understood(Message):
     explained: Explained
 
 
+class _Most(NamedTuple):
+    """What one diagnosis may take: candidates that are listed, seconds for them, and seconds for the explanation."""
+
+    candidates: int
+    seconds: float
+    explaining: float
+
+
 class DiagnoserActor(Actor):
     """Diagnoses when something has changed, not all the time (D42), beside the event loop.
 
@@ -103,8 +111,8 @@ class DiagnoserActor(Actor):
         recent: float = 30.0,
         trust: Mapping[str, float] | None = None,
     ) -> None:
-        self._quiet, self._limit, self._recent = quiet, limit, recent
-        self._seconds, self._explaining = seconds, explaining
+        self._quiet, self._recent = quiet, recent
+        self._most = _Most(limit, seconds, explaining)
         self._trust = dict(trust or {})
         self._repaired: dict[str, float] = {}
         self._refused: dict[tuple[str, str], str] = {}
@@ -127,7 +135,7 @@ class DiagnoserActor(Actor):
         self._observations = ObservationSet(self._engine.model.vocabulary, self._trust)
 
     def _engine_for(self, declaration: Declaration, version: int) -> Diagnoser:
-        return Diagnoser(Model(declaration, version), limit=self._limit, seconds=self._seconds)
+        return Diagnoser(Model(declaration, version), limit=self._most.candidates, seconds=self._most.seconds)
 
     # -- what comes in ----------------------------------------------------------------------------------------------
 
@@ -260,8 +268,8 @@ class DiagnoserActor(Actor):
 
     async def _soon(self, engine: Diagnoser, observed: Observed, repaired: frozenset[str]) -> _Thought:
         """What is known soon."""
-        diagnosis = await engine.diagnose(observed, repaired=repaired, seconds=min(FIRST, self._seconds))
-        is_last = "time" not in diagnosis.truncated or self._seconds <= FIRST
+        diagnosis = await engine.diagnose(observed, repaired=repaired, seconds=min(FIRST, self._most.seconds))
+        is_last = "time" not in diagnosis.truncated or self._most.seconds <= FIRST
         return _Thought(diagnosis, observed, repaired, is_last)
 
     async def _rest_of(self, engine: Diagnoser, first: _Thought) -> _Thought:
@@ -280,8 +288,8 @@ class DiagnoserActor(Actor):
         if diagnosis.state is not State.FAULTY:
             return Explained("\n".join(torn) or _STATES[diagnosis.state], refused=refused)
         with beside_a_loop():
-            why = engine.explain(observed, seconds=self._explaining)
-            probes = engine.next_observations(observed, diagnosis, seconds=self._explaining)[:SUGGESTED]
+            why = engine.explain(observed, seconds=self._most.explaining)
+            probes = engine.next_observations(observed, diagnosis, seconds=self._most.explaining)[:SUGGESTED]
         return Explained(
             "\n".join([str(why), *torn]),
             tuple(map(str, why.conflicts)),

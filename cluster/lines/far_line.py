@@ -7,6 +7,7 @@ under that name, and has one outcome. What was sent to other actors then ends wi
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import secrets
 import weakref
@@ -226,6 +227,23 @@ class KeptTell(RelayedAsk, eq=False):
         far.kept_is_over(self)
 
 
+@dataclasses.dataclass(slots=True)
+class Unsent:
+    """What waits until the other program has answered.
+
+    Attributes:
+        items: in order.
+        size: of all of them, in bytes.
+        asks: the numbers of the asks among them.
+        fresh: asks of recorded actors that are not among them, and that nobody has been sent yet.
+    """
+
+    items: list[bytes] = dataclasses.field(default_factory=list)
+    size: int = 0
+    asks: set[int] = dataclasses.field(default_factory=set)
+    fresh: set[int] = dataclasses.field(default_factory=set)
+
+
 class FarLine(Peer):
     """A line to another program, with the stand-ins for its actors.
 
@@ -264,11 +282,8 @@ class FarLine(Peer):
         self.await_actor: Callable[[str, Callable[[], None]], bool] = lambda path, then: False
         self.most = MOST_BYTES
         self.hand_back: Callable[[SwitchAsk], None] = lambda ask: None
-        self._held: list[bytes] = []  # until the other program has answered
-        self._held_bytes = 0
+        self._unsent = Unsent()
         self._last_id = secrets.randbits(40) << 12  # A late reply to an earlier run names nothing of this one.
-        self._held_asks: set[int] = set()  # the asks among those
-        self._fresh: set[int] = set()  # asks that wait, and that nobody has been sent yet
         self._cells: weakref.WeakValueDictionary[str, Cell] = weakref.WeakValueDictionary()
         self._host = FarHost(self)
         self.join(cast("Any", LineConnection(self)))
@@ -306,12 +321,12 @@ class FarLine(Peer):
         if self.line is not None:
             self.line.put(NEW + data)
             return
-        if self._held_bytes > WINDOW_BYTES:
+        if self._unsent.size > WINDOW_BYTES:
             raise Unreachable(f"/{self.name}", "too much waits for it already")
-        self._held_bytes += len(data)
-        self._held.append(NEW + data)
+        self._unsent.items.append(NEW + data)
+        self._unsent.size += len(data)
         if isinstance(frame, frames.Ask):
-            self._held_asks.add(frame.id)
+            self._unsent.asks.add(frame.id)
 
     def command(self, path: str, verb: str, data: dict[str, Any]) -> None:
         """Tell the other program what an actor here, or one of its own, wants."""
@@ -368,7 +383,7 @@ class FarLine(Peer):
         if self.line is not None:
             self.line.put((AGAIN if again else NEW) + self._ask_frame(key, ask))
         elif not again:
-            self._fresh.add(key)
+            self._unsent.fresh.add(key)
 
     def _ask_frame(self, key: int, ask: Ask) -> bytes:
         """The frame of an ask under this number."""
@@ -404,8 +419,8 @@ class FarLine(Peer):
         self.line = Line(self.node.loop, self._post, self._take)
         self.alive()
         self._ask_again()
-        held, self._held, self._held_bytes = self._held, [], 0
-        for data in held:
+        unsent, self._unsent = self._unsent, Unsent()
+        for data in unsent.items:
             self.line.put(data)
         for cell in list(self._cells.values()):
             self._watch_again(cell)
@@ -469,10 +484,8 @@ class FarLine(Peer):
         """Ask the new program what was asked of the one before it, in the same order and under the same names."""
         assert self.line is not None
         for key, ask in list(self.pending.items()):
-            if not ask.is_done and ask.to is not None and key not in self._held_asks:
-                self.line.put((NEW if key in self._fresh else AGAIN) + self._ask_frame(key, ask))
-        self._fresh.clear()
-        self._held_asks.clear()
+            if not ask.is_done and ask.to is not None and key not in self._unsent.asks:
+                self.line.put((NEW if key in self._unsent.fresh else AGAIN) + self._ask_frame(key, ask))
 
     # -- in ---------------------------------------------------------------------------------------------------------
 

@@ -37,7 +37,7 @@ from .notices import (
     Touched,
     Undone,
 )
-from .policy import NORMAL, SAFE, STANCES, Policy, Stance
+from .policy import NORMAL, SAFE, STANCES, Caution, Policy, Stance
 from .repairer import Repairer
 from .setup import repairer
 from .stock import (
@@ -82,6 +82,7 @@ __all__ = [
     "Memory",
     "NobodyWaits",
     "Planned",
+    "Caution",
     "Policy",
     "RepairAction",
     "RepairBegan",

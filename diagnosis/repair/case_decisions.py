@@ -190,8 +190,8 @@ def judge_pings(
         case.doubted.pop(bad, None)
         return None
     since = case.doubted.setdefault(bad, at.now)
-    if at.now - since < policy.confirm:
-        return Wait(since + policy.confirm - at.now)
+    if at.now - since < policy.caution.confirm:
+        return Wait(since + policy.caution.confirm - at.now)
     down = {one.args[0] for one in at.diagnosis.symptoms if one.name == "running" and not one.positive}
     if wrong := [name for name in alive if name in down]:
         return Dismiss(bad, f"{', '.join(wrong)} runs and answers, although it is said not to run")

@@ -23,6 +23,28 @@ def check_stance(stance: str) -> Stance:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class Caution:
+    """How repair sees to it that nobody is restarted who works.
+
+    Attributes:
+        confirm: seconds for which a diagnosis must stand before an actor that answers is restarted.
+        ping: seconds an actor has to answer, or to get on with its turn, before it is restarted.
+        grace: seconds after anybody has started a component in which no plan is made.
+    """
+
+    confirm: float = 1.0
+    ping: float = 0.25
+    grace: float = 1.5
+
+    def __post_init__(self) -> None:
+        if not 0 < self.ping < float("inf"):
+            raise ValueError(f"ping must be a finite number of seconds > 0, not {self.ping!r}")
+        for name, seconds in (("confirm", self.confirm), ("grace", self.grace)):
+            if not 0 <= seconds < float("inf"):
+                raise ValueError(f"{name} must be a finite number of seconds >= 0, not {seconds!r}")
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class Policy:
     """The rules of repair.
 
@@ -44,9 +66,7 @@ class Policy:
         approval: seconds a person has to approve a plan.
         component_actions: actions of any kind on one component within `window` seconds.
         hour_actions: actions of all cases together within an hour.
-        confirm: seconds for which a diagnosis must stand before an actor that answers is restarted.
-        ping: seconds an actor has to answer, or to get on with its turn, before it is restarted.
-        grace: seconds after anybody has started a component in which no plan is made.
+        caution: what is done before anybody is restarted who may work.
         modes: the actions that may be done in a mode; all of them in a mode that is not here (T65).
     """
 
@@ -68,19 +88,17 @@ class Policy:
     approval: float = 60.0
     component_actions: int = 6
     hour_actions: int = 60
-    confirm: float = 1.0
-    ping: float = 0.25
-    grace: float = 1.5
+    caution: Caution = dataclasses.field(default_factory=Caution)
     modes: Mapping[str, Collection[str]] = dataclasses.field(default_factory=lambda: {SAFE: ()})
 
     def __post_init__(self) -> None:
         for name in ("attempts", "rounds", "component_actions", "hour_actions"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be >= 1, not {getattr(self, name)!r}")
-        for name in ("window", "seconds", "verify", "unknown", "plan_seconds", "approval", "ping"):
+        for name in ("window", "seconds", "verify", "unknown", "plan_seconds", "approval"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} must be a finite number of seconds > 0, not {getattr(self, name)!r}")
-        for name in ("cool_down", "settle", "look", "confirm", "grace"):
+        for name in ("cool_down", "settle", "look"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} must be a finite number of seconds >= 0, not {getattr(self, name)!r}")
         if self.settle > self.verify:

@@ -136,7 +136,7 @@ class Repairer(Actor):
             self._restarted[event.address.rpartition("/")[0]] = self.now()
         elif isinstance(event, ActorStarted) and event.life > 1:
             names = tuple(name for name, address in self._addresses.items() if address == event.address)
-            if names and self._outlook.note_life(names, self._policy.grace, self.now()):
+            if names and self._outlook.note_life(names, self._policy.caution.grace, self.now()):
                 self._note_others(names, event.address)
                 self.ctx.ref.tell(_Started())
 
@@ -151,7 +151,7 @@ class Repairer(Actor):
 
     @on(_Started)
     def _wait_for_grace(self, message: _Started) -> None:
-        self.ctx.tell_after(self._policy.grace + MOMENT, _GraceIsOver())
+        self.ctx.tell_after(self._policy.caution.grace + MOMENT, _GraceIsOver())
         self._wake()
 
     async def _catch_up(self, diagnoser: str) -> None:
@@ -400,7 +400,7 @@ class Repairer(Actor):
     async def _give_time(self, case: Case, names: tuple[str, ...]) -> None:
         """Their supervisor has done its work just now: what was seen while it did says nothing of what has begun."""
         case.awaited -= set(names)
-        grace = self._policy.grace
+        grace = self._policy.caution.grace
         self._outlook.note_start(names, grace, self.now())
         await self.ctx.publish(TOUCHED, say.Touched(names, "restart by its supervisor", self.now(), grace))
         self.ctx.tell_after(grace + MOMENT, _GraceIsOver())
@@ -418,7 +418,7 @@ class Repairer(Actor):
         """What to do instead of a plan that restarts who answers; None: the plan stands."""
         steps = [step for step in plan.steps if self._actions[step.action].is_restart and step.args]
         targets = {step.args[0]: address for step in steps if (address := self._addresses.get(step.args[0]))}
-        node, seconds = self.ctx._cell.node, self._policy.ping
+        node, seconds = self.ctx._cell.node, self._policy.caution.ping
         said = await asyncio.gather(*(answers(node, address, seconds) for address in targets.values()))
         at = self._moment(case)
         if at.diagnosis.state is State.FAULTY and at.bad != bad:
@@ -459,7 +459,7 @@ class Repairer(Actor):
             address = self._addresses.get(step.args[0]) if step.args and step.args[0] in suspects else None
             if address is None or not self._actions[step.action].is_restart:
                 continue
-            if await answers(node, address, self._policy.ping):
+            if await answers(node, address, self._policy.caution.ping):
                 self._ledger.note_vain(step, now)  # It lives, and is as it was: once more would not be better.
         undos, case.undos = case.undos, []
         for step, undo in reversed(undos):
