@@ -250,8 +250,12 @@ class Ask(Item, msgspec.Struct, eq=False):
         """End the wait with a typed failure."""
         if not self.future.done():
             self.future.set_exception(error)
-            if self.to is not None and (watcher := self.to.node.deadlines.watcher) is not None:
-                watcher(self, error)
+            self.tell_failure(error)
+
+    def tell_failure(self, error: BaseException) -> None:
+        """Tell whoever watches the asks of the node that this one has failed."""
+        if self.to is not None and (watcher := self.to.node.deadlines.watcher) is not None:
+            watcher(self, error)
 
     def expire(self) -> None:
         """The deadline has passed; a turn that has not begun will not begin."""

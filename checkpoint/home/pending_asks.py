@@ -87,6 +87,8 @@ class SwitchAsk(RelayedAsk, eq=False):
         self.give(Answer(REPLY, "", body))
 
     def fail(self, error: BaseException) -> None:
+        if not self.is_over:
+            self.tell_failure(error)
         self.give(Answer(*self.codec.encode_error(error)))
 
     def fail_raw(self, kind: str, name: str, body: bytes) -> None:

@@ -54,6 +54,8 @@ class _Seen:
     """Since when its mailbox takes nothing more."""
     unanswered: deque[tuple[float, float]] = dataclasses.field(default_factory=lambda: deque(maxlen=16))
     """When asks of it have failed, and when they were made."""
+    refused: float = -math.inf
+    """When it has refused what it was asked for the last time."""
     crashes: tuple[float, ...] = ()
     waited: deque[str] = dataclasses.field(default_factory=lambda: deque(maxlen=USUAL))
     """Whom it waited for at the last looks."""
@@ -183,8 +185,12 @@ class RuntimeObserver(Observer):
         for ask, error in failed:
             callee = names.get(ask.to.path)
             asker = names.get(ask.sender.path) if ask.sender is not None else None
-            if isinstance(error, Refusal):
-                continue  # That is an answer.
+            if isinstance(
+                error, Refusal
+            ):  # That is an answer, and says nothing of whether it could have given another.
+                if callee is not None:
+                    self._seen(callee).refused = self.now
+                continue
             if callee is not None and isinstance(error, AskTimeout):
                 self._seen(callee).unanswered.append((self.now, self.now - ask.timeout))
             if asker is not None and asker != callee:
@@ -249,7 +255,10 @@ class RuntimeObserver(Observer):
                 progress(component),
                 True if has_got_on else None if now - seen.since > keeps else self.said(progress(component)),
             )
-            self.verdict(replies(component), True if has_got_on and answered else self.said(replies(component)))
+            if now - seen.refused <= keeps:
+                self.verdict(replies(component), None)
+            else:
+                self.verdict(replies(component), True if has_got_on and answered else self.said(replies(component)))
         return is_late or is_full
 
     # -- blaming ----------------------------------------------------------------------------------------------------

@@ -77,6 +77,20 @@ CHECKS = {
         RUNTIME,
         "a_long_turn",
     ),
+    "a refusal is no evidence": Check(
+        "diagnosis/observers/runtime.py",
+        "if now - seen.refused <= keeps:",
+        "if False:",
+        RUNTIME,
+        "who_refuses",
+    ),
+    "what a recorded actor is refused counts, too": Check(
+        "checkpoint/home/pending_asks.py",
+        "            self.tell_failure(error)\n",
+        "            pass\n",
+        RUNTIME,
+        "who_refuses",
+    ),
     "nobody is told of failures when nobody looks": Check(
         "diagnosis/observers/runtime.py",
         "            self._node.deadlines.watcher = None",

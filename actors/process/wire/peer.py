@@ -391,6 +391,8 @@ class RelayedAsk(Ask, eq=False):
             self.peer.connection.send(frames.Reply(self.id, Raw(body)))
 
     def fail(self, error: BaseException) -> None:
+        if not self.is_over:
+            self.tell_failure(error)
         codec = self.peer.codec
         try:
             kind, name, body = codec.encode_error(error)

@@ -23,6 +23,10 @@ class Go(hf.Message[int]):
     timeout: float = 60.0
 
 
+class Sorry(hf.Refusal):
+    """It cannot be done now."""
+
+
 class Worker(hf.Actor):
     @hf.on(Go)
     async def go(self, message: Go) -> int:
@@ -41,6 +45,10 @@ class Worker(hf.Actor):
                 await asyncio.Event().wait()
             case ["crash"]:
                 raise RuntimeError("broken")
+            case ["refuse"]:
+                raise Sorry
+            case ["refused", address]:
+                await self.ctx.find(address, Worker).ask(Go("refuse"))
             case ["long", seconds]:
                 await asyncio.sleep(float(seconds))
             case _:
@@ -99,6 +107,27 @@ async def test_a_time_out_names_the_callee_though_it_was_never_seen_to_get_on(sy
     await asked(worker(system, "c").ask(Go(), timeout=3.0))
     await advance(0.3)
     assert (await watching.diagnosis()).certain == ("all/c",)
+
+
+@pytest.mark.parametrize("asker", ["nobody", "an actor", "a recorded actor"])
+async def test_who_refuses_is_not_seen_to_work(system: hf.ActorSystem, asker: str) -> None:
+    """A refusal is an answer, and no evidence that it could give another one; nor is it a fault."""
+    recovery = hf.hybrid() if asker == "a recorded actor" else None
+    other = await system.start(hf.child("other", hf.start(Worker), recovery=recovery))
+    watching = await watched(system)
+    assert replies("all/c") in (await watching.observed()).positive
+    if asker == "nobody":
+        await asked(worker(system, "c").ask(Go("refuse")))
+    else:
+        await asked(other.ask(Go("refused /t/all/c")))
+    await worker(system, "c").ask(Go())  # What it has in hand is another ask, which it answers.
+    await advance(0.5)
+    observed = await watching.observed()
+    assert replies("all/c") not in observed.positive | observed.negative
+    await advance(5.0)
+    await worker(system, "c").ask(Go())
+    await advance(0.5)
+    assert replies("all/c") in (await watching.observed()).positive
 
 
 async def test_in_a_circle_of_asks_all_are_certain(system: hf.ActorSystem) -> None:
