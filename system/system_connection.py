@@ -70,10 +70,12 @@ class SystemConnection:
             lines = self._lines = self._lines_of(self._within)
             call = self._call = LineCaller(lines, transport, to, self._system, self._subscribe_again)
             await call.begin(self._seconds)
-        except TimeoutError as error:
+        except (TimeoutError, Unanswered) as error:
             await self.close()
             problem = f"no program that leads it has answered for {self._seconds:g} s"
-            raise Unreachable(f"/{self._system}", problem) from error
+            raise Unreachable(
+                f"/{self._system}", error.problem if isinstance(error, Unanswered) else problem
+            ) from error
         except BaseException:
             await self.close()
             raise

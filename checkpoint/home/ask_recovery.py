@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from hashlib import blake2b
+from time import monotonic
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import msgspec
@@ -40,6 +41,8 @@ SYSTEM: Final = "connected "
 """How the key of a fact begins that names a system to which there was a line."""
 PASSING: Final = "/client~"
 """How the addresses of programs begin that are no systems, and only connect to some."""
+TIDIED: Final = 1024
+"""Asks under way after which it is looked for some that have run out."""
 MOST_ENTRIES: Final = 2000
 """Entries after which what is left is written anew."""
 
@@ -150,7 +153,7 @@ class FarMail:
     def __init__(self, homes: Homes) -> None:
         self._homes = homes
         self._answers: dict[FarId, FarAnswer] = {}
-        self._open: set[FarId] = set()
+        self._open: dict[FarId, float] = {}
         self._outs: dict[str, FarOut] = {}
         self._systems = {key.removeprefix(SYSTEM) for key in homes.journal.notes(SYSTEM)}
         self._positions: list[int] = []
@@ -198,9 +201,12 @@ class FarMail:
         """Whether an address is that of a system that there has been a line to, in this run or an earlier one."""
         return path[1:].partition("/")[0] in self._systems
 
-    def begin(self, which: FarId) -> None:
-        """It is on its way to its receiver."""
-        self._open.add(which)
+    def begin(self, which: FarId, until: float) -> None:
+        """It is on its way to its receiver, and nobody waits for it after `until`, on the monotonic clock."""
+        self._open[which] = until
+        if len(self._open) % TIDIED == 0:  # Those that have run out in a mailbox have no outcome.
+            now = monotonic()
+            self._open = {one: until for one, until in self._open.items() if until > now}
 
     def is_open(self, which: FarId) -> bool:
         """Whether its outcome will come: the receiver has it."""
@@ -217,7 +223,7 @@ class FarMail:
 
     def answered(self, which: FarId, answer: Answer, batch: Batch) -> None:
         """It has its outcome, which is safe behind the batch."""
-        self._open.discard(which)
+        self._open.pop(which, None)
         one = FarAnswer(*which, answer.kind, answer.name, bytes(answer.body))
 
         def safe() -> None:

@@ -196,7 +196,7 @@ class FarAsk(RejoinedAsk, eq=False):
         ask = cls(None, asker, frame.chain, left, homes.node.loop.time() + left, None, cell)
         ask.future, ask.until, ask.homes = ask, frame.until, homes
         ask.asker, ask.turn, ask.k = asker.path, frame.id, run
-        homes.far.begin(FarId(ask.asker, ask.turn, ask.k))
+        homes.far.begin(FarId(ask.asker, ask.turn, ask.k), ask.until)
         return ask
 
 
