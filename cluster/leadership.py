@@ -215,7 +215,7 @@ class Leading:
 
 
 def _nobody(what: str) -> None:
-    """Nobody is told."""
+    """Tell nobody that somebody else leads."""
 
 
 async def lead(

@@ -267,7 +267,7 @@ class DiagnoserActor(Actor):
     # -- thinking ---------------------------------------------------------------------------------------------------
 
     async def _soon(self, engine: Diagnoser, observed: Observed, repaired: frozenset[str]) -> _Thought:
-        """What is known soon."""
+        """What is known within the first moments of a search."""
         diagnosis = await engine.diagnose(observed, repaired=repaired, seconds=min(FIRST, self._most.seconds))
         is_last = "time" not in diagnosis.truncated or self._most.seconds <= FIRST
         return _Thought(diagnosis, observed, repaired, is_last)

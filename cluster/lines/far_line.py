@@ -82,7 +82,7 @@ class TextNames:
     kinds: dict[type, int] = {}  # noqa: RUF012  # nothing is ever put in: no name has a number
 
     def to_wire(self, text: str) -> frames.Name:
-        """The text."""
+        """The text itself, for names have no numbers here."""
         return text
 
     def from_wire(self, name: frames.Name) -> str:
@@ -207,7 +207,7 @@ class KeptTell(RelayedAsk, eq=False):
     origin: str = ""
 
     def answer_raw(self, body: bytes) -> None:
-        """It is accepted."""
+        """The other program has accepted it for good."""
         self._over("")
 
     def fail(self, error: BaseException) -> None:

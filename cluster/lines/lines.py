@@ -128,7 +128,7 @@ class Lines:
         return self._lines.get(name)
 
     def drop(self, far: FarLine) -> None:
-        """End a line."""
+        """End a line, whose name is free again."""
         if self._lines.get(far.name) is far:
             del self._lines[far.name]
         far.close()
@@ -147,7 +147,7 @@ class Lines:
             far.is_closing = True
 
     def close(self) -> None:
-        """End all lines."""
+        """End all lines to other programs, and look after none."""
         for far in list(self._lines.values()):
             self.drop(far)
         if self._beat is not None:

@@ -205,7 +205,7 @@ class FlowObserver(Observer):
             await self._baselines.save()
 
     async def on_stop(self, reason: Any) -> None:
-        """Keep what was learned."""
+        """Keep what was learned beyond this life."""
         await self._baselines.save()
 
     def _learned(self, topic: str) -> Usual:
