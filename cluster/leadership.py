@@ -215,7 +215,7 @@ class Leading:
 
 
 def _nobody(what: str) -> None:
-    """Tell nobody that somebody else leads."""
+    """Tell nobody what is waited for."""
 
 
 async def lead(
