@@ -14,7 +14,6 @@ from .transaction.operation import Operation, Step
 
 __all__ = [
     "Change",
-    "SystemConnection",
     "HistoryPage",
     "Opaque",
     "Operation",
@@ -24,5 +23,6 @@ __all__ = [
     "Statistics",
     "Status",
     "Step",
+    "SystemConnection",
     "ThreadPortal",
 ]

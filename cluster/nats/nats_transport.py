@@ -108,5 +108,9 @@ async def open_transport(access: NatsAccess) -> NatsTransport:
         Unanswered: no server can be reached.
     """
     client = SystemClient(access)
-    await client.enter(CONNECT_SECONDS)
+    try:
+        await client.enter(CONNECT_SECONDS)
+    except BaseException:  # It may be connected all the same, if this was cancelled just then.
+        await client.close()
+        raise
     return NatsTransport(client, access.name)
