@@ -296,6 +296,19 @@ class WaitTimeout(HoldfastError, text="{actor} has waited for {message}, and its
     message: str
 
 
+class TurnTimeout(
+    HoldfastError, text="{actor} has been in the turn of {message} for {seconds:g} s, which is its turn_timeout"
+):
+    """A turn has waited for longer than its actor's class allows; the actor has crashed by this error.
+
+    Its cause is the cancellation of the turn, whose traceback says where it has waited.
+    """
+
+    actor: str
+    message: str
+    seconds: float
+
+
 class ReplayDiverged(HoldfastError):
     """A replayed turn went another way than before the crash: another output or reply, or no end at all.
 

@@ -84,6 +84,8 @@ class Place:
     """Whether each life has a process of its own, or several."""
     kind: str = "task"
     """Where that is, in a word, for whoever counts."""
+    limits_turns: bool = True
+    """Whether a turn that takes longer than its class allows is ended where it runs, and not by others."""
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         """Begin a life. None: it is up already. Raises, or fails the future, with StartFailed."""
