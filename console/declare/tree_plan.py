@@ -65,7 +65,8 @@ async def change_to(
     """Have the tree of a running system be as it is wanted, by one transaction; None: it is so already.
 
     Raises:
-        SpecError: it cannot be so while all runs, or would leave something behind. TransactionRefused, TransactionFailed: as any transaction.
+        SpecError: it cannot be so while all runs, or would leave something behind.
+        TransactionRefused, TransactionFailed: as any transaction.
     """
     plan = TreePlan(system, wanted, timeout)
     steps = await plan.steps()
