@@ -393,10 +393,11 @@ class GroupPlace(Place):
             if not pieces and switch.ledger.state_turn >= 0:
                 pieces = [Restore(b"")]  # It begins afresh, but its turns are counted on.
             traps = traps or any(piece.traps for piece in pieces)
+            variables = tuple(name for piece in pieces for name in piece.variables)
             for index, piece in enumerate(pieces, 1):
                 is_last = index == len(pieces)
                 turn, stash = switch.ledger.state_turn, switch.ledger.stash
-                order = Install(known.epoch, turn, piece.data, stash, is_last, [], traps)
+                order = Install(known.epoch, turn, piece.data, stash, is_last, [], traps, variables)
                 await replicas.ask(first, order, LED_WITHIN)
             await replicas.ask(first, Lead(known.epoch, self.config), LED_WITHIN)
         except HoldfastError as error:

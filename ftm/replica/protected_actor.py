@@ -354,7 +354,7 @@ class Server(lifecycle.HerePlace):
                 data = point.data.whole()
             except DamagedValue as error:
                 raise StartFailed(self.address, str(error)) from error
-            life.to_life(Restore(data))
+            life.to_life(Restore(data, variables=point.variables))
         turn = state.start_turn if point is None else point.turn
         life.begin(start, turn, [] if point is None else point.stash_ids)
         self.life = life
@@ -367,6 +367,10 @@ class Server(lifecycle.HerePlace):
             take_up(life, point, has_deltas=state.has_deltas)
         elif state.has_deltas:
             actor.get_delta()
+        if life.restored.is_mapped:  # What is begun with, and gone back to, is a state of the class as it is now.
+            made = self._whole(life)
+            self.points.stand_changed(made)
+            self._note_names(life, made)
         return life
 
     def abandon(self) -> None:
