@@ -14,24 +14,47 @@ from ..supervision.spec import ChildSpec, child
 from .assembly import observer, tree
 from .diagnoser import SERVER, DiagnoserActor
 from .engine import Diagnosis
-from .generate import Generated, LiveWiring, WatchedSystem, child_name, evident, generate, observers_for
+from .generate import (
+    Generated,
+    LiveWiring,
+    WatchedSystem,
+    child_name,
+    evident,
+    generate,
+    has_replicas,
+    observers_for,
+    replicas_of,
+)
 from .literals import ok
 from .messages import DIAGNOSER, Explained, GetDiagnosis, GetExplanation, GetObserved
 from .model import Declaration, Expectation, History, System
 from .model_follower import ModelFollower
 from .observations import Observed
-from .observers import Baselines, Bound, Limits, Manner, NodeObserver, Property, PropertyObserver, RuntimeObserver
+from .observers import (
+    Baselines,
+    Bound,
+    Limits,
+    Manner,
+    NodeObserver,
+    Property,
+    PropertyObserver,
+    ReplicaObserver,
+    RuntimeObserver,
+)
 from .repair import (
     Approver,
     GetRepairStatus,
+    GetStories,
     Policy,
     RepairAction,
     Repairer,
     RepairStatus,
     SetStance,
     Stance,
+    Story,
     repairer,
     restart_child,
+    restart_replica,
     restart_subtree,
 )
 from .repair.policy import check_stance
@@ -78,6 +101,10 @@ class Watch:
     async def repair_status(self) -> RepairStatus:
         """Ask how repair stands, and how good its advice was. Raises NoSuchActor if repair was never on."""
         return await self.repairer.ask(GetRepairStatus())
+
+    async def stories(self) -> tuple[Story, ...]:
+        """Ask for what repair has told of its last cases, the oldest first. Raises NoSuchActor if it was never on."""
+        return (await self.repairer.ask(GetStories())).stories
 
     async def why(self) -> Explained:
         """Ask why the diagnosis is what it is, and what to look at next."""
@@ -154,10 +181,12 @@ async def watch(
         assert model is not None
         declaration = model.declaration() if isinstance(model, System) else model
     where = (dict(generated.addresses) if generated is not None else {}) | dict(addresses or {})
+    groups = {name: path for name, path in where.items() if has_replicas(system._node.find(path))}
     if generated is None and where:
         watchers.append(observer("nodes", Start(NodeObserver, (where,), {"hung_after": hung_after, "manner": manner})))
         watchers.append(observer("runtime", Start(RuntimeObserver, (where,))))
-        declaration = evident(declaration, where)
+        watchers.append(observer("replicas", Start(ReplicaObserver, (groups,))))
+        declaration = evident(declaration, where, protected=groups)
     if limits:
         declaration = expecting(declaration, limits)
         watchers += property_observers(limits, where, manner)
@@ -206,5 +235,7 @@ def _actions(node: Node, addresses: Mapping[str, str], more: Iterable[RepairActi
     root = "" if node.root is None else node.root.path
     above = {component: path.rpartition("/")[0] for component, path in addresses.items()}
     subtrees = {component: path for component, path in above.items() if path not in ("", root)}
-    ours = {action.name: action for action in (restart_child(addresses), restart_subtree(subtrees))}
+    groups = {replicas_of(component): path for component, path in addresses.items()}
+    stock = (restart_child(addresses), restart_subtree(subtrees), restart_replica(groups))
+    ours = {action.name: action for action in stock}
     return list((ours | given).values())
