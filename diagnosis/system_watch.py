@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any, Final
 
 import msgspec
@@ -131,6 +132,7 @@ async def watch(
     window: float = 2.0,
     hung_after: float | None = None,
     baselines: Baselines | None = None,
+    repair_file: str | Path | None = None,
     name: str = "diagnosis",
     **options: Any,
 ) -> Watch:
@@ -157,6 +159,8 @@ async def watch(
         seconds: see `model`.
         window: of a generated model: seconds of silence of a topic that are never too long.
         baselines: of a generated model: what is usual of its topics, such as `Baselines("usual.json")`, which is kept.
+        repair_file: where the scores of advice, and what people have denied to repair, are kept for the next program,
+            such as "repair.json"; None: nowhere.
         hung_after: seconds after which an actor that is still in the same turn counts as not running, such as one that
             others ask in vain. None: nothing takes too long.
         name: of the supervisor that is started.
@@ -164,7 +168,7 @@ async def watch(
 
     Raises:
         ModelError: something is wrong with the model. StartFailed, AlreadyStarted: see `ActorSystem.start`.
-        ValueError: there is no such stance of repair.
+        ValueError: there is no such stance of repair, or the file of repair is another one.
     """
     check_stance(repair)
     generated = await generate(system, seconds=seconds) if model is None else None
@@ -193,7 +197,9 @@ async def watch(
     mend = None
     if repair != "off":
         ways = _actions(system._node, where, actions)
-        mend = repairer(declaration, ways, policy, name=REPAIRER, addresses=where, stance=repair, approve=approve)
+        mend = repairer(
+            declaration, ways, policy, name=REPAIRER, addresses=where, stance=repair, approve=approve, file=repair_file
+        )
     started = await system.start(tree(History(declaration), watchers, name=name, repairer=mend, **options))
     return Watch(started, system._node, where, generated)
 

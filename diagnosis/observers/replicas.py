@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Final
 
 from ...actors.kernel.cell import RUNNING
@@ -80,10 +80,10 @@ class ReplicaObserver(Observer):
         at_root(self)
         super().on_start(restored)
 
-    def afresh(self) -> None:
+    def afresh(self, names: Collection[str]) -> None:
         """Who was missing before somebody acted has time to come back."""
         now = self.now
-        for group in self._groups.values():
+        for group in (group for component, group in self._groups.items() if component in names):
             group.led = now
             for replica in group.replicas.values():
                 replica.well, replica.falls = now, 0

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Final
 
 from ...actors.errors import AskTimeout
@@ -132,9 +132,9 @@ class RuntimeObserver(Observer):
         """How often it crashes is just what is to be known."""
         return self._loops.isdisjoint(about.args) and super().spares(grace, about)
 
-    def afresh(self) -> None:
+    def afresh(self, names: Collection[str]) -> None:
         """What was late before somebody acted says nothing of after."""
-        for seen in self._known.values():
+        for seen in (seen for component, seen in self._known.items() if component in names):
             seen.unanswered.clear()
             seen.waited.clear()
             seen.full = None

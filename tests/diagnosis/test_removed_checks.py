@@ -149,6 +149,13 @@ CHECKS = {
         RUNTIME,
         "nothing_is_told",
     ),
+    "a start forgets what was seen of those that it is about, and of nobody else": Check(
+        "diagnosis/observers/flow.py",
+        "            if topic in names:\n                flow.begin(self.now)\n",
+        "            flow.begin(self.now)\n            flow.began = float('inf')\n",
+        FLOW,
+        "a_clock_that_has_stopped",
+    ),
     "silence without input is no fault": Check(
         "diagnosis/observers/flow.py",
         "is_by_clock = not made.inputs and learned",

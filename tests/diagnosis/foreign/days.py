@@ -25,7 +25,7 @@ def healthy(name: str, kind: str, seed: int, hours: float) -> tuple[tuple[str, .
     """Run a system under traffic for `hours` virtual hours; the false alarms, and the seconds of a core it took."""
     (foreign,) = (one for one in SYSTEMS if one.name == name)
     with asyncio.Runner(loop_factory=lambda: VirtualClockLoop(jumps=JUMPS)) as runner:
-        outcome = runner.run(trial(foreign, None, kind, seed, hours * 3600.0))
+        outcome = runner.run(trial(foreign, {}, kind, seed, hours * 3600.0))
     return outcome.false_alarms, time.process_time()
 
 
