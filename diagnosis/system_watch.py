@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any, Final
 
 import msgspec
@@ -14,24 +15,47 @@ from ..supervision.spec import ChildSpec, child
 from .assembly import observer, tree
 from .diagnoser import SERVER, DiagnoserActor
 from .engine import Diagnosis
-from .generate import Generated, LiveWiring, WatchedSystem, child_name, evident, generate, observers_for
+from .generate import (
+    Generated,
+    LiveWiring,
+    WatchedSystem,
+    child_name,
+    evident,
+    generate,
+    has_replicas,
+    observers_for,
+    replicas_of,
+)
 from .literals import ok
 from .messages import DIAGNOSER, Explained, GetDiagnosis, GetExplanation, GetObserved
 from .model import Declaration, Expectation, History, System
 from .model_follower import ModelFollower
 from .observations import Observed
-from .observers import Baselines, Bound, Limits, Manner, NodeObserver, Property, PropertyObserver, RuntimeObserver
+from .observers import (
+    Baselines,
+    Bound,
+    Limits,
+    Manner,
+    NodeObserver,
+    Property,
+    PropertyObserver,
+    ReplicaObserver,
+    RuntimeObserver,
+)
 from .repair import (
     Approver,
     GetRepairStatus,
+    GetStories,
     Policy,
     RepairAction,
     Repairer,
     RepairStatus,
     SetStance,
     Stance,
+    Story,
     repairer,
     restart_child,
+    restart_replica,
     restart_subtree,
 )
 from .repair.policy import check_stance
@@ -79,6 +103,10 @@ class Watch:
         """Ask how repair stands, and how good its advice was. Raises NoSuchActor if repair was never on."""
         return await self.repairer.ask(GetRepairStatus())
 
+    async def stories(self) -> tuple[Story, ...]:
+        """Ask for what repair has told of its last cases, the oldest first. Raises NoSuchActor if it was never on."""
+        return (await self.repairer.ask(GetStories())).stories
+
     async def why(self) -> Explained:
         """Ask why the diagnosis is what it is, and what to look at next."""
         return await self.diagnoser.ask(GetExplanation())
@@ -104,6 +132,7 @@ async def watch(
     window: float = 2.0,
     hung_after: float | None = None,
     baselines: Baselines | None = None,
+    repair_file: str | Path | None = None,
     name: str = "diagnosis",
     **options: Any,
 ) -> Watch:
@@ -130,6 +159,8 @@ async def watch(
         seconds: see `model`.
         window: of a generated model: seconds of silence of a topic that are never too long.
         baselines: of a generated model: what is usual of its topics, such as `Baselines("usual.json")`, which is kept.
+        repair_file: where the scores of advice, and what people have denied to repair, are kept for the next program,
+            such as "repair.json"; None: nowhere.
         hung_after: seconds after which an actor that is still in the same turn counts as not running, such as one that
             others ask in vain. None: nothing takes too long.
         name: of the supervisor that is started.
@@ -137,7 +168,7 @@ async def watch(
 
     Raises:
         ModelError: something is wrong with the model. StartFailed, AlreadyStarted: see `ActorSystem.start`.
-        ValueError: there is no such stance of repair.
+        ValueError: there is no such stance of repair, or the file of repair is another one.
     """
     check_stance(repair)
     generated = await generate(system, seconds=seconds) if model is None else None
@@ -154,17 +185,21 @@ async def watch(
         assert model is not None
         declaration = model.declaration() if isinstance(model, System) else model
     where = (dict(generated.addresses) if generated is not None else {}) | dict(addresses or {})
+    groups = {name: path for name, path in where.items() if has_replicas(system._node.find(path))}
     if generated is None and where:
         watchers.append(observer("nodes", Start(NodeObserver, (where,), {"hung_after": hung_after, "manner": manner})))
         watchers.append(observer("runtime", Start(RuntimeObserver, (where,))))
-        declaration = evident(declaration, where)
+        watchers.append(observer("replicas", Start(ReplicaObserver, (groups,))))
+        declaration = evident(declaration, where, protected=groups)
     if limits:
         declaration = expecting(declaration, limits)
         watchers += property_observers(limits, where, manner)
     mend = None
     if repair != "off":
         ways = _actions(system._node, where, actions)
-        mend = repairer(declaration, ways, policy, name=REPAIRER, addresses=where, stance=repair, approve=approve)
+        mend = repairer(
+            declaration, ways, policy, name=REPAIRER, addresses=where, stance=repair, approve=approve, file=repair_file
+        )
     started = await system.start(tree(History(declaration), watchers, name=name, repairer=mend, **options))
     return Watch(started, system._node, where, generated)
 
@@ -206,5 +241,7 @@ def _actions(node: Node, addresses: Mapping[str, str], more: Iterable[RepairActi
     root = "" if node.root is None else node.root.path
     above = {component: path.rpartition("/")[0] for component, path in addresses.items()}
     subtrees = {component: path for component, path in above.items() if path not in ("", root)}
-    ours = {action.name: action for action in (restart_child(addresses), restart_subtree(subtrees))}
+    groups = {replicas_of(component): path for component, path in addresses.items()}
+    stock = (restart_child(addresses), restart_subtree(subtrees), restart_replica(groups))
+    ours = {action.name: action for action in stock}
     return list((ours | given).values())

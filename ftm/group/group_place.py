@@ -108,6 +108,14 @@ class GroupPlace(Place):
         leader = None if group is None else group.membership.primary
         return None if group is None or leader is None else group.replicas.worker_of(leader)
 
+    def replica_states(self) -> dict[str, str]:
+        """How each replica does; none while the actor is being recovered."""
+        group = self.group
+        if group is None or group.membership.is_over:
+            return {}
+        known = group.membership
+        return {name: known.state_of(name, group.replicas.life_of(name)) for name in known.names}
+
     def handed_to(self, parent: Parent) -> None:
         """The replicas stay: another supervisor hears of the end of the life."""
         self.parent = parent

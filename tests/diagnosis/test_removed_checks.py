@@ -11,6 +11,8 @@ from tests.removing import Check, as_tests
 ENGINE = "tests/diagnosis/test_engine.py"
 OBSERVATIONS = "tests/diagnosis/test_observations.py"
 RUNTIME = "tests/diagnosis/observers/test_runtime.py"
+BACKLOG = "tests/diagnosis/observers/test_backlog.py"
+REPLICAS = "tests/diagnosis/live/test_replicas.py"
 FLOW = "tests/diagnosis/observers/test_flow.py"
 
 CHECKS = {
@@ -44,7 +46,7 @@ CHECKS = {
     ),
     "that an actor runs says nothing of its work": Check(
         "diagnosis/engine/cone.py",
-        'literal.name not in ("running", "room")',
+        "literal.name not in NO_WORK",
         "True",
         ENGINE,
         "is_unknown",
@@ -62,6 +64,55 @@ CHECKS = {
         "while (following := None) is not None:",
         RUNTIME,
         "behind_two_that_wait",
+    ),
+    "what grows and then is worked off is no leak": Check(
+        "diagnosis/observers/backlog.py",
+        "has_grown = is_larger and still_rises and is_long and",
+        "has_grown = is_larger and is_long and",
+        BACKLOG,
+        "a_long_rise",
+    ),
+    "a burst is no leak": Check(
+        "diagnosis/observers/backlog.py",
+        "has_grown = is_larger and still_rises and is_long and",
+        "has_grown = is_long and",
+        BACKLOG,
+        "a_burst",
+    ),
+    "a rise is compared with what was usual": Check(
+        "diagnosis/observers/backlog.py",
+        "max(SHORTEST, LONGER * self.longest)",
+        "SHORTEST",
+        BACKLOG,
+        "a_long_rise",
+    ),
+    "who does not keep up because it waits for another one is not accused": Check(
+        "diagnosis/observers/runtime.py",
+        "overrun = self._ends(growing, {}, waiting)",
+        "overrun = set(growing)",
+        BACKLOG,
+        "Through",
+    ),
+    "a missing replica is no fault of the actor": Check(
+        "diagnosis/generate.py",
+        "Expectation(str(atom(name)), (replicas_of(name),))",
+        "Expectation(str(atom(name)), (name,))",
+        REPLICAS,
+        "life_after_life",
+    ),
+    "catching up is compared with what was usual": Check(
+        "diagnosis/observers/replicas.py",
+        "max(self._catching, LONGER * group.catching)",
+        "self._catching",
+        REPLICAS,
+        "four_times",
+    ),
+    "replicas that lead or follow are left alone": Check(
+        "diagnosis/repair/stock.py",
+        'if state not in ("leads", "follows")]',
+        "]",
+        REPLICAS,
+        "begun_anew",
     ),
     "who crashes because of another one is not to blame": Check(
         "diagnosis/observers/runtime.py",
@@ -97,6 +148,13 @@ CHECKS = {
         "            pass",
         RUNTIME,
         "nothing_is_told",
+    ),
+    "a start forgets what was seen of those that it is about, and of nobody else": Check(
+        "diagnosis/observers/flow.py",
+        "            if topic in names:\n                flow.begin(self.now)\n",
+        "            flow.begin(self.now)\n            flow.began = float('inf')\n",
+        FLOW,
+        "a_clock_that_has_stopped",
     ),
     "silence without input is no fault": Check(
         "diagnosis/observers/flow.py",
