@@ -18,6 +18,7 @@ from ..checkpoint.store_opening import check_durability, check_store_key
 from ..cluster.configuration import NatsSettings, read_configuration
 from ..cluster.joining import is_replicated
 from ..cluster.leadership import Standby
+from ..cluster.lines.inflow import ConnectionLimits
 from ..supervision.spec import Flags
 
 CONFIGURED: Final = "configured"
@@ -38,6 +39,7 @@ class SystemOptions:
     durability: Durability | None
     standby: Standby | None
     reachable: str | None
+    connection_limits: ConnectionLimits
     nats: NatsSettings
     flags: Flags
     preload: tuple[str, ...]
@@ -62,6 +64,9 @@ class SystemOptions:
             if not is_replicated(self.store):
                 problem = f"standby={self.standby!r} needs a store that several machines keep: store='nats://HOST/NAME'"
                 raise SpecError("ActorSystem", problem)
+        limits: object = self.connection_limits
+        if not isinstance(limits, ConnectionLimits):
+            raise SpecError("ActorSystem", f"connection_limits must be a ConnectionLimits, not {limits!r}")
         hooks = self.recovery_hooks
         if hooks is not None and not isinstance(hooks, RecoveryHooks):
             raise SpecError("ActorSystem", f"recovery_hooks must come from recovery_hooks(...), not be {hooks!r}")

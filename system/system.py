@@ -42,6 +42,7 @@ from ..checkpoint.store_key import StoreKey
 from ..checkpoint.store_opening import check_system, open_journal
 from ..cluster.joining import is_replicated, join
 from ..cluster.leadership import LeadershipLost, Standby
+from ..cluster.lines.inflow import DEFAULT_LIMITS, ConnectionLimits
 from ..cluster.lines.lines import Lines, Transport, new_boot
 from ..cluster.log_writer import Deposed
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
@@ -104,6 +105,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             "warm" with what is stored in memory, "cold" without. None: StoreInUse names who leads.
         reachable: "nats://HOST,HOST/NAME": where `hf.connect` of other programs finds this system. A store on several
             machines is that place by itself.
+        connection_limits: how much each program that is connected may have outstanding here.
         intensity, period: how many restarts of its direct children the root allows before the tree fails.
         preload: modules the fork server imports beforehand, besides those of the actors it starts.
         log: write crashes, dead letters, output of processes and the like to structlog or standard logging, whichever
@@ -131,6 +133,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         durability: Durability | None = None,
         standby: Standby | None = None,
         reachable: str | None = None,
+        connection_limits: ConnectionLimits = DEFAULT_LIMITS,
         intensity: int = 3,
         period: float = 5.0,
         preload: Sequence[str] = (),
@@ -153,6 +156,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             durability=durability,
             standby=standby,
             reachable=reachable,
+            connection_limits=connection_limits,
             flags=Flags("one_for_one", intensity, period),
             preload=tuple(preload),
             log=log,
@@ -221,7 +225,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         self._specifications = Specifications(self._homes, is_kept=options.store is not None)
         self._mechanism_notes = MechanismNotes(self._homes)
         epoch = engine.epoch if engine.safe_at == "sync" else None
-        self._lines = Lines(node, self.name, new_boot(epoch), self._homes)
+        self._lines = Lines(node, self.name, new_boot(epoch), self._homes, options.connection_limits)
         node.connect(
             Ports(
                 host_for=self._host_for,

@@ -18,13 +18,16 @@ from ..actors.seconds import check_seconds
 from ..actors.values.path_parts import check_path_part
 from ..checkpoint.home.ask_recovery import PASSING
 from ..cluster.configuration import NatsSettings
-from ..cluster.lines.lines import LineCaller, Lines, Transport, new_boot
+from ..cluster.lines.calls import LineCaller, LineGate
+from ..cluster.lines.lines import Lines, Transport, new_boot
 from ..cluster.ports import Unanswered
 
 if TYPE_CHECKING:
     from .system import ActorSystem
 
 A = TypeVar("A", bound=Actor)
+CLOSE_SECONDS = 5.0
+"""How long a connection that is closed waits until what was sent is on its way."""
 
 
 async def open_lines(at: str, settings: NatsSettings) -> tuple[Transport, str, str]:
@@ -97,8 +100,8 @@ class SystemConnection:
 
     async def close(self) -> None:
         """End the connection: asks that are out fail, and nothing more is sent. A second call changes nothing."""
-        if self._call is not None and self._lines is not None:
-            self._lines.drop(self._call.far)
+        if self._call is not None:
+            await self._call.end(CLOSE_SECONDS)
         transport, self._transport = self._transport, None
         if transport is not None:
             await transport.close()
@@ -214,7 +217,7 @@ async def serve(lines: Lines, at: str, settings: NatsSettings) -> Transport:
     """
     transport, inbox, _ = await open_lines(at, settings)
     try:
-        await transport.hear(inbox, lines.serve(transport).hear)
+        await transport.hear(inbox, LineGate(lines, transport).hear)
     except BaseException:
         with contextlib.suppress(TimeoutError):
             await transport.close()
