@@ -390,8 +390,8 @@ class LeadershipTaken(Event, frozen=True, eq=False):
 class ConnectionLimited(Event, frozen=True, eq=False):
     """A program wants more of a system than its `ConnectionLimits` allow, and is refused.
 
-    Both ends tell it, once for each kind and line; `address` is that of the other system. `what` is over its limit, such
-    as asks or subscriptions, and `problem` says how many there are.
+    Both ends tell it, once for each kind and line; `address` is that of the other system. `what` is over its limit,
+    such as asks or subscriptions, and `problem` says how many there are.
     """
 
     what: str

@@ -8,7 +8,7 @@ import os
 from collections.abc import Sequence
 from importlib.util import find_spec
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args, overload
 
 from ..actors.control.drain import drain as drain_queue
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, StoreError, TreeFailed
@@ -17,7 +17,7 @@ from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, pack_exit
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.address_host import AddressHost
-from ..actors.kernel.cell import GONE, Cell, Host
+from ..actors.kernel.cell import GONE, Cell, Host, Scope
 from ..actors.kernel.lifecycle import LOCAL, NEAR
 from ..actors.kernel.mailbox import Bounded
 from ..actors.kernel.message import Message
@@ -618,9 +618,20 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
 
     # -- names, topics, bindings ------------------------------------------------------------------------------------
 
-    def register(self, name: str, ref: ActorRef[Any]) -> None:
-        """Give an actor a name beside its address. Raises NameTaken."""
-        self._node.register(name, ref._cell.living)
+    def register(self, name: str, ref: ActorRef[Any], *, scope: Scope = "system") -> None:
+        """Give an actor a name beside its address, for the life that it has.
+
+        Args:
+            name: the name.
+            ref: the actor.
+            scope: who finds it by the name: "system", or "fleet": other systems and clients that are connected, too.
+
+        Raises:
+            NameTaken: somebody else has the name. SpecError: the name or the scope is not valid.
+        """
+        if scope not in get_args(Scope):
+            raise SpecError("register", f"scope must be 'system' or 'fleet', not {scope!r}")
+        self._node.register(name, ref._cell.living, scope=scope)
 
     def unregister(self, name: str) -> None:
         """Free a name; unknown ones are fine."""

@@ -19,6 +19,7 @@ from ..actors.values.path_parts import check_path_part
 from ..checkpoint.home.ask_recovery import PASSING
 from ..cluster.configuration import NatsSettings
 from ..cluster.lines.calls import LineCaller, LineGate
+from ..cluster.lines.far_line import FindName
 from ..cluster.lines.lines import Lines, Transport, new_boot
 from ..cluster.ports import Unanswered
 
@@ -139,6 +140,25 @@ class SystemConnection:
         if path != top and not path.startswith(f"{top}/"):
             raise SpecError("connect", f"{path!r} is no address of {self.system!r}: they begin with {top}/")
         return ActorRef(self._opened().far.stand_in(path))
+
+    async def whereis(self, name: str, kind: type[A] | None = None, *, timeout: float = 5.0) -> ActorRef[A]:
+        """Return a ref to the actor of the other system that has a name there, given with `scope="fleet"`.
+
+        Who leads the system has answered, and it was sure then that no other program does. The ref is to the address,
+        and stays good when the name is freed. Between two lives of its actor nobody has a name.
+
+        Args:
+            name: beside its address, as the other system has registered it.
+            kind: its class, for type checkers.
+            timeout: seconds until an answer has come.
+
+        Raises:
+            NoSuchActor: nobody has the name now, or it is for the other system alone. AskTimeout: no answer came.
+            ConnectionLost: the program that was asked may lead no more.
+        """
+        call = self._opened()
+        system: ActorRef[Any] = ActorRef(call.far.stand_in(f"/{self.system}"))
+        return ActorRef(call.far.stand_in(await system.ask(FindName(name), timeout)))
 
     async def publish(self, topic: str, message: Message[Any]) -> None:
         """Publish on a topic of the other system, and return when each subscriber there has accepted it.

@@ -35,7 +35,7 @@ from ...actors.kernel import links
 from ...actors.kernel.cell import ANY, RUNNING, Cell
 from ...actors.kernel.codec import Parcel, encode_special, unencodable
 from ...actors.kernel.envelope import AnyTable, Ask
-from ...actors.kernel.message import Message, RuntimeOrder
+from ...actors.kernel.message import Message, RuntimeOrder, message_name
 from ...actors.process.wire import frames
 from ...actors.process.wire.frames import BadFrame
 from ...actors.process.wire.peer import (
@@ -79,6 +79,17 @@ SPEAKER: Final = {
 LONGEST_TOPIC: Final = 4096
 """In characters, of a topic that another program may subscribe to."""
 _DECODER: Final[msgspec.msgpack.Decoder[frames.AnyFrame]] = msgspec.msgpack.Decoder(frames.AnyFrame)
+
+
+class FindName(Message[str]):
+    """Asks a system, at its first address, for the address of the actor that has a name there."""
+
+    registered: str
+
+
+FIND_NAME: Final = message_name(FindName)
+ASKED_FOR: Final = "names asked for"
+"""A fact that is noted anew before a name is answered: if another leads, that cannot be, and nobody is answered."""
 
 
 class TextNames:
@@ -329,6 +340,7 @@ class FarLine(Peer):
         self.most = MOST_BYTES
         self.inflow = Inflow(owner.limits)
         self._unsent = Unsent()
+        self._oldest: tuple[int | None, float] = (None, 0.0)
         self._last_id = secrets.randbits(40) << 12  # A late reply to an earlier run names nothing of this one.
         self._cells: weakref.WeakValueDictionary[str, Cell] = weakref.WeakValueDictionary()
         self._host = FarHost(self)
@@ -503,6 +515,17 @@ class FarLine(Peer):
         for key, ask in list(self.pending.items()):
             if type(ask.message) is Accepted:
                 self.pending.pop(key).fail(ConnectionLost(f"/{self.name}", why))
+
+    def unaccepted_for(self) -> float:
+        """For how many seconds the other program has neither accepted nor refused the oldest message that waits so.
+
+        It is looked at now and then: the time since the first look that found the message.
+        """
+        now = self.node.loop.time()
+        oldest = next((key for key, ask in self.pending.items() if type(ask.message) is Accepted), None)
+        if oldest is None or oldest != self._oldest[0]:
+            self._oldest = oldest, now
+        return now - self._oldest[1]
 
     def lose(self) -> None:
         """The other program has not answered for long: whoever watches actors there is told of the suspicion, once."""
@@ -700,6 +723,9 @@ class FarLine(Peer):
         if self._refuses_order(frame.name):
             self._fail(frame, UnknownMessage(path, str(frame.name).replace(":", ".")))
             return
+        if frame.name == FIND_NAME:
+            self._find_name(frame)
+            return
         if self._waits(frame.to, lambda: self._ask_now(frame, again)):
             return
         cell = self._receiver(frame.to)
@@ -725,6 +751,35 @@ class FarLine(Peer):
         else:
             self.on_ask(cell, frame, None)
         self.inflow.sent(cell, memoryview(frame.body).nbytes)
+
+    def _find_name(self, frame: frames.Ask) -> None:
+        """Say who has a name here, once it is sure that this program leads the system."""
+        homes, wanted = self._owner.homes, self.codec.decode(FindName, frame.body).registered
+        if homes is None or not homes.journal.durable or homes.journal.engine.safe_at != "sync":
+            self._answer_name(frame, wanted, None)  # No other program can lead it.
+            return
+        try:
+            homes.journal.note(ASKED_FOR, b"")
+            synced = homes.journal.engine.synced()
+        except HoldfastError as error:
+            self._answer_name(frame, wanted, error)
+            return
+        if synced is None:
+            self._answer_name(frame, wanted, None)
+        else:
+            synced.add_done_callback(
+                lambda done: self._answer_name(frame, wanted, None if done.cancelled() else done.exception())
+            )
+
+    def _answer_name(self, frame: frames.Ask, wanted: str, error: BaseException | None) -> None:
+        try:
+            if error is not None:
+                raise ConnectionLost(f"/{self._owner.name}", "it may be led by another program")
+            path = self.node.shown(wanted).path
+        except HoldfastError as problem:
+            self._fail(frame, problem)
+        else:
+            self.connection.send(frames.Reply(frame.id, msgspec.Raw(msgspec.msgpack.encode(path))))
 
     def ask_in(self, frame: frames.Ask, cell: Cell, page: memoryview | None) -> RelayedAsk:
         homes = self._owner.homes

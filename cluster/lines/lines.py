@@ -336,6 +336,9 @@ class Lines:
                 if far.line is not None and (waits := far.line.stuck_for(STUCK_SECONDS, MOST_WAITING)):
                     self.overrun(far, f"it does not take what it is sent: {waits} bytes wait for it")
                     continue
+                if far.unaccepted_for() > STUCK_SECONDS:  # Whoever has published it waits for that.
+                    self.overrun(far, "it neither accepts nor refuses what it is sent")
+                    continue
             if quiet > SILENT_SECONDS:
                 far.lose()
             far.say()

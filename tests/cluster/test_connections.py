@@ -267,7 +267,7 @@ def test_two_systems_of_one_name_are_not_reached_at_once() -> None:
 def test_what_an_earlier_run_has_sent_is_refused_however_late() -> None:
     async def work(reach: Reach) -> None:
         async with reach.bank() as system:
-            late = frames.Tell("/bank/plain", f"{__name__}:Add", Add(7))  # type: ignore[arg-type]
+            late = frames.Tell("/bank/plain", f"{Add.__module__}:Add", Add(7))  # type: ignore[arg-type]
             items = (NEW + msgspec.msgpack.encode(late),)
             for to in (NOBODY, Boot(system.lines.boot.era, "abcd"), Boot(1, "00")):
                 batch = LineBatch("client", Boot(5, "ff"), to, 0, 1, items)
@@ -398,7 +398,7 @@ def test_what_is_too_large_is_refused_and_the_line_goes_on(who: str) -> None:
     run(work)
 
 
-NAME = f"{__name__}:Add"
+NAME = f"{Add.__module__}:Add"
 HOSTILE = {
     "a tell in the name of an actor here": lambda: frames.Tell("/bank/plain", NAME, Add(7), 0, "/bank/kept"),  # type: ignore[arg-type]
     "a tell in the name of a third system": lambda: frames.Tell("/bank/plain", NAME, Add(7), 0, "/shop/clerk"),  # type: ignore[arg-type]

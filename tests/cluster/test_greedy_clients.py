@@ -202,6 +202,11 @@ class Hostile:
         self._send(())
         await asyncio.sleep(0.1)
 
+    async def beat(self, *, takes: bool) -> None:
+        while True:
+            self._send((), 1000 if takes else 0)
+            await asyncio.sleep(1.0)
+
     def _hear(self, data: bytes, back: str) -> None:
         batch = msgspec.msgpack.decode(data, type=LineBatch)
         if self.bank == NOBODY:
@@ -213,8 +218,8 @@ class Hostile:
         self._send(tuple(NEW + msgspec.msgpack.encode(one) for one in made))
         self.sent += len(made)
 
-    def _send(self, items: tuple[bytes, ...]) -> None:
-        batch = LineBatch(self.name, self.boot, self.bank, 0, self.sent + 1, items, "", self.line, self.to_line)
+    def _send(self, items: tuple[bytes, ...], got: int = 0) -> None:
+        batch = LineBatch(self.name, self.boot, self.bank, got, self.sent + 1, items, "", self.line, self.to_line)
         self._transport.post("inbox of bank", msgspec.msgpack.encode(batch), self._transport.own_place())
 
 
@@ -275,7 +280,27 @@ def test_who_never_takes_its_outcomes_gets_no_more_and_then_loses_its_line() -> 
     run(work)
 
 
-def test_who_takes_nothing_of_what_is_published_holds_nobody_up_for_long() -> None:
+def test_who_takes_nothing_of_what_it_is_told_loses_its_line() -> None:
+    async def work(reach: Reach) -> None:
+        async with reach.bank() as system:
+            evil = Hostile(reach, "evil")
+            await evil.greet()
+            far = system.lines.at("evil")
+            assert far is not None
+            beats = asyncio.ensure_future(evil.beat(takes=False))
+            for _ in range(20):
+                far.stand_in("/evil/ear").ref.tell(News("x" * (1 << 20)))
+            await asyncio.sleep(5.0)
+            assert not far.is_closed
+            await asyncio.sleep(10.0)
+            assert far.is_closed
+            beats.cancel()
+
+    run(work)
+
+
+@pytest.mark.parametrize("takes", [False, True], ids=["takes nothing", "accepts nothing"])
+def test_who_takes_nothing_of_what_is_published_holds_nobody_up_for_long(takes: bool) -> None:
     async def work(reach: Reach) -> None:
         async with reach.bank() as system, hf.connect("bank") as other:
             evil = Hostile(reach, "evil")
@@ -283,9 +308,11 @@ def test_who_takes_nothing_of_what_is_published_holds_nobody_up_for_long() -> No
             evil.send(frames.Command("/evil/ear", "subscribe", {"topic": "/news"}))
             await asyncio.sleep(0.1)
             assert system._node.topics.names() == ["/news"]
+            beats = asyncio.ensure_future(evil.beat(takes=takes))  # It is there.
             async with asyncio.timeout(60.0):
-                for _ in range(20):
+                for _ in range(30):
                     await system.publish("/news", News("x" * (1 << 20)))
+            beats.cancel()
             assert await other.ref("/bank/plain", Account).ask(Total()) == 0
             assert system.lines.at("evil") is None
             assert system._node.topics.names() == []

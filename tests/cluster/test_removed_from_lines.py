@@ -48,13 +48,6 @@ CHECKS: dict[str, Check] = {
         CONNECTIONS,
         "order_another_about",
     ),
-    "no other system ends an actor": Check(
-        "cluster/lines/far_line.py",
-        "case verb if verb in COMMANDS:",
-        "case verb if verb:",
-        CONNECTIONS,
-        "order_another_about",
-    ),
     "what may have been done by an actor without a journal is not done again": Check(
         "cluster/lines/far_line.py",
         "if again and (homes is None or switch_of(cell) is None):",
@@ -210,7 +203,14 @@ CHECKS |= {
         "if far.line is not None and (waits := far.line.stuck_for(STUCK_SECONDS, MOST_WAITING)):",
         "if waits := 0:",
         GREEDY,
-        "takes_nothing",
+        "takes_nothing_of_what_it_is_told",
+    ),
+    "whoever accepts nothing of what is published loses its line": Check(
+        "cluster/lines/lines.py",
+        "if far.unaccepted_for() > STUCK_SECONDS:",
+        "if False:",
+        GREEDY,
+        "takes_nothing_of_what_is_published",
     ),
     "whoever only greets gives way to others": Check(
         "cluster/lines/calls.py",
