@@ -78,7 +78,8 @@ def check_store_key(store: str | Journal | None, key: StoreKey | None) -> None:
     """Refuse a key for what is not encrypted.
 
     Raises:
-        SpecError: the store is none of holdfast's own on the disk.
+        SpecError: the store is none of holdfast's own on disks.
     """
-    if key is not None and not (isinstance(store, str) and store.startswith("sqlite:")):
-        raise SpecError("ActorSystem", "store_key needs a store on the disk that it encrypts: store='sqlite:PATH'")
+    if key is not None and not (isinstance(store, str) and store.startswith(("sqlite:", "nats:", "tls:"))):
+        problem = "store_key needs a store on the disk that it encrypts: store='sqlite:PATH', or 'nats://HOST/NAME'"
+        raise SpecError("ActorSystem", problem)

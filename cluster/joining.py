@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 from ..actors.errors import SpecError
 from ..checkpoint.engine_calls import Called
 from ..checkpoint.journal import DamagedStore, StoreEngine, StoreFailed, StoreInUse
+from ..checkpoint.store_key import StoreKey, read_store_key
 from ..checkpoint.store_opening import open_journal
 from .engine_thread import EngineThread
 from .leadership import LeaderElsewhere, Standby, give_up, lead, leader_name
@@ -20,6 +21,7 @@ from .log_records import DamagedLog
 from .log_writer import FIRST_PAUSE, LONGEST_PAUSE, Deposed
 from .ports import Engine, Unanswered
 from .replicated_journal import ReplicatedJournal
+from .sealed_engine import sealed
 
 T = TypeVar("T")
 SILENT_SECONDS: Final = 30.0
@@ -45,6 +47,7 @@ async def join(
     silent: Callable[[str], None],
     deposed: Callable[[Deposed], None],
     is_new: bool = True,
+    key: StoreKey | None = None,
 ) -> ReplicatedJournal:
     """Wait until this program leads the system, and return the journal of its store.
 
@@ -57,9 +60,11 @@ async def join(
         silent: told on the running loop why no server answers, at once and each SILENT_SECONDS, while that is so.
         deposed: told on the running loop that another program leads.
         is_new: whether it is made if it is not there.
+        key: encrypts what is kept there, see `read_store_key`.
 
     Raises:
-        SpecError: the store cannot be read, or the library for it is missing.
+        SpecError: the store cannot be read, or the library for it is missing; or the key is none.
+        WrongStoreKey: the key is not the one that the store was made with; nothing was changed.
         AccessRefused: the servers do not let this program in.
         StoreInUse: another program leads, and this one was not to wait.
         StoreFailed: no server can be reached, and this program was not to wait; or the store is not there.
@@ -72,15 +77,24 @@ async def join(
     from .nats.access import access_of
     from .nats.nats_engine import open_engine  # only now: it imports that library
 
-    access = access_of(store, settings)
+    access, secret = access_of(store, settings), read_store_key(key)
     loop = asyncio.get_running_loop()
     me = leader_name()
     thread = EngineThread(f"holdfast {system}")
+
+    async def connected() -> Engine:
+        engine = await open_engine(access, is_new=is_new)
+        try:
+            return await sealed(engine, secret, access.system)
+        except BaseException:
+            await engine.close()
+            raise
+
     opened: list[Engine] = []  # filled in there: whoever is cancelled here would not get to know of it
     unanswered = NowAndThen(lambda problem: _tell(loop, silent, problem))
     try:
         insists = unanswered if standby is not None else None
-        joined = await thread.run(_connected(lambda: open_engine(access, is_new=is_new), insists, opened))
+        joined = await thread.run(_connected(connected, insists, opened))
         leading = await thread.run(
             lead(
                 joined,
@@ -165,7 +179,11 @@ async def _connected(
 
 
 def open_store(
-    store: str, settings: Mapping[str, str | bool | int] | None = None, *, is_new: bool = True
+    store: str,
+    settings: Mapping[str, str | bool | int] | None = None,
+    *,
+    is_new: bool = True,
+    key: StoreKey | None = None,
 ) -> StoreEngine:
     """Open a store by itself, for a tool: no system may have it open, and none may open it meanwhile.
 
@@ -173,9 +191,11 @@ def open_store(
         store: "sqlite:PATH" or "nats://HOST,HOST/NAME".
         settings: how servers are reached, see `access_of`.
         is_new: whether it is made if it is not there.
+        key: of an encrypted store, see `read_store_key`.
 
     Raises:
-        SpecError: the name cannot be read, or is that of memory.
+        SpecError: the name cannot be read, or is that of memory; or the key is none.
+        WrongStoreKey: the key is not the store's.
         StoreFailed: it is not there, or cannot be reached. AccessRefused: the servers do not let this program in.
         StoreInUse, DamagedStore, UnsafeServer: it cannot be opened.
     """
@@ -185,15 +205,14 @@ def open_store(
     if not is_replicated(store):
         if not is_new and kind == "sqlite" and path and not os.path.exists(path):
             raise StoreFailed(path, "there is no such file; name the database, as in store='sqlite:PATH'")
-        return open_journal(store)
+        return open_journal(store, key=key)
 
     def pass_over(what: object) -> None:
         """Nobody waits here to whom it would matter."""
 
     async def joined() -> ReplicatedJournal:
-        return await join(
-            store, "tool", None, settings or {}, waits=pass_over, silent=pass_over, deposed=pass_over, is_new=is_new
-        )
+        told = {"waits": pass_over, "silent": pass_over, "deposed": pass_over}
+        return await join(store, "tool", None, settings or {}, is_new=is_new, key=key, **told)
 
     return Called(asyncio.run(joined()))
 

@@ -389,7 +389,7 @@ class RemoteSystem:
         """Drop what recorded actors have told another system that has not accepted it; return how many that were.
 
         Raises:
-            NoSuchActor: no system of that name was ever connected. SpecError: this is a dry run.
+            SpecError: no system of that name was ever connected, or this is a dry run.
         """
         if self._dry_run:
             raise SpecError("drop", "in a dry run nothing that is kept is dropped")

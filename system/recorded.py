@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..actors.errors import HoldfastError, NoSuchActor, SpecError
+from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.ref import ActorRef
 from ..actors.seconds import check_seconds
 from ..checkpoint.home.homes import Homes
@@ -71,10 +71,10 @@ class Recorded:
             how many messages were kept for it, once the store has it that they are no more.
 
         Raises:
-            NoSuchActor: no system of that name was ever connected. StoreError: the store does not take it.
+            SpecError: no system of that name was ever connected. StoreError: the store does not take it.
         """
         if system not in {one.system for one in self._lines.peers()}:
-            raise NoSuchActor(f"/{system}")
+            raise SpecError(system, "no system of that name was ever connected: `holdfast connections` lists who was")
         dropped = self._lines.forget_system(system)
         await self._homes.journal.safe()
         return dropped

@@ -96,8 +96,9 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             "sqlite:PATH", or "nats://HOST,HOST/NAME": on several machines (docs/many-machines.md), or an engine of your
             own: anything that keeps to `Journal` (see holdfast.testing.stores); or "configured": what `holdfast.toml`
             and the environment say.
-        store_key: encrypts the store "sqlite:PATH", from its making on: 32 bytes, the path of a file that has them and
-            that only its owner may read, or a function that returns them (docs/recovery/encryption.md).
+        store_key: encrypts the store, "sqlite:PATH" or "nats://...", from its making on: 32 bytes, the path of a file
+            that has them and that only its owner may read, or a function that returns them
+            (docs/recovery/encryption.md).
         durability: what an admission outlives when it is told of (send returns, an ask is fed, a reply leaves):
             "memory" (without a store) any process but this one, "os" (with one) this one too, "fsync" the machine.
             Each child may say otherwise: `hybrid(durability=...)`.
@@ -294,6 +295,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             waits=lambda leader: node.emit(StandingBy(where, leader)),
             silent=lambda reason: node.emit(ServersSilent(where, reason)),
             deposed=self._deposed,
+            key=options.store_key,
         )
         node.emit(LeadershipTaken(where, journal.epoch))
         return Called(journal)
