@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import os
 from collections.abc import Awaitable, Callable, Mapping
-from importlib.util import find_spec
 from typing import Final, TypeVar
 from urllib.parse import urlsplit
 
@@ -15,15 +15,17 @@ from ..checkpoint.engine_calls import Called
 from ..checkpoint.journal import DamagedStore, StoreEngine, StoreFailed, StoreInUse
 from ..checkpoint.store_key import StoreKey, read_store_key
 from ..checkpoint.store_opening import open_journal
-from .engine_thread import EngineThread
 from .leadership import LeaderElsewhere, Standby, give_up, lead, leader_name
 from .log_records import DamagedLog
 from .log_writer import FIRST_PAUSE, LONGEST_PAUSE, Deposed
 from .ports import Engine, Unanswered
 from .replicated_journal import ReplicatedJournal
 from .sealed_engine import sealed
+from .servers import Servers, servers_of
 
 T = TypeVar("T")
+TOOL_SECONDS: Final = 30.0
+"""How long a tool waits for servers that take nothing."""
 SILENT_SECONDS: Final = 30.0
 """How often a program that waits says that the servers do not answer."""
 
@@ -34,11 +36,11 @@ def is_replicated(store: object) -> bool:
     >>> [is_replicated(store) for store in ("nats://a,b/app", "sqlite:app.db", None)]
     [True, False, False]
     """
-    return isinstance(store, str) and store.startswith(("nats://", "tls://"))
+    return isinstance(store, Servers) or (isinstance(store, str) and store.startswith(("nats://", "tls://")))
 
 
 async def join(
-    store: str,
+    store: str | Servers,
     system: str,
     standby: Standby | None,
     settings: Mapping[str, str | bool | int],
@@ -48,11 +50,12 @@ async def join(
     deposed: Callable[[Deposed], None],
     is_new: bool = True,
     key: StoreKey | None = None,
+    patience: float = math.inf,
 ) -> ReplicatedJournal:
     """Wait until this program leads the system, and return the journal of its store.
 
     Args:
-        store: "nats://HOST,HOST/NAME".
+        store: "nats://HOST,HOST/NAME", or such servers.
         system: the name of the system.
         standby: how to wait while another program leads; `None` does not.
         settings: how the servers are reached, see `access_of`.
@@ -61,6 +64,7 @@ async def join(
         deposed: told on the running loop that another program leads.
         is_new: whether it is made if it is not there.
         key: encrypts what is kept there, see `read_store_key`.
+        patience: seconds after which a `sync` of which the servers take nothing fails.
 
     Raises:
         SpecError: the store cannot be read, or the library for it is missing; or the key is none.
@@ -71,21 +75,15 @@ async def join(
         UnsafeServer: the servers may lose what they have acknowledged.
         DamagedStore: what the log holds cannot be used.
     """
-    if find_spec("nats") is None:
-        kind = store.partition(":")[0]
-        raise SpecError("store", f"{kind}:// needs the library nats-py: pip install 'holdfast[nats]'")
-    from .nats.access import access_of
-    from .nats.nats_engine import open_engine  # only now: it imports that library
-
-    access, secret = access_of(store, settings), read_store_key(key)
+    servers, secret = servers_of(store, settings), read_store_key(key)
     loop = asyncio.get_running_loop()
     me = leader_name()
-    thread = EngineThread(f"holdfast {system}")
+    thread = servers.engine_loop(f"holdfast {system}")
 
     async def connected() -> Engine:
-        engine = await open_engine(access, is_new=is_new)
+        engine = await servers.open_engine(is_new=is_new)
         try:
-            return await sealed(engine, secret, access.system)
+            return await sealed(engine, secret, servers.system)
         except BaseException:
             await engine.close()
             raise
@@ -109,12 +107,12 @@ async def join(
             if isinstance(error, Deposed):
                 _tell(loop, deposed, error)
 
-        return ReplicatedJournal(joined, thread, leading, lost=lost)
+        return ReplicatedJournal(joined, thread, leading, lost=lost, patience=patience)
     except BaseException as error:
         with contextlib.suppress(asyncio.CancelledError, TimeoutError):
             await asyncio.wait_for(thread.run(_let_go(opened, me)), 2.0)
         await asyncio.to_thread(thread.close)
-        named = opened[0].name if opened else store.partition("?")[0]
+        named = opened[0].name if opened else str(store).partition("?")[0]
         match error:
             case LeaderElsewhere():
                 raise StoreInUse(named, 0, error.leader) from error
@@ -212,7 +210,7 @@ def open_store(
 
     async def joined() -> ReplicatedJournal:
         told = {"waits": pass_over, "silent": pass_over, "deposed": pass_over}
-        return await join(store, "tool", None, settings or {}, is_new=is_new, key=key, **told)
+        return await join(store, "tool", None, settings or {}, is_new=is_new, key=key, patience=TOOL_SECONDS, **told)
 
     return Called(asyncio.run(joined()))
 

@@ -45,6 +45,7 @@ from ..cluster.leadership import LeadershipLost, Standby
 from ..cluster.lines.inflow import DEFAULT_LIMITS, ConnectionLimits
 from ..cluster.lines.lines import Lines, Transport, new_boot
 from ..cluster.log_writer import Deposed
+from ..cluster.servers import Servers
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.children import tell_stopped
 from ..supervision.patience import end_within
@@ -95,7 +96,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         store: where journals and snapshots go: None (memory: survives any process but this one), or
             "sqlite:PATH", or "nats://HOST,HOST/NAME": on several machines (docs/many-machines.md), or an engine of your
             own: anything that keeps to `Journal` (see holdfast.testing.stores); or "configured": what `holdfast.toml`
-            and the environment say.
+            and the environment say; or the servers of a simulated fleet (see holdfast.testing.fleet).
         store_key: encrypts the store, "sqlite:PATH" or "nats://...", from its making on: 32 bytes, the path of a file
             that has them and that only its owner may read, or a function that returns them
             (docs/recovery/encryption.md).
@@ -129,11 +130,11 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         self,
         name: str = "app",
         *,
-        store: str | Journal | None = None,
+        store: str | Journal | Servers | None = None,
         store_key: StoreKey | None = None,
         durability: Durability | None = None,
         standby: Standby | None = None,
-        reachable: str | None = None,
+        reachable: str | Servers | None = None,
         connection_limits: ConnectionLimits = DEFAULT_LIMITS,
         intensity: int = 3,
         period: float = 5.0,
@@ -284,11 +285,12 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
     async def _open_store(self, node: Node) -> StoreEngine:
         """The journal of the store; of one on several machines, once this program leads the system."""
         options = self._options
-        if not (isinstance(options.store, str) and is_replicated(options.store)):
-            return open_journal(options.store, takeover=options.takeover, key=options.store_key)
+        store = options.store
+        if not isinstance(store, Servers) and not (isinstance(store, str) and is_replicated(store)):
+            return open_journal(store, takeover=options.takeover, key=options.store_key)
         where = f"/{self.name}"
         journal = await join(
-            options.store,
+            store,
             self.name,
             options.standby,
             options.nats.told(),

@@ -367,6 +367,7 @@ class FarMail:
             mail.answers = {which: one for which, one in mail.answers.items() if which.run != run}
             if not mail.is_system and not mail.answers:
                 del self._mail[system]
+                self._gone.pop(system, None)
 
     def connects(self, system: str) -> None:
         """There is a line to a program."""

@@ -81,17 +81,24 @@ class Account(hf.Actor):
         self.total += len(message.text)
 
 
+class Posted:
+    """Servers that carry lines alone; see `holdfast.cluster.servers.Servers`."""
+
+    def __init__(self, reach: Reach, system: str) -> None:
+        self._reach, self.system = reach, system
+
+    async def open_lines(self) -> tuple[SimTransport, str]:
+        self._reach.transports.append(self._reach.post.transport())
+        return self._reach.transports[-1], f"inbox of {self.system}"
+
+
 class Reach:
     """Systems that are reached over one post."""
 
     def __init__(self, patch: pytest.MonkeyPatch, seed: int, faults: PostFaults = NO_POST_FAULTS) -> None:
         self.post = SimPost(seed, faults)
         self.transports: list[SimTransport] = []
-        patch.setattr(system_connection, "open_lines", self._open)
-
-    async def _open(self, at: str, settings: object) -> tuple[SimTransport, str, str]:
-        self.transports.append(self.post.transport())
-        return self.transports[-1], f"inbox of {at}", at
+        patch.setattr(system_connection, "servers_of", lambda at, settings: Posted(self, at))
 
     @asynccontextmanager
     async def bank_stack(self, store: Path) -> AsyncGenerator[Bank]:

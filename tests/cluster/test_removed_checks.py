@@ -280,6 +280,13 @@ CHECKS = {
         LEADERSHIP,
         "a_transaction_keeps_nobody",
     ),
+    "a whole system loses its clients' writes if appends name no predecessor": Check(
+        "testing/fleet/broker.py",
+        "if after != self._last or self.strikes(self.faults.refused):",
+        "if self.strikes(self.faults.refused):",
+        "tests/cluster/test_simulated_fleet.py",
+        "clients_see_one_ledger",
+    ),
     "the key is tried before anything is done": Check(
         "cluster/sealed_engine.py",
         "made.log.opened(last)",
