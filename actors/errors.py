@@ -235,6 +235,14 @@ class Unreachable(SendError, text="{actor} cannot be reached: {problem}; nothing
     problem: str
 
 
+class ConnectionFull(SendError, text="{system} takes no more from {program} for now: {problem}; it was not handled"):
+    """A program has as much outstanding in another system as it may: wait for what is out, or raise the limit there."""
+
+    system: str
+    program: str
+    problem: str
+
+
 class RemoteCrash(HoldfastError):
     """The receiver's handler raised; the actor crashed.
 

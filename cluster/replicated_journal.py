@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import threading
 import uuid
 import zlib
 from collections.abc import Callable, Collection, Generator, Sequence
-from concurrent.futures import Future
 from typing import Final
 
 import msgspec
@@ -59,6 +59,8 @@ class ReplicatedJournal:
         loop: on which the engine's work runs.
         leading: what this leader begins with.
         lost: told, on the engine's loop, why nothing can be written any more: another leads, or the log is damaged.
+        patience: seconds in which the engine must have taken something when somebody waits for it in `sync`, so that a
+            tool ends when the servers are away; a system waits for them.
     """
 
     durable = True
@@ -72,10 +74,11 @@ class ReplicatedJournal:
         leading: Leading,
         *,
         lost: Callable[[HoldfastError], None] = lambda error: None,
+        patience: float = math.inf,
     ) -> None:
         self.path = engine.name
         self.epoch = leading.maker.epoch
-        self._engine, self._loop, self._lost = engine, loop, lost
+        self._engine, self._loop, self._lost, self._patience = engine, loop, lost, patience
         self._contents = leading.contents
         self._lock = threading.RLock()  # of the contents; the engine's loop, which keeps the lease, never waits for it
         self._joint: list[LogWrite] | None = None
@@ -311,19 +314,22 @@ class ReplicatedJournal:
         Raises:
             StaleEpoch: another leads. StoreFailed: the log cannot be written.
         """
-        self._wait_written(None)
+        self._loop.wait(self._written())
 
-    def _wait_written(self, seconds: float | None) -> None:
-        done: Future[None] = Future()
-
-        def tell(error: HoldfastError | None) -> None:
-            if error is None:
-                done.set_result(None)
-            else:
-                done.set_exception(type(error)(*error.args))
-
-        self._tell_written(tell)
-        done.result(seconds)
+    async def _written(self) -> None:
+        """Wait until what was written so far stands in the log, as long as the engine takes something now and then."""
+        done, loop = self.synced(), asyncio.get_running_loop()
+        steps, until = self._writer.steps, loop.time() + self._patience
+        while not done.done():
+            left = None if self._patience == math.inf else max(until - loop.time(), 0.0)
+            await asyncio.wait([done], timeout=left)
+            if self._writer.steps != steps:
+                steps, until = self._writer.steps, loop.time() + self._patience
+            elif not done.done():
+                done.cancel()
+                problem = f"no server has taken anything for {self._patience:g} s"
+                raise StoreFailed(self.path, f"{problem}; see whether they run, and whether their disks have room")
+        done.result()
 
     def _wait_for_room(self) -> None:
         if self._blobs.size > MOST_UNSENT and self._joint is None:
@@ -426,7 +432,7 @@ class ReplicatedJournal:
         if not self._is_open:
             return
         try:
-            self._loop.wait(self.end(), 3 * CLOSE_SECONDS)
+            self._loop.finish(self.end(), 3 * CLOSE_SECONDS)
         except TimeoutError as error:
             raise StoreFailed(self.path, "its work for the engine does not end") from error
         finally:

@@ -23,6 +23,7 @@ from .trust import Needed, trusted_imports
 from .wire import (
     About,
     AnyRequest,
+    AskConnections,
     AskDiagnosis,
     AskHistory,
     AskLives,
@@ -32,6 +33,7 @@ from .wire import (
     ControlActor,
     CountTurns,
     DeclareTree,
+    DropKept,
     FollowActor,
     InspectActor,
     NextEvents,
@@ -118,6 +120,10 @@ class ClientSession:
                 return msgspec.to_builtins(system.put_aside(request.path))
             case SettleQuarantined():
                 return self._settle(request)
+            case AskConnections():
+                return msgspec.to_builtins(system.connected())
+            case DropKept():
+                return await system.drop_kept(request.system)
             case AskDiagnosis():
                 from .diagnosed import diagnosed  # only now: few systems have diagnosis, and all have an endpoint
 

@@ -280,6 +280,48 @@ CHECKS = {
         LEADERSHIP,
         "a_transaction_keeps_nobody",
     ),
+    "a whole system loses its clients' writes if appends name no predecessor": Check(
+        "testing/fleet/broker.py",
+        "if after != self._last or self.strikes(self.faults.refused):",
+        "if self.strikes(self.faults.refused):",
+        "tests/cluster/test_simulated_fleet.py",
+        "clients_see_one_ledger",
+    ),
+    "the key is tried before anything is done": Check(
+        "cluster/sealed_engine.py",
+        "made.log.opened(last)",
+        "pass",
+        "tests/cluster/test_sealed_engine.py",
+        "wrong_key",
+    ),
+    "a program without a key is refused what is encrypted": Check(
+        "cluster/sealed_engine.py",
+        "        if is_sealed:\n            remedy",
+        "        if False:\n            remedy",
+        "tests/cluster/test_sealed_engine.py",
+        "wrong_key",
+    ),
+    "what was written without a key is not taken for encrypted": Check(
+        "cluster/sealed_engine.py",
+        "if last is not None and not is_sealed:",
+        "if False:",
+        "tests/cluster/test_sealed_engine.py",
+        "wrong_key",
+    ),
+    "records are encrypted": Check(
+        "cluster/sealed_engine.py",
+        "SEALED + bytes(self._cipher.seal(_LOG, data))",
+        "SEALED + data",
+        "tests/cluster/test_sealed_engine.py",
+        "without_the_key",
+    ),
+    "large values are encrypted": Check(
+        "cluster/sealed_engine.py",
+        'bytes(self._cipher.seal(b"blob" + name.encode(), data))',
+        "data",
+        "tests/cluster/test_sealed_engine.py",
+        "without_the_key",
+    ),
 }
 
 test_the_table_is_true, test_somebody_misses_it = as_tests(CHECKS)
