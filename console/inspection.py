@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ..actors.errors import NoSuchActor
 from ..actors.kernel.cell import Cell
 from ..supervision.intensity import recent_restarts
 from ..supervision.spec import ChildSpec
 from ..supervision.supervisor import Supervisor
-from .overview import Found, as_told, children_of, is_far, process_use, row_of
+from .overview import as_told, find, is_far, process_use, row_of
 
 if TYPE_CHECKING:
     from ..system.system import ActorSystem
@@ -44,26 +43,6 @@ async def inspected(system: ActorSystem, path: str, timeout: float) -> dict[str,
         "protection": msgspec.to_builtins(protection) if protection.is_protected else None,
         "process": None if use is None else msgspec.structs.asdict(use),
     }
-
-
-def find(system: ActorSystem, path: str) -> Found:
-    """An address as a pass through the whole tree finds it, also one that is stopped. Raises NoSuchActor."""
-    try:
-        cell = system.ref(path)._cell.living
-    except NoSuchActor:
-        above, _, name = path.rpartition("/")
-        known = children_of(system.ref(above)._cell.actor) if above else []
-        child = next((one for one in known if one.spec.id == name), None)
-        if child is None:
-            raise
-        return Found(path, child.cell, child, 0)
-    parent = cell.parent
-    known = children_of(parent.actor) if parent is not None else []
-    child = next((one for one in known if one.cell is cell), None)
-    try:
-        return Found(cell.path, cell, child, system.pid_of(cell.ref))
-    except NoSuchActor:  # It is between two lives.
-        return Found(cell.path, cell, child, 0)
 
 
 def _spec_words(spec: object) -> dict[str, Any]:

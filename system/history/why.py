@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 from .evidence import LONG_TURN, MOST_TEXT, Evidence, PutAside, seconds_text
 from .lives import PastLife
@@ -28,14 +29,25 @@ MUCH = 0.6
 Rule = Callable[[Evidence], list[str]]
 
 
+class Cause(NamedTuple):
+    """One sentence of `why`, with the name of the cause in the table `RULES` that it tells of."""
+
+    cause: str
+    sentence: str
+
+
+def causes(evidence: Evidence) -> list[Cause]:
+    """Say what is wrong at the address, a sentence for each thing, what weighs most first; nothing if all is well."""
+    return [Cause(name, sentence) for name, rule in RULES.items() for sentence in rule(evidence)]
+
+
 def why(evidence: Evidence) -> list[str]:
     """Say in sentences why the actor restarts, has ended, or does not get on: what weighs most comes first.
 
     >>> why(Evidence("/app/till", 0.0))
     ['Nobody lives at /app/till, and the history knows of no life there.']
     """
-    said = [sentence for rule in RULES.values() for sentence in rule(evidence)]
-    return said or [_well(evidence)]
+    return [one.sentence for one in causes(evidence)] or [_well(evidence)]
 
 
 def _well(evidence: Evidence) -> str:
