@@ -6,7 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from ..actors.errors import type_name
 from ..actors.kernel.cell import Cell
+from ..actors.kernel.node import cell_kind
+from ..ftm.replica.replica import Replica
 from ..supervision.intensity import recent_restarts
 from ..supervision.spec import ChildSpec
 from ..supervision.supervisor import Supervisor
@@ -41,8 +44,20 @@ async def inspected(system: ActorSystem, path: str, timeout: float) -> dict[str,
         "spec": _spec_words(cell.spec),
         "supervises": _supervises(cell),
         "protection": msgspec.to_builtins(protection) if protection.is_protected else None,
+        "bricks": bricks_of(cell) if protection.is_protected else {},
         "process": None if use is None else msgspec.structs.asdict(use),
     }
+
+
+def bricks_of(cell: Cell) -> dict[str, dict[str, str]]:
+    """What the replicas of a protected actor are made of: of each replica its parts by name, and their classes."""
+    found: dict[str, dict[str, str]] = {}
+    group = (cell.children or {}).get("ftm")
+    for name, replica in list((group.children or {}).items()) if group is not None else ():
+        if cell_kind(replica) is Replica:
+            parts = list((replica.children or {}).items())
+            found[name] = {part: type_name(kind) if (kind := cell_kind(one)) is not None else "" for part, one in parts}
+    return found
 
 
 def _spec_words(spec: object) -> dict[str, Any]:

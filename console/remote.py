@@ -239,6 +239,10 @@ class RemoteSystem:
     def __exit__(self, *exc: object) -> None:
         self._client.close()
 
+    def close(self) -> None:
+        """End the connection; what is asked for and not done yet is undone."""
+        self._client.close()
+
     def greet(self, seconds: float) -> None:
         """Find out whether the system answers at all. Raises NotAnswering, NotReached."""
         self._client.greet(seconds)
