@@ -77,6 +77,7 @@ class SocketAnswers:
         self._path = path
         self._free = asyncio.Semaphore(MOST_CONNECTIONS)
         self._idle: list[tuple[float, RemoteSystem]] = []
+        self._is_closed = False
 
     async def ask(self, request: AnyRequest, timeout: float) -> Any:
         """Ask over a connection that is free. Raises HoldfastError: what the system answers, or that it is away."""
@@ -87,7 +88,16 @@ class SocketAnswers:
                 except NotReached:  # It was closed, perhaps long ago: what only looks is asked again.
                     if isinstance(request, CHANGES):
                         raise
-            return await self._asked(await asyncio.to_thread(RemoteSystem, self._path), request, timeout)
+            return await self._asked(await self._connected(), request, timeout)
+
+    async def _connected(self) -> RemoteSystem:
+        """A new connection; the kernel may have it wait."""
+        connecting = asyncio.ensure_future(asyncio.to_thread(RemoteSystem, self._path))
+        try:
+            return await asyncio.shield(connecting)
+        except asyncio.CancelledError:
+            connecting.add_done_callback(_close)  # The thread goes on, and nobody would close what it brings.
+            raise
 
     def _kept(self) -> RemoteSystem | None:
         """A connection that was used a short time ago."""
@@ -108,7 +118,7 @@ class SocketAnswers:
             is_good = not isinstance(error, NotReached)
             raise
         finally:
-            if is_good:
+            if is_good and not self._is_closed:
                 self._idle.append((time.monotonic(), remote))
             else:
                 remote.close()
@@ -125,6 +135,12 @@ class SocketAnswers:
 
     async def close(self) -> None:
         """Close the idle connections; those in use close when their request is over."""
+        self._is_closed = True
         for _, remote in self._idle:
             remote.close()
         self._idle.clear()
+
+
+def _close(connecting: asyncio.Future[RemoteSystem]) -> None:
+    if not connecting.cancelled() and connecting.exception() is None:
+        connecting.result().close()

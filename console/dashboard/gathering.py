@@ -15,10 +15,10 @@ from ...system.history.evidence import PutAside
 from ...system.history.pages import HistoryPage, question
 from ...system.history.past_event import PastEvent
 from ..overview import LOOK, SystemLook
-from ..wire import AskCauses, AskHistory, AskQuarantined, Overview
+from ..wire import AskCauses, AskDiagnosis, AskHistory, AskQuarantined, NotDiagnosed, Overview
 from .answers import Answers
 from .picture import Picture, plain
-from .troubles import NEWS, TELLING, Seen, Trouble, seen_causes, suspects, troubles
+from .troubles import NEWS, TELLING, Seen, Trouble, diagnosed_troubles, grade_of, seen_causes, suspects, troubles
 
 SHARE: Final = 0.01
 """The part of one processor that looking may take, as long as that does not make looks rarer than `RAREST`."""
@@ -28,6 +28,10 @@ RAREST: Final = 5.0
 """Seconds between two looks at all actors at most."""
 RAREST_SOME: Final = 1.0
 """Seconds between two looks at the actors that are on somebody's screen at most."""
+SETTLED: Final = 0.4
+"""Seconds after which actors of whom something was told are looked at again: an end may be told before it is over."""
+CHANGING: Final = ("TransactionCommitted", "TransactionRolledBack", "SystemStarted")
+"""Events after which all actors are looked at: any of them may be elsewhere, or be another one."""
 MOST_AT_ONCE: Final = 500
 """Actors of a look at some: if more have changed, all are looked at."""
 MOST_WATCHED: Final = 200
@@ -111,12 +115,15 @@ class Gathering:
         """Nobody looks: begin with nothing, next time."""
         self.picture = Picture()
         self._troubles: list[Trouble] = []
+        self._diagnosed: list[Trouble] = []
         self._problem = ""
         self._events: deque[PastEvent] = deque(maxlen=KEPT)
         self._told: dict[str, float] = {}
         self._put_aside: list[PutAside] = []
         self._is_seen = False
         self._hurried: set[str] = set()
+        self._later: set[str] = set()
+        self._has_changed = False
         self._hurry, self._suspect = asyncio.Event(), asyncio.Event()
 
     # -- viewers ------------------------------------------------------------------------------------------------------
@@ -130,7 +137,7 @@ class Gathering:
         self._viewers[viewer.number] = viewer
         if not self._tasks:
             self._forget()
-            work = (self._look_on, self._follow, self._ask_why)
+            work = (self._look_on, self._follow, self._ask_why, self._ask_diagnosis)
             self._tasks = [asyncio.create_task(self._again(one), name="holdfast dashboard") for one in work]
         elif self._is_seen or self._problem:
             viewer.put(self._snapshot(viewer))
@@ -167,10 +174,18 @@ class Gathering:
             self._hurry.set()
 
     def hurry(self, paths: Collection[str]) -> None:
-        """Something was done to these actors: look at them now."""
+        """Something was done to these actors: look at them now, and once more when it is over."""
+        if self._tasks and not self._later:
+            asyncio.get_running_loop().call_later(SETTLED, self._hurry_again)
+        self._later.update(paths)
         self._hurried.update(paths)
         self._hurry.set()
         self._suspect.set()
+
+    def _hurry_again(self) -> None:
+        self._hurried.update(self._later)
+        self._later.clear()
+        self._hurry.set()
 
     def _tell(self, event: str, value: Any) -> None:
         message = framed(event, value)
@@ -222,7 +237,8 @@ class Gathering:
             self._hurry.clear()
             begun = loop.time()
             some = self._hurried.union(*(viewer.watched for viewer in self._viewers.values()))
-            if begun >= next_all or len(some) > MOST_AT_ONCE or not self._is_seen:
+            if begun >= next_all or len(some) > MOST_AT_ONCE or self._has_changed or not self._is_seen:
+                self._has_changed = False
                 self._hurried.clear()
                 self._take(await self._look(None), None)
                 cost = loop.time() - begun
@@ -281,6 +297,7 @@ class Gathering:
             if page.events:
                 self._events.extend(page.events)
                 self._hear(page.events)
+                self._has_changed |= any(event.kind in CHANGING for event in page.events)
                 self.hurry({event.address for event in page.events})
                 self._tell("events", page.events[-KEPT:])
 
@@ -327,10 +344,22 @@ class Gathering:
             answers = await self._answers.ask(AskCauses(tuple(asked), 1.0), 3 * ANSWER)
         except SpecError:  # It keeps no history: what can be seen of them has to do.
             answers = {path: seen_causes(seen, path) for path in asked}
-        found = troubles(seen, answers)
+        found = sorted([*self._diagnosed, *troubles(seen, answers)], key=grade_of)
         if (found, put_aside) != (self._troubles, self._put_aside):
             self._troubles, self._put_aside = found, put_aside
             self._tell("troubles", {"troubles": found, "quarantine": put_aside})
+
+    async def _ask_diagnosis(self) -> None:
+        """Ask what diagnosis says, now and then; where none runs, rarely: one may be started later."""
+        loop = asyncio.get_running_loop()
+        while True:
+            begun = loop.time()
+            try:
+                self._diagnosed = diagnosed_troubles(await self._answers.ask(AskDiagnosis(None, 2.0), ANSWER))
+                pause = 1.0
+            except NotDiagnosed:
+                self._diagnosed, pause = [], 2 * RAREST
+            await asyncio.sleep(min(2 * RAREST, max(pause, (loop.time() - begun) / SHARE)))
 
 
 def framed(event: str, value: Any) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
@@ -18,6 +18,8 @@ FRESH: Final = 30.0
 """Seconds for which an end is worth a look, even if the next life goes on."""
 MOST: Final = 24
 """Actors that are asked why at a time."""
+MOST_SUSPECTS: Final = 3
+"""Suspects of diagnosis of whom it is told how they are now."""
 TELLING: Final = (
     "ActorCrashed",
     "AutoShutdown",
@@ -113,6 +115,8 @@ class Trouble(msgspec.Struct, frozen=True, omit_defaults=True):
         advice: what to do, in sentences.
         orders: the orders that help.
         leads: addresses of other troubles that the sentences name: their cause may be there.
+        case: the number of the case of repair whose plan waits for a yes; 0: none does.
+        view: the view that shows more, "diagnosis"; "": the page of the actor.
     """
 
     address: str
@@ -121,6 +125,8 @@ class Trouble(msgspec.Struct, frozen=True, omit_defaults=True):
     advice: tuple[str, ...] = ()
     orders: tuple[str, ...] = ()
     leads: tuple[str, ...] = ()
+    case: int = 0
+    view: str = ""
 
 
 class Seen(msgspec.Struct, frozen=True):
@@ -182,7 +188,12 @@ def troubles(seen: Seen, answers: Mapping[str, Sequence[tuple[str, str]]]) -> li
     silent = [_silent(row) for path, row in seen.rows.items() if row.state == "silent" and path in answers]
     by_path = {one.address: one for one in [*found, *silent]}
     linked = [msgspec.structs.replace(one, leads=_leads(one, by_path)) for one in by_path.values()]
-    return sorted(linked, key=lambda one: (GRADES.index(one.grade), len(one.leads), -seen.told.get(one.address, 0.0)))
+    return sorted(linked, key=lambda one: (grade_of(one), len(one.leads), -seen.told.get(one.address, 0.0)))
+
+
+def grade_of(one: Trouble) -> int:
+    """How grave it is, as a number to be sorted by: the gravest first."""
+    return GRADES.index(one.grade)
 
 
 def seen_causes(seen: Seen, path: str) -> list[tuple[str, str]]:
@@ -267,6 +278,34 @@ def _advice(seen: Seen, path: str, cause: str) -> Advice:
 def _silent(row: ActorRow) -> Trouble:
     sentence = f"The process {row.pid} of {row.path} does not answer."
     return Trouble(row.path, ILL, (sentence,), (SILENT.text,), SILENT.orders)
+
+
+def diagnosed_troubles(found: Sequence[Mapping[str, Any]]) -> list[Trouble]:
+    """What diagnosis suspects, and which plans of repair wait for a yes.
+
+    Args:
+        found: what each diagnoser has answered, as `AskDiagnosis` gives it.
+    """
+    said: list[Trouble] = []
+    for one in found:
+        repair = one["repair"]
+        if repair and repair["waiting"]:
+            case = int(repair["waiting"])
+            stories = [story for story in repair["stories"] if story["case"] == case]
+            texts = tuple(str(entry["text"]) for story in stories for entry in story["entries"][-3:])
+            advice = ("Approve the plan, or deny it: repair waits for one of both.",)
+            said.append(
+                Trouble(str(repair["repairer"]), ILL, texts, advice, ("repair-approve",), case=case, view="diagnosis")
+            )
+        elif one["suspects"]:
+            now = [str(suspect["now"]).replace("`", "") for suspect in one["suspects"] if suspect["now"]]
+            sentences = (f"Diagnosis says: {one['text']}.", *now[:MOST_SUSPECTS])
+            said.append(
+                Trouble(
+                    str(one["diagnoser"]), ODD, sentences, ("See why, and what repair would do.",), view="diagnosis"
+                )
+            )
+    return said
 
 
 def _leads(one: Trouble, by_path: Mapping[str, Trouble]) -> tuple[str, ...]:

@@ -121,7 +121,7 @@ def dashboard(
     """
     given: dict[Role, str | Path | None] = {"operate": operators, "read": readers}
     names: dict[Role, str] = {"operate": "operators", "read": "readers"}
-    tokens = {role: token_of(token, names[role]) for role, token in given.items() if token is not None}
+    tokens: dict[Role, str] = {role: token_of(token, names[role]) for role, token in given.items() if token is not None}
     answers: Answers = OwnAnswers(target) if isinstance(target, ActorSystem) else SocketAnswers(target)
     return Dashboard(answers, Access(tokens, hosts), readers_see_state=readers_see_state)
 
@@ -311,6 +311,7 @@ class Trace(Response):
         async with self._answers.session() as session:
             try:
                 await session.ask(FollowActor(self._path), ANSWER)
+                await self._put(send, "trace", {"events": [], "missed": 0, "is_over": False})  # It is followed now.
                 while True:
                     told = await session.ask(NextEvents(BEAT / 2), ANSWER)
                     await self._put(send, "trace", told)

@@ -133,7 +133,7 @@ export function actorView(main, path, more) {
   draw();
   load();
   loadEvents();
-  if (more === "state" && session.sees_state) showState();
+  if (more === "state" && session.sees_state) showState().then(() => stateCard.scrollIntoView({ block: "center" }));
   return () => { isOver = true; clearInterval(timer); endTrace?.(); live.removeEventListener("rows", onRows); live.removeEventListener("events", onEvents); };
 }
 

@@ -26,7 +26,7 @@ export function eventsView(main) {
   const body = el("tbody"), told = el("p", { class: "faint", role: "status" });
   follows.checked = true;
   main.replaceChildren(el("h1", {}, "Events"), el("form", { class: "bar", onsubmit: (event) => { event.preventDefault(); load(); } }, path, kind, kinds,
-    el("button", { class: "main" }, "Show"), el("label", { for: "follows" }, follows, " follow")), told, el("div", { class: "scroll" }, el("table", {}, body)));
+    el("button", { class: "main" }, "Show"), el("label", { for: "follows" }, follows, "follow")), told, el("div", { class: "scroll" }, el("table", {}, body)));
   let last = -1, isOver = false, isAsking = false;
   const chosen = (more) => question({ path: path.value.trim() || "**", kinds: kind.value.trim() ? [kind.value.trim()] : [], ...more });
   async function load() {

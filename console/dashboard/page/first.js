@@ -67,14 +67,16 @@ function update(element, one) {
   texts(element.querySelector(".todos"), one.level ? [] : one.advice || [], "todo");
   const bar = element.querySelector(".bar"), orders = one.level ? [] : one.orders || [];
   const put = live.quarantine.filter((message) => message.address === one.address);
-  const key = JSON.stringify([orders, put.map((message) => message.id), session.role]);
+  const key = JSON.stringify([orders, one.case || 0, put.map((message) => message.id), session.role]);
   if (bar.dataset.orders === key) return; // What somebody is about to press stays where it is.
   bar.dataset.orders = key;
-  bar.replaceChildren(...orders.flatMap((verb) => buttons(verb, one.address, put)).filter(Boolean), el("a", { href: actorHref(one.address), class: "look" }, "Look closer"));
+  bar.replaceChildren(...orders.flatMap((verb) => buttons(verb, one, put)).filter(Boolean), el("a", { href: one.view ? `#/${one.view}` : actorHref(one.address), class: "look" }, one.view ? `See the ${one.view}` : "Look closer"));
 }
 
-function buttons(verb, path, put) {
-  if (verb === "state") return session.sees_state ? [el("a", { class: "button", href: `${actorHref(path)}?state` }, LABELS.state)] : [];
+function buttons(verb, one, put) {
+  const path = one.address;
+  if (verb === "repair-approve") return [orderButton(verb, [], { words: [one.case], isMain: true, label: `Approve case ${one.case}` })];
+  if (verb === "state") return session.sees_state ? [el("a", { class: "button", "data-verb": "state", href: `${actorHref(path)}?state` }, LABELS.state)] : [];
   if (!verb.startsWith("quarantine")) return [orderButton(verb, [path])];
   return put.slice(0, 3).map((message) => orderButton(verb, [path], { words: [message.id], label: put.length > 1 ? `${LABELS[verb]} ${message.id}` : LABELS[verb] }));
 }

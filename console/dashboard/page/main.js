@@ -40,7 +40,7 @@ function show() {
     main.replaceChildren(el("p", { class: "empty" }, "There is no such page."));
   }
   for (const link of document.querySelectorAll("#views a")) {
-    if (link.dataset.view === view) link.setAttribute("aria-current", "page"); else link.removeAttribute("aria-current");
+    if (link.dataset.view === view) { link.setAttribute("aria-current", "page"); link.scrollIntoView({ block: "nearest", inline: "nearest" }); } else link.removeAttribute("aria-current");
   }
   document.title = view === "actor" ? `${path} · holdfast` : `${live.system || "holdfast"} · holdfast`;
 }

@@ -131,10 +131,10 @@ export class Tree {
     set(one, "grave", hangs ? (turn >= 5 ? "ill" : "odd") : gravity(row.state), (grave) => { one.state.className = `st ${grave}`; });
     heated(one, "queued", row.queued, [1, 10, 100, 1000]);
     heated(one, "restarts", row.restarts, [1, 2, 3, 6]);
-    heated(one, "cpu", process?.cpu ?? null, [1, 25, 60, 90], (value) => `${value.toFixed(0)} %`);
+    heated(one, "cpu", process?.cpu ?? null, [25, 50, 75, 90], (value) => `${value.toFixed(0)} %`);
     const share = process && row.allowed ? process.memory / row.allowed : 0;
     set(one, "memory", process ? bytes(process.memory) : "", (text) => { one.memory.textContent = text; });
-    set(one, "mheat", share ? heat(share, [0.01, 0.4, 0.6, 0.8]) : 0, (h) => { one.memory.className = `num mb heat ${h ? `h${h}` : ""}`; });
+    set(one, "mheat", share ? heat(share, [0.4, 0.5, 0.6, 0.8]) : 0, (h) => { one.memory.className = `num mb heat ${h ? `h${h}` : ""}`; });
     const more = [hangs ? `${shortKind(row.turn)} for ${seconds(turn)}` : "", row.place === "task" ? "" : row.place, row.recovery, row.mechanism.join(" + "), row.names.join(", ")];
     set(one, "more", more.filter(Boolean).join(", "), (text) => { one.more.textContent = text; one.more.title = text; });
   }
