@@ -146,15 +146,19 @@ class Access:
         """Forget a browser."""
         self._logins.pop(connection.cookies.get(self.cookie, ""), None)
 
+    def is_known(self, connection: HTTPConnection) -> bool:
+        """Whether somebody has logged in, and the login is not over."""
+        login = self._logins.get(connection.cookies.get(self.cookie, ""))
+        return login is not None and time.monotonic() <= login.until
+
     def login_of(self, connection: HTTPConnection) -> Login:
         """Who asks. Raises NotAllowed: somebody who has not logged in, or whose login is over."""
         key = connection.cookies.get(self.cookie, "")
-        login = self._logins.get(key)
-        if login is None or login.until < time.monotonic():
+        if not self.is_known(connection):
             self._logins.pop(key, None)
             raise NotAllowed(401, "log in with a token: this page was opened without one, or the program began anew")
         self._logins.move_to_end(key)
-        return login
+        return self._logins[key]
 
     def check_page(self, connection: HTTPConnection, login: Login) -> None:
         """Refuse a request that the page itself has not made. Raises NotAllowed."""

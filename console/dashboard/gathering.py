@@ -233,6 +233,7 @@ class Gathering:
         """Look at all actors as often as that costs little, and at those on the screens, or told of, in between."""
         loop = asyncio.get_running_loop()
         next_all = next_some = 0.0
+        costs: deque[float] = deque([0.0], maxlen=2)  # The dearer of two may have met something else that was slow.
         while True:
             self._hurry.clear()
             begun = loop.time()
@@ -241,8 +242,8 @@ class Gathering:
                 self._has_changed = False
                 self._hurried.clear()
                 self._take(await self._look(None), None)
-                cost = loop.time() - begun
-                next_all = loop.time() + min(RAREST, max(QUICKEST, cost / SHARE))
+                costs.append(loop.time() - begun)
+                next_all = loop.time() + min(RAREST, max(QUICKEST, min(costs) / SHARE))
                 next_some = loop.time() + QUICKEST
             elif some and (begun >= next_some or self._hurried):
                 self._hurried.clear()

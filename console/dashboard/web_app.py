@@ -186,7 +186,7 @@ class Dashboard:
         return checked
 
     async def _session(self, request: Request) -> Response:
-        """GET: who one is. POST: exchange a token for a cookie. DELETE: log out."""
+        """GET: who one is; the role is empty before the login. POST: exchange a token for a cookie. DELETE: log out."""
         self._access.check_origin(request)
         if request.method == "POST":
             key, login = self._access.log_in((await _body(request, Token)).token)
@@ -196,6 +196,8 @@ class Dashboard:
                 self._access.cookie, key, path=_home(request), secure=is_secure, httponly=True, samesite="strict"
             )
             return response
+        if request.method == "GET" and not self._access.is_known(request):
+            return answered({"role": "", "csrf": "", "sees_state": False})
         login = self._access.login_of(request)
         if request.method == "DELETE":
             self._access.check_page(request, login)

@@ -3,29 +3,34 @@
 import { dialog, order, orderButton } from "./acting.js";
 import { causes, story } from "./charts.js";
 import { actorLink, clock, el, sentence, table } from "./dom.js";
-import { isKnown, live } from "./live.js";
+import { isKnown } from "./live.js";
 import { ask, session } from "./server.js";
 
 export function diagnosisView(main) {
   const body = el("div", { class: "wide" });
   main.replaceChildren(body);
-  let isOver = false, shown = "";
+  let isOver = false, shown = "", runs = false;
   async function load() {
     try {
       const found = await ask({ ask: "diagnosis", path: null, timeout: 5 });
+      runs = true;
       const key = JSON.stringify([found, session.role]);
       if (isOver || key === shown || body.querySelector("select:focus")) return;
       shown = key;
       body.replaceChildren(el("h1", {}, "Diagnosis and repair"), ...found.flatMap((one) => [repairCard(one.repair, load), diagnosisCard(one)]).filter(Boolean));
     } catch (error) {
+      runs = false;
       if (!isOver && shown !== error.message) body.replaceChildren(el("h1", {}, "Diagnosis and repair"), el("p", { class: "empty" }, error.message));
       shown = error.message;
     }
   }
-  const timer = setInterval(() => { if (document.visibilityState === "visible") load(); }, 2000);
-  load();
-  live.addEventListener("troubles", load);
-  return () => { isOver = true; clearInterval(timer); live.removeEventListener("troubles", load); };
+  let timer = 0;
+  const again = async () => {
+    if (document.visibilityState === "visible") await load();
+    if (!isOver) timer = setTimeout(again, runs ? 2000 : 15000); // It may be started later.
+  };
+  again();
+  return () => { isOver = true; clearTimeout(timer); };
 }
 
 function diagnosisCard(one) {

@@ -17,7 +17,7 @@ const VIEWS = [
   ["events", "Events", eventsView], ["changes", "Changes", changesView], ["metrics", "Metrics", metricsView],
 ];
 const main = document.getElementById("main");
-let end = null, isConnected = false;
+let end = null, isConnected = false, wantsSearch = false;
 
 function where() {
   const [path, more = ""] = location.hash.replace(/^#\/?/, "").split("?");
@@ -42,6 +42,7 @@ function show() {
   for (const link of document.querySelectorAll("#views a")) {
     if (link.dataset.view === view) { link.setAttribute("aria-current", "page"); link.scrollIntoView({ block: "nearest", inline: "nearest" }); } else link.removeAttribute("aria-current");
   }
+  seek();
   document.title = view === "actor" ? `${path} · holdfast` : `${live.system || "holdfast"} · holdfast`;
 }
 
@@ -120,13 +121,18 @@ async function start() {
   begin();
 }
 
+function seek() {
+  if (wantsSearch) document.getElementById("search")?.focus();
+  wantsSearch = false;
+}
+
 function keys(event) {
   const isTyping = /^(INPUT|TEXTAREA|SELECT)$/.test(event.target.tagName) || document.getElementById("ask").open;
   if (isTyping || event.ctrlKey || event.metaKey || event.altKey) return;
   if (event.key === "/") {
     event.preventDefault();
-    if (where().view !== "") { location.hash = "#/"; show(); }
-    document.getElementById("search")?.focus();
+    wantsSearch = true;
+    if (where().view === "") seek(); else location.hash = "#/";
   } else if (event.key === "Escape" && where().view === "actor") location.hash = "#/";
 }
 

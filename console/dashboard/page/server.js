@@ -24,7 +24,11 @@ async function call(method, address, body) {
   return told;
 }
 
-export async function whoAmI() { Object.assign(session, await call("GET", "session")); }
+export async function whoAmI() {
+  const told = await call("GET", "session");
+  if (!told.role) { window.dispatchEvent(new Event("loggedout")); throw new Refused(401, ""); }
+  Object.assign(session, told);
+}
 export async function logIn(token) { Object.assign(session, await call("POST", "session", { token })); }
 export const logOut = () => call("DELETE", "session");
 export const ask = async (question) => (await call("POST", "ask", question)).value;

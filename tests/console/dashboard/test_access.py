@@ -22,7 +22,9 @@ SUSPEND = {"verb": "suspend", "paths": ["/app/left"]}
 
 async def test_without_a_token_nothing_of_the_system_is_told(app: Dashboard) -> None:
     browser = Browser(app)
-    for method, path in (("GET", "/session"), ("GET", "/live"), ("GET", "/trace"), ("DELETE", "/session")):
+    told = (await browser.http.get("/session")).json()
+    assert told == {"role": "", "csrf": "", "sees_state": False}
+    for method, path in (("GET", "/live"), ("GET", "/trace"), ("DELETE", "/session")):
         assert (await browser.http.request(method, path)).status_code == 401
     for path in ("/ask", "/act", "/seek", "/watch"):
         assert (await browser.post(path, ASKED)).status_code == 401
@@ -36,8 +38,12 @@ async def test_a_token_is_exchanged_for_a_cookie_that_scripts_do_not_see(app: Da
     browser = Browser(app)
     answer = await browser.log_in(OPERATORS)
     cookie = answer.headers["set-cookie"].lower()
-    assert "httponly" in cookie and "samesite=strict" in cookie and "path=/" in cookie and "secure" not in cookie
-    assert OPERATORS not in cookie and OPERATORS not in answer.text
+    assert "httponly" in cookie
+    assert "samesite=strict" in cookie
+    assert "path=/" in cookie
+    assert "secure" not in cookie
+    assert OPERATORS not in cookie
+    assert OPERATORS not in answer.text
     assert (await browser.ask("about"))["name"] == "app"
     safe = Browser(app, HOME.replace("http:", "https:"))
     assert "secure" in (await safe.log_in(OPERATORS)).headers["set-cookie"].lower()
@@ -121,7 +127,12 @@ async def test_a_request_is_json_and_small(operator: Browser) -> None:
     assert plain.status_code == 415
     large = await operator.post("/ask", {"ask": "about", "x": "x" * 2_000_000})
     assert large.status_code == 413
-    for body in ({"ask": "terminate", "path": "/app"}, {"ask": "about", "more": 1}, [], {"ask": "control", "path": "/"}):
+    for body in (
+        {"ask": "terminate", "path": "/app"},
+        {"ask": "about", "more": 1},
+        [],
+        {"ask": "control", "path": "/"},
+    ):
         assert (await operator.post("/ask", body)).status_code == 400
 
 
@@ -133,7 +144,11 @@ async def test_tokens_are_not_guessed_fast(app: Dashboard) -> None:
 
 
 async def test_each_answer_says_what_a_browser_may_do_with_it(operator: Browser) -> None:
-    for answer in (await operator.http.get("/"), await operator.post("/ask", ASKED), await operator.http.get("/nobody")):
+    for answer in (
+        await operator.http.get("/"),
+        await operator.post("/ask", ASKED),
+        await operator.http.get("/nobody"),
+    ):
         assert "default-src 'self'" in answer.headers["content-security-policy"]
         assert "frame-ancestors 'none'" in answer.headers["content-security-policy"]
         assert answer.headers["x-content-type-options"] == "nosniff"
@@ -143,7 +158,15 @@ async def test_each_answer_says_what_a_browser_may_do_with_it(operator: Browser)
 
 async def test_only_the_files_of_the_page_are_served(operator: Browser) -> None:
     assert (await operator.http.get("/style.css")).headers["content-type"].startswith("text/css")
-    for path in ("/../access.py", "/%2e%2e/access.py", "/..%2faccess.py", "/access.py", "//etc/passwd", "/page", "/a/b"):
+    for path in (
+        "/../access.py",
+        "/%2e%2e/access.py",
+        "/..%2faccess.py",
+        "/access.py",
+        "//etc/passwd",
+        "/page",
+        "/a/b",
+    ):
         assert (await operator.http.get(path)).status_code == 404
 
 
@@ -193,7 +216,7 @@ async def test_a_dashboard_without_tokens_or_with_one_for_both_is_refused(system
 
 
 async def test_others_reach_it_with_tls_only(app: Dashboard, tmp_path: Path) -> None:
-    with pytest.raises(hf.errors.SpecError, match="others can reach 0.0.0.0.*insecure=True"):
+    with pytest.raises(hf.errors.SpecError, match=r"others can reach 0\.0\.0\.0.*insecure=True"):
         async with open_dashboard(app, host="0.0.0.0"):
             pass
     with pytest.raises(hf.errors.SpecError, match="there is no file"):

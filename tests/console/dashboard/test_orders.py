@@ -96,7 +96,8 @@ class = "tests.system.trees:Counter"
 
 async def test_a_tree_is_planned_asked_about_and_applied(system: hf.ActorSystem, operator: Browser) -> None:
     plan = await operator.act("apply", text=TREE, is_dry_run=True)
-    assert plan["steps"] and plan["lost"] == ["without recovery, the state is lost of /app/left/b, /app/left/c"]
+    assert plan["steps"]
+    assert plan["lost"] == ["without recovery, the state is lost of /app/left/b, /app/left/c"]
     assert "/app/left/b" in await states(system)
     assert (await operator.act("apply", text=TREE))["warnings"] == plan["lost"]
     assert "/app/left/b" in await states(system)
@@ -142,5 +143,5 @@ async def test_an_order_is_for_so_many_actors(operator: Browser) -> None:
 
 
 def test_each_verb_is_listed() -> None:
-    assert VERBS == get_args(Verb)
+    assert get_args(Verb) == VERBS
     assert Order("suspend").is_confirmed is False
