@@ -21,13 +21,19 @@ from .picture import Picture, plain
 from .troubles import NEWS, TELLING, Seen, Trouble, diagnosed_troubles, grade_of, seen_causes, suspects, troubles
 
 SHARE: Final = 0.01
-"""The part of one processor that looking may take, as long as that does not make looks rarer than `RAREST`."""
+"""The part of one processor that looks at what is on the screens may take, unless they became rarer than a second."""
+SHARE_OF_ALL: Final = 0.005
+"""The same of looks at all actors, and of asking why, unless they became rarer than `RAREST`."""
 QUICKEST: Final = 0.1
 """Seconds between two looks at least."""
 RAREST: Final = 5.0
 """Seconds between two looks at all actors at most."""
 RAREST_SOME: Final = 1.0
 """Seconds between two looks at the actors that are on somebody's screen at most."""
+SUSPECTING: Final = 0.5
+"""Seconds after which it is looked again whether somebody looks ill."""
+TOGETHER: Final = 0.2
+"""Seconds between two rounds of asking why at least."""
 SETTLED: Final = 0.4
 """Seconds after which actors of whom something was told are looked at again: an end may be told before it is over."""
 CHANGING: Final = ("TransactionCommitted", "TransactionRolledBack", "SystemStarted")
@@ -243,15 +249,15 @@ class Gathering:
                 self._hurried.clear()
                 self._take(await self._look(None), None)
                 costs.append(loop.time() - begun)
-                next_all = loop.time() + min(RAREST, max(QUICKEST, min(costs) / SHARE))
+                next_all = loop.time() + min(RAREST, max(QUICKEST, min(costs) / SHARE_OF_ALL))
                 next_some = loop.time() + QUICKEST
-            elif some and (begun >= next_some or self._hurried):
+            elif some and (begun >= next_some or self._hurried) and next_all - begun > QUICKEST:
                 self._hurried.clear()
                 self._take(await self._look(tuple(some)), some)
                 next_some = loop.time() + min(RAREST_SOME, max(QUICKEST, (loop.time() - begun) / SHARE))
             await asyncio.sleep(QUICKEST / 4)  # However many events there are, the loop is left to others.
             is_watched = any(viewer.watched for viewer in self._viewers.values())
-            due = min(next_all, next_some) if is_watched else next_all
+            due = min(next_all, next_some) if is_watched and next_all - loop.time() > QUICKEST else next_all
             try:
                 async with asyncio.timeout(max(0.0, due - loop.time())):
                     await self._hurry.wait()
@@ -318,37 +324,45 @@ class Gathering:
     async def _ask_why(self) -> None:
         """Ask those who look ill why, soon after something has happened, and now and then."""
         loop = asyncio.get_running_loop()
-        pause = QUICKEST
+        asked = set[str]()
+        pause, next_round = TOGETHER, 0.0
         while True:
-            if self._is_seen:
+            self._suspect.clear()  # Now: what is told while somebody is asked is asked about by the next round.
+            if self._is_seen and (loop.time() >= next_round or set(suspects(self._seen())) != asked):
                 begun = loop.time()
-                await self._ask_suspects()
-                pause = min(RAREST, max(0.3, (loop.time() - begun) / SHARE))
-            self._suspect.clear()
+                asked = await self._ask_suspects()
+                pause = min(RAREST, max(TOGETHER, (loop.time() - begun) / SHARE_OF_ALL))
+                next_round = loop.time() + max(1.0, pause)
             try:
-                async with asyncio.timeout(max(1.0, pause)):
+                async with asyncio.timeout(SUSPECTING):
                     await self._suspect.wait()
-                await asyncio.sleep(min(pause, 0.3))  # What comes at the same time is asked about together.
+                next_round = 0.0
+                await asyncio.sleep(min(pause, RAREST_SOME))  # What comes at the same time is asked about together.
             except TimeoutError:
-                pass
+                pass  # Somebody may look ill without anything having been told: a turn that goes on and on.
 
-    async def _ask_suspects(self) -> None:
-        raw = await self._answers.ask(AskQuarantined(None), ANSWER)
-        put_aside = msgspec.convert(raw, list[PutAside])
+    def _seen(self) -> Seen:
+        """What is known before anybody is asked."""
         memory = {one.pid: one.memory_bytes for one in self.picture.processes}
-        now = time.time()
-        self._told = {path: at for path, at in self._told.items() if now - at < NEWS}
-        addresses = frozenset(one.address for one in put_aside)
-        seen = Seen(now, f"/{self.picture.system}", self.picture.rows, memory, addresses, self._told)
+        addresses = frozenset(one.address for one in self._put_aside)
+        return Seen(time.time(), f"/{self.picture.system}", self.picture.rows, memory, addresses, self._told)
+
+    async def _ask_suspects(self) -> set[str]:
+        """One round: who looks ill is asked why, and what has changed of the answers is told. Returns whom it asked."""
+        raw = await self._answers.ask(AskQuarantined(None), ANSWER)
+        before, self._put_aside = self._put_aside, msgspec.convert(raw, list[PutAside])
+        self._told = {path: at for path, at in self._told.items() if time.time() - at < NEWS}
+        seen = self._seen()
         asked = suspects(seen)
         try:
             answers = await self._answers.ask(AskCauses(tuple(asked), 1.0), 3 * ANSWER)
         except SpecError:  # It keeps no history: what can be seen of them has to do.
             answers = {path: seen_causes(seen, path) for path in asked}
         found = sorted([*self._diagnosed, *troubles(seen, answers)], key=grade_of)
-        if (found, put_aside) != (self._troubles, self._put_aside):
-            self._troubles, self._put_aside = found, put_aside
-            self._tell("troubles", {"troubles": found, "quarantine": put_aside})
+        if (found, self._put_aside) != (self._troubles, before):
+            self._troubles = found
+            self._tell("troubles", {"troubles": found, "quarantine": self._put_aside})
+        return set(asked)
 
     async def _ask_diagnosis(self) -> None:
         """Ask what diagnosis says, now and then; where none runs, rarely: one may be started later."""
@@ -360,7 +374,7 @@ class Gathering:
                 pause = 1.0
             except NotDiagnosed:
                 self._diagnosed, pause = [], 2 * RAREST
-            await asyncio.sleep(min(2 * RAREST, max(pause, (loop.time() - begun) / SHARE)))
+            await asyncio.sleep(min(2 * RAREST, max(pause, (loop.time() - begun) / SHARE_OF_ALL)))
 
 
 def framed(event: str, value: Any) -> bytes:

@@ -108,8 +108,8 @@ function measure() {
 }
 
 export function connect() {
-  setInterval(measure, 1000);
-  return stream("live", {
+  const timer = setInterval(measure, 1000);
+  const close = stream("live", {
     open() { live.isConnected = true; tell("connection"); },
     broken() {
       live.isConnected = false;
@@ -147,6 +147,7 @@ export function connect() {
     },
     problem(told) { live.problem = told.text; tell("connection"); },
   });
+  return () => { clearInterval(timer); live.viewer = 0; close(); };
 }
 
 let watched = "", watchTimer = 0;
@@ -156,6 +157,7 @@ export function onScreen(paths) {
   if (key === watched || !live.viewer) return;
   clearTimeout(watchTimer);
   watchTimer = setTimeout(() => {
+    if (!live.viewer) return; // It was closed meanwhile.
     watched = key;
     watch(live.viewer, paths.slice(0, 200)).catch(() => { watched = ""; });
   }, 120);

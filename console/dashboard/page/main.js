@@ -17,7 +17,7 @@ const VIEWS = [
   ["events", "Events", eventsView], ["changes", "Changes", changesView], ["metrics", "Metrics", metricsView],
 ];
 const main = document.getElementById("main");
-let end = null, isConnected = false, wantsSearch = false;
+let end = null, disconnect = null, wantsSearch = false;
 
 function where() {
   const [path, more = ""] = location.hash.replace(/^#\/?/, "").split("?");
@@ -69,7 +69,7 @@ function head() {
 function navigation() {
   document.getElementById("views").replaceChildren(
     ...VIEWS.map(([name, label]) => el("a", { href: `#/${name}`, "data-view": name }, label, name === "letters" ? el("span", { class: "count", id: "put-aside" }) : null)),
-    el("a", { href: "#/", title: `You may ${session.role === "operate" ? "look and change" : "look only"}.`, onclick: async (event) => { event.preventDefault(); await logOut(); location.reload(); } }, "Log out"));
+    el("a", { href: "#/", title: `You may ${session.role === "operate" ? "look and change" : "look only"}.`, onclick: async (event) => { event.preventDefault(); end?.(); end = null; disconnect(); await logOut(); location.reload(); } }, "Log out"));
 }
 
 function theme(is) {
@@ -82,7 +82,7 @@ function isDark() {
 
 function begin() {
   navigation();
-  if (!isConnected) { isConnected = true; connect(); }
+  disconnect ??= connect();
   window.addEventListener("hashchange", show);
   for (const kind of ["troubles", "connection", "rows"]) live.addEventListener(kind, head);
   show();

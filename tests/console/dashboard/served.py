@@ -14,11 +14,11 @@ OPERATORS, READERS = "operators-token-0123456789", "readers-token-0123456789"
 
 
 def plan(leaves: int) -> list[hf.ChildSpec]:
-    """The tree: a shop with ill actors, and a crowd of well ones."""
+    """The tree: a shop with ill actors, and if there are leaves a protected actor and a crowd of well ones."""
     shop = [
         hf.child("bank", hf.start(Worker), shutdown=0.2),
         hf.child("till", hf.start(Worker), bindings={"bank": "/app/shop/bank"}, shutdown=0.2),
-        hf.child("clerk", hf.start(Worker)),
+        hf.child("clerk", hf.start(Worker), shutdown=0.2),
         hf.child("ledger", hf.start(Worker), recovery=hf.hybrid()),
         hf.child("fragile", hf.start(Worker), isolation="process", recovery=hf.hybrid(max_deliveries=1)),
     ]
@@ -26,8 +26,11 @@ def plan(leaves: int) -> list[hf.ChildSpec]:
         hf.supervisor(f"group{at}", children=[hf.child(f"leaf{n}", hf.start(Leaf)) for n in range(99)])
         for at in range(leaves // 100)
     ]
+    ill = hf.supervisor("shop", intensity=50, period=60.0, children=shop)
+    if not leaves:
+        return [ill]
     return [
-        hf.supervisor("shop", intensity=50, period=60.0, children=shop),
+        ill,
         hf.child("safe", hf.start(Worker), mechanism=hf.ftm.PBR()),
         hf.supervisor("crowd", children=groups),
     ]

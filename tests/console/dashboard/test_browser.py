@@ -85,30 +85,54 @@ def browser(playwright: Playwright) -> Iterator[Browser]:
     one.close()
 
 
+class Visit:
+    """A browser's visit, of which nothing that is written down is an error, nor anything evil has run."""
+
+    def __init__(self, browser: Browser) -> None:
+        self.errors: list[str] = []
+        self.context = browser.new_context(
+            viewport={"width": 1280, "height": 800}, color_scheme="light", reduced_motion="reduce"
+        )
+        self.context.set_default_timeout(PATIENCE)
+        self.context.on("console", self._hear)
+        self.context.on("weberror", lambda error: self.errors.append(str(error.error)))
+
+    def _hear(self, message: ConsoleMessage) -> None:
+        if message.type == "error" and not any(words in message.text for words in EXPECTED):
+            self.errors.append(message.text)
+
+    def check(self) -> None:
+        """Nothing went wrong so far."""
+        assert [page.evaluate("window.evil") for page in self.context.pages] == [None] * len(self.context.pages)
+        assert self.errors == []
+
+
 @pytest.fixture
 def context(browser: Browser) -> Iterator[BrowserContext]:
-    """A browser that has visited nothing so far; nothing in it may be an error, nor may anything evil have run."""
-    errors: list[str] = []
+    """A browser that has visited nothing so far."""
+    visit = Visit(browser)
+    yield visit.context
+    visit.check()
+    visit.context.close()
 
-    def hear(message: ConsoleMessage) -> None:
-        if message.type == "error" and not any(words in message.text for words in EXPECTED):
-            errors.append(message.text)
 
-    one = browser.new_context(viewport={"width": 1280, "height": 800}, color_scheme="light", reduced_motion="reduce")
-    one.set_default_timeout(PATIENCE)
-    one.on("console", hear)
-    one.on("weberror", lambda error: errors.append(str(error.error)))
+@pytest.fixture(scope="module")
+def visit(browser: Browser, served: Served) -> Iterator[Visit]:
+    """An operator with one page open."""
+    one = Visit(browser)
+    opened(one.context, served.url)
     yield one
-    evil = [page.evaluate("window.evil") for page in one.pages]
-    one.close()
-    assert errors == []
-    assert evil == [None] * len(evil)
+    one.context.close()
 
 
 @pytest.fixture
-def page(context: BrowserContext, served: Served) -> Page:
-    """The first page, for an operator."""
-    return opened(context, served.url)
+def page(visit: Visit) -> Iterator[Page]:
+    """The page of an operator, at its first view."""
+    [one] = visit.context.pages
+    at(one, "")
+    expect(one.get_by_role("treeitem").first).to_be_visible()
+    yield one
+    visit.check()
 
 
 def opened(context: BrowserContext, url: str, token: str = OPERATORS) -> Page:

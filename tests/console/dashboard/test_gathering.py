@@ -176,6 +176,7 @@ async def test_in_a_large_system_the_screen_is_looked_at_more_often(
 ) -> None:
     """All actors are looked at rarely here; a mailbox that is on somebody's screen is seen to grow all the same."""
     monkeypatch.setattr(gathering_module, "SHARE", 1e-9)
+    monkeypatch.setattr(gathering_module, "SHARE_OF_ALL", 1e-9)
     monkeypatch.setattr(gathering_module, "RAREST", 3600.0)
     monkeypatch.setattr(gathering_module, "RAREST_SOME", 0.05)
     answers = Counted(OwnAnswers(system))
