@@ -242,19 +242,19 @@ class Gathering:
         costs: deque[float] = deque([0.0], maxlen=2)  # The dearer of two may have met something else that was slow.
         while True:
             self._hurry.clear()
-            begun = loop.time()
+            begun, clock = loop.time(), time.perf_counter()  # The loop's own clock may have milliseconds only.
             some = self._hurried.union(*(viewer.watched for viewer in self._viewers.values()))
             if begun >= next_all or len(some) > MOST_AT_ONCE or self._has_changed or not self._is_seen:
                 self._has_changed = False
                 self._hurried.clear()
                 self._take(await self._look(None), None)
-                costs.append(loop.time() - begun)
+                costs.append(time.perf_counter() - clock)
                 next_all = loop.time() + min(RAREST, max(QUICKEST, min(costs) / SHARE_OF_ALL))
                 next_some = loop.time() + QUICKEST
             elif some and (begun >= next_some or self._hurried) and next_all - begun > QUICKEST:
                 self._hurried.clear()
                 self._take(await self._look(tuple(some)), some)
-                next_some = loop.time() + min(RAREST_SOME, max(QUICKEST, (loop.time() - begun) / SHARE))
+                next_some = loop.time() + min(RAREST_SOME, max(QUICKEST, (time.perf_counter() - clock) / SHARE))
             await asyncio.sleep(QUICKEST / 4)  # However many events there are, the loop is left to others.
             is_watched = any(viewer.watched for viewer in self._viewers.values())
             due = min(next_all, next_some) if is_watched and next_all - loop.time() > QUICKEST else next_all
@@ -329,9 +329,9 @@ class Gathering:
         while True:
             self._suspect.clear()  # Now: what is told while somebody is asked is asked about by the next round.
             if self._is_seen and (loop.time() >= next_round or set(suspects(self._seen())) != asked):
-                begun = loop.time()
+                begun = time.perf_counter()
                 asked = await self._ask_suspects()
-                pause = min(RAREST, max(TOGETHER, (loop.time() - begun) / SHARE_OF_ALL))
+                pause = min(RAREST, max(TOGETHER, (time.perf_counter() - begun) / SHARE_OF_ALL))
                 next_round = loop.time() + max(1.0, pause)
             try:
                 async with asyncio.timeout(SUSPECTING):
@@ -366,15 +366,14 @@ class Gathering:
 
     async def _ask_diagnosis(self) -> None:
         """Ask what diagnosis says, now and then; where none runs, rarely: one may be started later."""
-        loop = asyncio.get_running_loop()
         while True:
-            begun = loop.time()
+            begun = time.perf_counter()
             try:
                 self._diagnosed = diagnosed_troubles(await self._answers.ask(AskDiagnosis(None, 2.0), ANSWER))
                 pause = 1.0
             except NotDiagnosed:
                 self._diagnosed, pause = [], 2 * RAREST
-            await asyncio.sleep(min(2 * RAREST, max(pause, (loop.time() - begun) / SHARE_OF_ALL)))
+            await asyncio.sleep(min(2 * RAREST, max(pause, (time.perf_counter() - begun) / SHARE_OF_ALL)))
 
 
 def framed(event: str, value: Any) -> bytes:
