@@ -13,6 +13,7 @@ import msgspec
 from ..actors.errors import HoldfastError, SpecError, type_name
 from ..actors.events import Event, EventStream, MessageIn, MessageOut, TurnBegan, TurnEnded
 from ..actors.kernel.actor import Actor
+from ..system.history.authors import ACTING, OPERATOR
 from ..system.history.evidence import PutAside, put_aside
 from ..system.transaction.change import Change
 from .declare.tree_plan import declare
@@ -23,6 +24,7 @@ from .trust import Needed, trusted_imports
 from .wire import (
     About,
     AnyRequest,
+    AskCauses,
     AskConnections,
     AskDiagnosis,
     AskHistory,
@@ -53,6 +55,8 @@ if TYPE_CHECKING:
 
 LONGEST = 3600.0
 """Seconds that one request may take."""
+MOST_CAUSES = 100
+"""Addresses of which one request asks what is wrong there."""
 MOST_COUNTED = 1000
 """Actors whose turns are counted for one client."""
 OPENED_TOGETHER = 32
@@ -80,6 +84,12 @@ class ClientSession:
             self._followed.close()
         await self._count([])
 
+    async def carry_out(self, request: AnyRequest) -> Any:
+        """Answer a request as an operator's, in a task of its own. Raises whatever goes wrong, and TimeoutError."""
+        ACTING.set(OPERATOR)  # In the context of the task of this request.
+        async with asyncio.timeout(LONGEST):
+            return await self.answer(request)
+
     async def answer(self, request: AnyRequest) -> Any:
         """Carry out a request. Raises whatever goes wrong."""
         system = self._system
@@ -91,7 +101,7 @@ class ClientSession:
             case Whereis():
                 return system.whereis(request.name).path
             case Overview():
-                return msgspec.msgpack.encode(await look_at(system, parts=request.parts))
+                return msgspec.msgpack.encode(await look_at(system, parts=request.parts, paths=request.paths))
             case InspectActor():
                 return await inspected(system, request.path, min(request.timeout, LONGEST))
             case RestartActor():
@@ -116,6 +126,8 @@ class ClientSession:
                 return msgspec.to_builtins(system.lives(request.path))
             case AskWhy():
                 return await system.why(request.path, timeout=min(request.timeout, LONGEST))
+            case AskCauses():
+                return await self._causes(request)
             case AskQuarantined():
                 return msgspec.to_builtins(system.put_aside(request.path))
             case SettleQuarantined():
@@ -134,6 +146,13 @@ class ClientSession:
                 return await order_repair(system, request.verb, request.words, min(request.timeout, LONGEST))
             case _:
                 assert_never(request)
+
+    async def _causes(self, request: AskCauses) -> dict[str, Any]:
+        """What is wrong at each address, one after another: the evidence about many is much work for one step."""
+        if len(request.paths) > MOST_CAUSES:
+            raise SpecError("causes", f"at most {MOST_CAUSES} addresses are asked about at a time")
+        timeout = min(request.timeout, LONGEST)
+        return {path: list(map(list, await self._system.causes(path, timeout=timeout))) for path in request.paths}
 
     async def _history(self, request: AskHistory) -> HistoryPage:
         """A page; its question comes from elsewhere, and is checked as everybody's is."""

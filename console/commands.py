@@ -12,7 +12,18 @@ from rich.console import Console
 from .. import HoldfastError, run
 from . import mechanism_commands, upgrade_commands
 from .nats_commands import nats
-from .operate import changing, connecting, declaring, diagnosing, following, looking, remembering, repairing, retrying
+from .operate import (
+    changing,
+    connecting,
+    declaring,
+    diagnosing,
+    following,
+    looking,
+    remembering,
+    repairing,
+    retrying,
+    showing,
+)
 from .service import doctor, project, service_run
 from .store_commands import store
 
@@ -96,6 +107,7 @@ for command in (
     diagnosing.diagnose,
     declaring.plan,
     declaring.apply,
+    showing.dashboard,
     service_run.run,
     project.new,
     doctor.doctor,

@@ -18,10 +18,9 @@ from ..actors.ordered import Ordered
 from ..actors.process.wire.frame_buffer import LENGTH
 from ..actors.streams import Listener
 from ..actors.values import encode_value
-from ..system.history.authors import ACTING, OPERATOR
 from ..system.system import ActorSystem
 from .claims import EndpointInUse, absolute, claimed, listen, remove
-from .client_session import LONGEST, ClientSession
+from .client_session import ClientSession
 from .runtime_folder import socket_path
 from .wire import (
     REQUEST,
@@ -202,10 +201,7 @@ class Endpoint:
 
     async def _respond(self, session: ClientSession, request: AnyRequest) -> ControlResponse:
         try:
-            ACTING.set(OPERATOR)  # In the context of the task of this request.
-            async with asyncio.timeout(LONGEST):
-                value = await session.answer(request)
-            return ControlResponse(encode_value(value))
+            return ControlResponse(encode_value(await session.carry_out(request)))
         except (asyncio.CancelledError, GeneratorExit):
             raise
         except BaseException as error:  # It is the client's to know: whatever a user's code raises ends nobody here.

@@ -6,12 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ..actors.errors import NoSuchActor
+from ..actors.errors import type_name
 from ..actors.kernel.cell import Cell
+from ..actors.kernel.node import cell_kind
+from ..ftm.replica.replica import Replica
 from ..supervision.intensity import recent_restarts
 from ..supervision.spec import ChildSpec
 from ..supervision.supervisor import Supervisor
-from .overview import Found, as_told, children_of, is_far, process_use, row_of
+from .overview import as_told, find, is_far, process_use, row_of
 
 if TYPE_CHECKING:
     from ..system.system import ActorSystem
@@ -42,28 +44,20 @@ async def inspected(system: ActorSystem, path: str, timeout: float) -> dict[str,
         "spec": _spec_words(cell.spec),
         "supervises": _supervises(cell),
         "protection": msgspec.to_builtins(protection) if protection.is_protected else None,
+        "bricks": bricks_of(cell) if protection.is_protected else {},
         "process": None if use is None else msgspec.structs.asdict(use),
     }
 
 
-def find(system: ActorSystem, path: str) -> Found:
-    """An address as a pass through the whole tree finds it, also one that is stopped. Raises NoSuchActor."""
-    try:
-        cell = system.ref(path)._cell.living
-    except NoSuchActor:
-        above, _, name = path.rpartition("/")
-        known = children_of(system.ref(above)._cell.actor) if above else []
-        child = next((one for one in known if one.spec.id == name), None)
-        if child is None:
-            raise
-        return Found(path, child.cell, child, 0)
-    parent = cell.parent
-    known = children_of(parent.actor) if parent is not None else []
-    child = next((one for one in known if one.cell is cell), None)
-    try:
-        return Found(cell.path, cell, child, system.pid_of(cell.ref))
-    except NoSuchActor:  # It is between two lives.
-        return Found(cell.path, cell, child, 0)
+def bricks_of(cell: Cell) -> dict[str, dict[str, str]]:
+    """What the replicas of a protected actor are made of: of each replica its parts by name, and their classes."""
+    found: dict[str, dict[str, str]] = {}
+    group = (cell.children or {}).get("ftm")
+    for name, replica in list((group.children or {}).items()) if group is not None else ():
+        if cell_kind(replica) is Replica:
+            parts = list((replica.children or {}).items())
+            found[name] = {part: type_name(kind) if (kind := cell_kind(one)) is not None else "" for part, one in parts}
+    return found
 
 
 def _spec_words(spec: object) -> dict[str, Any]:

@@ -6,14 +6,14 @@ import asyncio
 import dataclasses
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import psutil
 
 from ..actors.control.orders import Status, status_of
-from ..actors.errors import HoldfastError, type_name
+from ..actors.errors import HoldfastError, NoSuchActor, type_name
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import cell_kind
 from ..actors.process.wire.peer import OutsideHost
@@ -61,6 +61,8 @@ class ActorRow(msgspec.Struct, frozen=True, array_like=True):
     restart: str
     """When its supervisor restarts it; empty if nobody does."""
     is_supervisor: bool
+    allowed_bytes: int = 0
+    """The memory that its own process may have; 0 if nothing bounds it."""
 
 
 class ProcessUse(msgspec.Struct, frozen=True, array_like=True):
@@ -96,17 +98,18 @@ class Found:
     pid: int
 
 
-async def look_at(system: ActorSystem, *, parts: bool) -> SystemLook:
+async def look_at(system: ActorSystem, *, parts: bool, paths: Iterable[str] | None = None) -> SystemLook:
     """Every actor of a system, in one pass; those in other processes are asked all at once.
 
     Args:
         system: the system.
         parts: whether the parts of the runtime itself are listed too: recovery, and what mechanisms are made of.
+        paths: only the actors at these addresses; addresses at which nobody is known are left out.
     """
-    root = system._root
+    top = Found(f"/{system.name}", system._root, None, os.getpid())
     rows: list[ActorRow] = []
     far: dict[int, Cell] = {}
-    for number, one in enumerate(walk(Found(f"/{system.name}", root, None, os.getpid()), parts=parts), 1):
+    for number, one in enumerate(walk(top, parts=parts) if paths is None else found_at(system, paths), 1):
         if one.cell is not None and not one.cell.is_dead and is_far(one.cell):
             far[len(rows)] = one.cell
         rows.append(row_of(one))
@@ -144,6 +147,35 @@ def walk(top: Found, *, parts: bool) -> Iterator[Found]:
                 f"{one.path}/{name}", under, None if known is None else known.child, _pid(under, one.pid)
             )
         waiting.extend(reversed(below.values()))
+
+
+def found_at(system: ActorSystem, paths: Iterable[str]) -> Iterator[Found]:
+    """What is found at these addresses; those at which nobody is known are left out."""
+    for path in paths:
+        try:
+            yield find(system, path)
+        except NoSuchActor:
+            continue
+
+
+def find(system: ActorSystem, path: str) -> Found:
+    """An address as a pass through the whole tree finds it, also one that is stopped. Raises NoSuchActor."""
+    try:
+        cell = system.ref(path)._cell.living
+    except NoSuchActor:
+        above, _, name = path.rpartition("/")
+        known = children_of(system.ref(above)._cell.actor) if above else []
+        child = next((one for one in known if one.spec.id == name), None)
+        if child is None:
+            raise
+        return Found(path, child.cell, child, 0)
+    parent = cell.parent
+    known = children_of(parent.actor) if parent is not None else []
+    child = next((one for one in known if one.cell is cell), None)
+    try:
+        return Found(cell.path, cell, child, system.pid_of(cell.ref))
+    except NoSuchActor:  # It is between two lives.
+        return Found(cell.path, cell, child, 0)
 
 
 def children_of(actor: Any) -> list[Child]:
@@ -192,6 +224,7 @@ def row_of(one: Found) -> ActorRow:
         names_of(cell),
         spec.restart if spec is not None else "",
         kind is not None and issubclass(kind, Supervisor),
+        (spec.limits.memory_bytes or 0) if spec is not None and spec.limits is not None else 0,
     )
 
 

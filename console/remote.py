@@ -242,6 +242,10 @@ class RemoteSystem:
     def __exit__(self, *exc: object) -> None:
         self._client.close()
 
+    def close(self) -> None:
+        """End the connection; what is asked for and not done yet is undone."""
+        self._client.close()
+
     def greet(self, seconds: float) -> None:
         """Find out whether the system answers at all. Raises NotAnswering, NotReached."""
         self._client.greet(seconds)
@@ -483,7 +487,7 @@ class RemoteSystem:
     async def transact(self, change: RemoteChange, *, dry_run: bool, timeout: float) -> None:
         """Have the collected operations carried out."""
         check_seconds("transaction", "timeout", timeout)
-        request = Transact(change._operations, dry_run, timeout, self._script)
+        request = Transact(change.operations, dry_run, timeout, self._script)
         answer = await self.call(request, timeout)
         change._take(answer)
         if self._told is not None:
@@ -621,6 +625,11 @@ class RemoteChange:
     def update(self, target: RemoteTarget, brick: str, new: Any, *, mechanism: str = "", role: str = "") -> None:
         """Give one brick new code."""
         self._put("update", target, brick, in_full(new), mechanism, role)
+
+    @property
+    def operations(self) -> list[tuple[str, list[Any]]]:
+        """What was collected so far, as a `Transact` takes it."""
+        return self._operations
 
     def _put(self, verb: str, target: RemoteTarget, *args: Any) -> None:
         packed = [pack_arg(arg, f"{verb} {text_of(target)}") for arg in (text_of(target), *args)]

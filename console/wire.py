@@ -183,9 +183,10 @@ class About(ControlRequest, tag="about", frozen=True):
 
 
 class Overview(ControlRequest, tag="overview", frozen=True):
-    """How all actors are; with `parts` those of the runtime itself too."""
+    """How all actors are; with `parts` those of the runtime itself too; with `paths` only those at these addresses."""
 
     parts: bool = False
+    paths: tuple[str, ...] | None = None
 
 
 class InspectActor(ControlRequest, tag="inspect", frozen=True):
@@ -282,6 +283,13 @@ class AskWhy(ControlRequest, tag="why", frozen=True):
     timeout: float
 
 
+class AskCauses(ControlRequest, tag="causes", frozen=True):
+    """What is wrong at addresses: of each the sentences of `AskWhy`, every one with the name of its cause."""
+
+    paths: tuple[str, ...]
+    timeout: float
+
+
 class AskQuarantined(ControlRequest, tag="quarantined", frozen=True):
     """The messages in quarantine, of one address or of all."""
 
@@ -346,6 +354,7 @@ AnyRequest = (
     | AskHistory
     | AskLives
     | AskWhy
+    | AskCauses
     | AskQuarantined
     | SettleQuarantined
     | AskConnections

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +13,7 @@ import typer
 from ...actors.errors import HoldfastError
 from ..overview import ActorRow
 from ..remote import RemoteChange, RemoteSystem
+from .losses import WARNINGS, held_up_by, lost_states, tops
 from .patterns import select
 from .reaching import (
     FAILED,
@@ -32,11 +32,6 @@ from .reaching import (
     reached,
     show_json,
 )
-
-MANY_CHILDREN = 10
-"""Children from which on it is asked before their supervisor is suspended."""
-MOST_NAMED = 5
-"""Actors that are named before something is lost; the others are counted."""
 
 
 def suspend(
@@ -101,7 +96,7 @@ def restart(
     with reached("restart", system, socket) as remote:
         all_rows = remote.look().rows
         rows = select(all_rows, paths)
-        confirm("restart", _lost_states(rows, all_rows), yes=yes)
+        confirm("restart", lost_states(rows, all_rows), yes=yes)
         done = [
             asyncio.run(remote.restart(row.path, timeout=timeout, at_once=at_once)) for row in _announced(rows, as_json)
         ]
@@ -163,8 +158,8 @@ def _end(
 ) -> None:
     with reached(verb, system, socket) as remote:
         all_rows = remote.look().rows
-        rows = _tops(select(all_rows, paths))
-        confirm(verb, [] if dry_run else lost_by(rows, all_rows), yes=yes)
+        rows = tops(select(all_rows, paths))
+        confirm(verb, [] if dry_run else WARNINGS[verb](rows, all_rows), yes=yes)
         _transact(
             remote,
             lambda change: _each(change.stop if verb == "stop" else change.remove, rows),
@@ -318,57 +313,3 @@ def show_change(change: RemoteChange, *, dry_run: bool, as_json: bool, lost: lis
     for line in (lost or ()) if dry_run else ():
         typer.echo(f"! {line}")
     typer.echo("nothing was done: this was a dry run" if dry_run else "done")
-
-
-def _tops(rows: list[ActorRow]) -> list[ActorRow]:
-    """Those that are below no other one of them: the others end with those."""
-    paths = {row.path for row in rows}
-    return [row for row in rows if not any(above in paths for above in _above(row.path))]
-
-
-def _above(path: str) -> list[str]:
-    found: list[str] = []
-    while path := path.rpartition("/")[0]:
-        found.append(path)
-    return found
-
-
-def _ending(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[ActorRow]:
-    """The actors that end: these, and all below them."""
-    paths = {row.path for row in rows}
-    return [row for row in all_rows if row.path in paths or any(above in paths for above in _above(row.path))]
-
-
-def held_up_by(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[str]:
-    """What waits while these are suspended, in words: of the root, and of supervisors with many children."""
-    children = Counter(row.path.rpartition("/")[0] for row in all_rows)
-    return [
-        f"while {row.path} is suspended it starts, stops and restarts none of its {children[row.path]} children: "
-        f"what ends stays down, and what it is asked for waits, until `holdfast resume {row.path}`"
-        for row in rows
-        if row.is_supervisor and (row.path.count("/") == 1 or children[row.path] >= MANY_CHILDREN)
-    ]
-
-
-def lost_by(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[str]:
-    """What is lost when these end for good, in words."""
-    return _lost_states(rows, all_rows) + _lost_messages(rows, all_rows)
-
-
-def _lost_states(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[str]:
-    """Whose state is lost when they end, in words."""
-    lost = [
-        row.path
-        for row in _ending(rows, all_rows)
-        if not (row.is_supervisor or row.recovery) and row.state != "stopped"
-    ]
-    if not lost:
-        return []
-    more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
-    return [f"without recovery, the state is lost of {', '.join(lost[:MOST_NAMED])}{more}"]
-
-
-def _lost_messages(rows: list[ActorRow], all_rows: list[ActorRow]) -> list[str]:
-    """How many waiting messages are handed back when they end, in words."""
-    count = sum(row.queued for row in _ending(rows, all_rows))
-    return [f"{count} waiting messages are handed back"] if count else []

@@ -11,7 +11,8 @@ import typer
 from ...actors.errors import SpecError
 from ...system.script import read_source
 from ..remote import RemoteChange, RemoteSystem
-from .changing import lost_by, show_change
+from .changing import show_change
+from .losses import lost_by
 from .reaching import UNUSABLE, DryRun, Json, Socket, System, Timeout, Yes, confirm, ended, reached, told
 from .scripts import run_script
 

@@ -13,7 +13,8 @@ import msgspec
 import typer
 
 from .reaching import FAILED, Json, Socket, System, complete_path, ended, reached, show_json
-from .remembering import moment, print_lines
+from .remembering import print_lines
+from .told_lines import moment
 
 
 def diagnose(

@@ -24,7 +24,7 @@ COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {
 FORM: Final = re.compile(r"(?P<glob>[^\[\]]+)(?:\[(?P<conditions>[^\[\]]*)\])?")
 CONDITION: Final = re.compile(r"\s*(?P<field>\w+)\s*(?P<verb>>=|<=|!=|=|>|<)\s*(?P<value>.*?)\s*")
 FIELDS: Final = tuple(name for name in ActorRow.__struct_fields__ if name not in ("path", "is_supervisor"))
-NUMBERS: Final = ("pid", "restarts", "queued", "turn_seconds")
+NUMBERS: Final = ("pid", "restarts", "queued", "turn_seconds", "allowed_bytes")
 
 
 class BadPattern(HoldfastError, text="pattern {pattern!r}: {problem}"):

@@ -12,7 +12,7 @@ import msgspec
 import typer
 
 from ... import events as events_of_all
-from ...system import PastEvent, PastLife
+from ...system import PastEvent
 from .reaching import (
     FAILED,
     UNUSABLE,
@@ -26,11 +26,10 @@ from .reaching import (
     reached,
     show_json,
 )
+from .told_lines import event_line, life_line
 
 ONE_LOOK = 30.0
 """Seconds that one request of `--follow` waits for the next event."""
-HIDDEN = frozenset({"traceback", "reason_kind", "turns", "longest_turn", "longest_message"})
-"""Fields of events that stand in `--json` only: their line would become too long."""
 KINDS = frozenset(events_of_all.__all__) | {"SystemStarted", "SystemStopped", "EventsLeftOut"}
 """The names of the events that there are."""
 
@@ -113,41 +112,3 @@ def _print_events(found: Iterable[PastEvent], *, as_json: bool) -> None:
             typer.echo(msgspec.json.encode(event).decode())
         else:
             print_lines([event_line(event)])
-
-
-def event_line(event: PastEvent) -> str:
-    """A past event as a line of text.
-
-    >>> event_line(PastEvent(7, 0.0, "ActorStarted", "/app/till", {"life": 2})).split()[2:]
-    ['7', '/app/till', 'ActorStarted', 'life=2']
-    """
-    fields = " ".join(f"{name}={value}" for name, value in event.fields.items() if name not in HIDDEN)
-    return f"{moment(event.at)} {event.number} {event.address} {event.kind} {fields}".rstrip()
-
-
-def life_line(life: PastLife) -> str:
-    """A past life as a line of text.
-
-    >>> life_line(PastLife(2, started=None, ended=0.0, reason="no such file")).partition(": ")[2]
-    'not started, no such file'
-    """
-    began = "not started" if life.started is None else moment(life.started)
-    parts = [f"life {life.number}: {began}"]
-    if life.ended is None:
-        parts.append("goes on")
-    else:
-        if life.started is not None:
-            parts.append(f"ended {moment(life.ended)}")
-        parts.append(life.reason)
-        parts += [f"handling {life.handling}"] if life.handling else []
-        parts += [f"by {life.by} ({life.because})"] if life.by else []
-        parts += [f"restart {life.restarts} of {life.allowed}"] if life.restarts is not None else []
-    parts += [f"{life.turns} turns"] if life.turns is not None else []
-    parts += [f"the longest {life.longest_turn:.1f} s with {life.longest_message}"] if life.longest_message else []
-    parts += [f"recovered in {sum(life.phases.values()):.3f} s, {life.replayed} replayed"] if life.phases else []
-    return ", ".join(parts)
-
-
-def moment(at: float) -> str:
-    """A moment as local time, with milliseconds."""
-    return f"{time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(at))}.{int(at % 1 * 1000):03d}"

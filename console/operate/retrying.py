@@ -8,7 +8,6 @@ import msgspec
 import typer
 from typer.core import TyperGroup
 
-from ...system.history.evidence import PutAside
 from ..remote import RemoteSystem
 from .reaching import (
     FAILED,
@@ -23,7 +22,8 @@ from .reaching import (
     reached,
     show_json,
 )
-from .remembering import moment, print_lines
+from .remembering import print_lines
+from .told_lines import quarantine_line
 
 LISTING = "list"
 
@@ -128,14 +128,3 @@ def _settle(remote: RemoteSystem, verb: Literal["retry", "drop"], path: str, id:
         print_lines(f"{words[verb]}: {quarantine_line(one)}" for one in done)
     if failed:
         raise ended(f"quarantine {verb}", "; ".join(failed), FAILED)
-
-
-def quarantine_line(one: PutAside) -> str:
-    """A message in quarantine as a line of text, its number behind its address.
-
-    >>> quarantine_line(PutAside("/app/till", "shop.Pay", 3, 0.0, "/app/clerk", 7)).split(" ", 2)[2]
-    '/app/till 7 shop.Pay from /app/clerk, 3 deaths'
-    """
-    sender = f" from {one.sender}" if one.sender else ""
-    payload = f": {one.payload}" if one.payload else ""
-    return f"{moment(one.since)} {one.address} {one.id} {one.message}{sender}, {one.attempts} deaths{payload}"

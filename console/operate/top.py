@@ -17,8 +17,8 @@ from textual.widgets import Footer, Input, Static
 from ...actors.errors import HoldfastError
 from ..overview import ActorRow, SystemLook
 from ..remote import NotReached, RemoteSystem
-from .changing import held_up_by, lost_by
 from .looking import COLOURS, inspection_lines
+from .losses import held_up_by, lost_by
 from .patterns import select
 from .row_list import RowList
 

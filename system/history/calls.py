@@ -13,11 +13,11 @@ from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
 from ...actors.seconds import check_seconds
 from ...supervision.supervisor import Supervisor
 from .counted_work import count_work
-from .evidence import PutAside, Told, collect, literal, put_aside
+from .evidence import Evidence, PutAside, Told, collect, literal, put_aside
 from .lives import PastLife, done
 from .pages import MOST_ON_PAGE, HistoryPage, HistoryQuestion, answer, question
 from .recorder import HistoryRecorder
-from .why import why
+from .why import Cause, causes, why
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node
@@ -121,8 +121,24 @@ class HistoryCalls:
             SpecError: the system was made with `history=False`.
         """
         check_seconds("why", "timeout", timeout)
-        path, node, recorder = _path(target), self._node, self._recorder
-        return why(collect(node, recorder, path, await self._ask_itself(path, timeout), self.quarantined(path)))
+        return why(await self._evidence(_path(target), timeout))
+
+    async def causes(self, target: ActorRef[Any] | str, *, timeout: float = DEFAULT_TIMEOUT) -> list[Cause]:
+        """Say what `why` says, each sentence with the name of its cause, for programs; nothing if nothing is wrong.
+
+        Args:
+            target: an actor, or an address, whether or not anybody lives there.
+            timeout: seconds that the actor's process may take to say how it is; the rest is known without it.
+
+        Raises:
+            SpecError: the system was made with `history=False`.
+        """
+        check_seconds("causes", "timeout", timeout)
+        return causes(await self._evidence(_path(target), timeout))
+
+    async def _evidence(self, path: str, timeout: float) -> Evidence:
+        node, recorder = self._node, self._recorder
+        return collect(node, recorder, path, await self._ask_itself(path, timeout), self.quarantined(path))
 
     def put_aside(self, target: ActorRef[Any] | str | None = None) -> list[PutAside]:
         """The messages in quarantine as plain data, oldest first; what is in them only with `log_payloads`.

@@ -215,7 +215,8 @@ def collect(
         answer(recorder, question(kinds=STORE_KINDS, limit=20)).events,
         told.status,
         told.queued_before,
-        outstanding(node, address),
+        # All mailboxes are searched for them, and only of a turn that goes on is anything said of its asks.
+        outstanding(node, address) if told.status is not None and told.status.turn is not None else [],
         None if cell is None else _allowance(cell),
         [put_aside(one) for one in quarantined],
         recorder.is_in_storm,

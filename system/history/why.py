@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
+from ...ftm.group.protected import ProtectionStatus
 from .evidence import LONG_TURN, MOST_TEXT, Evidence, PutAside, seconds_text
 from .lives import PastLife
 from .past_event import PastEvent
@@ -28,14 +30,25 @@ MUCH = 0.6
 Rule = Callable[[Evidence], list[str]]
 
 
+class Cause(NamedTuple):
+    """One sentence of `why`, with the name of the cause in the table `RULES` that it tells of."""
+
+    cause: str
+    sentence: str
+
+
+def causes(evidence: Evidence) -> list[Cause]:
+    """Say what is wrong at the address, a sentence for each thing, what weighs most first; nothing if all is well."""
+    return [Cause(name, sentence) for name, rule in RULES.items() for sentence in rule(evidence)]
+
+
 def why(evidence: Evidence) -> list[str]:
     """Say in sentences why the actor restarts, has ended, or does not get on: what weighs most comes first.
 
     >>> why(Evidence("/app/till", 0.0))
     ['Nobody lives at /app/till, and the history knows of no life there.']
     """
-    said = [sentence for rule in RULES.values() for sentence in rule(evidence)]
-    return said or [_well(evidence)]
+    return [one.sentence for one in causes(evidence)] or [_well(evidence)]
 
 
 def _well(evidence: Evidence) -> str:
@@ -299,7 +312,7 @@ def _memory(evidence: Evidence) -> list[str]:
 def _replicas(evidence: Evidence) -> list[str]:
     """Which replica was lost, when and by what; who leads since, and whether all of them are there again."""
     lost, over = _newest(evidence, "ReplicaLost"), _newest(evidence, "FailedOver")
-    gone, back = _newest(evidence, "ProtectionLost"), _newest(evidence, "ReplicaJoined")
+    back = _newest(evidence, "ReplicaJoined")
     is_back = lost is not None and back is not None and back.number > lost.number
     said: list[str] = []
     if lost is not None:
@@ -310,15 +323,28 @@ def _replicas(evidence: Evidence) -> list[str]:
         took = f"Replica {over.fields.get('replica')} took over {evidence.ago(over.at)}"
         said.append(f"{took}, in epoch {over.fields.get('epoch')}: {over.fields.get('why')}.")
     protection = evidence.protection
-    if said and protection is not None and protection.replicas:
-        states = ", ".join(f"{name} {state}" for name, state in protection.replicas.items())
-        whole = "It is whole again" if protection.is_whole else "It is not whole"
-        if back is not None and is_back:
-            whole += f", for {back.fields.get('replica')} came back {evidence.ago(back.at)}"
-        said.append(f"{whole}: {states}, epoch {protection.epoch}.")
+    if said and protection is not None and protection.replicas and protection.is_whole:
+        came = f", for {back.fields.get('replica')} came back {evidence.ago(back.at)}" if back and is_back else ""
+        said.append(f"It is whole again{came}: {_replica_states(protection)}.")
+    return said
+
+
+def _replicas_away(evidence: Evidence) -> list[str]:
+    """Which replicas are there, if one has to come back; whether any may die meanwhile."""
+    lost, over = _newest(evidence, "ReplicaLost"), _newest(evidence, "FailedOver")
+    gone, back = _newest(evidence, "ProtectionLost"), _newest(evidence, "ReplicaJoined")
+    protection = evidence.protection
+    said: list[str] = []
+    if (lost or over) and protection is not None and protection.replicas and not protection.is_whole:
+        said.append(f"It is not whole: {_replica_states(protection)}.")
     if gone is not None and (back is None or back.number < gone.number):
         said.append("It is not protected at the moment: no replica may die.")
     return said
+
+
+def _replica_states(protection: ProtectionStatus) -> str:
+    states = ", ".join(f"{name} {state}" for name, state in protection.replicas.items())
+    return f"{states}, epoch {protection.epoch}"
 
 
 def _store(evidence: Evidence) -> list[str]:
@@ -361,6 +387,7 @@ RULES: dict[str, Rule] = {
     "mailbox": _mailbox,
     "memory": _memory,
     "replicas": _replicas,
+    "replicas that are away": _replicas_away,
     "store": _store,
     "restarts of children": restarts_of_children,
     "children that are not there": ended_children,

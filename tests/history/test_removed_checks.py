@@ -171,8 +171,8 @@ CHECKS = {
         "test_a_question_from_outside_is_checked_there",
     ),
     "an operator is named": Check(
-        "console/endpoint.py",
-        "            ACTING.set(OPERATOR)  # In the context of the task of this request.\n",
+        "console/client_session.py",
+        "        ACTING.set(OPERATOR)  # In the context of the task of this request.\n",
         "",
         OUTSIDE,
         "test_an_operator_is_named_as_who_stopped_it",
