@@ -201,8 +201,7 @@ def build(cell: Cell, start: Start[Any], context_type: Callable[[Cell], ActorCon
         raise StartFailed(cell.path, str(reason)) from error
     if cell.more is not None and cell.more.tap is not None:
         cell.more.tap.attach()
-    if kind.turn_timeout is not None and cell.host.place.limits_turns:
-        TurnLimit(cell, kind.turn_timeout)
+    limit_turns(cell)
 
 
 def up(cell: Cell) -> None:
@@ -372,6 +371,13 @@ def cut_off(cell: Cell, item: Any) -> None:
         item.fail(AskFailed(cell.path, str(KILLED)))
 
 
+def limit_turns(cell: Cell) -> None:
+    """The actor at a cell is of this class from now on: have its turns end that take longer than that allows."""
+    seconds = None if cell.actor is None else cell.actor.turn_timeout
+    if seconds is not None and cell.host.place.limits_turns:
+        TurnLimit(cell, seconds)
+
+
 class TurnLimit:
     """Ends the life at a cell whose turn waits for too long; no turn is slower for it, for nothing is done in one.
 
@@ -379,19 +385,20 @@ class TurnLimit:
     given the whole time anew.
 
     Args:
-        cell: whose life has just been built.
+        cell: whose life has just been built, or has another class.
         seconds: that a turn may take.
     """
 
-    __slots__ = ("_cell", "_life", "_seconds")
+    __slots__ = ("_cell", "_kind", "_life", "_seconds")
 
     def __init__(self, cell: Cell, seconds: float) -> None:
         self._cell, self._life, self._seconds = weakref.ref(cell), cell.life, seconds
+        self._kind = type(cell.actor)
         cell.node.loop.call_later(seconds, self._look)
 
     def _look(self) -> None:
         cell = self._cell()
-        if cell is None or cell.life != self._life or cell.actor is None:
+        if cell is None or cell.life != self._life or type(cell.actor) is not self._kind:
             return
         turn = cell.more.turn if cell.more is not None else None
         loop = cell.node.loop

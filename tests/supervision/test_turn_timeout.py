@@ -142,6 +142,27 @@ async def test_a_life_that_has_ended_is_not_watched_any_more() -> None:
         assert await ref.ask(Count()) == 1
 
 
+class Patient(Waiter):
+    turn_timeout = None
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+@pytest.mark.parametrize("before", [Patient, Waiter])
+async def test_other_code_says_its_own(before: type[Waiter]) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(spec(before))
+        for kind, seconds in ((Quick, 0.2), (Waiter, 1.0), (Patient, 0.0)):
+            async with system.transaction() as change:
+                change.replace_code(ref, kind)
+            begun = asyncio.get_running_loop().time()
+            if seconds:
+                with pytest.raises(hf.errors.RemoteCrash, match="turn_timeout"):
+                    await ref.ask(Wait(), timeout=30)
+                assert asyncio.get_running_loop().time() - begun == pytest.approx(seconds, abs=0.01)
+            else:
+                assert await ref.ask(Wait(100.0), timeout=200) == 0
+
+
 @pytest.mark.parametrize("isolation", ["task", "process"])
 @pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["plain", "recorded"])
 async def test_wherever_it_lives(system: hf.ActorSystem, isolation: Any, recovery: Any) -> None:
