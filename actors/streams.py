@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ipaddress
 import select
 import socket
 from collections.abc import Awaitable, Callable
@@ -22,8 +23,22 @@ PAUSE: Final = 1.0
 LIMIT: Final = 64 * 1024
 """Bytes that a reader holds before whoever writes has to wait."""
 
+LOOPBACK_NAMES: Final = ("localhost", "ip6-localhost")
+
 Address = str | tuple[str, int]
 """The path of a Unix socket, or a host and a port."""
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host can only be reached from its own machine.
+
+    >>> is_loopback("127.0.0.1"), is_loopback("::1"), is_loopback("localhost"), is_loopback("10.0.0.7")
+    (True, True, True, False)
+    """
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host.lower() in LOOPBACK_NAMES
 
 
 def check_can_watch(*fds: int) -> None:
