@@ -14,6 +14,7 @@ RUNTIME = "tests/diagnosis/observers/test_runtime.py"
 BACKLOG = "tests/diagnosis/observers/test_backlog.py"
 REPLICAS = "tests/diagnosis/live/test_replicas.py"
 BRIDGES = "tests/diagnosis/bridges/test_bridges.py"
+BOARD = "tests/diagnosis/board/test_board.py"
 FLOW = "tests/diagnosis/observers/test_flow.py"
 
 CHECKS = {
@@ -191,6 +192,20 @@ CHECKS = {
         "if False:",
         BRIDGES,
         "posted_again",
+    ),
+    "a board takes no token in clear": Check(
+        "diagnosis/board/board_tls.py",
+        "not (is_encrypted or insecure or is_loopback(host))",
+        "False",
+        BOARD,
+        "in_clear",
+    ),
+    "a board that asks for certificates wants one": Check(
+        "diagnosis/board/board_tls.py",
+        "        context.verify_mode = ssl.CERT_REQUIRED\n",
+        "        pass\n",
+        BOARD,
+        "by_tls",
     ),
     "silence without input is no fault": Check(
         "diagnosis/observers/flow.py",
