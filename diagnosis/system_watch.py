@@ -13,6 +13,7 @@ from ..actors.kernel.node import Node
 from ..actors.kernel.ref import ActorRef
 from ..supervision.spec import ChildSpec, child
 from .assembly import observer, tree
+from .bridges.alerts import AlertObserver, no_alert
 from .diagnoser import SERVER, DiagnoserActor
 from .engine import Diagnosis
 from .generate import (
@@ -133,6 +134,7 @@ async def watch(
     hung_after: float | None = None,
     baselines: Baselines | None = None,
     repair_file: str | Path | None = None,
+    alerts: bool = False,
     name: str = "diagnosis",
     **options: Any,
 ) -> Watch:
@@ -161,6 +163,8 @@ async def watch(
         baselines: of a generated model: what is usual of its topics, such as `Baselines("usual.json")`, which is kept.
         repair_file: where the scores of advice, and what people have denied to repair, are kept for the next program,
             such as "repair.json"; None: nowhere.
+        alerts: whether alerts from outside count (`OutsideAlert` on `/alerts`): while one fires about a component,
+            `ok(COMPONENT.alerts)` does not hold.
         hung_after: seconds after which an actor that is still in the same turn counts as not running, such as one that
             others ask in vain. None: nothing takes too long.
         name: of the supervisor that is started.
@@ -173,13 +177,13 @@ async def watch(
     check_stance(repair)
     generated = await generate(system, seconds=seconds) if model is None else None
     watchers = [*observers]
-    if generated is not None:
+    live = None if generated is None else LiveWiring(generated)
+    if generated is not None and live is not None:
         declaration = generated.declaration
-        live = LiveWiring(generated)
         watchers += observers_for(
             generated, window=window, hung_after=hung_after, manner=manner, wiring=live, baselines=baselines
         )
-        follower = child("follower", Start(ModelFollower, (live, SERVER, _with_limits(limits))))
+        follower = child("follower", Start(ModelFollower, (live, SERVER, _completed(limits, alerts=alerts))))
         options["others"] = (*options.get("others", ()), follower)
     else:
         assert model is not None
@@ -194,6 +198,10 @@ async def watch(
     if limits:
         declaration = expecting(declaration, limits)
         watchers += property_observers(limits, where, manner)
+    if alerts:
+        declaration = _with_alerts(declaration, where)
+        heard = where if live is None else live.addresses
+        watchers.append(observer("alerts", Start(AlertObserver, (heard,))))
     mend = None
     if repair != "off":
         ways = _actions(system._node, where, actions)
@@ -204,14 +212,23 @@ async def watch(
     return Watch(started, system._node, where, generated)
 
 
-def _with_limits(limits: LimitsOf | None) -> Callable[[Generated], Generated]:
+def _completed(limits: LimitsOf | None, *, alerts: bool) -> Callable[[Generated], Generated]:
     """What is added to each model that is generated anew; limits of components that have gone are left out."""
 
     def adapt(found: Generated) -> Generated:
         kept = {name: some for name, some in (limits or {}).items() if name in found.addresses}
-        return msgspec.structs.replace(found, declaration=expecting(found.declaration, kept))
+        declaration = expecting(found.declaration, kept)
+        if alerts:
+            declaration = _with_alerts(declaration, found.addresses)
+        return msgspec.structs.replace(found, declaration=declaration)
 
     return adapt
+
+
+def _with_alerts(declaration: Declaration, components: Iterable[str]) -> Declaration:
+    """Return the declaration again, in which nobody outside complains about a component that works."""
+    more = tuple(Expectation(str(no_alert(name)), (name,)) for name in components)
+    return msgspec.structs.replace(declaration, expectations=(*declaration.expectations, *more))
 
 
 def expecting(declaration: Declaration, limits: LimitsOf) -> Declaration:

@@ -13,6 +13,8 @@ OBSERVATIONS = "tests/diagnosis/test_observations.py"
 RUNTIME = "tests/diagnosis/observers/test_runtime.py"
 BACKLOG = "tests/diagnosis/observers/test_backlog.py"
 REPLICAS = "tests/diagnosis/live/test_replicas.py"
+BRIDGES = "tests/diagnosis/bridges/test_bridges.py"
+BOARD = "tests/diagnosis/board/test_board.py"
 FLOW = "tests/diagnosis/observers/test_flow.py"
 
 CHECKS = {
@@ -155,6 +157,55 @@ CHECKS = {
         "            flow.begin(self.now)\n            flow.began = float('inf')\n",
         FLOW,
         "a_clock_that_has_stopped",
+    ),
+    "an alert needs the token": Check(
+        "diagnosis/bridges/alert_app.py",
+        "if not hmac.compare_digest(given, self._authorization):",
+        "if False:",
+        BRIDGES,
+        "of_prometheus",
+    ),
+    "an alert ends only with the last one about its component": Check(
+        "diagnosis/bridges/alerts.py",
+        "elif all(one.component != component for one in self._firing.values()):",
+        "else:",
+        BRIDGES,
+        "an_alert_by_the_topic or of_prometheus",
+    ),
+    "a request has an end": Check(
+        "diagnosis/bridges/alert_app.py",
+        "if len(body) > MOST_BYTES:",
+        "if False:",
+        BRIDGES,
+        "of_prometheus",
+    ),
+    "a token does not go over a network in clear": Check(
+        "diagnosis/bridges/delivery.py",
+        "not (insecure or is_loopback(parts.hostname))",
+        "False",
+        BRIDGES,
+        "cannot_work",
+    ),
+    "what was not taken is posted again": Check(
+        "diagnosis/bridges/webhook.py",
+        "if not (is_taken or is_refused):",
+        "if False:",
+        BRIDGES,
+        "posted_again",
+    ),
+    "a board takes no token in clear": Check(
+        "diagnosis/board/board_tls.py",
+        "not (is_encrypted or insecure or is_loopback(host))",
+        "False",
+        BOARD,
+        "in_clear",
+    ),
+    "a board that asks for certificates wants one": Check(
+        "diagnosis/board/board_tls.py",
+        "        context.verify_mode = ssl.CERT_REQUIRED\n",
+        "        pass\n",
+        BOARD,
+        "by_tls",
     ),
     "silence without input is no fault": Check(
         "diagnosis/observers/flow.py",
