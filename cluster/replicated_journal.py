@@ -432,7 +432,7 @@ class ReplicatedJournal:
         if not self._is_open:
             return
         try:
-            self._loop.finish(self.end(), 3 * CLOSE_SECONDS)
+            self._loop.finish(self.end(), 4 * CLOSE_SECONDS)
         except TimeoutError as error:
             raise StoreFailed(self.path, "its work for the engine does not end") from error
         finally:
@@ -456,10 +456,10 @@ class ReplicatedJournal:
         await asyncio.wait([done], timeout=CLOSE_SECONDS)
         left = submitted - self._progress.written if self._failure is None else 0
         await end_tasks(self._leading)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(CLOSE_SECONDS):
-                await self._keeper.release()
-                await self._engine.close()
+        for last in (self._keeper.release, self._engine.close):  # Servers that do not answer cost neither its time.
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(CLOSE_SECONDS):
+                    await last()
         if left > 0:
             problem = f"it has not answered for {CLOSE_SECONDS:g} s: {left} writes may be lost"
             self._fail(StoreFailed(self.path, problem))

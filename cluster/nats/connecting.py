@@ -180,9 +180,18 @@ class SystemClient(Client):
         raise AccessRefused(self.access.name, self._denied[-1], "give the key of a node, or let its user do that")
 
     async def close(self) -> None:
-        """Close the connection, if there ever was one to be made."""
-        if self._flush_queue is not None:  # Else the library asserts that there is.
-            await super().close()
+        """Close the connection, if there ever was one to be made; a server that takes nothing is not waited for."""
+        try:
+            if self._flush_queue is not None:  # Else the library asserts that there is.
+                await super().close()
+        finally:
+            self._let_go()
+
+    def _let_go(self) -> None:
+        """Close the socket at once, with what was not sent."""
+        transport = self._transport
+        if isinstance(transport, TcpTransport) and transport._io_writer is not None:
+            transport._io_writer.transport.abort()
 
     # What the library calls
 
@@ -201,9 +210,7 @@ class SystemClient(Client):
         Else it would be waited for until that is closed in good order: on a network that is cut 30 seconds with TLS,
         and as long as the kernel tries to send, a quarter of an hour, if anything was still to be sent.
         """
-        transport = self._transport
-        if isinstance(transport, TcpTransport) and transport._io_writer is not None:
-            transport._io_writer.transport.abort()
+        self._let_go()
         await super()._attempt_reconnect()
 
     async def _process_err(self, err_msg: str) -> None:

@@ -229,8 +229,9 @@ async def test_the_end_tells_whoever_waits(stage: Stage) -> None:
 
 async def test_a_simulated_journal_says_what_it_cannot_wait_for(stage: Stage) -> None:
     first = await stage.leader("first")
-    with pytest.raises(WouldWait, match=r"end at .* has to wait .* await it there"):
-        first.journal.close()
+    first.write()
+    with pytest.raises(WouldWait, match=r"_written at .* has to wait .* await it there"):
+        first.journal.sync()
 
 
 async def test_whoever_reads_long_keeps_the_lease_meanwhile() -> None:

@@ -287,6 +287,20 @@ CHECKS = {
         "tests/cluster/test_simulated_fleet.py",
         "clients_see_one_ledger",
     ),
+    "no system takes a copy that was not finished": Check(
+        "checkpoint/store_opening.py",
+        "if journal.noted(UNFINISHED) is not None:",
+        "if False:",
+        "tests/cluster/test_copy_faults.py",
+        "is_no_store",
+    ),
+    "a copy that was not finished is made anew": Check(
+        "cluster/store_copy.py",
+        "if dest.noted(UNFINISHED) is not None:",
+        "if False:",
+        "tests/cluster/test_copy_faults.py",
+        "is_no_store",
+    ),
     "the key is tried before anything is done": Check(
         "cluster/sealed_engine.py",
         "made.log.opened(last)",
