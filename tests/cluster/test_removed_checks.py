@@ -301,6 +301,27 @@ CHECKS = {
         "tests/cluster/test_copy_faults.py",
         "is_no_store",
     ),
+    "a leader that may not write any more does not wait": Check(
+        "cluster/nats/nats_engine.py",
+        "self._client.refuse_denied(self._names.log, denials)",
+        "pass",
+        "tests/cluster/test_takeover_on_nats.py",
+        "may_not_write",
+    ),
+    "large snapshots are there before the tree is started": Check(
+        "cluster/joining.py",
+        "await thread.run(journal.fetch())",
+        "pass",
+        "tests/cluster/test_simulated_fleet.py",
+        "large_snapshots",
+    ),
+    "the end of a system does not wait once more for servers that are silent": Check(
+        "cluster/replicated_journal.py",
+        "timeout=max(CLOSE_SECONDS - silent, 0.0)",
+        "timeout=CLOSE_SECONDS",
+        "tests/cluster/test_leadership.py",
+        "silent_servers",
+    ),
     "the key is tried before anything is done": Check(
         "cluster/sealed_engine.py",
         "made.log.opened(last)",
