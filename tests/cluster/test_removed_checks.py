@@ -113,8 +113,8 @@ CHECKS = {
     ),
     "an epoch names the last record that was read": Check(
         "cluster/leadership.py",
-        "append_behind(engine, record, reader.at)",
-        'append_behind(engine, record, (await engine.log.last() or LogRecord(0, b"")).sequence)',
+        "append_behind(engine, record, reader.at, patience)",
+        'append_behind(engine, record, (await engine.log.last() or LogRecord(0, b"")).sequence, patience)',
         FLEETS,
         "was_safe_is_there",
     ),

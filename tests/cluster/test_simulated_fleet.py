@@ -116,7 +116,9 @@ def weather(fleet: SimFleet) -> None:
     else:
         share = draw.choice([0.0, 0.01, 0.05])
         drawn = [share * draw.random() for _ in range(8)]
-        broker.faults = BrokerFaults(*drawn[:6], drawn[6] / 4, drawn[7], 0.2 * draw.random())
+        lost, unheard, late, doubled, refused, stale, silent, skipped = drawn
+        skew = 0.2 * draw.random()
+        broker.faults = BrokerFaults(lost, unheard, late, doubled, refused, stale, silent / 4, skipped, skew)
         fleet.post.faults = PostFaults(*(share * draw.random() for _ in range(3)))
 
 
