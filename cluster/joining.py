@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Final, TypeVar
 from urllib.parse import urlsplit
 
-from ..actors.errors import SpecError
+from ..actors.errors import HoldfastError, SpecError
 from ..checkpoint.engine_calls import Called
 from ..checkpoint.journal import DamagedStore, StoreEngine, StoreFailed, StoreInUse
 from ..checkpoint.store_key import StoreKey, read_store_key
@@ -107,7 +107,15 @@ async def join(
             if isinstance(error, Deposed):
                 _tell(loop, deposed, error)
 
-        return ReplicatedJournal(joined, thread, leading, lost=lost, patience=patience)
+        journal = ReplicatedJournal(joined, thread, leading, lost=lost, patience=patience)
+        if patience == math.inf:  # A tool reads all, one after another.
+            try:
+                await thread.run(journal.fetch())
+            except BaseException:
+                with contextlib.suppress(asyncio.CancelledError, HoldfastError):
+                    await thread.run(journal.end())
+                raise
+        return journal
     except BaseException as error:
         with contextlib.suppress(asyncio.CancelledError, TimeoutError):
             await asyncio.wait_for(thread.run(_let_go(opened, me)), 2.0)

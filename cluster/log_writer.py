@@ -66,6 +66,7 @@ class LogWriter:
 
     Attributes:
         steps: how many records and large values the engine has taken.
+        asked: since when the engine has not answered what is written now, on the loop's clock; inf: it owes nothing.
     """
 
     def __init__(
@@ -86,6 +87,7 @@ class LogWriter:
         self._freed: deque[str] = deque()
         self._has_freed = asyncio.Event()
         self._done = self.steps = 0
+        self.asked = math.inf
         self._grown, self._base_size = grown, 0
         self._base: Iterator[bytes] | None = None  # its further parts
         self._base_begins = 0
@@ -200,7 +202,9 @@ class LogWriter:
 
     async def _append(self, record: bytes) -> None:
         """Append one record behind the last one, as long as it takes."""
+        self.asked = asyncio.get_running_loop().time()
         stands = await append_behind(self._engine, record, self._maker.after)
+        self.asked = math.inf
         if not isinstance(stands, int):
             raise _deposed(stands, self._maker.epoch)
         self._maker.after = stands
@@ -208,7 +212,9 @@ class LogWriter:
         self._grown += len(record)
 
     async def _insist(self, call: Callable[[str, bytes], Awaitable[None]], name: str, data: bytes) -> None:
+        self.asked = asyncio.get_running_loop().time()
         await insist(lambda: call(name, data))
+        self.asked = math.inf
 
 
 async def insist(call: Callable[[], Awaitable[T]]) -> T:

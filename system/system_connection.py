@@ -126,7 +126,11 @@ class SystemConnection:
             raise SpecError("connect", f"{path!r} is no address of {self.system!r}: they begin with {top}/")
         return ActorRef(self._opened().far.stand_in(path))
 
-    async def whereis(self, name: str, kind: type[A] | None = None, *, timeout: float = 5.0) -> ActorRef[A]:
+    @overload
+    async def whereis(self, name: str, *, timeout: float = ...) -> ActorRef[Any]: ...
+    @overload
+    async def whereis(self, name: str, kind: type[A], *, timeout: float = ...) -> ActorRef[A]: ...
+    async def whereis(self, name: str, kind: type[Actor] = Actor, *, timeout: float = 5.0) -> ActorRef[Any]:
         """Return a ref to the actor of the other system that has a name there, given with `scope="fleet"`.
 
         Who leads the system has answered, and it was sure then that no other program does. The ref is to the address,

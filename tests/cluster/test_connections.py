@@ -15,7 +15,7 @@ import holdfast as hf
 from holdfast.actors.errors import AskDeadlock, BadMessage, BadReply, ConnectionLost, NotGranted
 from holdfast.actors.process.wire import frames
 from holdfast.cluster.lines.far_line import NEW
-from holdfast.cluster.lines.line import NOBODY, Boot, LineBatch
+from holdfast.cluster.lines.line import NOBODY, Boot, LineBatch, Note
 from holdfast.cluster.lines.lines import FORGET_SECONDS, SILENT_SECONDS, LineTaken
 from holdfast.testing.fleet.post import NO_POST_FAULTS, PostFaults
 from tests.cluster.reach import (
@@ -465,8 +465,8 @@ def test_two_systems_may_open_a_connection_to_each_other_at_the_same_time(faults
             await asyncio.gather(there.__aenter__(), back.__aenter__())
             ours, theirs = there.ref("/beta/plain", Account), back.ref("/alpha/plain", Account)
             for number in range(1, 21):
-                got = await asyncio.gather(ours.ask(Add(1), timeout=600.0), theirs.ask(Add(1), timeout=600.0))
-                assert got == [number, number]
+                asked = [ref.ask(Add(1), timeout=600.0) for ref in (ours, theirs)]
+                assert await asyncio.gather(*asked) == [number, number]
             assert (len(alpha.lines._lines), len(beta.lines._lines)) == (1, 1)
             for closed, still in ((there, theirs), (back, ours)):
                 await closed.close()
@@ -515,8 +515,9 @@ def test_nobody_takes_over_a_connection_by_a_greeting() -> None:
                 evil.own_place(), lambda data, back: heard.append(msgspec.msgpack.decode(data, type=LineBatch))
             )
             for to in (NOBODY, alpha.lines.boot):
-                for note in ("", "bye"):
-                    batch = LineBatch("beta", Boot(1 << 60, "ff"), to, 0, 1, (NEW + b"x",), note)  # type: ignore[arg-type]
+                notes: tuple[Note, ...] = ("", "bye")
+                for note in notes:
+                    batch = LineBatch("beta", Boot(1 << 60, "ff"), to, 0, 1, (NEW + b"x",), note)
                     evil.post("inbox of alpha", msgspec.msgpack.encode(batch), evil.own_place())
             await asyncio.sleep(5.0)
             assert await account.ask(Add(1)) == 2

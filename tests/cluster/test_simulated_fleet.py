@@ -10,9 +10,11 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.errors import ConnectionLost, NoSuchActor
+from holdfast.cluster.ports import Unanswered
 from holdfast.testing import History, Model, linearizable
 from holdfast.testing.fleet.broker import BrokerFaults
 from holdfast.testing.fleet.post import PostFaults
+from holdfast.testing.fleet.sim_engine import SimBlobs
 from holdfast.testing.fleet.sim_fleet import SimFleet, SimProgram
 from tests.cluster.fleets import simulate
 
@@ -114,7 +116,9 @@ def weather(fleet: SimFleet) -> None:
     else:
         share = draw.choice([0.0, 0.01, 0.05])
         drawn = [share * draw.random() for _ in range(8)]
-        broker.faults = BrokerFaults(*drawn[:6], drawn[6] / 4, drawn[7], 0.2 * draw.random())
+        lost, unheard, late, doubled, refused, stale, silent, skipped = drawn
+        skew = 0.2 * draw.random()
+        broker.faults = BrokerFaults(lost, unheard, late, doubled, refused, stale, silent / 4, skipped, skew)
         fleet.post.faults = PostFaults(*(share * draw.random() for _ in range(3)))
 
 
@@ -223,5 +227,55 @@ def test_what_a_program_raises_is_told() -> None:
             fleet.check()
         with pytest.raises(ValueError, match="broken"):
             await fleet.close()
+
+    simulate(run, 0)
+
+
+class Bulk(hf.Message[int]):
+    size: int
+
+
+class Warehouse(hf.Actor):
+    def __init__(self) -> None:
+        self.bulk = b""
+
+    @hf.on(Bulk)
+    def grow(self, message: Bulk) -> int:
+        self.bulk += random.Random(message.size).randbytes(message.size)
+        return len(self.bulk)
+
+
+async def warehouse(program: SimProgram) -> None:
+    async with program.open() as system:
+        await system.start(hf.child("warehouse", hf.start(Warehouse), recovery=hf.hybrid(every=1)))
+        await asyncio.Event().wait()
+
+
+def test_a_program_that_begins_to_lead_waits_for_its_large_snapshots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The servers do not answer for longer than any read waits, when it wants what stands beside the log."""
+    get, asked = SimBlobs.get, list[float]()
+
+    async def away(blobs: SimBlobs, name: str) -> bytes | None:
+        asked.append(asyncio.get_running_loop().time())
+        if asked[-1] < asked[0] + 45.0:
+            raise Unanswered("sim:broker", "it is away")
+        return await get(blobs, name)
+
+    async def run() -> None:
+        async with SimFleet() as fleet:
+            first = fleet.start(warehouse)
+            async with hf.connect(fleet.servers(), timeout=60.0) as connection:
+                actor = connection.ref("/app/warehouse", Warehouse)
+                assert await actor.ask(Bulk(1 << 18), timeout=60.0) == 1 << 18
+                async with asyncio.timeout(60.0):
+                    while not fleet.broker().blobs:
+                        await asyncio.sleep(0.1)
+                monkeypatch.setattr(SimBlobs, "get", away)
+                fleet.start(warehouse)
+                await asyncio.sleep(1.0)
+                fleet.kill(first)
+                assert await actor.ask(Bulk(0), timeout=200.0) == 1 << 18
+                fleet.check()
+        assert len(asked) > 1
 
     simulate(run, 0)
