@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from typing import Any
 
 import httpx
@@ -45,7 +45,7 @@ class Browser:
         return answer.json()
 
     @contextlib.asynccontextmanager
-    async def stream(self, path: str = "/live", query: str = "") -> AsyncIterator[EventReader]:
+    async def stream(self, path: str = "/live", query: str = "") -> AsyncGenerator[EventReader]:
         """Open a stream of events, and leave it at the end of the block."""
         cookies = "; ".join(f"{name}={value}" for name, value in self.http.cookies.items())
         reader = EventReader(self._app, path, query, cookies)
