@@ -60,7 +60,7 @@ class EventReader:
 
     def __init__(self, app: Dashboard, path: str, query: str, cookies: str) -> None:
         self.status = 0
-        self._left, self._reads = asyncio.Event(), asyncio.Event()
+        self._left, self._reads, self._answered = asyncio.Event(), asyncio.Event(), asyncio.Event()
         self._reads.set()
         self._parts: asyncio.Queue[bytes] = asyncio.Queue()
         self._rest = b""
@@ -77,7 +77,13 @@ class EventReader:
     async def _send(self, message: Message) -> None:
         await self._reads.wait()
         self.status = message.get("status", self.status)
+        self._answered.set()
         self._parts.put_nowait(message.get("body", b""))
+
+    async def answer(self) -> int:
+        """The status of the answer, as soon as there is one."""
+        await self._answered.wait()
+        return self.status
 
     def stop_reading(self) -> None:
         self._reads.clear()

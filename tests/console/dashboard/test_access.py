@@ -74,7 +74,8 @@ async def test_states_and_messages_are_for_operators_unless_it_is_said_otherwise
 ) -> None:
     asked = {"ask": "state", "path": "/app/left/a"}
     assert (await reader.post("/ask", asked)).status_code == 403
-    assert (await reader.http.get("/trace", params={"path": "/app/left/a"})).status_code == 403
+    async with reader.stream("/trace", "path=/app/left/a") as stream:
+        assert await stream.answer() == 403
     assert "count" in (await operator.post("/ask", asked)).json()["value"]
     shown = Browser(dashboard(system, readers=READERS, readers_see_state=True))
     assert (await shown.log_in(READERS)).json()["sees_state"] is True
