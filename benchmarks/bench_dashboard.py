@@ -16,7 +16,7 @@ import contextlib
 import shutil
 import statistics
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 
 import httpx
 from harness import Job, Run, main
@@ -51,7 +51,7 @@ class Echo(hf.Actor):
 
 
 @contextlib.asynccontextmanager
-async def served(actors: int) -> AsyncIterator[tuple[hf.ActorSystem, str]]:
+async def served(actors: int) -> AsyncGenerator[tuple[hf.ActorSystem, str]]:
     """A system of so many actors, with its dashboard."""
     async with hf.ActorSystem("bench", log=False) as system:
         for at in range(max(1, actors // (GROUP + 1))):
@@ -62,7 +62,7 @@ async def served(actors: int) -> AsyncIterator[tuple[hf.ActorSystem, str]]:
 
 
 @contextlib.asynccontextmanager
-async def browsed(url: str) -> AsyncIterator[Page]:
+async def browsed(url: str) -> AsyncGenerator[Page]:
     """A page in Chromium that shows the dashboard."""
     async with async_playwright() as playwright:
         browser = await playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
@@ -82,7 +82,7 @@ async def scrolling(run: Run) -> None:
 
         async def spent() -> float:
             told = {one["name"]: one["value"] for one in (await session.send("Performance.getMetrics"))["metrics"]}
-            return told["ScriptDuration"] + told["LayoutDuration"] + told["RecalcStyleDuration"]
+            return float(told["ScriptDuration"] + told["LayoutDuration"] + told["RecalcStyleDuration"])
 
         frames: list[float] = []
         for _ in range(run.size(10)):

@@ -154,6 +154,8 @@ def test_an_import_brings_nothing_that_few_programs_use() -> None:
     [
         ("cryptography", "sec", "import holdfast.ftm.sec.authority"),
         ("prometheus_client", "metrics", "import holdfast.console.telemetry.metrics"),
+        ("starlette", "dashboard", "import holdfast.console.dashboard"),
+        ("uvicorn", "dashboard", "import holdfast.console.dashboard"),
         ("opentelemetry", "traces", "import holdfast; holdfast.ActorSystem().trace_with(None)"),
     ],
 )

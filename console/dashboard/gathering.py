@@ -239,7 +239,7 @@ class Gathering:
         """Look at all actors as often as that costs little, and at those on the screens, or told of, in between."""
         loop = asyncio.get_running_loop()
         next_all = next_some = 0.0
-        costs: deque[float] = deque([0.0], maxlen=2)  # The dearer of two may have met something else that was slow.
+        costs, costs_of_some = (deque([0.0], maxlen=2) for _ in "ab")  # The dearer of two may have met something slow.
         while True:
             self._hurry.clear()
             begun, clock = loop.time(), time.perf_counter()  # The loop's own clock may have milliseconds only.
@@ -254,7 +254,8 @@ class Gathering:
             elif some and (begun >= next_some or self._hurried) and next_all - begun > QUICKEST:
                 self._hurried.clear()
                 self._take(await self._look(tuple(some)), some)
-                next_some = loop.time() + min(RAREST_SOME, max(QUICKEST, (time.perf_counter() - clock) / SHARE))
+                costs_of_some.append(time.perf_counter() - clock)
+                next_some = loop.time() + min(RAREST_SOME, max(QUICKEST, min(costs_of_some) / SHARE))
             await asyncio.sleep(QUICKEST / 4)  # However many events there are, the loop is left to others.
             is_watched = any(viewer.watched for viewer in self._viewers.values())
             due = min(next_all, next_some) if is_watched and next_all - loop.time() > QUICKEST else next_all

@@ -64,7 +64,7 @@ export function difference(lines) {
 // Gives an order; asks in the words of the command line first, if something would be lost. Returns what was done, or null.
 export async function order(verb, paths, { words = [], text = "", isDryRun = false } = {}) {
   const wanted = { verb, paths, words: words.map(String), text, is_dry_run: isDryRun };
-  const title = `${LABELS[verb] || verb} ${paths.length === 1 ? paths[0] : paths.length ? `${paths.length} actors` : ""}`.trim();
+  const title = `${(LABELS[verb] || verb).replace("…", "")} ${paths.length === 1 ? paths[0] : paths.length ? `${paths.length} actors` : ""}`.trim();
   try {
     let done = await act(wanted);
     if (done.warnings.length) {

@@ -17,7 +17,7 @@ const VIEWS = [
   ["events", "Events", eventsView], ["changes", "Changes", changesView], ["metrics", "Metrics", metricsView],
 ];
 const main = document.getElementById("main");
-let end = null, disconnect = null, wantsSearch = false;
+let end = null, disconnect = null, wantsSearch = false, hasShown = false;
 
 function where() {
   const [path, more = ""] = location.hash.replace(/^#\/?/, "").split("?");
@@ -43,6 +43,8 @@ function show() {
     if (link.dataset.view === view) { link.setAttribute("aria-current", "page"); link.scrollIntoView({ block: "nearest", inline: "nearest" }); } else link.removeAttribute("aria-current");
   }
   seek();
+  if (document.activeElement === document.body && hasShown) main.focus({ preventScroll: true }); // Tab goes on from here.
+  hasShown = true;
   document.title = view === "actor" ? `${path} · holdfast` : `${live.system || "holdfast"} · holdfast`;
 }
 

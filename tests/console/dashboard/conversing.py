@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from typing import Any
 
 import httpx
@@ -45,7 +45,7 @@ class Browser:
         return answer.json()
 
     @contextlib.asynccontextmanager
-    async def stream(self, path: str = "/live", query: str = "") -> AsyncIterator[EventReader]:
+    async def stream(self, path: str = "/live", query: str = "") -> AsyncGenerator[EventReader]:
         """Open a stream of events, and leave it at the end of the block."""
         cookies = "; ".join(f"{name}={value}" for name, value in self.http.cookies.items())
         reader = EventReader(self._app, path, query, cookies)
@@ -60,7 +60,7 @@ class EventReader:
 
     def __init__(self, app: Dashboard, path: str, query: str, cookies: str) -> None:
         self.status = 0
-        self._left, self._reads = asyncio.Event(), asyncio.Event()
+        self._left, self._reads, self._answered = asyncio.Event(), asyncio.Event(), asyncio.Event()
         self._reads.set()
         self._parts: asyncio.Queue[bytes] = asyncio.Queue()
         self._rest = b""
@@ -77,7 +77,13 @@ class EventReader:
     async def _send(self, message: Message) -> None:
         await self._reads.wait()
         self.status = message.get("status", self.status)
+        self._answered.set()
         self._parts.put_nowait(message.get("body", b""))
+
+    async def answer(self) -> int:
+        """The status of the answer, as soon as there is one."""
+        await self._answered.wait()
+        return self.status
 
     def stop_reading(self) -> None:
         self._reads.clear()

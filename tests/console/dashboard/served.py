@@ -43,9 +43,9 @@ async def main(leaves: int, with_diagnosis: bool) -> None:
             await system.start(spec)
         if with_diagnosis:
             await watch(system, repair="ask", seconds=1.0, hung_after=1.0)
-        # The last one: diagnosis takes no names with spaces.
-        async with system.transaction() as change:
-            change.add("/app/shop", hf.child(EVIL_NAME, hf.start(Worker)))
+        else:
+            async with system.transaction() as change:
+                change.add("/app/shop", hf.child(EVIL_NAME, hf.start(Worker)))
         app = dashboard(system, operators=OPERATORS, readers=READERS)
         async with open_dashboard(app) as url:
             print(url, flush=True)

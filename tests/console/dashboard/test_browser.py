@@ -148,6 +148,7 @@ def at(page: Page, view: str) -> None:
 
 def picture(page: Page, name: str) -> None:
     if PICTURES:
+        page.evaluate("document.getElementById('notes').replaceChildren()")
         page.screenshot(path=ROOT / PICTURES / f"dashboard-{name}.png")
 
 
@@ -170,7 +171,7 @@ def test_the_token_is_in_no_address_and_the_cookie_in_no_script(context: Browser
     assert "token" not in page.url
     assert page.evaluate("document.cookie") == ""
     [cookie] = context.cookies()
-    assert (cookie["httpOnly"], cookie["sameSite"]) == (True, "Strict")
+    assert (cookie.get("httpOnly"), cookie.get("sameSite")) == (True, "Strict")
     page.reload()
     expect(page.locator("#system")).to_have_text("/app")
 
@@ -194,6 +195,11 @@ def test_what_is_ill_comes_first_and_says_why_and_what_to_do(page: Page, served:
     expect(till_card).to_contain_text("because of /app/shop/bank, it seems")
     expect(page.locator("#summary")).to_have_text("2010 actors, 2 need attention")
     picture(page, "frozen")
+    page.emulate_media(color_scheme="dark")
+    page.set_viewport_size({"width": 400, "height": 800})
+    picture(page, "narrow")
+    page.emulate_media(color_scheme="light")
+    page.set_viewport_size({"width": 1280, "height": 800})
     bank_card.get_by_role("button", name="Kill the turn").click()
     confirm(page, "without recovery, the state is lost of /app/shop/bank")
     expect(page.locator("article.led")).to_have_count(0)
@@ -275,7 +281,9 @@ def test_a_protected_actor_shows_its_replicas(page: Page) -> None:
     drawn = page.get_by_role("img", name=re.compile(r"pbr, whole, epoch 1"))
     expect(drawn).to_contain_text("r1 leads")
     expect(drawn).to_contain_text("after: Checkpointing")
+    page.set_viewport_size({"width": 1280, "height": 960})
     picture(page, "actor")
+    page.set_viewport_size({"width": 1280, "height": 800})
     verb(page, "protect")
     expect(page.get_by_label("Mechanisms, outermost first")).to_have_value("pbr")
     page.keyboard.press("Escape")
@@ -392,6 +400,8 @@ def test_everything_is_reached_by_the_keyboard_alone(page: Page) -> None:
     page.keyboard.press("End")
     expect(at_row).to_contain_text("crowd")
     page.keyboard.press("Enter")
+    expect(page.locator("h1")).to_have_text("/app/crowd")
+    expect(page.locator("main")).to_be_focused()
     page.keyboard.press("Tab")
     for _ in range(40):  # From the head of the page to an order: each step shows where one is.
         focus = page.evaluate("getComputedStyle(document.activeElement).outlineStyle")
@@ -441,7 +451,6 @@ def test_it_is_dark_and_light_and_narrow(context: BrowserContext, served: Served
         assert page.locator("main").evaluate("main => main.scrollWidth - main.clientWidth") <= 0, view
     at(page, "")
     expect(page.get_by_role("treeitem").first).to_be_visible()
-    picture(page, "narrow")
 
 
 def test_who_may_look_sees_no_orders_and_no_states(context: BrowserContext, served: Served) -> None:

@@ -95,7 +95,7 @@ class = "tests.system.trees:Counter"
 
 
 async def test_a_tree_is_planned_asked_about_and_applied(system: hf.ActorSystem, operator: Browser) -> None:
-    plan = await operator.act("apply", text=TREE, is_dry_run=True)
+    plan = await operator.act("apply", text=TREE, is_dry_run=True, is_confirmed=True)
     assert plan["steps"]
     assert plan["lost"] == ["without recovery, the state is lost of /app/left/b, /app/left/c"]
     assert "/app/left/b" in await states(system)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import pytest
 
 from holdfast.console.dashboard.orders import VERBS
@@ -29,16 +30,20 @@ NOW = 1_000_000.0
 
 
 def row(path: str, **fields: Any) -> ActorRow:
-    known = {"state": "running", "place": "task", "pid": 7, "queued": 0, "turn": "", "turn_seconds": 0.0, **fields}
-    names = ("state", "place", "pid", "queued", "turn", "turn_seconds")
-    state, place, pid, queued, turn, since = (known.pop(name) for name in names)
-    return ActorRow(path, "m.C", state, place, pid, 0, queued, turn, since, "", (), (), "permanent", False, **known)
+    """A row of an actor that is well, but for these fields."""
+    well = ActorRow(path, "m.C", "running", "task", 7, 0, 0, "", 0.0, "", (), (), "permanent", False)
+    return msgspec.structs.replace(well, **fields)
 
 
-def seen(*rows: ActorRow, **more: Any) -> Seen:
+def seen(
+    *rows: ActorRow,
+    memory: dict[int, int] | None = None,
+    quarantined: frozenset[str] = frozenset(),
+    told: dict[str, float] | None = None,
+) -> Seen:
+    """What is known of a system with a root and these actors."""
     known = {one.path: one for one in (row("/app"), *rows)}
-    given = {"memory": {}, "quarantined": frozenset(), "told": {}, **more}
-    return Seen(NOW, "/app", known, given["memory"], given["quarantined"], given["told"])
+    return Seen(NOW, "/app", known, memory or {}, quarantined, told or {})
 
 
 def test_there_is_advice_for_each_cause_and_for_no_other() -> None:
