@@ -6,6 +6,7 @@ Two programs that call each other have one line, which is there as long as one o
 from __future__ import annotations
 
 import asyncio
+import functools
 import re
 from collections.abc import Callable
 from typing import Final
@@ -53,7 +54,7 @@ class LineGate:
 
     def reach(self, far: FarLine) -> None:
         """From now on the other program is reached where it has said that answers go."""
-        far.post_bytes = lambda data: self._post(far, data)
+        far.post_bytes = functools.partial(self._post, far)
 
     def left(self, far: FarLine) -> None:
         """The line is over."""

@@ -108,7 +108,8 @@ class SimProgram:
             standby: how it waits; None does not.
             options: further arguments of `ActorSystem`.
         """
-        named, told = name or self.servers.system, {"log": False, **options}
+        named = name or self.servers.system
+        told: dict[str, Any] = {"log": False, **options}
         self.system = ActorSystem(named, store=self.servers, standby=standby, **told)
         return self.system
 

@@ -132,9 +132,6 @@ CHECKS: dict[str, Check] = {
         CONNECTIONS,
         "away_are_refused",
     ),
-}
-
-CHECKS |= {
     "a program that has too many messages waiting is held back": Check(
         "cluster/lines/inflow.py",
         "self.is_full = not self.has_room(1.0)",
