@@ -235,6 +235,14 @@ class Unreachable(SendError, text="{actor} cannot be reached: {problem}; nothing
     problem: str
 
 
+class ConnectionFull(SendError, text="{system} takes no more from {program} for now: {problem}; it was not handled"):
+    """A program has as much outstanding in another system as it may: wait for what is out, or raise the limit there."""
+
+    system: str
+    program: str
+    problem: str
+
+
 class RemoteCrash(HoldfastError):
     """The receiver's handler raised; the actor crashed.
 
@@ -294,6 +302,19 @@ class WaitTimeout(HoldfastError, text="{actor} has waited for {message}, and its
 
     actor: str
     message: str
+
+
+class TurnTimeout(
+    HoldfastError, text="{actor} has been in the turn of {message} for {seconds:g} s, which is its turn_timeout"
+):
+    """A turn has waited for longer than its actor's class allows; the actor has crashed by this error.
+
+    Its cause is the cancellation of the turn, whose traceback says where it has waited.
+    """
+
+    actor: str
+    message: str
+    seconds: float
 
 
 class ReplayDiverged(HoldfastError):

@@ -387,6 +387,28 @@ class LeadershipTaken(Event, frozen=True, eq=False):
     epoch: int
 
 
+class ConnectionLimited(Event, frozen=True, eq=False):
+    """A program wants more of a system than its `ConnectionLimits` allow, and is refused.
+
+    Both ends tell it, once for each kind and line; `address` is that of the other system. `what` is over its limit,
+    such as asks or subscriptions, and `problem` says how many there are.
+    """
+
+    what: str
+    problem: str
+
+
+class KeptForSystem(Event, frozen=True, eq=False):
+    """Much is kept for another system that does not take it: what recorded actors tell it. `address` is that system's.
+
+    Told when half of the limit is reached, and when the limit is; `is_full`: what else it is told is a dead letter.
+    """
+
+    messages: int
+    bytes: int
+    is_full: bool
+
+
 class TurnSlow(Event, frozen=True, eq=False):
     """A turn occupied the event loop for at least `seconds`: nothing else ran meanwhile; `message` is its type.
 

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ipaddress
 import select
 import socket
+import ssl
 from collections.abc import Awaitable, Callable
 from typing import Any, Final
 
@@ -19,11 +21,27 @@ AT_ONCE: Final = 32
 """Connections that are accepted before others have the loop."""
 PAUSE: Final = 1.0
 """Seconds until a listener that could take nobody, for the system had no room, looks again."""
+GREETING: Final = 5.0
+"""Seconds in which two sides agree on how they encrypt."""
 LIMIT: Final = 64 * 1024
 """Bytes that a reader holds before whoever writes has to wait."""
 
+LOOPBACK_NAMES: Final = ("localhost", "ip6-localhost")
+
 Address = str | tuple[str, int]
 """The path of a Unix socket, or a host and a port."""
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host can only be reached from its own machine.
+
+    >>> is_loopback("127.0.0.1"), is_loopback("::1"), is_loopback("localhost"), is_loopback("10.0.0.7")
+    (True, True, True, False)
+    """
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host.lower() in LOOPBACK_NAMES
 
 
 def check_can_watch(*fds: int) -> None:
@@ -36,8 +54,10 @@ def check_can_watch(*fds: int) -> None:
             scratch.register(fd, select.EPOLLIN)
 
 
-async def connect(address: Address, *, limit: int = LIMIT) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    """Connect to whoever listens at an address.
+async def connect(
+    address: Address, *, limit: int = LIMIT, tls: ssl.SSLContext | None = None
+) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """Connect to whoever listens at an address; with `tls` what is sent is encrypted, and who is there must prove it.
 
     Raises:
         OSError: nobody takes connections there, or the system cannot watch one more.
@@ -51,7 +71,8 @@ async def connect(address: Address, *, limit: int = LIMIT) -> tuple[asyncio.Stre
             await asyncio.get_running_loop().sock_connect(sock, where)
             if family == socket.AF_UNIX:
                 return await asyncio.open_unix_connection(sock=sock, limit=limit)
-            return await asyncio.open_connection(sock=sock, limit=limit)
+            named = None if tls is None else address[0]
+            return await asyncio.open_connection(sock=sock, limit=limit, ssl=tls, server_hostname=named)
         except OSError as error:
             sock.close()
             problem = error
@@ -80,6 +101,7 @@ class Listener:
         sock: it listens; it does not block. Whoever made it closes it.
         serve: has one connection, to its end; it runs as a task.
         turn_away: has a connection that cannot be watched, and closes it.
+        tls: has connections encrypted; whoever has not agreed on that within `GREETING` seconds is not served.
     """
 
     def __init__(
@@ -89,8 +111,9 @@ class Listener:
         turn_away: Callable[[socket.socket, OSError], None] = lambda client, error: client.close(),
         *,
         limit: int = LIMIT,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
-        self._sock, self._serve, self._turn_away, self._limit = sock, serve, turn_away, limit
+        self._sock, self._serve, self._turn_away, self._limit, self._tls = sock, serve, turn_away, limit, tls
         self._loop = asyncio.get_running_loop()
         self._pause: asyncio.TimerHandle | None = None
         self._is_watched = False
@@ -150,6 +173,9 @@ class Listener:
             undo.callback(client.close)
             with contextlib.suppress(OSError):  # It has gone.
                 await self._loop.connect_accepted_socket(
-                    lambda: asyncio.StreamReaderProtocol(reader, self._serve, self._loop), client
+                    lambda: asyncio.StreamReaderProtocol(reader, self._serve, self._loop),
+                    client,
+                    ssl=self._tls,
+                    ssl_handshake_timeout=None if self._tls is None else GREETING,
                 )
                 undo.pop_all()

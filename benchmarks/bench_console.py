@@ -8,7 +8,9 @@ Command: python benchmarks/bench_console.py [--quick]
 from __future__ import annotations
 
 import asyncio
+import gc
 import json
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -157,6 +159,88 @@ async def changing(run: Run) -> None:
         run.bound(f"p99 of {what} while {CHANGED:,} children are added", p99, unit="ms", target=20.0)
 
 
+class Pay(hf.Message[int]):
+    """Count one more."""
+
+
+class Account(hf.Actor):
+    """Counts."""
+
+    def __init__(self) -> None:
+        self.total = 0
+
+    @hf.on(Pay)
+    def pay(self, message: Pay) -> int:
+        self.total += 1
+        return self.total
+
+
+class Clerk(hf.Actor):
+    """Has the account count that it is bound to."""
+
+    account: hf.Binding[Account]
+
+    @hf.on(Pay)
+    async def pay(self, message: Pay) -> int:
+        return await self.account.ask(Pay())
+
+
+PAIRS = 25
+"""Clerks, each with an account; a transaction has four operations for each of them."""
+ASKERS = 4
+"""Of each clerk, each with one ask outstanding: nothing is ever idle."""
+
+
+async def loaded(run: Run) -> None:
+    """A hundred operations, again and again, while 100 askers have clerks ask accounts as fast as they can."""
+    rounds = 5 if run.quick else 40
+    taken: list[float] = []  # by the asks that were out lately
+    p99: tuple[list[float], list[float]] = [], []  # of each round: without a change, and with one
+    async with hf.ActorSystem("bench", log=False) as system:
+        accounts = await system.start(hf.supervisor("accounts", children=[]))
+        desk = await system.start(hf.supervisor("clerks", children=[]))
+        clerks: list[hf.ActorRef[Clerk]] = []
+        for number in range(PAIRS):
+            await accounts.ask(hf.StartChild(hf.child(f"a0-{number}", hf.start(Account))))
+            bound = {"account": f"/bench/accounts/a0-{number}"}
+            clerks.append(await desk.ask(hf.StartChild(hf.child(f"c{number}", hf.start(Clerk), bindings=bound))))
+        is_over = False
+
+        async def ask(clerk: hf.ActorRef[Clerk]) -> None:
+            while not is_over:
+                began = time.perf_counter()
+                await clerk.ask(Pay(), timeout=60.0)  # An ask that is lost ends the benchmark.
+                taken.append(time.perf_counter() - began)
+
+        def note(values: list[float]) -> None:
+            values.append(sorted(taken)[int(len(taken) * 0.99)] * 1e3)
+            taken.clear()
+
+        async with asyncio.TaskGroup() as askers:
+            for clerk in clerks * ASKERS:
+                askers.create_task(ask(clerk))
+            for turn in range(rounds):
+                gc.collect()
+                await asyncio.sleep(0.1)
+                taken.clear()
+                await asyncio.sleep(0.1)
+                note(p99[0])
+                async with system.transaction(timeout=60.0) as change:
+                    for number, clerk in enumerate(clerks):
+                        new = change.add("/bench/accounts", hf.child(f"a{turn + 1}-{number}", hf.start(Account)))
+                        change.bind(clerk, "account", new)
+                        change.respecify(clerk, shutdown=float(5 + turn % 2))
+                        change.remove(f"/bench/accounts/a{turn}-{number}")
+                assert len(change.operations) == 4 * PAIRS
+                await asyncio.sleep(0.01)  # Also asks that were out at its end are.
+                note(p99[1])
+            is_over = True
+    quiet, busy = map(statistics.median, p99)
+    run.bound(
+        "p99 added to asks by a change of 100 operations under full load, 0 lost", busy - quiet, unit="ms", target=10.0
+    )
+
+
 if __name__ == "__main__":
     match sys.argv[1:]:
         case ["client", where, requests]:
@@ -166,4 +250,4 @@ if __name__ == "__main__":
         case ["changer", where, count]:
             changer(where, int(count))
         case _:
-            main([saturated, tree, changing])
+            main([saturated, tree, changing, loaded])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import get_args
+from typing import Final, get_args
 
 from ..actors.errors import SpecError
 from .engine_calls import Called
@@ -37,12 +37,18 @@ def open_journal(store: str | Journal | None, *, takeover: bool = False, key: St
     return Called(engine, StoreFile(engine.path, secret))
 
 
+UNFINISHED: Final = "copy that was not finished"
+"""The fact that a store has while something is copied into it."""
+
+
 def check_system(journal: Journal, system: str) -> None:
     """Refuse a store that another system has filled: under this name nothing of it would come back.
 
     Raises:
-        SpecError: naming the systems whose it is.
+        SpecError: naming the systems whose it is; or it is a copy that was never finished.
     """
+    if journal.noted(UNFINISHED) is not None:
+        raise SpecError("store", "it is a copy that was never finished: make it again, by `holdfast store copy`")
     names = {address.split("/")[1] for address in journal.addresses() if address.startswith("/")}
     if names and system not in names:
         known = ", ".join(map(repr, sorted(names)))
@@ -78,7 +84,8 @@ def check_store_key(store: str | Journal | None, key: StoreKey | None) -> None:
     """Refuse a key for what is not encrypted.
 
     Raises:
-        SpecError: the store is none of holdfast's own on the disk.
+        SpecError: the store is none of holdfast's own on disks.
     """
-    if key is not None and not (isinstance(store, str) and store.startswith("sqlite:")):
-        raise SpecError("ActorSystem", "store_key needs a store on the disk that it encrypts: store='sqlite:PATH'")
+    if key is not None and not (isinstance(store, str) and store.startswith(("sqlite:", "nats:", "tls:"))):
+        problem = "store_key needs a store on the disk that it encrypts: store='sqlite:PATH', or 'nats://HOST/NAME'"
+        raise SpecError("ActorSystem", problem)

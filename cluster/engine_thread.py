@@ -46,6 +46,14 @@ class EngineLoop(Protocol):
         """
         ...
 
+    def finish(self, work: Coroutine[Any, Any, None], seconds: float) -> None:
+        """Run the last coroutine on that loop.
+
+        Raises:
+            TimeoutError: it has taken longer, and was cancelled.
+        """
+        ...
+
     def close(self) -> None:
         """End the loop; everything that still runs on it is cancelled."""
         ...
@@ -93,6 +101,10 @@ class EngineThread:
         except concurrent.futures.TimeoutError:
             running.cancel()
             raise
+
+    def finish(self, work: Coroutine[Any, Any, None], seconds: float) -> None:
+        """Run the last coroutine on that loop, and wait for it; see `EngineLoop`."""
+        self.wait(work, seconds)
 
     def close(self) -> None:
         """End the loop and its thread; see `EngineLoop`."""

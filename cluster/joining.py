@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import os
 from collections.abc import Awaitable, Callable, Mapping
-from importlib.util import find_spec
 from typing import Final, TypeVar
 from urllib.parse import urlsplit
 
-from ..actors.errors import SpecError
+from ..actors.errors import HoldfastError, SpecError
 from ..checkpoint.engine_calls import Called
 from ..checkpoint.journal import DamagedStore, StoreEngine, StoreFailed, StoreInUse
+from ..checkpoint.store_key import StoreKey, read_store_key
 from ..checkpoint.store_opening import open_journal
-from .engine_thread import EngineThread
 from .leadership import LeaderElsewhere, Standby, give_up, lead, leader_name
 from .log_records import DamagedLog
 from .log_writer import FIRST_PAUSE, LONGEST_PAUSE, Deposed
 from .ports import Engine, Unanswered
 from .replicated_journal import ReplicatedJournal
+from .sealed_engine import sealed
+from .servers import Servers, servers_of
 
 T = TypeVar("T")
+TOOL_SECONDS: Final = 30.0
+"""How long a tool waits for servers that take nothing."""
 SILENT_SECONDS: Final = 30.0
 """How often a program that waits says that the servers do not answer."""
 
@@ -32,11 +36,11 @@ def is_replicated(store: object) -> bool:
     >>> [is_replicated(store) for store in ("nats://a,b/app", "sqlite:app.db", None)]
     [True, False, False]
     """
-    return isinstance(store, str) and store.startswith(("nats://", "tls://"))
+    return isinstance(store, Servers) or (isinstance(store, str) and store.startswith(("nats://", "tls://")))
 
 
 async def join(
-    store: str,
+    store: str | Servers,
     system: str,
     standby: Standby | None,
     settings: Mapping[str, str | bool | int],
@@ -45,11 +49,13 @@ async def join(
     silent: Callable[[str], None],
     deposed: Callable[[Deposed], None],
     is_new: bool = True,
+    key: StoreKey | None = None,
+    patience: float = math.inf,
 ) -> ReplicatedJournal:
     """Wait until this program leads the system, and return the journal of its store.
 
     Args:
-        store: "nats://HOST,HOST/NAME".
+        store: "nats://HOST,HOST/NAME", or such servers.
         system: the name of the system.
         standby: how to wait while another program leads; `None` does not.
         settings: how the servers are reached, see `access_of`.
@@ -57,30 +63,36 @@ async def join(
         silent: told on the running loop why no server answers, at once and each SILENT_SECONDS, while that is so.
         deposed: told on the running loop that another program leads.
         is_new: whether it is made if it is not there.
+        key: encrypts what is kept there, see `read_store_key`.
+        patience: seconds after which a `sync` of which the servers take nothing fails.
 
     Raises:
-        SpecError: the store cannot be read, or the library for it is missing.
+        SpecError: the store cannot be read, or the library for it is missing; or the key is none.
+        WrongStoreKey: the key is not the one that the store was made with; nothing was changed.
         AccessRefused: the servers do not let this program in.
         StoreInUse: another program leads, and this one was not to wait.
         StoreFailed: no server can be reached, and this program was not to wait; or the store is not there.
         UnsafeServer: the servers may lose what they have acknowledged.
         DamagedStore: what the log holds cannot be used.
     """
-    if find_spec("nats") is None:
-        kind = store.partition(":")[0]
-        raise SpecError("store", f"{kind}:// needs the library nats-py: pip install 'holdfast[nats]'")
-    from .nats.access import access_of
-    from .nats.nats_engine import open_engine  # only now: it imports that library
-
-    access = access_of(store, settings)
+    servers, secret = servers_of(store, settings), read_store_key(key)
     loop = asyncio.get_running_loop()
     me = leader_name()
-    thread = EngineThread(f"holdfast {system}")
+    thread = servers.engine_loop(f"holdfast {system}")
+
+    async def connected() -> Engine:
+        engine = await servers.open_engine(is_new=is_new)
+        try:
+            return await sealed(engine, secret, servers.system)
+        except BaseException:
+            await engine.close()
+            raise
+
     opened: list[Engine] = []  # filled in there: whoever is cancelled here would not get to know of it
     unanswered = NowAndThen(lambda problem: _tell(loop, silent, problem))
     try:
         insists = unanswered if standby is not None else None
-        joined = await thread.run(_connected(lambda: open_engine(access, is_new=is_new), insists, opened))
+        joined = await thread.run(_connected(connected, insists, opened))
         leading = await thread.run(
             lead(
                 joined,
@@ -95,12 +107,20 @@ async def join(
             if isinstance(error, Deposed):
                 _tell(loop, deposed, error)
 
-        return ReplicatedJournal(joined, thread, leading, lost=lost)
+        journal = ReplicatedJournal(joined, thread, leading, lost=lost, patience=patience)
+        if patience == math.inf:  # A tool reads all, one after another.
+            try:
+                await thread.run(journal.fetch())
+            except BaseException:
+                with contextlib.suppress(asyncio.CancelledError, HoldfastError):
+                    await thread.run(journal.end())
+                raise
+        return journal
     except BaseException as error:
         with contextlib.suppress(asyncio.CancelledError, TimeoutError):
             await asyncio.wait_for(thread.run(_let_go(opened, me)), 2.0)
         await asyncio.to_thread(thread.close)
-        named = opened[0].name if opened else store.partition("?")[0]
+        named = opened[0].name if opened else str(store).partition("?")[0]
         match error:
             case LeaderElsewhere():
                 raise StoreInUse(named, 0, error.leader) from error
@@ -165,7 +185,11 @@ async def _connected(
 
 
 def open_store(
-    store: str, settings: Mapping[str, str | bool | int] | None = None, *, is_new: bool = True
+    store: str,
+    settings: Mapping[str, str | bool | int] | None = None,
+    *,
+    is_new: bool = True,
+    key: StoreKey | None = None,
 ) -> StoreEngine:
     """Open a store by itself, for a tool: no system may have it open, and none may open it meanwhile.
 
@@ -173,9 +197,11 @@ def open_store(
         store: "sqlite:PATH" or "nats://HOST,HOST/NAME".
         settings: how servers are reached, see `access_of`.
         is_new: whether it is made if it is not there.
+        key: of an encrypted store, see `read_store_key`.
 
     Raises:
-        SpecError: the name cannot be read, or is that of memory.
+        SpecError: the name cannot be read, or is that of memory; or the key is none.
+        WrongStoreKey: the key is not the store's.
         StoreFailed: it is not there, or cannot be reached. AccessRefused: the servers do not let this program in.
         StoreInUse, DamagedStore, UnsafeServer: it cannot be opened.
     """
@@ -185,15 +211,14 @@ def open_store(
     if not is_replicated(store):
         if not is_new and kind == "sqlite" and path and not os.path.exists(path):
             raise StoreFailed(path, "there is no such file; name the database, as in store='sqlite:PATH'")
-        return open_journal(store)
+        return open_journal(store, key=key)
 
     def pass_over(what: object) -> None:
         """Nobody waits here to whom it would matter."""
 
     async def joined() -> ReplicatedJournal:
-        return await join(
-            store, "tool", None, settings or {}, waits=pass_over, silent=pass_over, deposed=pass_over, is_new=is_new
-        )
+        told = {"waits": pass_over, "silent": pass_over, "deposed": pass_over}
+        return await join(store, "tool", None, settings or {}, is_new=is_new, key=key, patience=TOOL_SECONDS, **told)
 
     return Called(asyncio.run(joined()))
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import os
 import random
 import socket
@@ -50,6 +51,8 @@ QUIET_SECONDS: Final = 2.0
 """Without a record for so long, a follower asks the log whether it has missed any."""
 MOST_READERS: Final = 5
 """Readers that have to begin a log with a record that begins nothing, before it is the log that is damaged."""
+PATIENCE_SECONDS: Final = 30.0
+"""How long a program that is not to wait tries to write that it leads."""
 RENEWALS: Final = 6
 """How often a leader renews its lease in the time that it lasts."""
 TRUSTED: Final = 0.75
@@ -252,7 +255,8 @@ async def lead(
                 await follower.begin_anew()
             renewing = asyncio.ensure_future(keeper.renew_while_reading(follower))
             try:
-                maker = await _begin_epoch(engine, me, follower, keeper)
+                patience = math.inf if standby is not None else PATIENCE_SECONDS
+                maker = await _begin_epoch(engine, me, follower, keeper, patience)
             except Unanswered as error:
                 if standby is None:
                     raise
@@ -323,7 +327,9 @@ async def _take_lease(
         await asyncio.sleep(LOOK_SECONDS * random.uniform(0.5, 1.0))
 
 
-async def _begin_epoch(engine: Engine, me: str, follower: Follower, keeper: LeaseKeeper) -> RecordMaker | None:
+async def _begin_epoch(
+    engine: Engine, me: str, follower: Follower, keeper: LeaseKeeper, patience: float
+) -> RecordMaker | None:
     """Append the beginning of an epoch behind all that stands in the log; `None` if the lease is over before that."""
     loop = asyncio.get_running_loop()
     attempt = uuid.uuid4().hex
@@ -332,7 +338,7 @@ async def _begin_epoch(engine: Engine, me: str, follower: Follower, keeper: Leas
         reader = follower.reader
         maker = RecordMaker(reader.epoch + 1, reader.at)
         record = maker.beginning(EpochBegun(me, attempt, FORMAT, time.time()))
-        stands = await append_behind(engine, record, reader.at)
+        stands = await append_behind(engine, record, reader.at, patience)
         if isinstance(stands, int):
             reader.check_whole()
             maker.after = stands

@@ -27,6 +27,8 @@ FORMAT: Final = 1
 """Of the records that are written. Whoever finds a higher one does not read on."""
 PART: Final = 512 << 10
 """Most bytes of what stands in one record."""
+SEALED: Final = b"\xc1hf1"
+"""How encrypted records begin; no record does that is not (MessagePack never uses that byte)."""
 EPOCH, CHANGES, BASE = "epoch", "changes", "base"
 
 
@@ -85,6 +87,8 @@ def read_part(record: LogRecord) -> LogPart:
     Raises:
         DamagedLog: it is none of ours, or damaged.
     """
+    if record.data.startswith(SEALED):
+        raise DamagedLog(record.sequence, "it is encrypted, and there is no key for it: give store_key=...")
     try:
         part = _decode_part(record.data)
     except msgspec.DecodeError as error:

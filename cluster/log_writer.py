@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from typing import Final, NamedTuple, TypeVar
@@ -62,6 +63,10 @@ class LogWriter:
         grown: bytes that the log has beside the newest base.
         written: told how many of the writes that were submitted stand in the log.
         want_base: called when it is worth writing all that lives anew: to submit that.
+
+    Attributes:
+        steps: how many records and large values the engine has taken.
+        asked: since when the engine has not answered what is written now, on the loop's clock; inf: it owes nothing.
     """
 
     def __init__(
@@ -81,7 +86,8 @@ class LogWriter:
         self._may_write.set()
         self._freed: deque[str] = deque()
         self._has_freed = asyncio.Event()
-        self._done = 0
+        self._done = self.steps = 0
+        self.asked = math.inf
         self._grown, self._base_size = grown, 0
         self._base: Iterator[bytes] | None = None  # its further parts
         self._base_begins = 0
@@ -148,6 +154,7 @@ class LogWriter:
         for write in taken:
             for name, data in write.puts:
                 await self._insist(self._engine.blobs.put, name, data)
+                self.steps += 1
         if taken[0].base is not None:
             await self._begin_base(taken[0].base)
         else:
@@ -195,14 +202,19 @@ class LogWriter:
 
     async def _append(self, record: bytes) -> None:
         """Append one record behind the last one, as long as it takes."""
+        self.asked = asyncio.get_running_loop().time()
         stands = await append_behind(self._engine, record, self._maker.after)
+        self.asked = math.inf
         if not isinstance(stands, int):
             raise _deposed(stands, self._maker.epoch)
         self._maker.after = stands
+        self.steps += 1
         self._grown += len(record)
 
     async def _insist(self, call: Callable[[str, bytes], Awaitable[None]], name: str, data: bytes) -> None:
+        self.asked = asyncio.get_running_loop().time()
         await insist(lambda: call(name, data))
+        self.asked = math.inf
 
 
 async def insist(call: Callable[[], Awaitable[T]]) -> T:
@@ -216,18 +228,23 @@ async def insist(call: Callable[[], Awaitable[T]]) -> T:
             pause = min(2 * pause, LONGEST_PAUSE)
 
 
-async def append_behind(engine: Engine, record: bytes, after: int) -> int | LogRecord:
-    """Append a record behind the one with the number `after`, however long it takes.
+async def append_behind(engine: Engine, record: bytes, after: int, patience: float = math.inf) -> int | LogRecord:
+    """Append a record behind the one with the number `after`, however long it takes, up to so many seconds.
 
     Returns:
         Its number; or, if another one stands there for good, that one.
+
+    Raises:
+        Unanswered: the engine has not answered for `patience` seconds. The record may stand there or not.
     """
-    pause = FIRST_PAUSE
+    pause, loop = FIRST_PAUSE, asyncio.get_running_loop()
+    until = loop.time() + patience
     while True:
         try:
             return await engine.log.append(record, after)
         except Unanswered:
-            pass
+            if loop.time() > until:
+                raise
         except OutOfTurn:
             found = await behind(engine, after)
             if found is not None:

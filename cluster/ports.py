@@ -77,6 +77,7 @@ class Log(Protocol):
         Raises:
             OutOfTurn: another record is the last one; it may be this very one, if it was appended before.
             Unanswered: it may stand there or not.
+            AccessRefused: the servers have said that this program may not append any more; it does not stand there.
         """
         ...
 

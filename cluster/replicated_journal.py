@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import threading
 import uuid
 import zlib
 from collections.abc import Callable, Collection, Generator, Sequence
-from concurrent.futures import Future
 from typing import Final
 
 import msgspec
@@ -25,7 +25,7 @@ from ..checkpoint.journal import DamagedStore, Entry, SafeAt, Saved, StaleEpoch,
 from ..checkpoint.snapshot.shared_blocks import Segment
 from .engine_thread import EngineLoop, end_tasks
 from .leadership import Leading
-from .log_writer import Deposed, LogWrite, LogWriter, insist
+from .log_writer import FIRST_PAUSE, LONGEST_PAUSE, Deposed, LogWrite, LogWriter, insist
 from .ports import Engine, Unanswered
 from .store_contents import Change
 from .write_progress import BlobsUnderWay, Tell, WriteProgress
@@ -34,6 +34,8 @@ LARGE: Final = 64 << 10
 """Bytes of a snapshot from which on it is kept beside the log."""
 MOST_UNSENT: Final = 64 << 20
 """Bytes beside the log that may wait to be sent, before whoever has more waits for them."""
+MOST_FETCHED: Final = 256 << 20
+"""Bytes of snapshots that are read before the tree is started."""
 CLOSE_SECONDS: Final = 5.0
 """How long a journal that is closed waits for what is not in the log yet."""
 READ_SECONDS: Final = 30.0
@@ -59,6 +61,8 @@ class ReplicatedJournal:
         loop: on which the engine's work runs.
         leading: what this leader begins with.
         lost: told, on the engine's loop, why nothing can be written any more: another leads, or the log is damaged.
+        patience: seconds in which the engine must have taken something when somebody waits for it in `sync`, so that a
+            tool ends when the servers are away; a system waits for them.
     """
 
     durable = True
@@ -72,10 +76,11 @@ class ReplicatedJournal:
         leading: Leading,
         *,
         lost: Callable[[HoldfastError], None] = lambda error: None,
+        patience: float = math.inf,
     ) -> None:
         self.path = engine.name
         self.epoch = leading.maker.epoch
-        self._engine, self._loop, self._lost = engine, loop, lost
+        self._engine, self._loop, self._lost, self._patience = engine, loop, lost, patience
         self._contents = leading.contents
         self._lock = threading.RLock()  # of the contents; the engine's loop, which keeps the lease, never waits for it
         self._joint: list[LogWrite] | None = None
@@ -87,6 +92,7 @@ class ReplicatedJournal:
         self._is_open = True
         self._is_awake = False
         self._keeper = leading.keeper
+        self._fetched: dict[str, bytes] = {}
         loop.wait(self._begin(leading))
 
     async def _begin(self, leading: Leading) -> None:
@@ -98,6 +104,28 @@ class ReplicatedJournal:
             want_base=self._want_base,
         )
         self._leading = asyncio.ensure_future(self._lead())
+
+    async def fetch(self) -> None:
+        """Have the newest large snapshots in memory, however long the engine is away: a tree is about to need them.
+
+        For the loop of the engine. What is over MOST_FETCHED is read when it is needed, and whoever needs it waits.
+        """
+        size = 0
+        for kept in list(self._contents.snapshots.values()):
+            name = kept[-1].data if kept else None
+            if isinstance(name, str) and size < MOST_FETCHED:
+                pause = FIRST_PAUSE
+                while self._failure is None:  # Else another leads: nobody needs it.
+                    try:
+                        data = await self._engine.blobs.get(name)
+                    except Unanswered:
+                        await asyncio.sleep(pause)
+                        pause = min(2 * pause, LONGEST_PAUSE)
+                        continue
+                    if data is not None:
+                        self._fetched[name] = data
+                        size += len(data)
+                    break
 
     async def _lead(self) -> None:
         """Write, keep the lease and tidy up, until the journal is closed or another leads."""
@@ -311,19 +339,22 @@ class ReplicatedJournal:
         Raises:
             StaleEpoch: another leads. StoreFailed: the log cannot be written.
         """
-        self._wait_written(None)
+        self._loop.wait(self._written())
 
-    def _wait_written(self, seconds: float | None) -> None:
-        done: Future[None] = Future()
-
-        def tell(error: HoldfastError | None) -> None:
-            if error is None:
-                done.set_result(None)
-            else:
-                done.set_exception(type(error)(*error.args))
-
-        self._tell_written(tell)
-        done.result(seconds)
+    async def _written(self) -> None:
+        """Wait until what was written so far stands in the log, as long as the engine takes something now and then."""
+        done, loop = self.synced(), asyncio.get_running_loop()
+        steps, until = self._writer.steps, loop.time() + self._patience
+        while not done.done():
+            left = None if self._patience == math.inf else max(until - loop.time(), 0.0)
+            await asyncio.wait([done], timeout=left)
+            if self._writer.steps != steps:
+                steps, until = self._writer.steps, loop.time() + self._patience
+            elif not done.done():
+                done.cancel()
+                problem = f"no server has taken anything for {self._patience:g} s"
+                raise StoreFailed(self.path, f"{problem}; see whether they run, and whether their disks have room")
+        done.result()
 
     def _wait_for_room(self) -> None:
         if self._blobs.size > MOST_UNSENT and self._joint is None:
@@ -384,6 +415,8 @@ class ReplicatedJournal:
                 unsent = next((data for write in self._joint for known, data in write.puts if known == name), None)
         if unsent is not None:
             return unsent
+        if (fetched := self._fetched.pop(name, None)) is not None:
+            return fetched
         try:
             # Again and again: at a takeover servers may be choosing a leader, and who cannot read cannot lead.
             return self._loop.wait(insist(lambda: self._engine.blobs.get(name)), READ_SECONDS)
@@ -426,7 +459,7 @@ class ReplicatedJournal:
         if not self._is_open:
             return
         try:
-            self._loop.wait(self.end(), 3 * CLOSE_SECONDS)
+            self._loop.finish(self.end(), 4 * CLOSE_SECONDS)
         except TimeoutError as error:
             raise StoreFailed(self.path, "its work for the engine does not end") from error
         finally:
@@ -447,13 +480,15 @@ class ReplicatedJournal:
             done = asyncio.get_running_loop().create_future()
             if self._failure is not None or not self._progress.wait(lambda error: done.set_result(None)):
                 done.set_result(None)  # Nothing more will be written.
-        await asyncio.wait([done], timeout=CLOSE_SECONDS)
+        silent = max(asyncio.get_running_loop().time() - self._writer.asked, 0.0)  # Whoever ends the system has waited.
+        await asyncio.wait([done], timeout=max(CLOSE_SECONDS - silent, 0.0))
         left = submitted - self._progress.written if self._failure is None else 0
         await end_tasks(self._leading)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(CLOSE_SECONDS):
-                await self._keeper.release()
-                await self._engine.close()
+        lasts = (self._keeper.release, self._engine.close) if silent < CLOSE_SECONDS else (self._engine.close,)
+        for last in lasts:  # Servers that do not answer cost neither its time.
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(CLOSE_SECONDS):
+                    await last()
         if left > 0:
             problem = f"it has not answered for {CLOSE_SECONDS:g} s: {left} writes may be lost"
             self._fail(StoreFailed(self.path, problem))

@@ -1,7 +1,8 @@
 """A copy of what one store has in another one, of whatever kind: between a file and servers, both ways.
 
-No system may have either of them open. The copy is there completely or not at all, and is compared before anybody is
-told that it is there. Positions are handed out anew: nothing that is recorded refers to them.
+No system may have either of them open. The copy is there completely or not at all: until it has been compared it has a
+mark, by which no system takes it, and the next attempt begins with an empty store. Positions are handed out anew:
+nothing that is recorded refers to them.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import NamedTuple
 from ..checkpoint.journal import DamagedStore, Entry, NotCopied, Saved, StoreEngine
 from ..checkpoint.snapshot.shared_blocks import by_segment
 from ..checkpoint.snapshot.snapshot_record import decode_meta
+from ..checkpoint.store_opening import UNFINISHED
 
 
 class CopiedStore(NamedTuple):
@@ -54,12 +56,19 @@ def copy_store(source: StoreEngine, dest: StoreEngine, *, names: tuple[str, str]
         names: what errors call the two.
 
     Raises:
-        NotCopied: there is something in `dest` already, or what is there afterwards is not the same.
+        NotCopied: there is something in `dest` already that is no copy which was given up; or what is there afterwards
+            is not the same.
         DamagedStore: something in `source` is damaged.
         StoreFailed: one of them cannot be read or written.
     """
-    if dest.addresses() or dest.notes(""):
+    if source.noted(UNFINISHED) is not None:
+        raise NotCopied(*names, "it is a copy itself that was never finished", "copy the store that it was made of")
+    if dest.noted(UNFINISHED) is not None:
+        _clear(dest)
+    elif dest.addresses() or dest.notes(""):
         raise NotCopied(*names, "there is something in it already", "name an empty store")
+    dest.note(UNFINISHED, b"")
+    dest.sync()  # Before anything else stands there.
     addresses = source.addresses()
     snapshots = entries = 0
     with dest.together():
@@ -72,8 +81,20 @@ def copy_store(source: StoreEngine, dest: StoreEngine, *, names: tuple[str, str]
             dest.note(key, value)
     dest.sync()
     for problem in differences(source, dest):
-        raise NotCopied(*names, problem, "the copy cannot be used: remove it, and make another")
+        raise NotCopied(*names, problem, "no system takes it: make another")
+    dest.note(UNFINISHED, None)
+    dest.sync()
     return CopiedStore(len(addresses), snapshots, entries, len(notes))
+
+
+def _clear(dest: StoreEngine) -> None:
+    """Take out what a copy has left that was given up."""
+    with dest.together():
+        for address in dest.addresses():
+            dest.erase(address)
+        for key in dest.notes(""):
+            if key != UNFINISHED:
+                dest.note(key, None)
 
 
 def kept_of(store: StoreEngine, address: str) -> KeptAddress:
@@ -139,7 +160,7 @@ def differences(one: StoreEngine, other: StoreEngine) -> Iterator[str]:
     """What two stores do not have alike, in words."""
     if one.addresses() != other.addresses():
         yield f"it has {len(other.addresses())} addresses, and not the {len(one.addresses())} of the first"
-    if one.notes("") != other.notes(""):
+    if one.notes("") != {key: value for key, value in other.notes("").items() if key != UNFINISHED}:
         yield "its notes are others"
     for address in one.addresses():
         if kept_of(one, address) != kept_of(other, address):

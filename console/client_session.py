@@ -25,6 +25,7 @@ from .wire import (
     About,
     AnyRequest,
     AskCauses,
+    AskConnections,
     AskDiagnosis,
     AskHistory,
     AskLives,
@@ -34,6 +35,7 @@ from .wire import (
     ControlActor,
     CountTurns,
     DeclareTree,
+    DropKept,
     FollowActor,
     InspectActor,
     NextEvents,
@@ -130,6 +132,10 @@ class ClientSession:
                 return msgspec.to_builtins(system.put_aside(request.path))
             case SettleQuarantined():
                 return self._settle(request)
+            case AskConnections():
+                return msgspec.to_builtins(system.connected())
+            case DropKept():
+                return await system.drop_kept(request.system)
             case AskDiagnosis():
                 from .diagnosed import diagnosed  # only now: few systems have diagnosis, and all have an endpoint
 

@@ -12,7 +12,18 @@ from rich.console import Console
 from .. import HoldfastError, run
 from . import mechanism_commands, upgrade_commands
 from .nats_commands import nats
-from .operate import changing, declaring, diagnosing, following, looking, remembering, repairing, retrying, showing
+from .operate import (
+    changing,
+    connecting,
+    declaring,
+    diagnosing,
+    following,
+    looking,
+    remembering,
+    repairing,
+    retrying,
+    showing,
+)
 from .service import doctor, project, service_run
 from .store_commands import store
 
@@ -107,6 +118,7 @@ commands.command("replay")(upgrade_commands.replay)
 commands.command("coverage")(mechanism_commands.show_coverage)
 commands.command("select")(mechanism_commands.show_selection)
 commands.add_typer(retrying.quarantine)
+commands.add_typer(connecting.connections)
 commands.add_typer(repairing.repair)
 commands.add_typer(store)
 commands.add_typer(nats)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
+from ..actors.process.open_asks import open_asks
 from ..diagnosis.diagnoser import DiagnoserActor
 from ..diagnosis.engine import Diagnosis
+from ..diagnosis.generate import replicas_of
 from ..diagnosis.messages import Explained, GetDiagnosis, GetExplanation
-from ..diagnosis.observers import NodeObserver
+from ..diagnosis.observers import NodeObserver, ReplicaObserver
 from ..diagnosis.repair import (
     Approve,
     CaseStories,
@@ -31,6 +33,11 @@ from .wire import BadRequest, NotDiagnosed
 
 LOOK: Final = 1.0
 """Seconds in which a suspect's process has to say how it is."""
+
+MOST: Final = 10_000
+"""Cells and mailbox items that are looked at for asks between processes."""
+MOST_NAMES: Final = 5
+"""Actors that wait for a suspect that are named."""
 
 if TYPE_CHECKING:
     from ..system.system import ActorSystem
@@ -58,10 +65,10 @@ async def diagnosed(system: ActorSystem, path: str | None, timeout: float) -> li
         raise NotDiagnosed(f"no component of the diagnosis is at {path}: `holdfast diagnose` without it shows all")
     answers: list[dict[str, Any]] = []
     for one in diagnosers:
-        said = await _said(system, one, addresses, None if path is None else near, timeout)
         beside = [each for each in repairers if each.rpartition("/")[0] == one.rpartition("/")[0]]
-        said["repair"] = await _told(system, beside[0], timeout) if beside else None
-        answers.append(said)
+        repair = await _told(system, beside[0], timeout) if beside else None
+        said = await _said(system, one, addresses, None if path is None else near, timeout, repair)
+        answers.append({**said, "repair": repair})
     return answers
 
 
@@ -128,6 +135,8 @@ async def _parts(system: ActorSystem) -> tuple[list[str], list[str], dict[str, s
             repairers.append(one.path)
         elif start is not None and start.kind is NodeObserver:
             addresses |= start.args[0]
+        elif start is not None and start.kind is ReplicaObserver:
+            addresses |= {replicas_of(name): where for name, where in start.args[0].items()}
         if number % SLICE == 0:
             await asyncio.sleep(0)
     return diagnosers, repairers, addresses
@@ -150,6 +159,57 @@ def is_at(where: str, path: str) -> bool:
     return where == path or where.startswith(f"{path.rstrip('/')}/")
 
 
+class Waiting(NamedTuple):
+    """Who waits for an actor: since when its oldest ask has no answer (loop clock), and all who wait in the end."""
+
+    since: float
+    actors: tuple[str, ...]
+
+
+def waiting_for(asks: Sequence[tuple[str, str | None, float]], address: str) -> Waiting | None:
+    """Who waits for an actor, directly or for another one that does; None: nobody.
+
+    Args:
+        asks: of each ask without an answer who is asked, who asks if that is an actor, and since when.
+        address: of the actor.
+
+    >>> waiting_for([("/a/c", "/a/b", 2.0), ("/a/b", "/a/a", 1.0)], "/a/c")
+    Waiting(since=2.0, actors=('/a/b', '/a/a'))
+    """
+    since = min((made for asked, _, made in asks if asked == address), default=None)
+    if since is None:
+        return None
+    found = dict.fromkeys([address])
+    todo = [address]
+    for one in todo:  # it grows
+        for asked, asker, _ in asks:
+            if asked == one and asker is not None and asker not in found:
+                found[asker] = None
+                todo.append(asker)
+    return Waiting(since, tuple(found)[1:])
+
+
+def _open_asks(system: ActorSystem) -> list[tuple[str, str | None, float]]:
+    asks = open_asks(system._node, MOST)
+    return [(to.path, ask.sender.path if ask.sender else None, ask.deadline - ask.timeout) for to, ask in asks]
+
+
+def _handled(name: str, repair: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What repair would do for a suspect, has done, and may not do, by its newest case that is about it."""
+    said: dict[str, Any] = {"would": "", "done": [], "denied": ""}
+    if repair is None:
+        return said
+    if name in repair["denied"]:
+        said["denied"] = repair["reasons"].get(name, "")
+    about = [[entry for entry in story["entries"] if name in entry["components"]] for story in repair["stories"]]
+    for entry in next((entries for entries in reversed(about) if entries), []):
+        if entry["what"] == "Planned":
+            said["would"] = entry["text"]
+        elif entry["what"] in ("ActionEnded", "Undone", "Repaired", "GaveUp"):
+            said["done"].append(entry["text"])
+    return said
+
+
 async def _seen(system: ActorSystem, address: str | None) -> str:
     """What is to be seen of a suspect at the moment, in words; empty if there is nothing strange."""
     if address is None:
@@ -166,27 +226,48 @@ async def _seen(system: ActorSystem, address: str | None) -> str:
     return f"`{address}` runs{waits}" if waits else ""
 
 
+async def _suspect(
+    system: ActorSystem,
+    name: str,
+    found: Diagnosis,
+    address: str | None,
+    asks: Sequence[tuple[str, str | None, float]],
+    repair: Mapping[str, Any] | None,
+) -> dict[str, Any]:
+    """All that is to be said of one suspect."""
+    waiting = None if address is None else waiting_for(asks, address)
+    return {
+        "component": name,
+        "address": address,
+        "is_certain": name in found.certain,
+        "now": await _seen(system, address),
+        "since": found.since.get(name),
+        "unanswered_seconds": None if waiting is None else system._node.loop.time() - waiting.since,
+        "waiting": [] if waiting is None else list(waiting.actors[:MOST_NAMES]),
+        "waiting_count": 0 if waiting is None else len(waiting.actors),
+        "repair": _handled(name, repair),
+    }
+
+
 async def _said(
-    system: ActorSystem, path: str, addresses: Mapping[str, str], near: Mapping[str, str] | None, timeout: float
+    system: ActorSystem,
+    path: str,
+    addresses: Mapping[str, str],
+    near: Mapping[str, str] | None,
+    timeout: float,
+    repair: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
     """What one diagnoser says; with `near`, of the suspects only those components."""
     ref = system.ref(path, DiagnoserActor)
     found: Diagnosis = await ref.ask(GetDiagnosis(), timeout=timeout)
     why: Explained = await ref.ask(GetExplanation(), timeout=timeout)
     suspects = [name for name in found.suspects if near is None or name in near]
+    asks = _open_asks(system) if suspects else []
     return {
         "diagnoser": path,
         "state": found.state.value,
         "text": str(found),
-        "suspects": [
-            {
-                "component": name,
-                "address": addresses.get(name),
-                "is_certain": name in found.certain,
-                "now": await _seen(system, addresses.get(name)),
-            }
-            for name in suspects
-        ],
+        "suspects": [await _suspect(system, name, found, addresses.get(name), asks, repair) for name in suspects],
         "candidates": [{"bad": list(one.bad), "probability": one.probability} for one in found.candidates],
         "symptoms": list(map(str, found.symptoms)),
         "contradictions": list(map(str, found.contradictions)),

@@ -23,6 +23,7 @@ from ..actors.kernel.actor import Actor, Start
 from ..actors.process.wire.frame_buffer import LENGTH
 from ..actors.seconds import check_seconds
 from ..actors.values import decode_value, describe_value
+from ..cluster.lines.lines import PeerLook
 from ..ftm.group.protected import ProtectionStatus
 from ..supervision.spec import NAMELESS, ChildSpec, Isolation, Strategy, child
 from ..system.history.evidence import PutAside
@@ -34,6 +35,7 @@ from .wire import (
     RESPONSE,
     About,
     AnyRequest,
+    AskConnections,
     AskDiagnosis,
     AskHistory,
     AskLives,
@@ -42,6 +44,7 @@ from .wire import (
     ControlActor,
     CountTurns,
     DeclareTree,
+    DropKept,
     FollowActor,
     InspectActor,
     NextEvents,
@@ -72,7 +75,7 @@ GRACE = 35.0
 
 SHORT_GRACE = 5.0
 """The same of one that changes nothing."""
-CHANGES = (ControlActor, DeclareTree, RestartActor, SettleQuarantined, Transact)
+CHANGES = (ControlActor, DeclareTree, DropKept, RestartActor, SettleQuarantined, Transact)
 
 
 class NotReached(
@@ -381,6 +384,20 @@ class RemoteSystem:
             raise SpecError(verb, "in a dry run nothing in quarantine is changed")
         answer = self._client.call(SettleQuarantined(verb, text_of(target), id), 10.0)
         return msgspec.convert(answer["done"], list[PutAside]), msgspec.convert(answer["failed"], list[str])
+
+    def connected(self) -> list[PeerLook]:
+        """The programs that are connected to the system, and systems that were, with what is kept for each."""
+        return msgspec.convert(self._client.call(AskConnections(), 10.0), list[PeerLook])
+
+    def drop_kept(self, system: str) -> int:
+        """Drop what recorded actors have told another system that has not accepted it; return how many that were.
+
+        Raises:
+            SpecError: no system of that name was ever connected, or this is a dry run.
+        """
+        if self._dry_run:
+            raise SpecError("drop", "in a dry run nothing that is kept is dropped")
+        return msgspec.convert(self._client.call(DropKept(system), 10.0), int)
 
     async def diagnosis(self, target: RemoteTarget | None = None, *, timeout: float = 5.0) -> list[dict[str, Any]]:
         """What each diagnosis that runs says now, as plain data; with a target of the suspects there and below it.

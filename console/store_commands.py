@@ -46,6 +46,7 @@ KeyFile = Annotated[
         help="Of an encrypted store: the file with its key, which only its owner may read.",
     ),
 ]
+NewKeyFile = Annotated[Path | None, typer.Option("--new-key-file", help="The file with the key of the copy.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
@@ -218,12 +219,14 @@ def restore(
 def copy(
     source: Annotated[str, typer.Argument(metavar="STORE", help="As in `store=`: sqlite:PATH or nats://HOST/NAME.")],
     dest: Annotated[str, typer.Argument(metavar="DEST", help="The same, of a store that has nothing yet.")],
+    key_file: KeyFile = None,
+    new_key_file: NewKeyFile = None,
     as_json: Json = False,
 ) -> None:
     """Copy what one store has into another one, between a file and servers, both ways, and compare the two.
 
-    No system may have either of them open. The copy is there completely, or not at all. How servers are reached is said
-    in their address, or by holdfast.toml and the environment.
+    No system may have either of them open. The copy is there completely, or not at all. It is encrypted if there is
+    --new-key-file. How servers are reached is said in their address, or by holdfast.toml and the environment.
 
     Exit status 0: done. 2: STORE is not there, one of them is open, damaged or cannot be reached, or DEST has something
     already.
@@ -236,8 +239,8 @@ def copy(
         if is_same_store(source, dest):
             raise NotCopied(*names, "both are one store", "name another one as DEST")
         with contextlib.ExitStack() as stack:
-            first = stack.enter_context(contextlib.closing(open_store(source, settings, is_new=False)))
-            second = stack.enter_context(contextlib.closing(open_store(dest, settings)))
+            first = stack.enter_context(contextlib.closing(open_store(source, settings, is_new=False, key=key_file)))
+            second = stack.enter_context(contextlib.closing(open_store(dest, settings, key=new_key_file)))
             made = copy_store(first, second, names=names)
     except HoldfastError as error:
         raise _ended("copy", error, UNREADABLE) from error
@@ -253,9 +256,7 @@ def rekey(
     path: StorePath,
     dest: Annotated[Path, typer.Argument(help="The database to be made, which must not be there.")],
     key_file: KeyFile = None,
-    new_key_file: Annotated[
-        Path | None, typer.Option("--new-key-file", help="The file with the key of the copy.")
-    ] = None,
+    new_key_file: NewKeyFile = None,
     plain: Annotated[bool, typer.Option("--plain", help="Make a copy that is not encrypted.")] = False,
     as_json: Json = False,
 ) -> None:

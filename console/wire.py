@@ -304,6 +304,16 @@ class SettleQuarantined(ControlRequest, tag="settle", frozen=True):
     id: int | None
 
 
+class AskConnections(ControlRequest, tag="connections", frozen=True):
+    """Which programs are connected, and what is kept for which system."""
+
+
+class DropKept(ControlRequest, tag="drop-kept", frozen=True):
+    """Drop what is kept for another system, and forget that system."""
+
+    system: str
+
+
 class AskDiagnosis(ControlRequest, tag="diagnosis", frozen=True):
     """What diagnosis says now, of all or of what is at an address and below it."""
 
@@ -347,6 +357,8 @@ AnyRequest = (
     | AskCauses
     | AskQuarantined
     | SettleQuarantined
+    | AskConnections
+    | DropKept
     | AskDiagnosis
     | OrderRepair
     | Tree

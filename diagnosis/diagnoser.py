@@ -6,6 +6,8 @@ import asyncio
 from collections.abc import Iterable, Mapping
 from typing import Any, Final, NamedTuple
 
+import msgspec
+
 from ..actors.kernel.actor import Actor, on, subscribe
 from ..actors.kernel.envelope import ReplyHandle
 from ..actors.kernel.message import Message
@@ -316,7 +318,10 @@ class DiagnoserActor(Actor):
             self._rest()
 
     async def _tell(self, diagnosis: Diagnosis) -> None:
-        before, self._newest = self._newest, diagnosis
+        before, now = self._newest, self.ctx._cell.node.clock.wall()
+        known = {} if before is None else before.since
+        since = {name: known.get(name, now) for name in diagnosis.suspects}
+        self._newest = diagnosis = msgspec.structs.replace(diagnosis, since=since)
         if before is None or _content(before) != _content(diagnosis):
             await self.ctx.publish(DIAGNOSIS, diagnosis)
             await self.ctx.publish(ROS_DIAGNOSTICS, RosDiagnostics(diagnosis.ros(self.ctx.now())))

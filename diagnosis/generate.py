@@ -20,13 +20,14 @@ from ..actors.kernel.ref import ActorRef
 from ..supervision.spec import ChildSpec
 from ..supervision.supervisor import Supervisor
 from .assembly import observer
-from .literals import crashes, made_atom, progress, replies, room, waits_for
+from .literals import caught_up, crashes, keeps_up, led, made_atom, progress, replies, room, waits_for, whole
 from .messages import DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, ROS_DIAGNOSTICS, STARTS
 from .model import Component, Declaration, Expectation, Kind
 from .observers.flow import Baselines, FlowObserver, FlowSource
 from .observers.hearing import Heard, listen
 from .observers.node_observer import NodeObserver
 from .observers.observer import Manner, Observer
+from .observers.replicas import ReplicaObserver
 from .observers.runtime import RuntimeObserver
 from .observers.verdicts import Agreement
 
@@ -36,8 +37,9 @@ OURS = frozenset({DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, RO
 """Topics of diagnosis itself."""
 
 
-BASE = (f"{__package__}.", f"{(__package__ or '').rpartition('.')[0]}.checkpoint.")
-"""Packages whose actors look after the system and are no part of it."""
+PACKAGE = (__package__ or "").rpartition(".")[0]
+BASE = tuple(f"{PACKAGE}.{room}." for room in ("diagnosis", "checkpoint", "ftm"))
+"""Packages whose actors look after the system and are no part of it; how replicas do is a component of its own."""
 
 
 class WatchedSystem(Protocol):
@@ -66,6 +68,8 @@ class Wired(msgspec.Struct, frozen=True, kw_only=True):
     """Port to component."""
     asks: tuple[str, ...] = ()
     """Whom it was seen to ask."""
+    is_protected: bool = False
+    """Whether replicas live its life."""
 
 
 class Generated(msgspec.Struct, frozen=True):
@@ -114,6 +118,7 @@ class LiveWiring:
 
     Attributes:
         addresses: component to address.
+        protected: component to address, of those whose lives replicas live.
         made: topic to how it comes about.
         heard: address to the topics on which it was heard.
         asked: component to those that it was seen to ask.
@@ -121,6 +126,7 @@ class LiveWiring:
 
     def __init__(self, found: Generated, leave_out: Collection[str] = ()) -> None:
         self.addresses: dict[str, str] = {}
+        self.protected: dict[str, str] = {}
         self.made: dict[str, FlowSource] = {}
         self.heard = {wired.path: set(wired.publishes) for wired in found.wiring.values()}
         self.asked: dict[str, set[str]] = {}
@@ -131,6 +137,7 @@ class LiveWiring:
         """Have observers go by this from their next look on."""
         self._wiring = found.wiring
         _replace(self.addresses, found.addresses)
+        _replace(self.protected, {name: wired.path for name, wired in found.wiring.items() if wired.is_protected})
         _replace(self.made, _made(found.wiring, set().union(*self.heard.values())))
 
     def look_again(self, node: Node) -> Generated | None:
@@ -210,7 +217,7 @@ def _below(cell: Cell, out: Collection[str]) -> Iterator[Cell]:
 
 
 def _is_ours(cell: Cell) -> bool:
-    """Whether an actor belongs to diagnosis or recovery; the power board belongs to the system."""
+    """Whether an actor belongs to diagnosis, recovery or a mechanism; the power board belongs to the system."""
     kind = cell_kind(cell)
     if kind is None or issubclass(kind, Observer):
         return True
@@ -229,6 +236,7 @@ def _wired(cell: Cell, names: dict[str, str], heard: dict[str, set[str]], asked:
         subscribes=tuple(sorted(set(more.belongings.topics) - OURS if more is not None else ())),
         bound={port: names[target.path] for port, target in sorted(bound.items()) if target.path in names},
         asks=tuple(sorted(asked.get(names[cell.path], set()) & set(names.values()))),
+        is_protected=has_replicas(cell),
     )
 
 
@@ -256,27 +264,51 @@ def declared(wiring: dict[str, Wired]) -> Generated:
     shared = tuple(_shared(out, inputs, outputs) for out, count in makers.items() if count > 1)
     addresses = {name: wired.path for name, wired in wiring.items()}
     waits = [(name, other) for name, wired in wiring.items() for other in (*wired.bound.values(), *wired.asks)]
-    made = evident(Declaration(components=components, expectations=shared), wiring, waits)
+    protected = [name for name, wired in wiring.items() if wired.is_protected]
+    made = evident(Declaration(components=components, expectations=shared), wiring, waits, protected)
     return Generated(made, addresses, wiring, left_out)
 
 
-def evident(declaration: Declaration, components: Iterable[str], waits: Iterable[tuple[str, str]] = ()) -> Declaration:
+def has_replicas(cell: Cell | None) -> bool:
+    """Whether replicas live the life at an address."""
+    return cell is not None and cell.host.place.replica_states() is not None
+
+
+def replicas_of(component: str) -> str:
+    """The component that stands for the replicas of another one.
+
+    It is one of its own: that a replica is missing is no fault of the actor, whose others work on.
+    """
+    return f"{component}.replicas"
+
+
+def evident(
+    declaration: Declaration,
+    components: Iterable[str],
+    waits: Iterable[tuple[str, str]] = (),
+    protected: Iterable[str] = (),
+) -> Declaration:
     """Return the declaration with what the runtime itself sees of these components, if they are actors.
 
     Args:
         declaration: the model.
         components: those with an address; others of the model are left as they are.
         waits: who may wait for whom.
+        protected: those whose lives replicas live; their replicas are a component each.
     """
     known = {component.name for component in declaration.components}
     actors = [name for name in components if name in known]
     outs = {out for component in declaration.components for out in component.out}
-    expected = [Expectation(str(atom(name)), (name,)) for name in actors for atom in (progress, room)]
+    expected = [Expectation(str(atom(name)), (name,)) for name in actors for atom in (progress, room, keeps_up)]
     expected += [Expectation(str(replies(name)), (name,)) for name in actors if str(replies(name)) not in outs]
+    groups = [name for name in protected if name in known]
+    expected += [Expectation(str(led(name)), (name,)) for name in groups]
+    expected += [Expectation(str(atom(name)), (replicas_of(name),)) for name in groups for atom in (whole, caught_up)]
     seen = [str(crashes(name)) for name in actors]
     seen += [str(waits_for(one, other)) for one, other in dict.fromkeys(waits) if one in known and other in known]
     return msgspec.structs.replace(
         declaration,
+        components=(*declaration.components, *(Component(name=replicas_of(name)) for name in groups)),
         expectations=(*declaration.expectations, *expected),
         propositions=(*declaration.propositions, *seen),
     )
@@ -325,7 +357,7 @@ def observers_for(
     wiring: LiveWiring | None = None,
     baselines: Baselines | None = None,
 ) -> tuple[ChildSpec, ...]:
-    """Describe an observer of whether the actors live, one of what the runtime knows of them, and one of all topics.
+    """Describe observers of whether the actors live, of what the runtime knows of them, of replicas, and of topics.
 
     Args:
         generated: what was found.
@@ -342,6 +374,7 @@ def observers_for(
     return (
         observer("nodes", Start(NodeObserver, (wiring.addresses,), nodes)),
         observer("runtime", Start(RuntimeObserver, (wiring.addresses,), {"asked": wiring.asked})),
+        observer("replicas", Start(ReplicaObserver, (wiring.protected,))),
         observer("topics", Start(FlowObserver, (wiring.made,), {**flow, "manner": manner})),
     )
 

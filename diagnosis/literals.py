@@ -29,6 +29,10 @@ ARITIES: Final = {
     "room": 1,
     "crashes": 1,
     "waits_for": 2,
+    "led": 1,
+    "whole": 1,
+    "caught_up": 1,
+    "keeps_up": 1,
 }
 """The paper's predicates and those of the runtime, with their numbers of arguments."""
 
@@ -111,6 +115,26 @@ def crashes(component: str) -> Literal:
 def waits_for(component: str, other: str) -> Literal:
     """The turn of a component waits for an answer of another one, for longer than is usual."""
     return Literal("waits_for", (component, other))
+
+
+def led(component: str) -> Literal:
+    """One of the replicas of a protected component leads, or another one takes its place in time."""
+    return Literal("led", (component,))
+
+
+def whole(component: str) -> Literal:
+    """All replicas of a protected component live, or come back in time."""
+    return Literal("whole", (component,))
+
+
+def caught_up(component: str) -> Literal:
+    """No replica of a protected component needs longer than is usual to come to the state of the others."""
+    return Literal("caught_up", (component,))
+
+
+def keeps_up(component: str) -> Literal:
+    """A component handles its messages as fast as they come: its mailbox does not grow and grow."""
+    return Literal("keeps_up", (component,))
 
 
 def made_atom(word: str) -> Literal:

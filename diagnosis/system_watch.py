@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any, Final
 
 import msgspec
@@ -12,26 +13,50 @@ from ..actors.kernel.node import Node
 from ..actors.kernel.ref import ActorRef
 from ..supervision.spec import ChildSpec, child
 from .assembly import observer, tree
+from .bridges.alerts import AlertObserver, no_alert
 from .diagnoser import SERVER, DiagnoserActor
 from .engine import Diagnosis
-from .generate import Generated, LiveWiring, WatchedSystem, child_name, evident, generate, observers_for
+from .generate import (
+    Generated,
+    LiveWiring,
+    WatchedSystem,
+    child_name,
+    evident,
+    generate,
+    has_replicas,
+    observers_for,
+    replicas_of,
+)
 from .literals import ok
 from .messages import DIAGNOSER, Explained, GetDiagnosis, GetExplanation, GetObserved
 from .model import Declaration, Expectation, History, System
 from .model_follower import ModelFollower
 from .observations import Observed
-from .observers import Baselines, Bound, Limits, Manner, NodeObserver, Property, PropertyObserver, RuntimeObserver
+from .observers import (
+    Baselines,
+    Bound,
+    Limits,
+    Manner,
+    NodeObserver,
+    Property,
+    PropertyObserver,
+    ReplicaObserver,
+    RuntimeObserver,
+)
 from .repair import (
     Approver,
     GetRepairStatus,
+    GetStories,
     Policy,
     RepairAction,
     Repairer,
     RepairStatus,
     SetStance,
     Stance,
+    Story,
     repairer,
     restart_child,
+    restart_replica,
     restart_subtree,
 )
 from .repair.policy import check_stance
@@ -79,6 +104,10 @@ class Watch:
         """Ask how repair stands, and how good its advice was. Raises NoSuchActor if repair was never on."""
         return await self.repairer.ask(GetRepairStatus())
 
+    async def stories(self) -> tuple[Story, ...]:
+        """Ask for what repair has told of its last cases, the oldest first. Raises NoSuchActor if it was never on."""
+        return (await self.repairer.ask(GetStories())).stories
+
     async def why(self) -> Explained:
         """Ask why the diagnosis is what it is, and what to look at next."""
         return await self.diagnoser.ask(GetExplanation())
@@ -104,6 +133,8 @@ async def watch(
     window: float = 2.0,
     hung_after: float | None = None,
     baselines: Baselines | None = None,
+    repair_file: str | Path | None = None,
+    alerts: bool = False,
     name: str = "diagnosis",
     **options: Any,
 ) -> Watch:
@@ -130,6 +161,10 @@ async def watch(
         seconds: see `model`.
         window: of a generated model: seconds of silence of a topic that are never too long.
         baselines: of a generated model: what is usual of its topics, such as `Baselines("usual.json")`, which is kept.
+        repair_file: where the scores of advice, and what people have denied to repair, are kept for the next program,
+            such as "repair.json"; None: nowhere.
+        alerts: whether alerts from outside count (`OutsideAlert` on `/alerts`): while one fires about a component,
+            `ok(COMPONENT.alerts)` does not hold.
         hung_after: seconds after which an actor that is still in the same turn counts as not running, such as one that
             others ask in vain. None: nothing takes too long.
         name: of the supervisor that is started.
@@ -137,46 +172,63 @@ async def watch(
 
     Raises:
         ModelError: something is wrong with the model. StartFailed, AlreadyStarted: see `ActorSystem.start`.
-        ValueError: there is no such stance of repair.
+        ValueError: there is no such stance of repair, or the file of repair is another one.
     """
     check_stance(repair)
     generated = await generate(system, seconds=seconds) if model is None else None
     watchers = [*observers]
-    if generated is not None:
+    live = None if generated is None else LiveWiring(generated)
+    if generated is not None and live is not None:
         declaration = generated.declaration
-        live = LiveWiring(generated)
         watchers += observers_for(
             generated, window=window, hung_after=hung_after, manner=manner, wiring=live, baselines=baselines
         )
-        follower = child("follower", Start(ModelFollower, (live, SERVER, _with_limits(limits))))
+        follower = child("follower", Start(ModelFollower, (live, SERVER, _completed(limits, alerts=alerts))))
         options["others"] = (*options.get("others", ()), follower)
     else:
         assert model is not None
         declaration = model.declaration() if isinstance(model, System) else model
     where = (dict(generated.addresses) if generated is not None else {}) | dict(addresses or {})
+    groups = {name: path for name, path in where.items() if has_replicas(system._node.find(path))}
     if generated is None and where:
         watchers.append(observer("nodes", Start(NodeObserver, (where,), {"hung_after": hung_after, "manner": manner})))
         watchers.append(observer("runtime", Start(RuntimeObserver, (where,))))
-        declaration = evident(declaration, where)
+        watchers.append(observer("replicas", Start(ReplicaObserver, (groups,))))
+        declaration = evident(declaration, where, protected=groups)
     if limits:
         declaration = expecting(declaration, limits)
         watchers += property_observers(limits, where, manner)
+    if alerts:
+        declaration = _with_alerts(declaration, where)
+        heard = where if live is None else live.addresses
+        watchers.append(observer("alerts", Start(AlertObserver, (heard,))))
     mend = None
     if repair != "off":
         ways = _actions(system._node, where, actions)
-        mend = repairer(declaration, ways, policy, name=REPAIRER, addresses=where, stance=repair, approve=approve)
+        mend = repairer(
+            declaration, ways, policy, name=REPAIRER, addresses=where, stance=repair, approve=approve, file=repair_file
+        )
     started = await system.start(tree(History(declaration), watchers, name=name, repairer=mend, **options))
     return Watch(started, system._node, where, generated)
 
 
-def _with_limits(limits: LimitsOf | None) -> Callable[[Generated], Generated]:
+def _completed(limits: LimitsOf | None, *, alerts: bool) -> Callable[[Generated], Generated]:
     """What is added to each model that is generated anew; limits of components that have gone are left out."""
 
     def adapt(found: Generated) -> Generated:
         kept = {name: some for name, some in (limits or {}).items() if name in found.addresses}
-        return msgspec.structs.replace(found, declaration=expecting(found.declaration, kept))
+        declaration = expecting(found.declaration, kept)
+        if alerts:
+            declaration = _with_alerts(declaration, found.addresses)
+        return msgspec.structs.replace(found, declaration=declaration)
 
     return adapt
+
+
+def _with_alerts(declaration: Declaration, components: Iterable[str]) -> Declaration:
+    """Return the declaration again, in which nobody outside complains about a component that works."""
+    more = tuple(Expectation(str(no_alert(name)), (name,)) for name in components)
+    return msgspec.structs.replace(declaration, expectations=(*declaration.expectations, *more))
 
 
 def expecting(declaration: Declaration, limits: LimitsOf) -> Declaration:
@@ -206,5 +258,7 @@ def _actions(node: Node, addresses: Mapping[str, str], more: Iterable[RepairActi
     root = "" if node.root is None else node.root.path
     above = {component: path.rpartition("/")[0] for component, path in addresses.items()}
     subtrees = {component: path for component, path in above.items() if path not in ("", root)}
-    ours = {action.name: action for action in (restart_child(addresses), restart_subtree(subtrees))}
+    groups = {replicas_of(component): path for component, path in addresses.items()}
+    stock = (restart_child(addresses), restart_subtree(subtrees), restart_replica(groups))
+    ours = {action.name: action for action in stock}
     return list((ours | given).values())

@@ -14,7 +14,7 @@ from ..actors.errors import SpecError, type_name
 from ..actors.events import ShutdownError
 from ..actors.exit_reasons import KILLED, SHUTDOWN, ExitReason
 from ..actors.kernel.actor import Actor, Start
-from ..actors.kernel.cell import Cell
+from ..actors.kernel.cell import Cell, Scope
 from ..actors.kernel.lifecycle import GRACE
 from ..actors.kernel.mailbox import Bounded
 from ..actors.process.resource_limits import Limits
@@ -113,6 +113,7 @@ class ChildSpec(Generic[A_co]):
     autostart: bool = True  # whether its supervisor starts it with the others, or only by order
     late: frozenset[str] = frozenset()  # ports that transactions have bound: whom they lead to may be started later
     register: str | None = None  # the name that each life has beside its address
+    scope: Scope = "system"  # who finds it by that name
 
     def __post_init__(self) -> None:
         where = f"child {self.id!r}"
@@ -136,6 +137,9 @@ class ChildSpec(Generic[A_co]):
         if name is not None and (not isinstance(name, str) or not name or name.startswith("/") or has_control(name)):
             problem = "must be text without control characters that does not begin with '/', or left out"
             raise SpecError(where, f"register {problem}, not {name!r}")
+        _choose(where, "scope", self.scope, Scope)
+        if self.scope != "system" and name is None:
+            raise SpecError(where, f"scope={self.scope!r} says who finds it by a name, and register='NAME' is missing")
         if not isinstance(self.significant, bool):
             raise SpecError(where, f"significant must be True or False, not {self.significant!r}")
         if self.significant and self.restart == "permanent":
@@ -241,6 +245,7 @@ def child(
     start_timeout: StartTimeout | None = None,
     autostart: bool = True,
     register: str | None = None,
+    scope: Scope = "system",
 ) -> ChildSpec[A]:
     """Describe one child of a supervisor: how it starts, lives, comes back, and is stopped.
 
@@ -267,6 +272,7 @@ def child(
         autostart: whether its supervisor starts it with the others. If not, it is known and stopped, at each start of
             its supervisor, until it is started by order (`RestartChild`, or `start` in a transaction).
         register: a name that each of its lives has, as `system.register` gives it to one; nobody has it between two.
+        scope: who finds it by that name: "system", or "fleet": other systems and clients that are connected, too.
             If it is taken, the start fails. Not below a supervisor with a process of its own.
 
     Raises:
@@ -294,6 +300,7 @@ def child(
         start_timeout=start_timeout,
         autostart=autostart,
         register=register,
+        scope=scope,
     )
 
 

@@ -300,7 +300,7 @@ class Supervisor(Inquiries):
         name = one.spec.register
         if name is not None:
             try:
-                cell.node.register(name, cell, is_starting=True)
+                cell.node.register(name, cell, is_starting=True, scope=one.spec.scope)
             except NameTaken as taken:
                 holder = cell.node.names[name].path
                 why = f"{holder} is registered as {name!r} already; free the name, or say another one"

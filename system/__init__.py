@@ -3,6 +3,7 @@
 from ..actors.control.live_state import Opaque
 from ..actors.control.orders import Status
 from ..actors.control.tracing import Statistics
+from ..cluster.lines.lines import PeerLook
 from .history.evidence import PutAside
 from .history.lives import PastLife
 from .history.pages import HistoryPage
@@ -19,6 +20,7 @@ __all__ = [
     "Operation",
     "PastEvent",
     "PastLife",
+    "PeerLook",
     "PutAside",
     "Statistics",
     "Status",

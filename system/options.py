@@ -18,6 +18,8 @@ from ..checkpoint.store_opening import check_durability, check_store_key
 from ..cluster.configuration import NatsSettings, read_configuration
 from ..cluster.joining import is_replicated
 from ..cluster.leadership import Standby
+from ..cluster.lines.inflow import ConnectionLimits
+from ..cluster.servers import Servers
 from ..supervision.spec import Flags
 
 CONFIGURED: Final = "configured"
@@ -33,11 +35,12 @@ class SystemOptions:
     """
 
     name: str
-    store: str | Journal | None
+    store: str | Journal | Servers | None
     store_key: StoreKey | None = dataclasses.field(repr=False)
     durability: Durability | None
     standby: Standby | None
-    reachable: str | None
+    reachable: str | Servers | None
+    connection_limits: ConnectionLimits
     nats: NatsSettings
     flags: Flags
     preload: tuple[str, ...]
@@ -53,8 +56,9 @@ class SystemOptions:
 
     def __post_init__(self) -> None:
         check_path_part("ActorSystem", "the name", self.name)
-        check_durability(self.store, self.durability)
-        check_store_key(self.store, self.store_key)
+        if not isinstance(self.store, Servers):
+            check_durability(self.store, self.durability)
+            check_store_key(self.store, self.store_key)
         if self.standby is not None:
             if self.standby not in get_args(Standby):
                 known = ", ".join(map(repr, get_args(Standby)))
@@ -62,22 +66,26 @@ class SystemOptions:
             if not is_replicated(self.store):
                 problem = f"standby={self.standby!r} needs a store that several machines keep: store='nats://HOST/NAME'"
                 raise SpecError("ActorSystem", problem)
+        limits: object = self.connection_limits
+        if not isinstance(limits, ConnectionLimits):
+            raise SpecError("ActorSystem", f"connection_limits must be a ConnectionLimits, not {limits!r}")
         hooks = self.recovery_hooks
         if hooks is not None and not isinstance(hooks, RecoveryHooks):
             raise SpecError("ActorSystem", f"recovery_hooks must come from recovery_hooks(...), not be {hooks!r}")
         check_limits(self.watch_lag, self.watch_turns)
 
     @property
-    def reached_at(self) -> str | None:
+    def reached_at(self) -> str | Servers | None:
         """Where other programs find the system, if they do."""
-        if self.reachable is None and isinstance(self.store, str) and is_replicated(self.store):
-            return self.store
+        store = self.store
+        if self.reachable is None and (isinstance(store, Servers) or (isinstance(store, str) and is_replicated(store))):
+            return store
         return self.reachable
 
     @staticmethod
     def configured(
-        store: str | Journal | None, standby: Standby | None, durability: Durability | None
-    ) -> tuple[str | Journal | None, Standby | None, Durability | None, NatsSettings]:
+        store: str | Journal | Servers | None, standby: Standby | None, durability: Durability | None
+    ) -> tuple[str | Journal | Servers | None, Standby | None, Durability | None, NatsSettings]:
         """The arguments, and what `holdfast.toml` and the environment say where the store is "configured".
 
         Raises:

@@ -12,6 +12,7 @@ from ..actors.kernel.ref import ActorRef
 from ..actors.seconds import check_seconds
 from ..checkpoint.home.homes import Homes
 from ..checkpoint.home.quarantine import QuarantinedMessage
+from ..cluster.lines.lines import Lines, PeerLook
 from ..supervision.admin import RestartChild, TerminateChild, WhichChildren
 from ..supervision.supervisor import Supervisor
 
@@ -24,6 +25,8 @@ class Recorded:
 
     _homes: Homes
     """All recorded addresses, for those who change the tree."""
+    _lines: Lines
+    """The lines to other systems."""
 
     def quarantined(self, actor: ActorRef[Any] | str | None = None) -> list[QuarantinedMessage]:
         """Messages put aside because they have ended their actor's process again and again, oldest first.
@@ -51,6 +54,30 @@ class Recorded:
             NotQuarantined: it was tried again, dropped or erased meanwhile.
         """
         self._homes.quarantine.drop(message)
+
+    def connected(self) -> list[PeerLook]:
+        """The programs that are connected to this system, and systems that were, with what is kept for each."""
+        return self._lines.peers()
+
+    async def drop_kept(self, system: str) -> int:
+        """Drop what recorded actors have told another system that has not accepted it, and forget that system.
+
+        The messages become dead letters. The system may connect again.
+
+        Args:
+            system: its name, the first part of its addresses.
+
+        Returns:
+            how many messages were kept for it, once the store has it that they are no more.
+
+        Raises:
+            SpecError: no system of that name was ever connected. StoreError: the store does not take it.
+        """
+        if system not in {one.system for one in self._lines.peers()}:
+            raise SpecError(system, "no system of that name was ever connected: `holdfast connections` lists who was")
+        dropped = self._lines.forget_system(system)
+        await self._homes.journal.safe()
+        return dropped
 
     async def backup(self, path: str | os.PathLike[str]) -> StoreCopy:
         """Copy the store of this system as it is now, while the system goes on; a thread does it.

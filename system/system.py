@@ -8,7 +8,7 @@ import os
 from collections.abc import Sequence
 from importlib.util import find_spec
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args, overload
 
 from ..actors.control.drain import drain as drain_queue
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, StoreError, TreeFailed
@@ -17,7 +17,7 @@ from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, pack_exit
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.address_host import AddressHost
-from ..actors.kernel.cell import GONE, Cell, Host
+from ..actors.kernel.cell import GONE, Cell, Host, Scope
 from ..actors.kernel.lifecycle import LOCAL, NEAR
 from ..actors.kernel.mailbox import Bounded
 from ..actors.kernel.message import Message
@@ -42,8 +42,10 @@ from ..checkpoint.store_key import StoreKey
 from ..checkpoint.store_opening import check_system, open_journal
 from ..cluster.joining import is_replicated, join
 from ..cluster.leadership import LeadershipLost, Standby
+from ..cluster.lines.inflow import DEFAULT_LIMITS, ConnectionLimits
 from ..cluster.lines.lines import Lines, Transport, new_boot
 from ..cluster.log_writer import Deposed
+from ..cluster.servers import Servers
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.children import tell_stopped
 from ..supervision.patience import end_within
@@ -94,9 +96,10 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         store: where journals and snapshots go: None (memory: survives any process but this one), or
             "sqlite:PATH", or "nats://HOST,HOST/NAME": on several machines (docs/many-machines.md), or an engine of your
             own: anything that keeps to `Journal` (see holdfast.testing.stores); or "configured": what `holdfast.toml`
-            and the environment say.
-        store_key: encrypts the store "sqlite:PATH", from its making on: 32 bytes, the path of a file that has them and
-            that only its owner may read, or a function that returns them (docs/recovery/encryption.md).
+            and the environment say; or the servers of a simulated fleet (see holdfast.testing.fleet).
+        store_key: encrypts the store, "sqlite:PATH" or "nats://...", from its making on: 32 bytes, the path of a file
+            that has them and that only its owner may read, or a function that returns them
+            (docs/recovery/encryption.md).
         durability: what an admission outlives when it is told of (send returns, an ask is fed, a reply leaves):
             "memory" (without a store) any process but this one, "os" (with one) this one too, "fsync" the machine.
             Each child may say otherwise: `hybrid(durability=...)`.
@@ -104,6 +107,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             "warm" with what is stored in memory, "cold" without. None: StoreInUse names who leads.
         reachable: "nats://HOST,HOST/NAME": where `hf.connect` of other programs finds this system. A store on several
             machines is that place by itself.
+        connection_limits: how much each program that is connected may have outstanding here.
         intensity, period: how many restarts of its direct children the root allows before the tree fails.
         preload: modules the fork server imports beforehand, besides those of the actors it starts.
         log: write crashes, dead letters, output of processes and the like to structlog or standard logging, whichever
@@ -126,11 +130,12 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         self,
         name: str = "app",
         *,
-        store: str | Journal | None = None,
+        store: str | Journal | Servers | None = None,
         store_key: StoreKey | None = None,
         durability: Durability | None = None,
         standby: Standby | None = None,
-        reachable: str | None = None,
+        reachable: str | Servers | None = None,
+        connection_limits: ConnectionLimits = DEFAULT_LIMITS,
         intensity: int = 3,
         period: float = 5.0,
         preload: Sequence[str] = (),
@@ -153,6 +158,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             durability=durability,
             standby=standby,
             reachable=reachable,
+            connection_limits=connection_limits,
             flags=Flags("one_for_one", intensity, period),
             preload=tuple(preload),
             log=log,
@@ -221,7 +227,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         self._specifications = Specifications(self._homes, is_kept=options.store is not None)
         self._mechanism_notes = MechanismNotes(self._homes)
         epoch = engine.epoch if engine.safe_at == "sync" else None
-        self._lines = Lines(node, self.name, new_boot(epoch), self._homes)
+        self._lines = Lines(node, self.name, new_boot(epoch), self._homes, options.connection_limits)
         node.connect(
             Ports(
                 host_for=self._host_for,
@@ -279,17 +285,19 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
     async def _open_store(self, node: Node) -> StoreEngine:
         """The journal of the store; of one on several machines, once this program leads the system."""
         options = self._options
-        if not (isinstance(options.store, str) and is_replicated(options.store)):
-            return open_journal(options.store, takeover=options.takeover, key=options.store_key)
+        store = options.store
+        if not isinstance(store, Servers) and not (isinstance(store, str) and is_replicated(store)):
+            return open_journal(store, takeover=options.takeover, key=options.store_key)
         where = f"/{self.name}"
         journal = await join(
-            options.store,
+            store,
             self.name,
             options.standby,
             options.nats.told(),
             waits=lambda leader: node.emit(StandingBy(where, leader)),
             silent=lambda reason: node.emit(ServersSilent(where, reason)),
             deposed=self._deposed,
+            key=options.store_key,
         )
         node.emit(LeadershipTaken(where, journal.epoch))
         return Called(journal)
@@ -614,9 +622,20 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
 
     # -- names, topics, bindings ------------------------------------------------------------------------------------
 
-    def register(self, name: str, ref: ActorRef[Any]) -> None:
-        """Give an actor a name beside its address. Raises NameTaken."""
-        self._node.register(name, ref._cell.living)
+    def register(self, name: str, ref: ActorRef[Any], *, scope: Scope = "system") -> None:
+        """Give an actor a name beside its address, for the life that it has.
+
+        Args:
+            name: the name.
+            ref: the actor.
+            scope: who finds it by the name: "system", or "fleet": other systems and clients that are connected, too.
+
+        Raises:
+            NameTaken: somebody else has the name. SpecError: the name or the scope is not valid.
+        """
+        if scope not in get_args(Scope):
+            raise SpecError("register", f"scope must be 'system' or 'fleet', not {scope!r}")
+        self._node.register(name, ref._cell.living, scope=scope)
 
     def unregister(self, name: str) -> None:
         """Free a name; unknown ones are fine."""

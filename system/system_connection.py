@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from importlib.util import find_spec
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
@@ -18,29 +17,18 @@ from ..actors.seconds import check_seconds
 from ..actors.values.path_parts import check_path_part
 from ..checkpoint.home.ask_recovery import PASSING
 from ..cluster.configuration import NatsSettings
-from ..cluster.lines.lines import LineCaller, Lines, Transport, new_boot
+from ..cluster.lines.calls import LineCaller, LineGate
+from ..cluster.lines.far_line import FindName
+from ..cluster.lines.lines import Lines, Transport, new_boot
 from ..cluster.ports import Unanswered
+from ..cluster.servers import Servers, servers_of
 
 if TYPE_CHECKING:
     from .system import ActorSystem
 
 A = TypeVar("A", bound=Actor)
-
-
-async def open_lines(at: str, settings: NatsSettings) -> tuple[Transport, str, str]:
-    """A transport by these servers; the subject at which the system listens that is kept there, and its name.
-
-    Raises:
-        SpecError: the address cannot be read, or the library for it is missing. Unanswered: no server can be reached.
-    """
-    if find_spec("nats") is None:
-        raise SpecError("connect", "nats:// needs the library nats-py: pip install 'holdfast[nats]'")
-    from ..cluster.nats.access import access_of
-    from ..cluster.nats.nats_transport import open_transport  # only now: they import that library
-    from ..cluster.nats.system_streams import SubjectNames
-
-    access = access_of(at, settings.told())
-    return await open_transport(access), SubjectNames(access.system).inbox, access.system
+CLOSE_SECONDS = 5.0
+"""How long a connection that is closed waits until what was sent is on its way."""
 
 
 class SystemConnection:
@@ -49,7 +37,7 @@ class SystemConnection:
     It stays while the other system is led by one program after the other.
     """
 
-    def __init__(self, servers: str, system: str | None, within: ActorSystem | None, seconds: float) -> None:
+    def __init__(self, servers: str | Servers, system: str | None, within: ActorSystem | None, seconds: float) -> None:
         self._servers, self._system, self._within, self._seconds = servers, system, within, seconds
         self._own: Node | None = None
         self._lines: Lines | None = None
@@ -60,12 +48,13 @@ class SystemConnection:
     async def __aenter__(self) -> SystemConnection:
         if self._call is not None:
             raise HoldfastError(f"the connection to {self.system!r} was opened already; make a new one")
+        servers = servers_of(self._servers, NatsSettings().told())
+        self._system = self._system or servers.system
         try:
-            transport, to, kept = await open_lines(self._servers, NatsSettings())
+            transport, to = await servers.open_lines()
         except Unanswered as error:
-            raise Unreachable(f"/{self._system or self._servers}", error.problem) from error
+            raise Unreachable(f"/{self._system}", error.problem) from error
         self._transport = transport
-        self._system = self._system or kept
         try:
             lines = self._lines = self._lines_of(self._within)
             call = self._call = LineCaller(lines, transport, to, self._system, self._subscribe_again)
@@ -97,8 +86,8 @@ class SystemConnection:
 
     async def close(self) -> None:
         """End the connection: asks that are out fail, and nothing more is sent. A second call changes nothing."""
-        if self._call is not None and self._lines is not None:
-            self._lines.drop(self._call.far)
+        if self._call is not None:
+            await self._call.end(CLOSE_SECONDS)
         transport, self._transport = self._transport, None
         if transport is not None:
             await transport.close()
@@ -111,7 +100,7 @@ class SystemConnection:
     @property
     def system(self) -> str:
         """The name of the other system: the first part of its addresses."""
-        return self._system or self._servers
+        return self._system or str(self._servers)
 
     @property
     def is_reachable(self) -> bool:
@@ -136,6 +125,29 @@ class SystemConnection:
         if path != top and not path.startswith(f"{top}/"):
             raise SpecError("connect", f"{path!r} is no address of {self.system!r}: they begin with {top}/")
         return ActorRef(self._opened().far.stand_in(path))
+
+    @overload
+    async def whereis(self, name: str, *, timeout: float = ...) -> ActorRef[Any]: ...
+    @overload
+    async def whereis(self, name: str, kind: type[A], *, timeout: float = ...) -> ActorRef[A]: ...
+    async def whereis(self, name: str, kind: type[Actor] = Actor, *, timeout: float = 5.0) -> ActorRef[Any]:
+        """Return a ref to the actor of the other system that has a name there, given with `scope="fleet"`.
+
+        Who leads the system has answered, and it was sure then that no other program does. The ref is to the address,
+        and stays good when the name is freed. Between two lives of its actor nobody has a name.
+
+        Args:
+            name: beside its address, as the other system has registered it.
+            kind: its class, for type checkers.
+            timeout: seconds until an answer has come.
+
+        Raises:
+            NoSuchActor: nobody has the name now, or it is for the other system alone. AskTimeout: no answer came.
+            ConnectionLost: the program that was asked may lead no more.
+        """
+        call = self._opened()
+        system: ActorRef[Any] = ActorRef(call.far.stand_in(f"/{self.system}"))
+        return ActorRef(call.far.stand_in(await system.ask(FindName(name), timeout)))
 
     async def publish(self, topic: str, message: Message[Any]) -> None:
         """Publish on a topic of the other system, and return when each subscriber there has accepted it.
@@ -183,12 +195,13 @@ class SystemConnection:
 
 
 def connect(
-    servers: str, *, system: str | None = None, within: ActorSystem | None = None, timeout: float = 5.0
+    servers: str | Servers, *, system: str | None = None, within: ActorSystem | None = None, timeout: float = 5.0
 ) -> SystemConnection:
     """Describe a connection to another system; `async with` opens it.
 
     Args:
-        servers: "nats://HOST,HOST/NAME", as the other system has it for a store; its credentials may be in it.
+        servers: "nats://HOST,HOST/NAME", as the other system has it for a store; its credentials may be in it. In a
+            simulation the servers of its fleet (`holdfast.testing.fleet`).
         system: the first part of the addresses of the other system; NAME if left out.
         within: the system whose actors use the refs, and are reached from there. None: this program has none.
         timeout: seconds until a program that leads the other system has answered.
@@ -206,15 +219,15 @@ def connect(
     return SystemConnection(servers, system, within, timeout)
 
 
-async def serve(lines: Lines, at: str, settings: NatsSettings) -> Transport:
+async def serve(lines: Lines, at: str | Servers, settings: NatsSettings) -> Transport:
     """Have this system reached at its servers.
 
     Raises:
         SpecError: the address cannot be read. Unanswered: no server can be reached.
     """
-    transport, inbox, _ = await open_lines(at, settings)
+    transport, inbox = await servers_of(at, settings.told()).open_lines()
     try:
-        await transport.hear(inbox, lines.serve(transport).hear)
+        await transport.hear(inbox, LineGate(lines, transport).hear)
     except BaseException:
         with contextlib.suppress(TimeoutError):
             await transport.close()

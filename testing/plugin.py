@@ -1,8 +1,8 @@
 """The pytest plugin: fixtures for tests of actors. It works on pytest-asyncio, 1.4 or later.
 
 `actor_system` and `actor_systems` give isolated running systems that fail the test for what it leaves behind or did not
-expect; `probe` is a probe in `actor_system`. Everything heavy is imported inside the fixtures: pytest loads plugins
-before coverage begins to measure.
+expect; `probe` is a probe in `actor_system`, and `sim_fleet` a simulated fleet. Everything heavy is imported inside the
+fixtures: pytest loads plugins before coverage begins to measure.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
+    from .fleet.sim_fleet import SimFleet
     from .guarded import Guard, GuardedSystem
     from .probes import Probe
     from .wanted import SystemsWanted
@@ -226,9 +227,23 @@ async def systems_of_the_test(item: pytest.Item | None = None) -> AsyncIterator[
         yield start
 
 
+async def fleet_of_the_test(item: pytest.Item | None = None) -> AsyncIterator[SimFleet]:
+    """A simulated fleet of the test's own, without faults, whose programs end with the test."""
+    from .clock import VirtualClockLoop
+    from .fleet.sim_fleet import SimFleet
+
+    if not isinstance(asyncio.get_running_loop(), VirtualClockLoop):
+        pytest.fail(
+            'sim_fleet needs the virtual clock: @pytest.mark.asyncio(loop_factories=["virtual"])', pytrace=False
+        )
+    async with SimFleet() as fleet:
+        yield fleet
+
+
 actor_system, _makers = async_fixture(system_of_the_test, name="actor_system")
 actor_systems, _more_makers = async_fixture(systems_of_the_test, name="actor_systems")
-MAKERS = {makers["function"]: makers for makers in (_makers, _more_makers) if makers}
+sim_fleet, _fleet_makers = async_fixture(fleet_of_the_test, name="sim_fleet")
+MAKERS = {makers["function"]: makers for makers in (_makers, _more_makers, _fleet_makers) if makers}
 """The same by what pytest knows each fixture by."""
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from ..errors import ControlFailed, NotSuspended, SpecError, error_text, type_name
-from ..kernel import mailbox
+from ..kernel import lifecycle, mailbox
 from ..kernel.actor import Actor, Start
 from ..kernel.envelope import message_in
 from ..kernel.message import message_name
@@ -171,6 +171,7 @@ def has_become(cell: Cell, old: type[Actor], start: Start[Any]) -> bytes | None:
             cell.node.topics.unsubscribe(topic, cell)
     for topic in new._topics:
         cell.node.topics.subscribe(topic, cell)
+    lifecycle.limit_turns(cell)
     cell.node.ports.respec(cell, start)
     return None if cell.node.ports.uplink is None else pack_recipe(start, cell.path)
 

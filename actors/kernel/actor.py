@@ -12,6 +12,7 @@ import msgspec
 
 from ..errors import type_name
 from ..safe_state import SafeStateChange, watch
+from ..seconds import is_seconds
 from .bindings import Binding
 from .blocking_handlers import in_thread
 from .envelope import Table
@@ -135,6 +136,13 @@ class Actor:
     """What a snapshot saves; None saves every instance attribute without a leading underscore."""
     schema_version: ClassVar[int] = 1
     """Raise it when the saved state changes its shape."""
+    turn_timeout: ClassVar[float | None] = None
+    """Seconds that a turn may take, with all that it waits for; then the actor crashes by `TurnTimeout`.
+
+    None: as many as it wants. Of an actor with recovery no time counts while its turn rests (`ctx.sleep`,
+    `ctx.wait_for`). A turn that blocks its process ends by `Limits(hung_after=...)`; starts and ends have limits of
+    their own (`start_timeout`, `shutdown`). Behind a mechanism it is the usual `Detection(watch_turns=...)`.
+    """
 
     _keeps_promises: ClassVar[bool] = False
     """Whether its reply handles belong to the address: the next life answers, or whatever `node.kept` has of it."""
@@ -184,6 +192,7 @@ class Actor:
                 raise TypeError(f"{type_name(cls)}.{name} has @subscribe without @on: nothing would ever reach it")
             topics.extend(subscribed)
         _check_state(cls)
+        _check_turn_timeout(cls)
         cls._table, cls._declared, cls._topics = table, declared, tuple(topics)
         cls._bindings = cls._bindings | _declared_bindings(cls)
 
@@ -255,6 +264,14 @@ class Actor:
         """The life ends: its children go first, newest first."""
         for child in reversed(list((self.ctx._cell.children or {}).values())):
             await child.node.stop_child(child)
+
+
+def _check_turn_timeout(cls: type[Actor]) -> None:
+    seconds = cls.turn_timeout
+    if seconds is not None and not is_seconds(seconds):
+        raise TypeError(f"{type_name(cls)}.turn_timeout must be seconds > 0 or None, not {seconds!r}")
+    if seconds is not None and cls._supervises:
+        raise TypeError(f"{type_name(cls)}.turn_timeout: a supervisor has none, for it waits for nobody in its turns")
 
 
 def _check(cls: type, name: str, handler: Any, kind: type) -> None:

@@ -7,7 +7,7 @@ that hands its messages over goes with any place that takes them, so a new home 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from ..events import ActorKilled
@@ -84,6 +84,8 @@ class Place:
     """Whether each life has a process of its own, or several."""
     kind: str = "task"
     """Where that is, in a word, for whoever counts."""
+    limits_turns: bool = True
+    """Whether a turn that takes longer than its class allows is ended where it runs, and not by others."""
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         """Begin a life. None: it is up already. Raises, or fails the future, with StartFailed."""
@@ -130,6 +132,13 @@ class Place:
 
     def process(self, cell: Cell) -> Any:
         """The process besides this one that the present life is lived in, if there is one now."""
+        return None
+
+    def replica_states(self) -> Mapping[str, str] | None:
+        """How each replica that lives the life here does: "leads", "follows", "joining", "silent" or "down".
+
+        Without any, none lives at the moment. None: the life here has no replicas.
+        """
         return None
 
     def spec_data(self, cell: Cell) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import asyncio
 import contextvars
 from collections import deque
 from collections.abc import Awaitable, Callable
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, cast
 
 from ..errors import ActorStopped, UnknownMessage, type_name
 from ..exit_reasons import SHUTDOWN, ExitReason
@@ -123,13 +123,17 @@ class Host(Protocol):
         ...
 
 
+Scope: TypeAlias = Literal["system", "fleet"]
+"""Who finds an actor by a name: the system that it is of, or other systems and clients that are connected, too."""
+
+
 class Belongings:
     """What a life has taken, and gives back at its end: background tasks, timers, subscriptions, names."""
 
     __slots__ = ("names", "tasks", "timers", "topics")
 
     def __init__(self) -> None:
-        self.names: list[str] = []
+        self.names: dict[str, Scope] = {}
         self.tasks = Ordered[asyncio.Task[Any]]()
         self.timers = Ordered[Any]()
         self.topics = Ordered[str]()

@@ -601,6 +601,10 @@ class ActorContext:
         """Whether a turn was left in the middle: this life handles nothing any more."""
         return False
 
+    def _rests(self) -> bool:
+        """Whether the turn in hand is at no work: it waits for a moment or a message, or is being handled again."""
+        return False
+
     def _leaves_turn(self) -> bool:
         """Leave the turn in hand, if it rests (for days, perhaps) and the next life runs it again from its start."""
         return False

@@ -9,12 +9,13 @@ from __future__ import annotations
 import asyncio
 import contextvars
 import signal
+import weakref
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable
 from typing import TYPE_CHECKING, Any
 
 from .. import exit_reasons
-from ..errors import ActorStopped, AskFailed, Ignore, StartFailed, StartIgnored, remote_crash
+from ..errors import ActorStopped, AskFailed, Ignore, StartFailed, StartIgnored, TurnTimeout, remote_crash, type_name
 from ..events import ActorCrashed, ActorStarted, HookFailed, LifeAbandoned
 from ..exit_reasons import KILLED, NORMAL, SHUTDOWN, Crash, ExitReason
 from . import links, mailbox
@@ -22,7 +23,7 @@ from .actor import Actor
 from .address_host import AddressHost, Home, Parent, Place
 from .cell import DOWN, ENDING, GONE, RUNNING, Cell
 from .context import ActorContext
-from .envelope import LEAVE, Ask, Item
+from .envelope import LEAVE, Ask, Item, message_in
 from .message import Refusal
 from .ref import current
 
@@ -200,6 +201,7 @@ def build(cell: Cell, start: Start[Any], context_type: Callable[[Cell], ActorCon
         raise StartFailed(cell.path, str(reason)) from error
     if cell.more is not None and cell.more.tap is not None:
         cell.more.tap.attach()
+    limit_turns(cell)
 
 
 def up(cell: Cell) -> None:
@@ -369,6 +371,52 @@ def cut_off(cell: Cell, item: Any) -> None:
         item.fail(AskFailed(cell.path, str(KILLED)))
 
 
+def limit_turns(cell: Cell) -> None:
+    """The actor at a cell is of this class from now on: have its turns end that take longer than that allows."""
+    seconds = None if cell.actor is None else cell.actor.turn_timeout
+    if seconds is not None and cell.host.place.limits_turns:
+        TurnLimit(cell, seconds)
+
+
+class TurnLimit:
+    """Ends the life at a cell whose turn waits for too long; no turn is slower for it, for nothing is done in one.
+
+    Starts and ends have limits of their own, and a turn that rests as it has said (`ctx.sleep`) is at no work: it is
+    given the whole time anew.
+
+    Args:
+        cell: whose life has just been built, or has another class.
+        seconds: that a turn may take.
+    """
+
+    __slots__ = ("_cell", "_kind", "_life", "_seconds")
+
+    def __init__(self, cell: Cell, seconds: float) -> None:
+        self._cell, self._life, self._seconds = weakref.ref(cell), cell.life, seconds
+        self._kind = type(cell.actor)
+        cell.node.loop.call_later(seconds, self._look)
+
+    def _look(self) -> None:
+        cell = self._cell()
+        if cell is None or cell.life != self._life or type(cell.actor) is not self._kind:
+            return
+        turn = cell.more.turn if cell.more is not None else None
+        loop = cell.node.loop
+        wait = self._seconds
+        if turn is not None and not self._is_excused(cell, turn):
+            wait = turn.since + self._seconds - loop.time()
+            if wait <= 0:
+                turn.overrun(TurnTimeout(cell.path, type_name(type(message_in(turn.item))), self._seconds))
+                loop.call_later(GRACE, abandon, turn)
+                return
+        loop.call_later(wait, self._look)
+
+    @staticmethod
+    def _is_excused(cell: Cell, turn: Suspended) -> bool:
+        is_turn = turn.then is None and not turn.killed and not turn.is_left and not isinstance(turn.item, FirstTurn)
+        return not is_turn or cell.ctx is None or cell.ctx._rests()
+
+
 def stop(cell: Cell, reason: ExitReason, item: Item) -> None:
     """A life was told to stop, by itself or by others. Called in the actor's own context."""
     if isinstance(reason, Crash):
@@ -443,18 +491,25 @@ async def _kill_children(cell: Cell) -> None:
 
 
 def abandon(turn: Suspended) -> None:
-    """A killed turn that swallows its cancellation: its life is over all the same, and its sends are refused."""
+    """A turn that swallows its cancellation: its life is over all the same, and its sends are refused."""
     cell = turn.cell
     more = cell.more
     if more is None or more.turn is not turn:
         return
     more.turn = None
     more.bindings.update(turn.rebinds or {})
-    cut_off(cell, turn.item)
     cell.node.turns_held -= 1
     cell.node.emit(LifeAbandoned(cell.path, cell.life))
+    reason: ExitReason = KILLED
+    if turn.overran is None:
+        cut_off(cell, turn.item)
+    else:
+        reason = exit_reasons.crash(turn.overran)
+        if isinstance(turn.item, Item):
+            turn.item.fail(remote_crash(turn.overran))
+        tell_crash(cell, reason, turn.item)
     _kill_orphans(cell)
-    ended(cell, KILLED)
+    ended(cell, reason)
 
 
 def _kill_orphans(cell: Cell) -> None:

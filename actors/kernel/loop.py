@@ -264,6 +264,9 @@ class RunLoop:
         more.turn = None
         if turn.rebinds is not None:
             more.bindings.update(turn.rebinds)
+        if turn.overran is not None:
+            turn.overran.__cause__ = error  # Its traceback says where the turn has waited.
+            error = turn.overran
         if turn.then is not None and not (turn.killed and cell.children):
             turn.then()
         elif turn.killed or (error is not None and not turn.is_left):
@@ -382,11 +385,24 @@ class TurnRemains(Item):
 class Suspended:
     """A turn that waits for something, and the runner that waits with it."""
 
-    __slots__ = ("cell", "coroutine", "is_left", "item", "killed", "rebinds", "runner", "since", "then", "waiting")
+    __slots__ = (
+        "cell",
+        "coroutine",
+        "is_left",
+        "item",
+        "killed",
+        "overran",
+        "rebinds",
+        "runner",
+        "since",
+        "then",
+        "waiting",
+    )
 
     def __init__(self, cell: Cell, item: Any, coroutine: Any, waiting: Any, runner: Runner) -> None:
         self.cell, self.item, self.coroutine, self.waiting, self.runner = cell, item, coroutine, waiting, runner
         self.killed = self.is_left = False  # (left: cancelled, and it does not matter how it ends)
+        self.overran: BaseException | None = None  # what it has raised, however its coroutine ends
         self.since: float = cell.node.now  # on the loop's clock, of the slice it began in
         self.rebinds: dict[str, Cell] | None = None  # bindings that change when this turn is over
         self.then: Callable[[], None] | None = None  # set when the coroutine is no turn but a winding down
@@ -394,6 +410,11 @@ class Suspended:
     def kill(self) -> None:
         """Cancel the turn; `after_turn` then ends the life as killed."""
         self.killed = True
+        self.runner.task.cancel()
+
+    def overrun(self, error: BaseException) -> None:
+        """Cancel the turn, which counts as having raised `error`."""
+        self.overran = error
         self.runner.task.cancel()
 
 

@@ -29,7 +29,7 @@ from ..persistence import Keeper, NothingKept
 from ..values.path_parts import check_beside, check_path_part
 from . import lifecycle
 from .blocking_handlers import HandlerThreads
-from .cell import DOWN, GONE, RUNNING, Cell, CellKinds, Host
+from .cell import DOWN, GONE, RUNNING, Cell, CellKinds, Host, Scope
 from .codec import Codec
 from .deadlines import Deadlines
 from .envelope import Item
@@ -341,13 +341,14 @@ class Node(RunLoop):
             raise WrongActor(path, type_name(kind), type_name(found))
         return ActorRef(cell)
 
-    def register(self, name: str, cell: Cell, *, is_starting: bool = False) -> None:
+    def register(self, name: str, cell: Cell, *, is_starting: bool = False, scope: Scope | None = None) -> None:
         """Give an actor a name beside its path; it is free again before anybody hears of the actor's end.
 
         Args:
             name: the name.
             cell: the actor.
             is_starting: a life of it is about to begin, and has the name from its very start.
+            scope: who finds it by the name; left out, who finds it so far, and for a new name this system.
 
         Raises:
             NameTaken: another living actor has it. SpecError: it is empty, or has control characters.
@@ -355,19 +356,32 @@ class Node(RunLoop):
         check_beside(cell.path, name)
         holder = self.names.get(name)
         if holder is cell:
+            if scope is not None:
+                cell.extra().belongings.names[name] = scope
             return
         if holder is not None:
             raise NameTaken(name)
         if cell.state is not RUNNING and not is_starting:
             raise ActorStopped(cell.path)
         self.names[name] = cell
-        cell.extra().belongings.names.append(name)
+        cell.extra().belongings.names[name] = scope or "system"
 
     def unregister(self, name: str) -> None:
         """Free a name; unknown ones are fine."""
         cell = self.names.pop(name, None)
         if cell is not None:
-            cell.extra().belongings.names.remove(name)
+            cell.extra().belongings.names.pop(name, None)
+
+    def shown(self, name: str) -> Cell:
+        """The actor that other systems find by a name.
+
+        Raises:
+            NoSuchActor: nobody has it, or it is for this system alone.
+        """
+        cell = self.names.get(name)
+        if cell is None or cell.extra().belongings.names.get(name) != "fleet":
+            raise NoSuchActor(name)
+        return cell
 
     def bind(self, cell: Cell, port: str, target: Cell, *, is_claimed: bool = False) -> None:
         """Point a binding elsewhere; the owner sees it from its next turn on.

@@ -6,7 +6,15 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
-from ..errors import ActorStopped, MailboxFull, StoreError, UnknownMessage
+from ..errors import (
+    ActorStopped,
+    ConnectionFull,
+    ConnectionLost,
+    MailboxFull,
+    StoreError,
+    UnknownMessage,
+    Unreachable,
+)
 from .message import require_message
 
 if TYPE_CHECKING:
@@ -14,7 +22,7 @@ if TYPE_CHECKING:
     from .message import Message
     from .node import Node
 
-NOT_TAKEN = (ActorStopped, MailboxFull, StoreError, UnknownMessage)
+NOT_TAKEN = (ActorStopped, ConnectionFull, ConnectionLost, MailboxFull, StoreError, UnknownMessage, Unreachable)
 """Why one subscriber may not take what is published; the others get it all the same."""
 
 

@@ -272,9 +272,9 @@ def settle(twin: Cell, cell: Cell) -> None:
     for topic in list(had.topics):
         node.topics.unsubscribe(topic, twin)
         node.topics.subscribe(topic, cell)
-    for name in had.names:
+    for name, scope in had.names.items():
         node.names[name] = cell
-        has.names.append(name)
+        has.names[name] = scope
     for peer, name in tied.links.items():
         peer.extra().ties.links.pop(twin, None)
         peer.extra().ties.links[cell], ties.links[peer] = cell.path, name

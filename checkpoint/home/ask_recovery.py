@@ -12,6 +12,7 @@ journal, and becomes an input when its home is opened.
 from __future__ import annotations
 
 import math
+import sys
 from hashlib import blake2b
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 import msgspec
 
 from ...actors.errors import HoldfastError
+from ...actors.events import KeptForSystem
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask
 from ..inputs import Batch, Input
@@ -43,6 +45,12 @@ PASSING: Final = "/client~"
 """How the addresses of programs begin that are no systems, and only connect to some."""
 TIDIED: Final = 1024
 """Asks under way after which it is looked for some that have run out."""
+MOST_GONE: Final = 10_000
+"""Outcomes that are kept for programs that are no systems and have left, all of them together."""
+MOST_GONE_BYTES: Final = 64 << 20
+"""The same in bytes."""
+MOST_FORGOTTEN: Final = 100_000
+"""Runs of programs of which it is known that their outcomes were given up."""
 MOST_ENTRIES: Final = 2000
 """Entries after which what is left is written anew."""
 
@@ -137,6 +145,84 @@ class FarAnswer(msgspec.Struct, array_like=True, frozen=True):
     body: bytes
 
 
+class KeptLimits(Protocol):
+    """How much is kept for one system until it has accepted it."""
+
+    @property
+    def kept(self) -> int:
+        """How many messages at most."""
+        ...
+
+    @property
+    def kept_bytes(self) -> int:
+        """How many bytes they may have together."""
+        ...
+
+
+class _NoLimits:
+    """Of a program without lines, which keeps nothing more."""
+
+    kept = kept_bytes = sys.maxsize
+
+
+NO_LIMITS: Final = _NoLimits()
+
+
+class KeptMail:
+    """What is kept for one other program: outcomes of what it has asked, and messages of recorded actors.
+
+    Attributes:
+        is_system: whether it is known for good, as a system is that there has been a line to.
+        answers: by the names of the asks.
+        outs: messages that it has not accepted yet, by what sent them, oldest first.
+        size: of these messages, in bytes.
+        told: how full that was when it was last told: not at all, half, or at its limit.
+    """
+
+    __slots__ = ("answers", "is_system", "outs", "size", "told")
+
+    def __init__(self) -> None:
+        self.is_system = False
+        self.answers: dict[FarId, FarAnswer] = {}
+        self.outs: dict[str, FarOut] = {}
+        self.size = self.told = 0
+
+    def add(self, out: FarOut) -> None:
+        """Keep a message until it is accepted."""
+        self.outs[out.origin] = out
+        self.size += len(out.body)
+
+    def take(self, origin: str) -> bool:
+        """Whether this message is kept here: then it is no more."""
+        out = self.outs.pop(origin, None)
+        if out is None:
+            return False
+        self.size -= len(out.body)
+        if not self.outs:
+            self.told = 0
+        return True
+
+    def clear(self) -> None:
+        """Keep nothing more."""
+        self.answers.clear()
+        self.outs.clear()
+        self.size = self.told = 0
+
+
+class FarKept(msgspec.Struct, array_like=True):
+    """All that is kept for other programs, as one value.
+
+    Attributes:
+        answers: outcomes that they are not known to have.
+        outs: messages that they have not accepted.
+        forgotten: runs of programs whose outcomes were given up.
+    """
+
+    answers: list[FarAnswer]
+    outs: list[FarOut]
+    forgotten: list[int] = msgspec.field(default_factory=list)
+
+
 class FarMail:
     """What recorded actors are asked by other systems, and what they tell those: once, whoever leads the systems.
 
@@ -147,44 +233,66 @@ class FarMail:
     Attributes:
         deliver: is told each outcome when it is safe.
         sender: sends to other systems; none before there are lines.
+        limits: how much is kept for one system.
         is_closing: whether this system ends: asks that are not answered any more wait for whoever leads it next.
     """
 
     def __init__(self, homes: Homes) -> None:
         self._homes = homes
-        self._answers: dict[FarId, FarAnswer] = {}
         self._open: dict[FarId, float] = {}
-        self._outs: dict[str, FarOut] = {}
-        self._systems = {key.removeprefix(SYSTEM) for key in homes.journal.notes(SYSTEM)}
+        self._gone: dict[str, None] = {}  # programs that are no systems and have left, longest ago first
+        self._forgotten: dict[int, None] = {}  # runs of those whose outcomes were given up, longest ago first
+        self._mail: dict[str, KeptMail] = {}
+        for key in homes.journal.notes(SYSTEM):
+            self._of(f"/{key.removeprefix(SYSTEM)}").is_system = True
         self._positions: list[int] = []
         self._opening: dict[str, list[Callable[[], None]]] = {}
         self.sender: FarSender | None = None
+        self.limits: KeptLimits = NO_LIMITS
         self.is_closing = False
         self.deliver: Callable[[FarId, Answer], None] = lambda which, answer: None
         saved = homes.journal.load(FAR)
         if saved.snapshot is not None:
-            answers, outs = msgspec.msgpack.decode(saved.snapshot, type=tuple[list[FarAnswer], list[FarOut]])
-            self._answers.update((_id(one), one) for one in answers)
-            self._outs.update((out.origin, out) for out in outs)
+            kept = msgspec.msgpack.decode(saved.snapshot, type=FarKept)
+            for one in kept.answers:
+                self._of(one.asker).answers[_id(one)] = one
+            for out in kept.outs:
+                self._of(out.to).add(out)
+            self._forgotten.update(dict.fromkeys(kept.forgotten))
         for position, entry in saved.entries:
             self._positions.append(position)
             self._read(position, entry)
         self._turn = saved.turn
+        for system, mail in self._mail.items():
+            if not mail.is_system:
+                self._gone[system] = None
 
     def _read(self, position: int, entry: tuple[Any, ...]) -> None:
         match entry:
             case ("answered", *fields):
                 one = FarAnswer(*fields)
-                self._answers[_id(one)] = one
+                self._of(one.asker).answers[_id(one)] = one
             case ("settled", asker, number, run):
-                self._answers.pop(FarId(asker, number, run), None)
+                self._of(asker).answers.pop(FarId(asker, number, run), None)
             case ("out", *fields):
                 out = FarOut(*fields)
-                self._outs[out.origin] = out
+                self._of(out.to).add(out)
             case ("accepted", origin):
-                self._outs.pop(origin, None)
+                any(mail.take(origin) for mail in self._mail.values())
+            case ("forgotten", system, run):
+                self._give_up(system, run)
+            case ("dropped", system):
+                self._of(f"/{system}").clear()
             case _:
                 raise HoldfastError(f"other systems: entry {position} is of an unknown kind {entry[0]!r}")
+
+    def _of(self, path: str) -> KeptMail:
+        """What is kept for the system of an address."""
+        system = _system(path)
+        found = self._mail.get(system)
+        if found is None:
+            found = self._mail[system] = KeptMail()
+        return found
 
     def is_far(self, path: str) -> bool:
         """Whether an address is another system's."""
@@ -193,13 +301,20 @@ class FarMail:
 
     def connected(self, system: str) -> None:
         """There is a line to a system: what recorded actors send it from now on is kept until it has it."""
-        if system not in self._systems and not f"/{system}".startswith(PASSING):
-            self._systems.add(system)
+        if not f"/{system}".startswith(PASSING) and not self._lasts(f"/{system}"):
+            self._of(f"/{system}").is_system = True
             self._homes.journal.note(f"{SYSTEM}{system}", b"")
+
+    def may_know(self, system: str, most: int) -> bool:
+        """Whether a program may be taken note of: for good if it is a system, so of those there are so many at most."""
+        if f"/{system}".startswith(PASSING) or self._lasts(f"/{system}"):
+            return True
+        return sum(mail.is_system for mail in self._mail.values()) < most
 
     def _lasts(self, path: str) -> bool:
         """Whether an address is that of a system that there has been a line to, in this run or an earlier one."""
-        return path[1:].partition("/")[0] in self._systems
+        mail = self._mail.get(_system(path))
+        return mail is not None and mail.is_system
 
     def begin(self, which: FarId, until: float) -> None:
         """It is on its way to its receiver, and nobody waits for it after `until`, on the monotonic clock."""
@@ -218,7 +333,8 @@ class FarMail:
 
     def outcome(self, which: FarId) -> Answer | None:
         """The outcome, if it is known."""
-        one = self._answers.get(which)
+        mail = self._mail.get(_system(which.asker))
+        one = None if mail is None else mail.answers.get(which)
         return None if one is None else Answer(one.kind, one.name, one.body)
 
     def answered(self, which: FarId, answer: Answer, batch: Batch) -> None:
@@ -227,7 +343,7 @@ class FarMail:
         one = FarAnswer(*which, answer.kind, answer.name, bytes(answer.body))
 
         def safe() -> None:
-            self._answers[which] = one
+            self._of(which.asker).answers[which] = one
             self.deliver(which, answer)
             self._tidy()
 
@@ -237,15 +353,66 @@ class FarMail:
 
     def settled(self, which: FarId) -> None:
         """Whoever has asked has the outcome, or does not want it any more."""
-        if self._answers.pop(which, None) is not None and which.run == LASTING and self._homes.journal.durable:
+        mail = self._mail.get(_system(which.asker))
+        was_kept = mail is not None and mail.answers.pop(which, None) is not None
+        if was_kept and which.run == LASTING and self._homes.journal.durable:
             batch = Batch()
             batch.add(FAR, ("settled", *which), self._positions)
             batch.commit(self._homes.journal)
 
     def forget_run(self, system: str, run: int) -> None:
         """A run of another program is over: what it has asked, and not by a recorded actor, it does not ask again."""
-        for which in [one for one in self._answers if one.run == run and one.asker[1:].partition("/")[0] == system]:
-            del self._answers[which]
+        mail = self._mail.get(system)
+        if mail is not None:
+            mail.answers = {which: one for which, one in mail.answers.items() if which.run != run}
+            if not mail.is_system and not mail.answers:
+                del self._mail[system]
+                self._gone.pop(system, None)
+
+    def connects(self, system: str) -> None:
+        """There is a line to a program."""
+        self._gone.pop(system, None)
+
+    def leaves(self, system: str) -> None:
+        """There is no line to a program any more; its outcomes wait for it, but not for ever if many others do."""
+        mail = self._mail.get(system)
+        if mail is None or mail.is_system:
+            return
+        self._gone[system] = None
+        answers = [one for name in self._gone for one in self._mail[name].answers.values()]
+        left, size = len(answers), sum(len(one.body) for one in answers)
+        while left > MOST_GONE or size > MOST_GONE_BYTES:
+            longest = next(iter(self._gone))
+            for one in list(self._mail[longest].answers.values()):
+                left, size = left - 1, size - len(one.body)
+                if one.run not in self._forgotten:
+                    self._note_forgotten(longest, one.run)
+            self._give_up(longest, None)
+
+    def _note_forgotten(self, system: str, run: int) -> None:
+        if self._homes.journal.durable:
+            batch = Batch()
+            batch.add(FAR, ("forgotten", system, run), self._positions)
+            batch.commit(self._homes.journal)
+        self._forgotten[run] = None
+        if len(self._forgotten) > MOST_FORGOTTEN:
+            del self._forgotten[next(iter(self._forgotten))]
+
+    def _give_up(self, system: str, run: int | None) -> None:
+        """Forget the outcomes of a program that has left; `run`: the store says so of this run."""
+        if run is not None:
+            self._forgotten[run] = None
+        self._mail.pop(system, None)
+        self._gone.pop(system, None)
+
+    def has_forgotten(self, which: FarId) -> bool:
+        """Whether the outcomes of the run that has asked were given up: nobody knows whether this was done."""
+        return which.run in self._forgotten
+
+    def answers_kept(self, system: str) -> int:
+        """How many outcomes are kept for recorded actors of a system, which have not said that they have them."""
+        mail = self._mail.get(system)
+        return 0 if mail is None else sum(which.run == LASTING for which in mail.answers)
 
     # -- what is told to other systems ------------------------------------------------------------------------------
 
@@ -253,16 +420,62 @@ class FarMail:
         """Keep what a turn tells an actor of another system that lasts, and send it when that is safe."""
         if self.sender is None or not self._lasts(out.to):
             return False
-        kept = self._outs[origin] = FarOut(origin, out.to, out.name, bytes(out.body), sender)
+        kept = FarOut(origin, out.to, out.name, bytes(out.body), sender)
+        mail, system = self._of(out.to), _system(out.to)
+        node, limits = self._homes.node, self.limits
+        if len(mail.outs) >= limits.kept or mail.size + len(kept.body) > limits.kept_bytes:
+            problem = f"{len(mail.outs)} messages ({mail.size} bytes) are kept for /{system} already"
+            node.dead_letter(node.cell_at(out.to), Parcel(out.name, kept.body), problem, node.cell_at(sender))
+            self._tell_kept(system, mail, 2)
+            return True
+        mail.add(kept)
+        if 2 * len(mail.outs) >= limits.kept or 2 * mail.size >= limits.kept_bytes:
+            self._tell_kept(system, mail, 1)
         if self._homes.journal.durable:
             batch.add(FAR, ("out", *msgspec.structs.astuple(kept)), self._positions)
         send = self.sender.tell
         batch.after.append(lambda: send(kept, again=False))
         return True
 
-    def accepted(self, origin: str, then: Callable[[], None]) -> None:
+    def _tell_kept(self, system: str, mail: KeptMail, level: int) -> None:
+        """Tell, once, how much is kept for a system: from half of the limit on (1), and at the limit (2)."""
+        if mail.told < level:
+            mail.told = level
+            self._homes.node.emit(KeptForSystem(f"/{system}", len(mail.outs), mail.size, level == 2))
+
+    def kept(self) -> dict[str, tuple[int, int]]:
+        """How many messages of recorded actors are kept for each system, and their bytes; none for most."""
+        return {system: (len(mail.outs), mail.size) for system, mail in self._mail.items() if mail.is_system}
+
+    def drop(self, system: str) -> int:
+        """Forget a system, and what is kept for it: how many messages that were. It may connect again all the same.
+
+        They are dead letters; recorded actors there that have asked something here may ask it again, and it is done
+        again.
+
+        Raises:
+            StoreError: the store does not take it.
+        """
+        mail = self._mail.get(system)
+        if mail is None:
+            return 0
+        outs = list(mail.outs.values())
+        mail.clear()
+        mail.is_system = False
+        if self._homes.journal.durable:
+            batch = Batch()
+            batch.add(FAR, ("dropped", system), self._positions)
+            batch.commit(self._homes.journal)
+            self._homes.journal.note(f"{SYSTEM}{system}", None)
+        node, problem = self._homes.node, f"what was kept for /{system} was dropped"
+        for out in outs:
+            node.dead_letter(node.cell_at(out.to), Parcel(out.name, out.body), problem, node.cell_at(out.sender))
+        return len(outs)
+
+    def accepted(self, system: str, origin: str, then: Callable[[], None]) -> None:
         """Another system has a message, or has refused it: it is not sent again. `then` is called when that is safe."""
-        if self._outs.pop(origin, None) is None:
+        mail = self._mail.get(system)
+        if mail is None or not mail.take(origin):
             return
         batch = Batch()
         if self._homes.journal.durable:
@@ -284,7 +497,8 @@ class FarMail:
 
     def outs(self, system: str) -> list[FarOut]:
         """What is kept for a system, oldest first."""
-        return [out for out in self._outs.values() if out.to.startswith(f"/{system}/")]
+        mail = self._mail.get(system)
+        return [] if mail is None else list(mail.outs.values())
 
     def when_opened(self, path: str, then: Callable[[], None]) -> None:
         """Have something done when the home of a recorded address that nobody was started at yet is open."""
@@ -300,7 +514,10 @@ class FarMail:
         if len(self._positions) < MOST_ENTRIES:
             return
         journal = self._homes.journal
-        left = msgspec.msgpack.encode((list(self._answers.values()), list(self._outs.values())))
+        mails = self._mail.values()
+        answers = [one for mail in mails for one in mail.answers.values()]
+        outs = [out for mail in mails for out in mail.outs.values()]
+        left = msgspec.msgpack.encode(FarKept(answers, outs, list(self._forgotten)))
         try:
             journal.barrier()
             journal.cut(FAR, left, self._positions, turn=self._turn + 1, keep=1)
@@ -308,6 +525,11 @@ class FarMail:
             return  # It stays as long as it is, and is tried again.
         self._turn += 1
         self._positions.clear()
+
+
+def _system(path: str) -> str:
+    """The first part of an address: the program that it is of."""
+    return path[1:].partition("/")[0]
 
 
 def _id(one: FarAnswer) -> FarId:

@@ -38,6 +38,7 @@ class RestoredState:
         has_state: whether there is one; else the actor begins afresh.
         traps: whether the actor trapped exits.
         variables: those that its class had when `__init__` had run.
+        is_mapped: whether that was another version of the class, whose state the actor would save otherwise now.
         stash_ids: inputs that had been put aside.
         unstashes: whether those are to come again.
         seconds: how long it took to put the state back.
@@ -48,6 +49,7 @@ class RestoredState:
     has_state: bool = False
     traps: bool = False
     variables: list[str] = dataclasses.field(default_factory=list)
+    is_mapped: bool = False
     stash_ids: frozenset[int] = frozenset()
     unstashes: bool = False
     seconds: float = 0.0

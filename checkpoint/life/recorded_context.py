@@ -411,6 +411,9 @@ class RecordedContext(ActorContext):
     def _is_adrift(self) -> bool:
         return self.recorded.stage.is_adrift
 
+    def _rests(self) -> bool:
+        return self.recorded.waits.resting > 0 or not self.recorded.is_live
+
     def _leaves_turn(self) -> bool:
         more = self._cell.more
         turn = None if more is None else more.turn

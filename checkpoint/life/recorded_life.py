@@ -160,7 +160,7 @@ class Life:
             try:
                 data = self.images.mapped(restored.image) if restored.image is not None else restored.joined()
                 self.images.last_bytes = len(data)
-                dropped = restore_state(actor, data, (restored.variables, self.saving.variables))
+                dropped, restored.is_mapped = restore_state(actor, data, (restored.variables, self.saving.variables))
             except BaseException as error:
                 why = UNFIT if isinstance(error, StateMismatch) else "its state could not be restored"
                 self._give_up(f"{why}: {error}", error)

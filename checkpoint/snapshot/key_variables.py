@@ -77,12 +77,24 @@ def _parts(actor: Actor, state: StateForm) -> list[tuple[str, object]]:
     return [(f"{where}.{name}", value) for name, value in state.value.items()]
 
 
+class PutBack(NamedTuple):
+    """What became of a saved state.
+
+    Attributes:
+        dropped: the saved variables that were dropped: the class has them no more.
+        is_mapped: whether the class that has saved it was another version: the actor would save something else now.
+    """
+
+    dropped: list[str]
+    is_mapped: bool
+
+
 def restore_state(
     actor: Actor,
     data: bytes | ByteParts,
     variables: tuple[list[str], list[str]] = ([], []),
     meant: Callable[[Any], Any] = as_it_is,
-) -> list[str]:
+) -> PutBack:
     """Put a saved state back; one of an older schema is handed to the class's `migrate` first.
 
     Args:
@@ -90,9 +102,6 @@ def restore_state(
         data: the state; parts are in memory that becomes the actor's own.
         variables: those that the class had that has saved it, and that it has now, after `__init__` alone.
         meant: gives what is meant by a saved value.
-
-    Returns:
-        The saved variables that were dropped: the class has them no more.
 
     Raises:
         DamagedValue, StateMismatch: the data is damaged, or of another class or schema version.
@@ -103,13 +112,15 @@ def restore_state(
     else:
         saved = read_image(data) if is_image(data) else decode_value(data)
     dropped: list[str] = []
+    is_mapped = isinstance(saved, tuple) and len(saved) == 3 and saved[0] != actor.schema_version
     if isinstance(saved, tuple) and len(saved) == 3 and saved[:2] == (actor.schema_version, "keys"):
         version, form, state = saved
         if isinstance(state, dict):
-            state, dropped = as_named_now(actor, state, *variables)
-            saved = version, form, state
+            named, dropped = as_named_now(actor, state, *variables)
+            is_mapped = named.keys() != state.keys() or not named.keys() >= set(variables[1])
+            saved = version, form, named
     put_back(actor, meant(saved))
-    return dropped
+    return PutBack(dropped, is_mapped)
 
 
 def as_named_now(

@@ -11,9 +11,9 @@ import dataclasses
 import math
 import secrets
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from time import monotonic
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, Protocol, cast
 
 import msgspec
 
@@ -21,6 +21,7 @@ from ...actors.control.trace_tail import enveloped
 from ...actors.errors import (
     BadMessage,
     BadReply,
+    ConnectionFull,
     ConnectionLost,
     HoldfastError,
     NotGranted,
@@ -28,12 +29,13 @@ from ...actors.errors import (
     Unreachable,
     type_name,
 )
-from ...actors.exit_reasons import ExitReason, NoConnection
+from ...actors.events import ConnectionLimited
+from ...actors.exit_reasons import ExitReason, NoConnection, pack_exit
 from ...actors.kernel import links
 from ...actors.kernel.cell import ANY, RUNNING, Cell
 from ...actors.kernel.codec import Parcel, encode_special, unencodable
 from ...actors.kernel.envelope import AnyTable, Ask
-from ...actors.kernel.message import Message, RuntimeOrder
+from ...actors.kernel.message import Message, RuntimeOrder, message_name
 from ...actors.process.wire import frames
 from ...actors.process.wire.frames import BadFrame
 from ...actors.process.wire.peer import (
@@ -51,6 +53,7 @@ from ...checkpoint.home.pending_asks import ACCEPTED, SwitchAsk
 from ...checkpoint.home.recorded_home import switch_of
 from ...checkpoint.inputs import Batch
 from ...checkpoint.protocol import MESSAGE, REPLY, Answer
+from .inflow import FULL_SECONDS, MOST_HELD, SLICE, ConnectionLimits, Inflow
 from .line import MOST_BYTES, NOBODY, WINDOW_BYTES, Boot, Line, LineBatch, Note
 
 if TYPE_CHECKING:
@@ -66,14 +69,27 @@ PASSING, ASKED, TOLD = 0, 1, 2
 """The number in an ask's frame: its name is void with the run of its program, is not, or it is a message that is kept
 there until it is accepted here."""
 COMMANDS: Final = frozenset(
-    ("monitor", "demonitor", "link", "unlink", "exit", "down", "subscribe", "unsubscribe", "settled")
+    ("monitor", "demonitor", "link", "unlink", "exit", "down", "subscribe", "unsubscribe", "settled", "limited")
 )  # fmt: skip
 """What one system may want of the actors of another one."""
 SPEAKER: Final = {
     "monitor": "watcher", "demonitor": "watcher", "link": "peer", "unlink": "peer", "exit": "source", "down": "source"
 }  # fmt: skip
 """Where a command has the address of the actor that wants it, unless that is the one that it is addressed to."""
+LONGEST_TOPIC: Final = 4096
+"""In characters, of a topic that another program may subscribe to."""
 _DECODER: Final[msgspec.msgpack.Decoder[frames.AnyFrame]] = msgspec.msgpack.Decoder(frames.AnyFrame)
+
+
+class FindName(Message[str]):
+    """Asks a system, at its first address, for the address of the actor that has a name there."""
+
+    registered: str
+
+
+FIND_NAME: Final = message_name(FindName)
+ASKED_FOR: Final = "names asked for"
+"""A fact that is noted anew before a name is answered: if another leads, that cannot be, and nobody is answered."""
 
 
 class TextNames:
@@ -244,45 +260,87 @@ class Unsent:
     fresh: set[int] = dataclasses.field(default_factory=set)
 
 
+class LineOwner(Protocol):
+    """What a line needs of whoever has all lines of a program."""
+
+    @property
+    def node(self) -> Node:
+        """The node whose actors use it."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """The name of this program."""
+        ...
+
+    @property
+    def boot(self) -> Boot:
+        """The incarnation of this program."""
+        ...
+
+    @property
+    def homes(self) -> Homes | None:
+        """The recorded actors here, if there can be any."""
+        ...
+
+    @property
+    def limits(self) -> ConnectionLimits:
+        """How much another program may have outstanding here."""
+        ...
+
+    def next_number(self) -> int:
+        """A number for a line that begins: it rises."""
+        ...
+
+    def hand_back(self, ask: SwitchAsk) -> None:
+        """Take an ask of a recorded actor that is out when its line is closed."""
+        ...
+
+    def overrun(self, far: FarLine, problem: str) -> None:
+        """End a line whose other end does not keep to what it may, and say in what."""
+        ...
+
+    def await_actor(self, path: str, then: Callable[[], None]) -> bool:
+        """Have something done when somebody is started at an address; False: nobody will be soon."""
+        ...
+
+
 class FarLine(Peer):
     """A line to another program, with the stand-ins for its actors.
 
     Args:
-        node: the node whose actors use it.
-        me: the name and the incarnation of this program.
+        owner: has all lines of this program.
         name: the name of the other one: the first part of its addresses.
-        post: posts bytes to the other program; they may get lost.
-        homes: the recorded actors here, if there can be any.
+        post: posts bytes to the other program; they may get lost. It may be reached by another way later: `post_bytes`.
 
     Attributes:
         theirs: the incarnation of the other program; NOBODY until it has answered.
+        numbers: of the line, as this end counts and as the other one does: an end that begins anew counts on.
         line: the line to that; None until then.
         heard: when something of it has last come, on the loop's clock.
         is_lost: whether it has not answered for long.
         is_closed: whether nothing goes over any more.
         is_closing: whether this program ends: it takes in nothing new, and still answers.
         most: the largest item that can be sent, in bytes.
-        hand_back: is given the asks of recorded actors that are out when it is closed.
-        await_actor: has something done when somebody is started at an address; None: nobody will be soon.
+        inflow: what the other program has outstanding here.
     """
 
-    def __init__(
-        self, node: Node, me: tuple[str, Boot], name: str, post: Callable[[bytes], None], homes: Homes | None
-    ) -> None:
-        super().__init__(node)
-        self._me, self._boot = me
+    def __init__(self, owner: LineOwner, name: str, post: Callable[[bytes], None]) -> None:
+        super().__init__(owner.node)
+        self._owner = owner
         self.name = name
-        self._post_bytes = post
-        self._homes = homes
+        self.post_bytes = post
         self.theirs = NOBODY
+        self.numbers = (owner.next_number(), 0)
         self.line: Line | None = None
-        self.heard = node.loop.time()
+        self.heard = owner.node.loop.time()
         self.is_lost = False
-        self.is_closed = self.is_closing = False
-        self.await_actor: Callable[[str, Callable[[], None]], bool] = lambda path, then: False
+        self.is_closed = False
+        self.is_closing = owner.homes is not None and owner.homes.far.is_closing
         self.most = MOST_BYTES
-        self.hand_back: Callable[[SwitchAsk], None] = lambda ask: None
+        self.inflow = Inflow(owner.limits)
         self._unsent = Unsent()
+        self._oldest: tuple[int | None, float] = (None, 0.0)
         self._last_id = secrets.randbits(40) << 12  # A late reply to an earlier run names nothing of this one.
         self._cells: weakref.WeakValueDictionary[str, Cell] = weakref.WeakValueDictionary()
         self._host = FarHost(self)
@@ -319,7 +377,13 @@ class FarLine(Peer):
         if self.is_closed or (self.is_lost and isinstance(frame, (frames.Tell, frames.Offer, frames.Publish))):
             raise Unreachable(f"/{self.name}", "the connection is closed" if self.is_closed else "it does not answer")
         if self.line is not None:
-            self.line.put(NEW + data)
+            if isinstance(frame, (frames.Reply, frames.Failure)):
+                self.inflow.answered(frame.id)
+                self.line.put(NEW + data)
+            elif _passes(frame):
+                self.line.put(NEW + data)
+            else:
+                self.line.put_message(NEW + data)
             return
         if self._unsent.size > WINDOW_BYTES:
             raise Unreachable(f"/{self.name}", "too much waits for it already")
@@ -334,7 +398,7 @@ class FarLine(Peer):
 
     def deliver(self, which: FarId, answer: Answer) -> None:
         """Send the outcome of an ask to a recorded actor here; it is kept until the other program has it."""
-        homes, line = self._homes, self.line
+        homes, line = self._owner.homes, self.line
         if homes is None or line is None or which.run not in (LASTING, run_number(self.theirs)):
             return  # It asks again when it is back; or it has been started anew, and nobody there waits.
         frame: frames.Frame
@@ -347,6 +411,7 @@ class FarLine(Peer):
             error = BadReply("the recorded actor", "what it was asked", self.too_large(len(data)))
             kind, name, body = self.codec.encode_error(error)
             data = msgspec.msgpack.encode(frames.Failure(which.number, kind, name, msgspec.Raw(body)))
+        self.inflow.answered(which.number)
         # A recorded asker says by itself when it has the outcome for good.
         arrived = None if which.run == LASTING else lambda: homes.far.settled(which)
         line.put(NEW + data, arrived)
@@ -372,16 +437,16 @@ class FarLine(Peer):
 
     def kept_is_over(self, told: KeptTell) -> None:
         """The other program has accepted what was kept for it, or never will."""
-        homes, key, sender = self._homes, lasting_number(told.origin), told.sender.path
+        homes, key, sender = self._owner.homes, lasting_number(told.origin), told.sender.path
         if homes is not None:
-            homes.far.accepted(told.origin, lambda: self.command(sender, "settled", {"number": key}))
+            homes.far.accepted(self.name, told.origin, lambda: self.command(sender, "settled", {"number": key}))
 
     def _put_ask(self, key: int, ask: Ask, *, again: bool) -> None:
         """Send an ask under this number, now or when the other program has answered."""
         self.pending[key] = ask
         ask.started = True
         if self.line is not None:
-            self.line.put((AGAIN if again else NEW) + self._ask_frame(key, ask))
+            self.line.put_message((AGAIN if again else NEW) + self._ask_frame(key, ask))
         elif not again:
             self._unsent.fresh.add(key)
 
@@ -408,22 +473,30 @@ class FarLine(Peer):
 
     def _post(self, first: int, items: tuple[bytes, ...], note: Note) -> None:
         got = 0 if self.line is None else self.line.got
-        batch = LineBatch(self._me, self._boot, self.theirs, got, first, items, note)
-        self._post_bytes(msgspec.msgpack.encode(batch))
+        if not note and self.inflow.is_full:
+            note = "full"
+        ours, theirs = self.numbers
+        batch = LineBatch(self._owner.name, self._owner.boot, self.theirs, got, first, items, note, ours, theirs)
+        self.post_bytes(msgspec.msgpack.encode(batch))
 
     # -- whom it leads to -------------------------------------------------------------------------------------------
 
-    def begin(self, theirs: Boot) -> None:
+    def begin(self, theirs: Boot, number: int) -> None:
         """The other program has answered: send it what waits, and again what was asked of the one before it."""
         self.theirs = theirs
+        self.numbers = (self.numbers[0], number)
         self.line = Line(self.node.loop, self._post, self._take)
         self.alive()
         self._ask_again()
         unsent, self._unsent = self._unsent, Unsent()
         for data in unsent.items:
-            self.line.put(data)
+            self.line.put_message(data)
         for cell in list(self._cells.values()):
             self._watch_again(cell)
+
+    def is_with(self, batch: LineBatch) -> bool:
+        """Whether a batch is of the line that there is, and not of one before it."""
+        return self.theirs == batch.boot and self.numbers == (batch.to_line, batch.line)
 
     def alive(self) -> None:
         """Something of the other program has come."""
@@ -433,11 +506,26 @@ class FarLine(Peer):
         """The line leads nowhere any more: whoever was reached over it may have ended; asks go over the next one."""
         if self.line is not None:
             self.line.close()
+            self.numbers = (self._owner.next_number(), 0)
         self.line, self.theirs = None, NOBODY
+        if self.inflow.beginning is not None:
+            self.inflow.beginning.cancel()
+        self.inflow = Inflow(self.inflow.limits)
         self._suspect()
         for key, ask in list(self.pending.items()):
             if type(ask.message) is Accepted:
                 self.pending.pop(key).fail(ConnectionLost(f"/{self.name}", why))
+
+    def unaccepted_for(self) -> float:
+        """For how many seconds the other program has neither accepted nor refused the oldest message that waits so.
+
+        It is looked at now and then: the time since the first look that found the message.
+        """
+        now = self.node.loop.time()
+        oldest = next((key for key, ask in self.pending.items() if type(ask.message) is Accepted), None)
+        if oldest is None or oldest != self._oldest[0]:
+            self._oldest = oldest, now
+        return now - self._oldest[1]
 
     def lose(self) -> None:
         """The other program has not answered for long: whoever watches actors there is told of the suspicion, once."""
@@ -457,7 +545,7 @@ class FarLine(Peer):
         for key, ask in list(self.pending.items()):
             if isinstance(ask, SwitchAsk):  # It waits for the next connection, as long as its turn does.
                 del self.pending[key]
-                self.hand_back(ask)
+                self._owner.hand_back(ask)
         self.fail_pending(ConnectionLost(f"/{self.name}", str(NoConnection(self.name))))
 
     def _suspect(self) -> None:
@@ -485,7 +573,7 @@ class FarLine(Peer):
         assert self.line is not None
         for key, ask in list(self.pending.items()):
             if not ask.is_done and ask.to is not None and key not in self._unsent.asks:
-                self.line.put((NEW if key in self._unsent.fresh else AGAIN) + self._ask_frame(key, ask))
+                self.line.put_message((NEW if key in self._unsent.fresh else AGAIN) + self._ask_frame(key, ask))
 
     # -- in ---------------------------------------------------------------------------------------------------------
 
@@ -496,6 +584,49 @@ class FarLine(Peer):
             self.line.hear(batch)
 
     def _take(self, data: bytes) -> None:
+        """Take an item, unless it is a message and others wait: then it waits behind them."""
+        inflow = self.inflow
+        if inflow.left > 0 and not inflow.held and not inflow.is_full:
+            inflow.left -= 1
+            if inflow.beginning is None:
+                inflow.beginning = self.node.loop.call_soon(self._begin_round)
+            self._take_now(data)
+            return
+        if _is_answer(data):
+            self._take_now(data)
+            return
+        inflow.hold(data)
+        if inflow.held_bytes > MOST_HELD and self.line is not None:
+            self._owner.overrun(self, f"{inflow.held_bytes} bytes of messages wait here, and it does not hold back")
+
+    def _begin_round(self) -> None:
+        """Take what waits of the messages, as much as one program may in one round of the loop."""
+        inflow, loop = self.inflow, self.node.loop
+        inflow.beginning = None
+        inflow.left = SLICE
+        if inflow.is_full and inflow.has_room():
+            inflow.is_full = False
+            if self.line is not None:
+                self.line.say()
+        while inflow.held and inflow.left > 0 and not inflow.is_full and inflow is self.inflow:
+            inflow.left -= 1
+            self._take_now(inflow.next())
+        if inflow is not self.inflow:
+            return  # The line has ended.
+        if inflow.is_full:
+            if self.line is not None:
+                self.line.say()
+            inflow.beginning = loop.call_later(FULL_SECONDS, self._begin_round)
+        elif inflow.held:
+            inflow.beginning = loop.call_soon(self._begin_round)
+
+    def take_rest(self) -> None:
+        """The other program ends the line in good order: take what still waits of its messages, as far as it may."""
+        inflow = self.inflow
+        while inflow.held and not inflow.is_full and inflow is self.inflow:
+            self._take_now(inflow.next())
+
+    def _take_now(self, data: bytes) -> None:
         try:
             frame = _DECODER.decode(memoryview(data)[1:])
             take = self._takers.get(type(frame))
@@ -516,12 +647,12 @@ class FarLine(Peer):
         """
         if isinstance(frame, frames.Command):
             speaks = SPEAKER.get(frame.verb)
-            self._check_within(frame.to, self._me if speaks else self.name)
+            self._check_within(frame.to, self._owner.name if speaks else self.name)
             if speaks:
                 self._check_within(frame.data.get(speaks), self.name)
         elif isinstance(frame, (frames.Tell, frames.Ask, frames.Offer, frames.Publish)):
             if not isinstance(frame, frames.Publish):
-                self._check_within(frame.to, self._me)
+                self._check_within(frame.to, self._owner.name)
             if frame.sender is not None:
                 self._check_within(frame.sender, self.name)
             if isinstance(frame, frames.Ask) and math.isnan(frame.until):
@@ -538,38 +669,73 @@ class FarLine(Peer):
     def _waits(self, to: frames.Name, then: Callable[[], None]) -> bool:
         """Whether the receiver is not there yet, but may be soon: then it is done when it is."""
         path = self.connection.names.from_wire(to)
-        homes = self._homes
+        homes = self._owner.homes
         if homes is not None and homes.is_unopened(path):
             homes.far.when_opened(path, then)
             return True
         cell = self.node.find(path)
-        return (cell is None or cell.is_dead) and self.await_actor(path, then)
+        return (cell is None or cell.is_dead) and self._owner.await_actor(path, then)
 
     def _take_tell(self, frame: frames.Tell, again: bool) -> None:
         if self._refuses_order(frame.name):
             self.node.dead_letter(self._receiver(frame.to), frame, "an order of another system")
         elif not self._waits(frame.to, lambda: self._take_tell(frame, again)):
-            self.on_tell(self._receiver(frame.to), frame, None)
+            cell = self._receiver(frame.to)
+            self.on_tell(cell, frame, None)
+            self.inflow.sent(cell, memoryview(frame.body).nbytes)
 
     def _take_ask(self, frame: frames.Ask, again: bool) -> None:
+        left = frame.until
         frame.until += monotonic()
+        if frame.number != TOLD:  # What is kept there is not refused: it waits.
+            problem = self._too_many_asks(frame, left)
+            if problem:
+                self._refused("asks", problem)
+                self._fail(frame, ConnectionFull(f"/{self._owner.name}", f"/{self.name}", problem))
+                return
         self._ask_now(frame, again)
+
+    def _too_many_asks(self, frame: frames.Ask, left: float) -> str:
+        """Why no more asks of the other program are taken; an empty text if they are."""
+        limits = self.inflow.limits
+        if self.line is not None and self.line.waiting_bytes > limits.message_bytes:
+            return f"it has not taken the {self.line.waiting_bytes} bytes of outcomes that wait for it"
+        now = self.node.loop.time()
+        if not self.inflow.asked(frame.id, now + left, now):
+            return f"{limits.asks} of its asks have no outcome yet"
+        if (
+            frame.number == ASKED
+            and self._owner.homes is not None
+            and self._owner.homes.far.answers_kept(self.name) >= limits.asks
+        ):
+            return f"{limits.asks} outcomes are kept for its recorded actors, which do not say that they have them"
+        return ""
+
+    def _refused(self, what: str, problem: str) -> None:
+        """Tell, once in the life of a line for each kind, that the other program wants more than it may."""
+        if what not in self.inflow.told:
+            self.inflow.told.add(what)
+            self.node.emit(ConnectionLimited(f"/{self.name}", what, problem))
+            self.command(f"/{self._owner.name}", "limited", {"what": what, "problem": problem})
 
     def _ask_now(self, frame: frames.Ask, again: bool) -> None:
         path = self.connection.names.from_wire(frame.to)
         if self._refuses_order(frame.name):
             self._fail(frame, UnknownMessage(path, str(frame.name).replace(":", ".")))
             return
+        if frame.name == FIND_NAME:
+            self._find_name(frame)
+            return
         if self._waits(frame.to, lambda: self._ask_now(frame, again)):
             return
         cell = self._receiver(frame.to)
-        homes = self._homes
+        homes = self._owner.homes
         which = self._named(frame)
         if again and (homes is None or switch_of(cell) is None):
             if frame.number == TOLD:
                 self.connection.send(frames.Reply(frame.id, msgspec.Raw(ACCEPTED.body)))  # Once at most.
             else:
-                self._fail(frame, ConnectionLost(path, str(NoConnection(self._me))))
+                self._fail(frame, ConnectionLost(path, str(NoConnection(self._owner.name))))
             return
         if homes is not None and (again or frame.number != PASSING):
             known = homes.far.outcome(which)
@@ -577,13 +743,46 @@ class FarLine(Peer):
                 self.deliver(which, known)
             if known is not None or homes.far.is_open(which):
                 return
+            if again and homes.far.has_forgotten(which):
+                self._fail(frame, ConnectionLost(path, "its outcome was given up, for nobody took it for long"))
+                return
         if frame.number == TOLD:
             self._take_kept(cell, frame, which)
+        else:
+            self.on_ask(cell, frame, None)
+        self.inflow.sent(cell, memoryview(frame.body).nbytes)
+
+    def _find_name(self, frame: frames.Ask) -> None:
+        """Say who has a name here, once it is sure that this program leads the system."""
+        homes, wanted = self._owner.homes, self.codec.decode(FindName, frame.body).registered
+        if homes is None or not homes.journal.durable or homes.journal.engine.safe_at != "sync":
+            self._answer_name(frame, wanted, None)  # No other program can lead it.
             return
-        self.on_ask(cell, frame, None)
+        try:
+            homes.journal.note(ASKED_FOR, b"")
+            synced = homes.journal.engine.synced()
+        except HoldfastError as error:
+            self._answer_name(frame, wanted, error)
+            return
+        if synced is None:
+            self._answer_name(frame, wanted, None)
+        else:
+            synced.add_done_callback(
+                lambda done: self._answer_name(frame, wanted, None if done.cancelled() else done.exception())
+            )
+
+    def _answer_name(self, frame: frames.Ask, wanted: str, error: BaseException | None) -> None:
+        try:
+            if error is not None:
+                raise ConnectionLost(f"/{self._owner.name}", "it may be led by another program")
+            path = self.node.shown(wanted).path
+        except HoldfastError as problem:
+            self._fail(frame, problem)
+        else:
+            self.connection.send(frames.Reply(frame.id, msgspec.Raw(msgspec.msgpack.encode(path))))
 
     def ask_in(self, frame: frames.Ask, cell: Cell, page: memoryview | None) -> RelayedAsk:
-        homes = self._homes
+        homes = self._owner.homes
         if homes is None or switch_of(cell) is None:
             return super().ask_in(frame, cell, page)
         return FarAsk.arrived(frame, self._asker(frame), cell, homes, self._named(frame).run)
@@ -596,7 +795,7 @@ class FarLine(Peer):
     def _take_kept(self, cell: Cell, frame: frames.Ask, which: FarId) -> None:
         """Take in a message that the other system keeps until it is accepted: once, if its receiver is recorded."""
         name, body, sender = self.connection.names.from_wire(frame.name), bytes(frame.body), self._asker(frame)
-        homes, switch = self._homes, switch_of(cell)
+        homes, switch = self._owner.homes, switch_of(cell)
         try:
             if switch is None or homes is None:
                 message = self.codec.message_in(cell, name, body)
@@ -627,33 +826,93 @@ class FarLine(Peer):
         if self._refuses_order(frame.name):
             self._fail(frame, UnknownMessage(str(frame.to), str(frame.name).replace(":", ".")))
         elif not self._waits(frame.to, lambda: self._take_offer(frame, again)):
-            self.on_offer([self._receiver(frame.to)], frame)
+            self._offer_to([self._receiver(frame.to)], frame)
 
     def _take_publication(self, frame: frames.Publish, again: bool) -> None:
         if self._refuses_order(frame.name):
             self._fail(frame, UnknownMessage(frame.topic, str(frame.name).replace(":", ".")))
         else:
-            self.on_offer(self.node.topics.subscribers(frame.topic), frame, frame.topic)
+            self._offer_to(self.node.topics.subscribers(frame.topic), frame, frame.topic)
+
+    def _offer_to(self, cells: Sequence[Cell], frame: frames.Offer | frames.Publish, topic: str | None = None) -> None:
+        """Hand on a message whose sender waits until it is accepted: as long as it waits for room it is outstanding."""
+        if not self.inflow.asked(frame.id, math.inf, 0.0):
+            self._refused("asks", problem := f"{self.inflow.limits.asks} of its messages wait for room")
+            self._fail(frame, ConnectionFull(f"/{self._owner.name}", f"/{self.name}", problem))
+            return
+        self.on_offer(cells, frame, topic)
+        for cell in cells:
+            self.inflow.sent(cell, memoryview(frame.body).nbytes)
 
     def _take_command(self, frame: frames.Command, again: bool) -> None:
         path = self.connection.names.from_wire(frame.to)
         match frame.verb:
             case "subscribe" | "unsubscribe":
-                topics = self.node.topics
-                change = topics.subscribe if frame.verb == "subscribe" else topics.unsubscribe
-                change(str(frame.data.get("topic")), self.stand_in(path))
+                self._take_subscription(self.stand_in(path), frame)
+            case "limited":
+                what, problem = str(frame.data.get("what")), str(frame.data.get("problem"))
+                self.node.emit(ConnectionLimited(f"/{self.name}", what, problem))
             case "settled":
                 number = frame.data.get("number")
-                if self._homes is not None and isinstance(number, int):
-                    self._homes.far.settled(FarId(path, number, LASTING))
+                if self._owner.homes is not None and isinstance(number, int):
+                    self._owner.homes.far.settled(FarId(path, number, LASTING))
+            case "monitor" | "link" if not self._may_tie(frame):
+                source, reason = frame.to, pack_exit(NoConnection(self._owner.name))
+                told = "down" if frame.verb == "monitor" else "exit"
+                data = {"source": source, "reason": reason, "recovering": False}
+                if told == "down":
+                    data["for_good"] = bool(frame.data.get("for_good"))
+                self.command(str(frame.data[SPEAKER[frame.verb]]), told, data)
             case verb if verb in COMMANDS:
                 obey(self.node, self._receiver(frame.to), path, frame)
             case verb:
                 raise BadFrame(f"another system may not {verb}")
 
+    def _take_subscription(self, cell: Cell, frame: frames.Command) -> None:
+        """An actor there wants what is published on a topic here, or wants it no more."""
+        topic, topics, most = frame.data.get("topic"), self.node.topics, self.inflow.limits.subscriptions
+        if not isinstance(topic, str) or not topic.startswith("/") or len(topic) > LONGEST_TOPIC:
+            raise BadFrame(f"the topic {topic!r:.100}")
+        if frame.verb == "unsubscribe":
+            topics.unsubscribe(topic, cell)
+        elif topics.has(topic, cell) or self.inflow.topics.may_add(
+            most, lambda: sum(len(one.more.belongings.topics) for one in self._tied())
+        ):
+            topics.subscribe(topic, cell)
+        else:
+            self._refused("subscriptions", f"its actors have {most} subscriptions")
+
+    def _may_tie(self, frame: frames.Command) -> bool:
+        """Whether an actor there may have one more monitor or link here."""
+        most = self.inflow.limits.ties
+        if self.inflow.ties.may_add(
+            most, lambda: sum(len(one.more.ties.watching) + len(one.more.ties.links) for one in self._tied())
+        ):
+            return True
+        self._refused("ties", f"its actors have {most} monitors and links")
+        return False
+
+    def _tied(self) -> Iterator[Any]:
+        """The stand-ins that have ties or subscriptions here."""
+        return (cell for cell in list(self._cells.values()) if cell.more is not None and cell.more.has_more)
+
     def _refuses_order(self, name: frames.Name) -> bool:
         """Whether a message is an order to the runtime: no other system gives any here."""
         return is_order(self.connection.names.from_wire(name))
+
+
+def _passes(frame: frames.Frame) -> bool:
+    """Whether a frame is no message: it goes past those that wait until the other program takes more."""
+    return isinstance(frame, frames.Command) and frame.verb in ("settled", "limited")
+
+
+def _is_answer(data: bytes) -> bool:
+    """The same of an item that has come; malformed ones are for whoever takes them."""
+    try:
+        frame = _DECODER.decode(memoryview(data)[1:])
+    except msgspec.MsgspecError:
+        return True
+    return isinstance(frame, (frames.Reply, frames.Failure)) or _passes(frame)
 
 
 def run_number(boot: Boot) -> int:

@@ -40,8 +40,9 @@ class Boot(NamedTuple):
 NOBODY: Final = Boot(0, "")
 """The incarnation that a greeting is for: whoever is there."""
 
-Note = Literal["", "lost", "unknown", "bye"]
-"""What a batch says besides: something before it has not come; whoever it answers is not known; the line ends."""
+Note = Literal["", "full", "lost", "unknown", "bye"]
+"""What a batch says besides: no more messages for now; something before it has not come; whoever it answers is not
+known; the line ends."""
 
 
 class LineBatch(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
@@ -55,6 +56,8 @@ class LineBatch(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fie
         first: the number of the first item.
         items: in order.
         note: what it says besides.
+        line: the number of the line, of all that the sender has begun with this program.
+        to_line: the same as the other end counts; 0 in a greeting.
     """
 
     sender: str
@@ -64,6 +67,8 @@ class LineBatch(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fie
     first: int
     items: tuple[bytes, ...]
     note: Note = ""
+    line: int = 0
+    to_line: int = 0
 
 
 class Unarrived(NamedTuple):
@@ -89,8 +94,11 @@ class Line:
         "_arrived",
         "_bytes",
         "_flushing",
+        "_flying",
+        "_is_choked",
         "_loop",
         "_missed",
+        "_moved",
         "_owed",
         "_owing",
         "_patience",
@@ -98,6 +106,7 @@ class Line:
         "_resend",
         "_sent",
         "_take",
+        "_unnumbered",
         "_waiters",
         "_waiting",
         "got",
@@ -114,16 +123,20 @@ class Line:
         self.got = 0
         self.is_open = True
         self._waiting: deque[Unarrived] = deque()  # sent, and not known to have arrived; then what is not sent yet
+        self._unnumbered: deque[bytes] = deque()  # what waits until the other end takes more
+        self._flying = 0  # bytes of what has a number
+        self._is_choked = False  # whether the other end wants no more messages for now
         self._arrived = 0  # how many of all items so far the other end has said to have
         self._sent = 0  # how many of all items so far have been sent
         self._owed = 0  # items that have come and are not acknowledged
         self._patience = RESEND_SECONDS
         self._missed = -1  # how many had come when it was last said that the next one had not
+        self._moved = loop.time()  # when something of ours has last arrived, or was sent when nothing else was out
         self._bytes = 0
         self._flushing: asyncio.Handle | None = None
         self._owing: asyncio.TimerHandle | None = None
         self._resend: asyncio.TimerHandle | None = None
-        self._waiters: list[asyncio.Future[None]] = []
+        self._waiters: list[tuple[Callable[[], bool], asyncio.Future[None]]] = []
 
     # -- out --------------------------------------------------------------------------------------------------------
 
@@ -131,10 +144,45 @@ class Line:
         """Send an item with all others of this tick; `arrived` is called when the other end has said that it has it."""
         if not self.is_open:
             return
+        if not self._waiting:
+            self._moved = self._loop.time()
         self._waiting.append(Unarrived(data, arrived))
         self._bytes += len(data)
+        self._flying += len(data)
         if self._flushing is None:
             self._flushing = self._loop.call_soon(self.flush)
+
+    def put_message(self, data: bytes) -> None:
+        """Send an item when the other end takes it: it may want no more for now, and what answers it goes past that."""
+        if self._unnumbered or self._is_choked or self._flying >= WINDOW_BYTES:
+            if self.is_open:
+                self._unnumbered.append(data)
+                self._bytes += len(data)
+        else:
+            self.put(data)
+
+    def _number_some(self) -> None:
+        """Send what has waited until the other end takes more."""
+        while self._unnumbered and not self._is_choked and self._flying < WINDOW_BYTES:
+            data = self._unnumbered.popleft()
+            self._bytes -= len(data)
+            self.put(data)
+
+    def emptied(self) -> asyncio.Future[None] | None:
+        """None if all messages are on their way; else a future that ends when they are, or the line has ended."""
+        return self._until(lambda: not self._unnumbered)
+
+    @property
+    def waiting_bytes(self) -> int:
+        """How many bytes of items there are that the other end is not known to have."""
+        return self._bytes
+
+    def stuck_for(self, seconds: float, most: int) -> int:
+        """How many bytes wait, if more do than may, or if the other end has had none of a full window for so long."""
+        if self._flying < WINDOW_BYTES and self._bytes < WINDOW_BYTES:
+            return 0
+        is_stuck = self._loop.time() - self._moved > seconds
+        return self._bytes if is_stuck or self._bytes > most else 0
 
     @property
     def has_room(self) -> bool:
@@ -143,10 +191,14 @@ class Line:
 
     def room(self) -> asyncio.Future[None] | None:
         """None while the other end keeps up; else a future that ends when it does again, or the line has ended."""
-        if self.has_room or not self.is_open:
+        return self._until(lambda: self.has_room)
+
+    def _until(self, holds: Callable[[], bool]) -> asyncio.Future[None] | None:
+        """None if something holds; else a future that ends when it does, or the line has ended."""
+        if holds() or not self.is_open:
             return None
         future: asyncio.Future[None] = self._loop.create_future()
-        self._waiters.append(future)
+        self._waiters.append((holds, future))
         return future
 
     def flush(self, most: int = sys.maxsize) -> None:
@@ -203,6 +255,10 @@ class Line:
     def hear(self, batch: LineBatch) -> None:
         """Take a batch of the other end."""
         self._arrive(batch.got)
+        if batch.note in ("", "full"):
+            self._is_choked = batch.note == "full"
+            self._number_some()
+            self._release()
         if batch.note == "lost" and self._waiting:
             self._again()
         if not batch.items:
@@ -228,6 +284,7 @@ class Line:
         """The other end has so many of our items."""
         if got <= self._arrived:
             return
+        self._moved = self._loop.time()
         if self._resend is not None:
             self._resend.cancel()
             self._resend = None
@@ -235,20 +292,15 @@ class Line:
             item = self._waiting.popleft()
             self._arrived += 1
             self._bytes -= len(item.data)
+            self._flying -= len(item.data)
             if item.arrived is not None:
                 item.arrived()
         self._sent = max(self._sent, self._arrived)
         self._patience = RESEND_SECONDS
+        self._number_some()
         if self._waiting:
             self.flush()
-        if self.has_room:
-            self._release()
-
-    def _release(self) -> None:
-        waiters, self._waiters = self._waiters, []
-        for one in waiters:
-            if not one.done():
-                one.set_result(None)
+        self._release()
 
     def close(self) -> None:
         """End it: nothing is sent or taken any more, and whoever waits for room goes on."""
@@ -258,4 +310,16 @@ class Line:
                 handle.cancel()
         self._flushing = self._owing = self._resend = None
         self._waiting.clear()
+        self._unnumbered.clear()
         self._release()
+
+    def _release(self) -> None:
+        """Have those go on who wait for what holds now."""
+        if not self._waiters:
+            return
+        waiters, self._waiters = self._waiters, []
+        for holds, future in waiters:
+            if self.is_open and not holds():
+                self._waiters.append((holds, future))
+            elif not future.done():
+                future.set_result(None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import re
+import itertools
 import secrets
 import time
 from collections.abc import Callable
@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import msgspec
 
-from ...actors.errors import HoldfastError, SpecError
-from ...actors.values.path_parts import check_path_part
+from ...actors.errors import HoldfastError
+from ...actors.events import ConnectionLimited
 from ...checkpoint.home.ask_recovery import FarId, FarOut
 from ...checkpoint.home.pending_asks import SwitchAsk
 from ...checkpoint.protocol import Answer
 from .far_line import FarLine, run_number
-from .line import NOBODY, Boot, LineBatch
+from .inflow import DEFAULT_LIMITS, ConnectionLimits
+from .line import Boot
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
@@ -32,19 +33,32 @@ FORGET_SECONDS: Final = 30.0
 """After so long without a word whoever has called is forgotten."""
 STARTING_SECONDS: Final = 5.0
 """How long after its begin a system keeps what comes for actors that it has not started yet."""
-HEAD_BYTES: Final = 4096
-"""What a batch may have besides its items, in bytes."""
-MOST_CALLERS: Final = 10_000
-"""How many programs may have called at a time; further ones are not answered."""
-MOST_NAME: Final = 255
-"""The longest name of a program, in characters."""
-_DECODER: Final[msgspec.msgpack.Decoder[LineBatch]] = msgspec.msgpack.Decoder(LineBatch)
+MOST_WAITING: Final = 64 * 1024 * 1024
+"""Bytes that wait for a program that has called before its line is ended: it does not take what it wanted."""
+STUCK_SECONDS: Final = 10.0
+"""After so long in which a program that has called took nothing of what it is to take, its line is ended."""
 
 
 class LineTaken(HoldfastError, text="there is a connection to a system called {system} already: use that one"):
     """Two systems of one name cannot both be reached: their addresses would be the same."""
 
     system: str
+
+
+class PeerLook(msgspec.Struct, frozen=True):
+    """Another program that is connected to this system, or was.
+
+    Attributes:
+        system: its name, the first part of its addresses.
+        is_connected: whether it has answered within the last seconds.
+        kept: messages of recorded actors here that it has not accepted yet.
+        kept_bytes: of these messages together.
+    """
+
+    system: str
+    is_connected: bool
+    kept: int
+    kept_bytes: int
 
 
 class Transport(Protocol):
@@ -76,6 +90,30 @@ class Transport(Protocol):
         ...
 
 
+class Gate(Protocol):
+    """Answers whoever calls this program; see `LineGate`."""
+
+    def has(self, far: FarLine) -> bool:
+        """Whether the other program has called here."""
+        ...
+
+    def reach(self, far: FarLine) -> None:
+        """From now on the other program is reached where it has said that answers go."""
+        ...
+
+    def left(self, far: FarLine) -> None:
+        """The line is over."""
+        ...
+
+
+class Caller(Protocol):
+    """Calls another program from here; see `LineCaller`."""
+
+    def begin_anew(self, why: str) -> None:
+        """The line has ended: greet whoever leads the other program now."""
+        ...
+
+
 def new_boot(era: int | None = None) -> Boot:
     """An incarnation; `era` is a number that rises with each one of this system, the clock's if left out."""
     return Boot(time.time_ns() // 1_000_000 if era is None else era, secrets.token_hex(6))
@@ -89,17 +127,23 @@ class Lines:
         name: of this program, as others know it.
         boot: the incarnation of this program.
         homes: the recorded actors here, if there can be any.
+        limits: how much each other program may have outstanding here.
     """
 
-    def __init__(self, node: Node, name: str, boot: Boot, homes: Homes | None = None) -> None:
+    def __init__(
+        self, node: Node, name: str, boot: Boot, homes: Homes | None = None, limits: ConnectionLimits = DEFAULT_LIMITS
+    ) -> None:
         self.node, self.name, self.boot, self.homes = node, name, boot, homes
+        self.limits = limits
         self._lines: dict[str, FarLine] = {}
-        self._gates: list[LineGate] = []
+        self._gates: list[Gate] = []
         self._began = node.loop.time()
         self._waiting: dict[str, list[Callable[[FarLine], None]]] = {}
         self._beat: asyncio.TimerHandle | None = None
+        self._numbers = itertools.count()
+        self._callers: dict[FarLine, Caller] = {}
         if homes is not None:
-            homes.far.deliver, homes.far.sender = self._deliver, self
+            homes.far.deliver, homes.far.sender, homes.far.limits = self._deliver, self, self.limits
 
     def find(self, path: str) -> Cell | None:
         """The stand-in for an actor of another program, if there is a line to that."""
@@ -107,21 +151,79 @@ class Lines:
         return None if far is None else far.stand_in(path)
 
     def open(self, name: str, post: Callable[[bytes], None]) -> FarLine:
-        """A line to another program, which has not answered yet.
-
-        Raises:
-            LineTaken: there is one to a program of that name, or this one is called so.
-        """
-        if name in self._lines or name == self.name:
-            raise LineTaken(name)
-        far = self._lines[name] = FarLine(self.node, (self.name, self.boot), name, post, self.homes)
-        far.await_actor = self._await_actor
-        far.is_closing = self.homes is not None and self.homes.far.is_closing
-        far.hand_back = lambda ask: self.ask(ask, again=True)
+        """A line to another program, which has not answered yet."""
+        far = self._lines[name] = FarLine(self, name, post)
         self._send_kept(far)
         if self._beat is None:
             self._beat = self.node.loop.call_later(BEAT_SECONDS, self._look)
         return far
+
+    def call(self, name: str, post: Callable[[bytes], None], caller: Caller) -> FarLine:
+        """A line to another program, which is called from here; if that has called already, both use the same line.
+
+        Raises:
+            LineTaken: that program is called already, or this one has its name.
+        """
+        far = self._lines.get(name)
+        if name == self.name or (far is not None and far in self._callers):
+            raise LineTaken(name)
+        if far is None:
+            far = self.open(name, post)
+        self._callers[far] = caller
+        far.post_bytes = post
+        return far
+
+    def hang_up(self, far: FarLine) -> None:
+        """A program is called no more; if it has called, too, it keeps its line."""
+        self._callers.pop(far, None)
+        gate = next((gate for gate in self._gates if gate.has(far)), None)
+        if gate is not None and far.line is not None:
+            gate.reach(far)
+        else:
+            self.drop(far)
+
+    def caller_of(self, far: FarLine) -> Caller | None:
+        """Who calls the other program from here, if anybody does."""
+        return self._callers.get(far)
+
+    def peers(self) -> list[PeerLook]:
+        """All programs that are connected, and systems for which something may be kept, by name."""
+        kept = {} if self.homes is None else self.homes.far.kept()
+        found = {name: PeerLook(name, False, *kept[name]) for name in kept}
+        for name, far in self._lines.items():
+            there = far.line is not None and not far.is_lost
+            found[name] = PeerLook(name, there, *kept.get(name, (0, 0)))
+        return [found[name] for name in sorted(found)]
+
+    def forget_system(self, name: str) -> int:
+        """Drop what recorded actors have told a system that has not accepted it; return how many messages that were.
+
+        Raises:
+            StoreError: the store does not take it.
+        """
+        dropped = 0 if self.homes is None else self.homes.far.drop(name)
+        if self.homes is not None and name in self._lines:
+            self.homes.far.connected(name)
+        return dropped
+
+    def overrun(self, far: FarLine, problem: str) -> None:
+        """End the line of a program that wants more than it may: what it has out is lost, and it may call anew."""
+        self.node.emit(ConnectionLimited(f"/{far.name}", "line", problem))
+        self.node.loop.call_soon(self._end, far)
+
+    def _end(self, far: FarLine) -> None:
+        caller = self._callers.get(far)
+        if caller is not None:
+            caller.begin_anew("it wants more than it may")
+        elif self._lines.get(far.name) is far:
+            self.forget(far)
+
+    def forget(self, far: FarLine) -> None:
+        """The run of the other program is over: nobody asks again what it has asked."""
+        theirs = far.theirs
+        self.drop(far)
+        if self.homes is not None:
+            self.homes.far.forget_run(far.name, run_number(theirs))
 
     def at(self, name: str) -> FarLine | None:
         """The line to the program of that name."""
@@ -131,13 +233,16 @@ class Lines:
         """End a line, whose name is free again."""
         if self._lines.get(far.name) is far:
             del self._lines[far.name]
+            if self.homes is not None:
+                self.homes.far.leaves(far.name)
+        self._callers.pop(far, None)
+        for gate in self._gates:
+            gate.left(far)
         far.close()
 
-    def serve(self, transport: Transport) -> LineGate:
-        """Answer whoever calls by this transport."""
-        gate = LineGate(self, transport)
+    def serve(self, gate: Gate) -> None:
+        """Have whoever calls answered by this gate."""
         self._gates.append(gate)
-        return gate
 
     def closing(self) -> None:
         """This program ends: what comes is for whoever follows it; what was asked before is still answered."""
@@ -159,6 +264,14 @@ class Lines:
         path = ask.to.path
         self._to(path, lambda far: _ask(far, path, ask, again=again))
 
+    def next_number(self) -> int:
+        """A number for a line that begins: it rises, over all lines of this run."""
+        return next(self._numbers)
+
+    def hand_back(self, ask: SwitchAsk) -> None:
+        """Have an ask whose line was closed wait for the next one, as long as its turn does."""
+        self.ask(ask, again=True)
+
     def tell(self, out: FarOut, *, again: bool) -> None:
         """Send a message of a recorded actor, now or when there is a line to whom it is for."""
         far = self._lines.get(_system(out.to))
@@ -176,6 +289,7 @@ class Lines:
         """Send what has waited for a line."""
         if self.homes is not None:
             self.homes.far.connected(far.name)
+            self.homes.far.connects(far.name)
             for out in self.homes.far.outs(far.name):
                 far.tell_lasting(out, again=True)
         for send in self._waiting.pop(far.name, ()):
@@ -186,7 +300,7 @@ class Lines:
         if far is not None:
             far.deliver(which, answer)
 
-    def _await_actor(self, path: str, then: Callable[[], None]) -> bool:
+    def await_actor(self, path: str, then: Callable[[], None]) -> bool:
         """Have something done when an actor is started at an address, or cannot be hoped for any more."""
         loop = self.node.loop
         left = self._began + STARTING_SECONDS - loop.time()
@@ -215,21 +329,19 @@ class Lines:
         self._beat = loop.call_later(BEAT_SECONDS, self._look) if self._lines else None
         for far in list(self._lines.values()):
             quiet = loop.time() - far.heard
-            if quiet > FORGET_SECONDS and any(gate.has(far) for gate in self._gates):
-                self.drop(far)
-                continue
+            if far not in self._callers:
+                if quiet > FORGET_SECONDS:
+                    self.drop(far)
+                    continue
+                if far.line is not None and (waits := far.line.stuck_for(STUCK_SECONDS, MOST_WAITING)):
+                    self.overrun(far, f"it does not take what it is sent: {waits} bytes wait for it")
+                    continue
+                if far.unaccepted_for() > STUCK_SECONDS:  # Whoever has published it waits for that.
+                    self.overrun(far, "it neither accepts nor refuses what it is sent")
+                    continue
             if quiet > SILENT_SECONDS:
                 far.lose()
             far.say()
-
-
-def _is_sound(batch: LineBatch) -> bool:
-    """Whether a program may be called so, and its run has a number."""
-    try:
-        check_path_part("connect", "the system", batch.sender)
-    except SpecError:
-        return False
-    return len(batch.sender) <= MOST_NAME and re.fullmatch("[0-9a-f]{1,15}", batch.boot.token) is not None
 
 
 def _system(path: str) -> str:
@@ -241,140 +353,3 @@ def _ask(far: FarLine, path: str, ask: SwitchAsk, *, again: bool) -> None:
     if not ask.is_over:
         ask.to = far.stand_in(path)
         far.ask_lasting(ask, again=again)
-
-
-class LineGate:
-    """Answers whoever calls this program."""
-
-    def __init__(self, lines: Lines, transport: Transport) -> None:
-        self._lines, self._transport = lines, transport
-        self._back: dict[FarLine, str] = {}
-
-    def has(self, far: FarLine) -> bool:
-        """Whether a line was made because somebody has called here."""
-        return far in self._back
-
-    def hear(self, data: bytes, back: str) -> None:
-        """Take what was posted to this program."""
-        lines = self._lines
-        try:
-            batch = _DECODER.decode(data)
-        except msgspec.MsgspecError:
-            return  # It comes from no program of ours.
-        if not back or not _is_sound(batch) or batch.sender == lines.name:
-            return
-        far = lines.at(batch.sender)
-        if far is not None and far not in self._back:
-            return  # Its name is that of a system that this one has called.
-        if batch.to == NOBODY:
-            if batch.note == "bye":
-                return  # It has given up before anybody answered.
-            if far is not None and far.theirs != batch.boot:
-                if far.theirs.era > batch.boot.era:
-                    return  # An earlier run, late.
-                self._forget(far)
-                far = None
-            if far is None and len(self._back) >= MOST_CALLERS:
-                return  # Whoever greets is not answered, as if nobody were here.
-            if far is None:
-                far = lines.open(batch.sender, lambda data: self._post(batch.sender, data))
-                self._back[far] = back
-                far.most = min(far.most, self._transport.most_bytes - HEAD_BYTES)
-                far.begin(batch.boot)
-            self._back[far] = back
-            far.alive()
-            far.say()
-        elif batch.to != lines.boot or far is None or far.theirs != batch.boot:
-            answer = LineBatch(lines.name, lines.boot, batch.boot, 0, 1, (), "unknown")
-            self._transport.post(back, msgspec.msgpack.encode(answer), "")
-        elif batch.note == "bye":
-            far.hear(batch)  # It says what has come, too.
-            self._forget(far)
-        else:
-            self._back[far] = back
-            far.hear(batch)
-
-    def _forget(self, far: FarLine) -> None:
-        """That run of the other program is over: nobody asks again what it has asked."""
-        theirs = far.theirs
-        self._drop(far)
-        if self._lines.homes is not None:
-            self._lines.homes.far.forget_run(far.name, run_number(theirs))
-
-    def _drop(self, far: FarLine) -> None:
-        self._lines.drop(far)
-        self._back.pop(far, None)
-
-    def _post(self, name: str, data: bytes) -> None:
-        far = self._lines.at(name)
-        if far is not None:
-            self._transport.post(self._back[far], data, "")
-
-
-class LineCaller:
-    """Calls another program, and calls again when that is led by another one.
-
-    Args:
-        lines: of this program.
-        transport: how the other one is reached.
-        to: where it listens.
-        name: of the other program.
-        begun: called whenever a program that leads it has answered for the first time.
-
-    Raises:
-        LineTaken: there is a line to a program of that name.
-    """
-
-    def __init__(
-        self, lines: Lines, transport: Transport, to: str, name: str, begun: Callable[[], None] = lambda: None
-    ) -> None:
-        self._begun = begun
-        self._lines, self._transport, self._to = lines, transport, to
-        self._own = transport.own_place()
-        self._newest = NOBODY
-        self.far = lines.open(name, lambda data: transport.post(to, data, self._own))
-        self.far.most = min(self.far.most, transport.most_bytes - HEAD_BYTES)
-        self._answered: asyncio.Future[None] = lines.node.loop.create_future()
-
-    async def begin(self, seconds: float) -> None:
-        """Greet the other program, and wait until it has answered.
-
-        Raises:
-            TimeoutError: it has not. SpecError: it has another name.
-        """
-        await self._transport.hear(self._own, self.hear)
-        async with asyncio.timeout(seconds):
-            while not self._answered.done():
-                self.far.say()
-                await asyncio.wait((self._answered,), timeout=0.2)
-        self._answered.result()
-
-    def hear(self, data: bytes, back: str) -> None:
-        """Take what the other program has posted."""
-        far, lines = self.far, self._lines
-        try:
-            batch = _DECODER.decode(data)
-        except msgspec.MsgspecError:
-            return
-        if batch.to != lines.boot or batch.boot.era < self._newest.era or far.is_closed:
-            return  # To an earlier run of this program, or of one that leads no more.
-        self._newest = batch.boot
-        if far.line is not None and (batch.boot != far.theirs or batch.note in ("unknown", "bye")):
-            far.end("another program leads it" if batch.boot != far.theirs else "it has ended")
-            if batch.note != "bye":
-                far.say()
-        elif far.line is None and not batch.note:
-            if batch.sender != far.name:
-                if not self._answered.done():
-                    problem = (
-                        f"the system there is called {batch.sender!r}, not {far.name!r}: say system={batch.sender!r}"
-                    )
-                    self._answered.set_exception(SpecError("connect", problem))
-                return
-            far.begin(batch.boot)
-            if not self._answered.done():
-                self._answered.set_result(None)
-            self._begun()
-            far.hear(batch)
-        elif far.line is not None:
-            far.hear(batch)

@@ -14,8 +14,9 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 import msgspec
 
 from ...actors.errors import SpecError
+from ...actors.streams import is_loopback
 from .private_files import read_private
-from .server_file import check_host, check_name, inbox_of, is_loopback, public_key
+from .server_file import check_host, check_name, inbox_of, public_key
 
 DEFAULT_PORT: Final = 4222
 SETTINGS: Final = ("ca", "certificate", "creds", "insecure", "key", "nkey", "replicas")

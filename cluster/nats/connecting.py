@@ -179,10 +179,41 @@ class SystemClient(Client):
             await end_tasks(doing, denied)
         raise AccessRefused(self.access.name, self._denied[-1], "give the key of a node, or let its user do that")
 
+    @property
+    def denials(self) -> int:
+        """How often the servers have said so far that something is not allowed to this program."""
+        return len(self._denied)
+
+    def refuse_denied(self, subject: str, since: int) -> None:
+        """See whether an answer that did not come was a refusal: to wait for a server that refuses changes nothing.
+
+        Args:
+            subject: what was published to.
+            since: `denials` before that.
+
+        Raises:
+            AccessRefused: it is not allowed to this program any more, or no server lets it in any more.
+        """
+        told = [one for one in self._denied[since:] if f'"{subject.lower()}"' in one]
+        if told:
+            remedy = "let the user of this program do that, or give the key of a node, and start it again"
+            raise AccessRefused(self.access.name, told[-1], remedy)
+        if not self.is_connected and len(self.refusals) >= len(self.access.servers):
+            raise AccessRefused(self.access.name, *next(iter(self.refusals.values())))
+
     async def close(self) -> None:
-        """Close the connection, if there ever was one to be made."""
-        if self._flush_queue is not None:  # Else the library asserts that there is.
-            await super().close()
+        """Close the connection, if there ever was one to be made; a server that takes nothing is not waited for."""
+        try:
+            if self._flush_queue is not None:  # Else the library asserts that there is.
+                await super().close()
+        finally:
+            self._let_go()
+
+    def _let_go(self) -> None:
+        """Close the socket at once, with what was not sent."""
+        transport = self._transport
+        if isinstance(transport, TcpTransport) and transport._io_writer is not None:
+            transport._io_writer.transport.abort()
 
     # What the library calls
 
@@ -201,9 +232,7 @@ class SystemClient(Client):
         Else it would be waited for until that is closed in good order: on a network that is cut 30 seconds with TLS,
         and as long as the kernel tries to send, a quarter of an hour, if anything was still to be sent.
         """
-        transport = self._transport
-        if isinstance(transport, TcpTransport) and transport._io_writer is not None:
-            transport._io_writer.transport.abort()
+        self._let_go()
         await super()._attempt_reconnect()
 
     async def _process_err(self, err_msg: str) -> None:

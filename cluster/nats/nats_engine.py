@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from typing import Final
 
 import nats.errors
-from nats.aio.client import Client
 from nats.js import JetStreamContext, api
 from nats.js.errors import APIError, NotFoundError
 from nats.js.errors import Error as JetStreamError
@@ -49,12 +48,12 @@ class NatsEngine:
         system: its name.
     """
 
-    def __init__(self, client: Client, name: str, system: str) -> None:
+    def __init__(self, client: SystemClient, name: str, system: str) -> None:
         self.name = name
         self._client = client
         stream = client.jetstream(timeout=ANSWER_SECONDS)
         self.names = names = SubjectNames(system)
-        self.log = NatsLog(stream, names, name)
+        self.log = NatsLog(client, stream, names, name)
         self.lease = NatsLease(stream, names, name)
         self.blobs = NatsBlobs(stream, names, name)
 
@@ -113,12 +112,21 @@ async def open_engine(access: NatsAccess, *, is_new: bool = True) -> NatsEngine:
 class NatsLog:
     """The log: one subject of one stream; see `cluster.ports.Log`."""
 
-    def __init__(self, stream: JetStreamContext, names: SubjectNames, name: str) -> None:
-        self._stream, self._names, self._name = stream, names, name
+    def __init__(self, client: SystemClient, stream: JetStreamContext, names: SubjectNames, name: str) -> None:
+        self._client, self._stream, self._names, self._name = client, stream, names, name
 
     async def append(self, data: bytes, after: int) -> int:
-        """Append a record behind the one with the number `after`; see `Log`."""
-        return await _publish(self._stream, self._names.log, data, after, self._name)
+        """Append a record behind the one with the number `after`; see `Log`.
+
+        Raises:
+            AccessRefused: this program may not write there any more.
+        """
+        denials = self._client.denials
+        try:
+            return await _publish(self._stream, self._names.log, data, after, self._name)
+        except Unanswered:
+            self._client.refuse_denied(self._names.log, denials)
+            raise
 
     async def last(self) -> LogRecord | None:
         """The last record, from whoever leads the stream; see `Log`."""

@@ -22,6 +22,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from ...actors.errors import HoldfastError, SpecError
+from ...actors.streams import is_loopback
 from .private_files import read_private
 
 MOST_BYTES: Final = 8 * 1024 * 1024
@@ -31,7 +32,6 @@ VARZ: Final = "$SYS.REQ.SERVER.PING.VARZ"
 NEEDS: Final = "a store on NATS needs the library nats-py: pip install 'holdfast[nats]'"
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _HOST: Final = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9._-]*[A-Za-z0-9_])?\.?")
-_LOOPBACK_NAMES: Final = ("localhost", "ip6-localhost")
 
 
 class FileExists(HoldfastError, text="{path} is there already: give another folder, or force it to be written anew"):
@@ -99,18 +99,6 @@ class Permissions(NamedTuple):
 
     publish: tuple[str, ...]
     subscribe: tuple[str, ...]
-
-
-def is_loopback(host: str) -> bool:
-    """Whether a host can only be reached from its own machine.
-
-    >>> is_loopback("127.0.0.1"), is_loopback("::1"), is_loopback("localhost"), is_loopback("10.0.0.7")
-    (True, True, True, False)
-    """
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return host.lower() in _LOOPBACK_NAMES
 
 
 def check_name(where: str, name: str) -> str:

@@ -38,7 +38,7 @@ ANEW = "cannot be another while it runs: take its table out, apply, and put it i
 
 
 async def declare(
-    system: ActorSystem, text: str, name: str, *, dry_run: bool = False, timeout: float = 60.0
+    system: ActorSystem, text: str, name: str, *, dry_run: bool = False, keep_all: bool = False, timeout: float = 60.0
 ) -> Change | None:
     """Have the tree of a running system be as a file says, by one transaction; None: it is so already.
 
@@ -47,6 +47,7 @@ async def declare(
         text: what is in the file.
         name: the name of the file, for errors.
         dry_run: only check, and say what would be done.
+        keep_all: refuse to leave a recorded state behind.
         timeout: seconds that the transaction may take.
 
     Raises:
@@ -55,23 +56,27 @@ async def declare(
     """
     with trusted_imports(system._node, Needed(None, [])):
         wanted = TreeFile(text, name)
-    return await change_to(system, wanted, dry_run=dry_run, timeout=timeout)
+    return await change_to(system, wanted, dry_run=dry_run, keep_all=keep_all, timeout=timeout)
 
 
 async def change_to(
-    system: ActorSystem, wanted: WantedTree, *, dry_run: bool = False, timeout: float = 60.0
+    system: ActorSystem, wanted: WantedTree, *, dry_run: bool = False, keep_all: bool = False, timeout: float = 60.0
 ) -> Change | None:
     """Have the tree of a running system be as it is wanted, by one transaction; None: it is so already.
 
     Raises:
-        SpecError: it cannot be so while all runs. TransactionRefused, TransactionFailed: as any transaction.
+        SpecError: it cannot be so while all runs, or would leave something behind.
+        TransactionRefused, TransactionFailed: as any transaction.
     """
     plan = TreePlan(system, wanted, timeout)
     steps = await plan.steps()
     if not steps:
         return None
+    lost = list(plan.left_behind())
+    if keep_all and lost:
+        raise SpecError(system.name, "; ".join(lost))
     async with system.transaction(dry_run=dry_run, timeout=timeout) as change:
-        change.lose(plan.left_behind())
+        change.lose(lost)
         for step in steps:
             change.step(step)
     return change

@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import msgspec
 import typer
@@ -90,8 +90,7 @@ def diagnosis_lines(one: dict[str, Any]) -> Iterator[str]:
     for suspect in one["suspects"]:
         where = f" at {suspect['address']}" if suspect["address"] else ""
         yield f"{'faulty' if suspect['is_certain'] else 'perhaps faulty'}: {suspect['component']}{where}"
-        if suspect["now"]:
-            yield f"  {suspect['now']}"
+        yield from (f"  {line}" for line in suspect_lines(suspect))
     if not one["suspects"]:
         yield f"none of {one['components']} components is suspected"
     yield from (f"why: {line}" for line in one["why"].splitlines() if line.strip())
@@ -99,6 +98,29 @@ def diagnosis_lines(one: dict[str, Any]) -> Iterator[str]:
     yield from (f"not understood: {each}" for each in one["refused"])
     if one["repair"]:
         yield from case_lines(one["repair"])
+
+
+NUMBERS: Final = ("nobody", "one actor", "two actors", "three actors", "four actors", "five actors")
+
+
+def suspect_lines(suspect: dict[str, Any]) -> Iterator[str]:
+    """What is to be said of one suspect: since when, who waits for it, what it does now, what repair makes of it."""
+    if suspect["since"] is not None:
+        yield f"suspected since {moment(suspect['since'])}"
+    if suspect["unanswered_seconds"] is not None:
+        count, names = suspect["waiting_count"], suspect["waiting"]
+        who = NUMBERS[count] if count < len(NUMBERS) else f"{count} actors"
+        named = "".join([": ", ", ".join(names), " and others" if count > len(names) else ""]) if names else ""
+        waits = f"{who} wait{'s' if count == 1 else ''} for it{named}" if count else "no actor waits for it"
+        yield f"`{suspect['address']}` has not answered for {suspect['unanswered_seconds']:.1f} s; {waits}"
+    if suspect["now"]:
+        yield suspect["now"]
+    repair = suspect["repair"]
+    if repair["would"]:
+        yield f"plan: {repair['would']}"
+    yield from (f"done: {text}" for text in repair["done"])
+    if repair["denied"]:
+        yield f"denied: {repair['denied']} (`holdfast repair retry {suspect['component']}` takes that back)"
 
 
 def case_lines(repair: dict[str, Any]) -> Iterator[str]:

@@ -101,5 +101,5 @@ def repair_lines(one: dict[str, Any]) -> Iterator[str]:
             f"advice: {one['right']} right ({one['seconds_saved']:.1f} s before somebody did it), "
             f"{one['wrong']} wrong, {one['needless']} needless; {one['missed']} restarts by order without advice"
         )
-    yield from (f"given up: {name}" for name in one["given_up"])
-    yield from (f"denied: {name}" for name in one["denied"])
+    yield from (f"given up: {name}: {one['reasons'][name]}" for name in one["given_up"])
+    yield from (f"denied: {name}: {one['reasons'][name]}" for name in one["denied"])

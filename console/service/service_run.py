@@ -64,13 +64,15 @@ class ServedProgram:
             HoldfastError: it cannot; all is as before.
         """
         if modules is None:
-            return _words(await declare(system, _text(self.target), self.target, timeout=RELOAD_TIMEOUT))
+            text = _text(self.target)
+            return _words(await declare(system, text, self.target, keep_all=True, timeout=RELOAD_TIMEOUT))
         with modules.imported_again() as names:
             if self.main is not None:
                 return await _replace_codes(system, names)
             specs = specs_in(self.target, load_named(self.target))
             top = [spec for path, spec in specs.items() if path.count("/") == 1]
-            return _words(await change_to(system, WantedSpecs(system.name, top, self.target), timeout=RELOAD_TIMEOUT))
+            wanted = WantedSpecs(system.name, top, self.target)
+            return _words(await change_to(system, wanted, keep_all=True, timeout=RELOAD_TIMEOUT))
 
 
 def load_program(target: str) -> ServedProgram:

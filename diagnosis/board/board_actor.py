@@ -45,22 +45,44 @@ class BoardActor(Actor):
     """Holds the connection to a board, also while there is none.
 
     Args:
-        url: `tcp://host:port`.
+        url: `tcp://host:port` or `tls://host:port`.
         interval: seconds between two measurements.
         timeout: seconds for a request; no other is handled meanwhile.
-        token: see `Board`.
+        token, ca, certificate, key, insecure: see `Board`.
+
+    Raises:
+        ValueError, SpecError: see `Board`.
     """
 
     deterministic = False
 
-    def __init__(self, url: str, *, interval: float = 1.0, timeout: float = 2.0, token: str | None = None) -> None:
-        self._token = token
+    def __init__(
+        self,
+        url: str,
+        *,
+        interval: float = 1.0,
+        timeout: float = 2.0,
+        token: str | None = None,
+        ca: str | None = None,
+        certificate: str | None = None,
+        key: str | None = None,
+        insecure: bool = False,
+    ) -> None:
         self._url, self._interval, self._timeout = url, interval, timeout
+        self._token, self._ca, self._certificate, self._key, self._insecure = token, ca, certificate, key, insecure
 
     async def on_start(self, restored: bool) -> None:
         """Begin to connect; whether there is a board shows later."""
         self._board = Board(
-            self._url, timeout=self._timeout, broadcast=self._interval, rng=self.ctx.random, token=self._token
+            self._url,
+            timeout=self._timeout,
+            broadcast=self._interval,
+            rng=self.ctx.random,
+            token=self._token,
+            ca=self._ca,
+            certificate=self._certificate,
+            key=self._key,
+            insecure=self._insecure,
         )
         entered: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self.ctx.create_task(self._publish(entered))

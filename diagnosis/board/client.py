@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import random
 from collections.abc import AsyncIterator, Iterable
+from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
 from urllib.parse import urlsplit
@@ -30,6 +31,7 @@ from .board_frames import (
     SwitchFrame,
     encode,
 )
+from .board_tls import check_token, client_tls
 
 A = TypeVar("A", bound=Answer)
 
@@ -76,15 +78,22 @@ class BoardRefused(BoardError, text="the board at {url} refuses: {why}"):
 
 
 class Board:
-    """The board at `tcp://host:port`, as an async context manager; it need not be there yet.
+    """The board at `tcp://host:port` or `tls://host:port`, as an async context manager; it need not be there yet.
 
     Args:
-        url: where it is.
+        url: where it is; with `tls` what is sent is encrypted, and the board's certificate is checked.
         timeout: seconds for a connection, and for each request with the wait for a connection.
         broadcast: seconds between two broadcasts, asked for with each new connection; 0 is none.
         backoff: between two attempts to connect.
         rng: for the jitter of the back-off.
         token: is said first over each connection; None: the board has none.
+        ca: a file with the certificates of who signs that of the board; None: those that the system trusts.
+        certificate, key: files with a certificate of ours and its private key, if the board asks for one.
+        insecure: whether a token may go to another machine in clear, by `tcp`.
+
+    Raises:
+        ValueError: the address is none, a number is out of range, or the token would go over a network in clear.
+        SpecError: the certificates cannot be read.
     """
 
     def __init__(
@@ -96,10 +105,16 @@ class Board:
         backoff: Backoff | None = None,
         rng: random.Random | None = None,
         token: str | None = None,
+        ca: str | Path | None = None,
+        certificate: str | Path | None = None,
+        key: str | Path | None = None,
+        insecure: bool = False,
     ) -> None:
         parts = urlsplit(url)
-        if parts.scheme != "tcp" or not parts.hostname or not parts.port or parts.path or parts.query:
-            raise ValueError(f"a board is at tcp://host:port, not {url!r}")
+        if parts.scheme not in ("tcp", "tls") or not parts.hostname or not parts.port or parts.path or parts.query:
+            raise ValueError(f"a board is at tcp://host:port or tls://host:port, not {url!r}")
+        check_token(parts.hostname, token, is_encrypted=parts.scheme == "tls", insecure=insecure)
+        self._tls = client_tls(ca, certificate, key) if parts.scheme == "tls" else None
         if not timeout > 0:
             raise ValueError(f"timeout must be > 0 seconds, not {timeout!r}")
         self.url, self._host, self._port = url, parts.hostname, parts.port
@@ -238,7 +253,7 @@ class Board:
         while True:
             try:
                 async with asyncio.timeout(self._timeout):
-                    reader, writer = await connect((self._host, self._port), limit=PIECE)
+                    reader, writer = await connect((self._host, self._port), limit=PIECE, tls=self._tls)
             except (OSError, TimeoutError) as error:
                 self._problem = str(error) or "it does not answer"
             else:

@@ -8,6 +8,7 @@ from typing import TypeAlias
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.message import Message, Refusal
 from .board_frames import CHANNELS
+from .board_tls import server_tls
 from .simulated_board import ROBOT, Load, SimulatedBoard
 from .tcp_server import BoardServer
 
@@ -104,7 +105,9 @@ class BoardSimulator(Actor):
         loads: what hangs on its channels; by default the paper's robot.
         defaults: channels that are on after its power-up; by default the PC.
         port: 0 is any that is free; `GetBoard` tells which.
-        token: see `BoardServer`.
+        token, insecure: see `BoardServer`.
+        certificate, key: files with which connections are encrypted; None: they are not.
+        ca: a file with the certificates of who signs those of clients, who then need one.
     """
 
     deterministic = False
@@ -117,8 +120,13 @@ class BoardSimulator(Actor):
         host: str = "127.0.0.1",
         port: int = 0,
         token: str | None = None,
+        certificate: str | None = None,
+        key: str | None = None,
+        ca: str | None = None,
+        insecure: bool = False,
     ) -> None:
-        self._token = token
+        self._token, self._insecure = token, insecure
+        self._tls = server_tls(certificate, key, ca) if certificate is not None and key is not None else None
         self._loads, self._defaults, self._host, self._port = loads, defaults, host, port
         self._refusals = 0
 
@@ -131,7 +139,9 @@ class BoardSimulator(Actor):
             rng=self.ctx.random,
             changed=self._changed,
         )
-        self._server = BoardServer(self._board, self._host, self._port, self._token)
+        self._server = BoardServer(
+            self._board, self._host, self._port, self._token, tls=self._tls, insecure=self._insecure
+        )
         listens: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self.ctx.create_task(self._listen(listens))
         await listens

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import hmac
 import socket
+import ssl
 from typing import Protocol
 
 from ...actors.streams import Listener
@@ -26,6 +27,7 @@ from .board_frames import (
     SwitchFrame,
     encode,
 )
+from .board_tls import check_token
 
 MOST_CLIENTS = 8
 """Connections at a time; of those that hear no broadcasts, the longest silent one gives its seat to a new one."""
@@ -64,8 +66,12 @@ class BoardServer:
     Args:
         device: what is behind it.
         host, port: where it listens.
-        token: what a client has to say before anything else; None: nothing. It is not encrypted: it keeps out who can
-            reach the port, and nobody who can listen on the way.
+        token: what a client has to say before anything else; None: nothing.
+        tls: how connections are encrypted, from `server_tls`; None: they are not.
+        insecure: whether a token is taken in clear from other machines.
+
+    Raises:
+        ValueError: the token would come over a network in clear.
 
     Attributes:
         delay: seconds by which each answer comes later than it could.
@@ -73,7 +79,18 @@ class BoardServer:
         is_deaf: new connections are closed at once.
     """
 
-    def __init__(self, device: Device, host: str = "127.0.0.1", port: int = 0, token: str | None = None) -> None:
+    def __init__(
+        self,
+        device: Device,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        token: str | None = None,
+        *,
+        tls: ssl.SSLContext | None = None,
+        insecure: bool = False,
+    ) -> None:
+        check_token(host, token, is_encrypted=tls is not None, insecure=insecure)
+        self._tls = tls
         self._device, self._host, self._port = device, host, port
         self._socket: socket.socket | None = None
         self._listener: Listener | None = None
@@ -86,14 +103,15 @@ class BoardServer:
     @property
     def url(self) -> str:
         """Where it listens, for `Board`."""
-        return f"tcp://{f'[{self._host}]' if ':' in self._host else self._host}:{self._port}"
+        scheme = "tcp" if self._tls is None else "tls"
+        return f"{scheme}://{f'[{self._host}]' if ':' in self._host else self._host}:{self._port}"
 
     async def start(self) -> None:
         """Listen. Raises OSError: the address cannot be had, or the system cannot watch one more connection."""
         family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
         sock = self._socket = socket.create_server((self._host, self._port), family=family)
         sock.setblocking(False)
-        self._listener = Listener(sock, self._serve, limit=PIECE)
+        self._listener = Listener(sock, self._serve, limit=PIECE, tls=self._tls)
         try:
             self._listener.start()
         except OSError:

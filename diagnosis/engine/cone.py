@@ -18,6 +18,8 @@ from .connected import connected
 
 FALSE: Final = 0
 """The atom that never holds: the head of rules without one."""
+NO_WORK: Final = ("running", "room", "keeps_up", "led")
+"""What is said of components whether they have done anything or not."""
 
 
 class RuleStep(NamedTuple):
@@ -93,7 +95,7 @@ class Index:
     def is_work(self, atom: int) -> bool:
         """Whether an atom says something of the work of a component: more than that it runs, and has room."""
         literal = self.atoms[atom]
-        return literal is not None and literal.name not in ("running", "room")
+        return literal is not None and literal.name not in NO_WORK
 
     def numbers(self, atoms: Collection[Literal]) -> frozenset[int]:
         """The numbers of atoms.

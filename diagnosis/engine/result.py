@@ -5,6 +5,8 @@ from __future__ import annotations
 import enum
 from typing import Any, TypeAlias
 
+import msgspec
+
 from ...actors.kernel.message import Message
 from ..literals import Literal
 from ..observations import Contradiction
@@ -58,6 +60,8 @@ class Diagnosis(Message):
     """Components of whose work nothing is seen at the moment: that they are healthy is not said."""
     set_aside: tuple[str, ...] = ()
     """Sources of observations that are not believed, because they contradict several others that agree."""
+    since: dict[str, float] = msgspec.field(default_factory=dict)
+    """Since when each suspect has been one without a break, in Unix seconds."""
 
     def __str__(self) -> str:
         """In words: `faulty: ja, or jn`."""

@@ -14,6 +14,7 @@ from .observer import Look, Manner, Observer
 from .property import Bound, Property, PropertyObserver
 from .qualitative import QualitativeObserver, trend
 from .regression import Fit, Regression
+from .replicas import ReplicaObserver
 from .runtime import RuntimeObserver
 from .score import ScoreObserver
 from .timeout import TimeoutObserver
@@ -44,6 +45,7 @@ __all__ = [
     "PropertyObserver",
     "QualitativeObserver",
     "Regression",
+    "ReplicaObserver",
     "RuntimeObserver",
     "ScoreObserver",
     "Smooth",

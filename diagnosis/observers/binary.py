@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import msgspec
@@ -54,7 +55,7 @@ class BinaryQualitativeObserver(Observer):
             if topic == its_topic and (value := read(message)) is not None:
                 line.add(self.now, value)
 
-    def afresh(self) -> None:
+    def afresh(self, names: Collection[str]) -> None:
         """A line through before and after would be neither's."""
         for _, _, line in self._lines:
             line.clear()

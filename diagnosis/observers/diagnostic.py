@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 import msgspec
@@ -62,7 +62,7 @@ class DiagnosticObserver(Observer):
                 filtered = value if check.filter is None else check.filter(value)
                 self.verdict(check.atom, check.limits.holds(filtered, self.said(check.atom)))
 
-    def afresh(self) -> None:
+    def afresh(self, names: Collection[str]) -> None:
         """Filters forget what came before."""
         for check in self._checks:
             check.afresh()

@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Collection, Mapping
+from copy import copy
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
 from ...actors.kernel.actor import on
+from ..kept_file import read_kept, write_kept
 from ..literals import ok
 from .hearing import Heard, listen
 from .observer import Manner, Observer
@@ -74,11 +76,8 @@ class Baselines:
     def __init__(self, path: str | Path | None = None, *, by_hour: bool = False) -> None:
         self._path, self._by_hour = None if path is None else Path(path), by_hour
         self._known: dict[str, Usual] = {}
-        if self._path is not None and self._path.exists():
-            try:
-                self._known = msgspec.json.decode(self._path.read_bytes(), type=dict[str, Usual])
-            except msgspec.DecodeError as error:
-                raise ValueError(f"{self._path} has no baselines ({error}); remove it to learn anew") from error
+        if self._path is not None:
+            self._known = read_kept(self._path, dict[str, Usual], "baselines") or {}
 
     def of(self, topic: str, wall: float) -> Usual:
         """What is known of a topic at a Unix time; nothing at first."""
@@ -91,13 +90,9 @@ class Baselines:
     async def save(self) -> None:
         """Write what is known to the file, if there is one: whole, or not at all."""
         if self._path is not None:
-            await asyncio.to_thread(_write, self._path, msgspec.json.encode(self._known))
-
-
-def _write(path: Path, data: bytes) -> None:
-    beside = path.with_name(f"{path.name}.new")
-    beside.write_bytes(data)
-    beside.replace(path)
+            await asyncio.to_thread(
+                write_kept, self._path, {topic: copy(usual) for topic, usual in self._known.items()}
+            )
 
 
 class FlowSource(msgspec.Struct, frozen=True):
@@ -110,7 +105,10 @@ class FlowSource(msgspec.Struct, frozen=True):
 class _Flow:
     """What is seen of one topic."""
 
-    __slots__ = ("came_in", "in_block", "last", "marks", "out_of_block", "poor")
+    __slots__ = ("began", "came_in", "in_block", "last", "marks", "out_of_block", "poor")
+
+    began: float
+    last: float | None
 
     def __init__(self, now: float) -> None:
         self.marks: tuple[object, ...] = ()
@@ -118,7 +116,7 @@ class _Flow:
 
     def begin(self, now: float) -> None:
         """Nothing that came before counts."""
-        self.last: float | None = None
+        self.began, self.last = now, None
         self.came_in = self.in_block = self.out_of_block = self.poor = 0
 
 
@@ -178,10 +176,11 @@ class FlowObserver(Observer):
             user.came_in += 1
             user.in_block += 1
 
-    def afresh(self) -> None:
-        """What came before somebody acted says nothing of after."""
-        for flow in self._flows.values():
-            flow.begin(self.now)
+    def afresh(self, names: Collection[str]) -> None:
+        """What came before somebody acted says nothing of after; other topics have nothing to do with it."""
+        for topic, flow in self._flows.items():
+            if topic in names:
+                flow.begin(self.now)
 
     async def look(self) -> None:
         """Listen to topics that are new, and say which flow."""
@@ -221,9 +220,9 @@ class FlowObserver(Observer):
                 one is not old for one, old in zip(marks, flow.marks, strict=True)
             )
             flow.came_in, flow.marks = flow.came_in + had_turns, marks
-        if flow.last is None:
+        if flow.last is None and learned.count < ENOUGH:
             return None
-        silent = now - flow.last
+        silent = now - (flow.began if flow.last is None else flow.last)
         if learned.count < ENOUGH:
             return True if silent < self._patience else None
         is_long = silent > max(self._patience, LONGER * learned.longest_gap)
@@ -239,4 +238,4 @@ class FlowObserver(Observer):
                 learned.take_block(part)
         if flow.poor > 1:
             return False
-        return True if silent < max(self._patience, LONGER * learned.mean_gap) else None
+        return True if flow.last is not None and silent < max(self._patience, LONGER * learned.mean_gap) else None

@@ -6,6 +6,7 @@ import dataclasses
 import math
 import statistics
 from collections import deque
+from collections.abc import Collection
 from typing import Any, Final
 
 from ..literals import Literal, ok
@@ -91,7 +92,7 @@ class GeneralObserver(Observer):
             if is_good or is_whole:  # Of a part of a window enough is enough, but too little is not yet too little.
                 self.verdict(self._atom, is_good)
 
-    def afresh(self) -> None:
+    def afresh(self, names: Collection[str]) -> None:
         """What came before somebody acted says nothing of after: it would be counted for a window longer."""
         self._times.clear()
         self._since = self.now

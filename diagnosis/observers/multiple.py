@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, Final
 
 from ..literals import Literal
@@ -58,7 +58,7 @@ class TriggeredObserver(Observer):
         else:
             self._come(key)
 
-    def afresh(self) -> None:
+    def afresh(self, names: Collection[str]) -> None:
         """Nobody answers triggers from before."""
         self._pending.clear()
         self._last = None
@@ -122,7 +122,7 @@ class ConditionedObserver(Observer):
         elif self._since is None:
             self._since = self.now
 
-    def afresh(self) -> None:
+    def afresh(self, names: Collection[str]) -> None:
         """Count the time in which messages are due from now on."""
         if self._since is not None:
             self._since, self._last = self.now, float("-inf")

@@ -5,7 +5,7 @@ It says what it sees by `verdict` or `say`; when that is published, renewed and 
 
 from __future__ import annotations
 
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Collection
 from typing import Any, Final
 
 import msgspec
@@ -92,8 +92,11 @@ class Observer(Actor):
         """Whether a grace is for what is said of this."""
         return not set(grace.names).isdisjoint(about.args)
 
-    def afresh(self) -> None:
-        """Somebody has acted upon what is observed: forget what was gathered before."""
+    def afresh(self, names: Collection[str]) -> None:
+        """Somebody has acted upon some of what is observed: forget what was gathered of it before.
+
+        `names` are the components, topics and values that this is about, none of which is to be blamed yet.
+        """
 
     @property
     def now(self) -> float:
@@ -154,7 +157,7 @@ class Observer(Actor):
         until = dict.fromkeys((name for name in message.names if name not in left_out), now + message.seconds)
         self._grace |= {name: max(self._grace.get(name, 0.0), end) for name, end in until.items()}
         if spared:
-            self.afresh()
+            self.afresh({name for about in spared for name in about.args})
         for word in spared.values():
             word.debounce.clear()  # samples from before say nothing about after
             if word.said is not None and not word.said.positive:

@@ -7,7 +7,7 @@ import contextlib
 import enum
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Final
 
 import msgspec
@@ -116,7 +116,7 @@ class PropertyObserver(Observer):
         """How often others start it is just what is to be known."""
         return super().spares(grace, about) and not (grace.is_counted and about in self._restarts_of)
 
-    def afresh(self) -> None:
+    def afresh(self, names: Collection[str]) -> None:
         """How it grew, and how often repair has restarted it, says nothing of after."""
         self._growth.clear()
         self._lives.clear()

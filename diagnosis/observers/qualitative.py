@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 from ..literals import Literal, const, dec, inc
@@ -73,7 +73,7 @@ class QualitativeObserver(Observer):
         if value is not None:
             self._line.add(self.now, value if self._filter is None else self._filter(value))
 
-    def afresh(self) -> None:
+    def afresh(self, names: Collection[str]) -> None:
         """A line through before and after would be neither's."""
         self._line.clear()
         self._filter = self._new_filter() if self._new_filter is not None else None

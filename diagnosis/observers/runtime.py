@@ -6,7 +6,7 @@ import dataclasses
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Final
 
 from ...actors.errors import AskTimeout
@@ -18,7 +18,8 @@ from ...actors.kernel.message import Refusal
 from ...actors.kernel.node import Node
 from ...actors.process.open_asks import open_asks, outlet_of
 from ...supervision.intensity import recent_restarts
-from ..literals import Literal, crashes, progress, replies, room, waits_for
+from ..literals import Literal, crashes, keeps_up, progress, replies, room, waits_for
+from .backlog import Backlog
 from .node_observer import at_root
 from .observer import Manner, Observer
 
@@ -57,17 +58,18 @@ class _Seen:
     refused: float = -math.inf
     """When it has refused what it was asked for the last time."""
     crashes: tuple[float, ...] = ()
+    backlog: Backlog = dataclasses.field(default_factory=Backlog)
     waited: deque[str] = dataclasses.field(default_factory=lambda: deque(maxlen=USUAL))
     """Whom it waited for at the last looks."""
 
 
 class RuntimeObserver(Observer):
-    """Says who gets on, who answers, who crashes again and again, whose mailbox is full, and who waits for whom.
+    """Says who gets on, answers, keeps up, crashes again and again, whose mailbox is full, and who waits for whom.
 
     An actor is late if asks of it were not answered in time, or if others wait for it longer than the longest turn it
     was seen to need, four times over. Who is late because it waits for another one is not accused: the last one in that
-    row is. If the row leads back to its beginning, all in the circle are. Of an actor that nobody has asked anything
-    nothing is said.
+    row is, also if a mailbox only grows because each turn waits for it. If the row leads back to its beginning, all in
+    the circle are. Of an actor that nobody has asked anything nothing is said.
 
     Args:
         actors: component to address; it may change, and what is in it at a look is looked at.
@@ -130,12 +132,13 @@ class RuntimeObserver(Observer):
         """How often it crashes is just what is to be known."""
         return self._loops.isdisjoint(about.args) and super().spares(grace, about)
 
-    def afresh(self) -> None:
+    def afresh(self, names: Collection[str]) -> None:
         """What was late before somebody acted says nothing of after."""
-        for seen in self._known.values():
+        for seen in (seen for component, seen in self._known.items() if component in names):
             seen.unanswered.clear()
             seen.waited.clear()
             seen.full = None
+            seen.backlog.clear()
 
     # -- looking ----------------------------------------------------------------------------------------------------
 
@@ -157,8 +160,10 @@ class RuntimeObserver(Observer):
             if cell is not None and cell.state is RUNNING and cell.host.is_up(cell):
                 late[component] = self._is_late(component, cell, asked_since.get(component), waits, now)
             else:
-                self._seen(component).full = None
-                for atom in (progress(component), replies(component), room(component)):
+                seen = self._seen(component)
+                seen.full = None
+                seen.backlog.clear()
+                for atom in (progress(component), replies(component), room(component), keeps_up(component)):
                     if component not in self._loops:
                         self.verdict(atom, None)
         self._tell(late, waits, now)
@@ -227,6 +232,7 @@ class RuntimeObserver(Observer):
         if seen.life != cell.life:
             seen.life, seen.mark, seen.since = cell.life, mark, now
             seen.unanswered.clear()
+            seen.backlog.clear()
         has_got_on = mark is not seen.mark
         stood = now - seen.since
         if has_got_on:
@@ -235,6 +241,7 @@ class RuntimeObserver(Observer):
         waits_now = sorted(waits.get(component, ()))
         seen.waited.append(waits_now[0] if waits_now else "")
         backlog = cell.host.backlog(cell)
+        seen.backlog.take(backlog, now)
         limit = max(self._patience, LONGER * seen.longest) if seen.turns >= LOOKS else float("inf")
         is_busy = began is not None or backlog > 0
         is_wanted = asked_since is not None or backlog > 0
@@ -265,18 +272,11 @@ class RuntimeObserver(Observer):
 
     def _tell(self, late: Mapping[str, bool], waits: Mapping[str, set[str]], now: float) -> None:
         """Accuse whoever those who are late wait for in the end."""
-        accused: set[str] = set()
         waiting: set[Literal] = set()
-        for component in (one for one, is_late in late.items() if is_late):
-            row = [component]
-            while (following := self._awaited(row[-1], waits)) is not None:
-                waiting.add(waits_for(row[-1], following))
-                if following in row:
-                    accused.update(row[row.index(following) :])
-                    break
-                row.append(following)
-            else:
-                accused.add(row[-1])
+        accused = self._ends((one for one, is_late in late.items() if is_late), waits, waiting)
+        growing = [one for one in late if self._known[one].backlog.has_grown]
+        # What they wait for at just this moment says little: they get on.
+        overrun = self._ends(growing, {}, waiting)
         for component, is_late in late.items():
             if component in accused:
                 full = self._seen(component).full
@@ -287,6 +287,11 @@ class RuntimeObserver(Observer):
             elif is_late:
                 for atom in (progress(component), replies(component), room(component)):
                     self.verdict(atom, None)
+        for component in late:
+            backlog, was = self._known[component].backlog, self.said(keeps_up(component))
+            is_known = None if was is False or component in growing else was
+            is_empty = backlog.is_empty and self._known[component].turns > 0
+            self.verdict(keeps_up(component), False if component in overrun else True if is_empty else is_known)
         for over in self._waiting - waiting:
             self.verdict(over, None)
         self._waiting = waiting
@@ -296,6 +301,21 @@ class RuntimeObserver(Observer):
             self.verdict(crashes(component), True if component in self._loops else None)
             if component in self._loops:
                 self.verdict(progress(component), False)
+
+    def _ends(self, late: Iterable[str], waits: Mapping[str, Iterable[str]], waiting: set[Literal]) -> set[str]:
+        """Who is at the end of the rows that begin with these; who waits for whom in them is noted in `waiting`."""
+        ends: set[str] = set()
+        for component in late:
+            row = [component]
+            while (following := self._awaited(row[-1], waits)) is not None:
+                waiting.add(waits_for(row[-1], following))
+                if following in row:
+                    ends.update(row[row.index(following) :])
+                    break
+                row.append(following)
+            else:
+                ends.add(row[-1])
+        return ends
 
     def _awaited(self, component: str, waits: Mapping[str, Iterable[str]]) -> str | None:
         """Whom an actor waits for now, or waited for at most of the last looks."""

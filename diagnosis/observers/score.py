@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 from ..literals import Literal, ok
@@ -38,9 +39,9 @@ class ScoreObserver(Observer):
         self._score, self._limits, self._weight, self._least = reader(score), limits, weight, least
         self._atom = ok(topic) if atom is None else atom_of(atom)
         self._last = 0.0
-        self.afresh()
+        self.afresh(())
 
-    def afresh(self) -> None:
+    def afresh(self, names: Collection[str]) -> None:
         """Forget the scores, so that the average begins anew."""
         self._average, self._count = Smooth(self._weight), 0
 

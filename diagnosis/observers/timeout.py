@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from typing import Any
 
 from ..literals import Literal, ok
@@ -36,7 +37,7 @@ class TimeoutObserver(Observer):
         if self.said(self._atom) is not True:
             self.verdict(self._atom, True)
 
-    def afresh(self) -> None:
+    def afresh(self, names: Collection[str]) -> None:
         """Count the time of silence from now on."""
         self._last, self._since = None, self.now
 

@@ -190,8 +190,8 @@ def judge_pings(
         case.doubted.pop(bad, None)
         return None
     since = case.doubted.setdefault(bad, at.now)
-    if at.now - since < policy.caution.confirm:
-        return Wait(since + policy.caution.confirm - at.now)
+    if (left := since + policy.caution.confirm - at.now) > 0:  # What is waited for is what is asked: both round alike.
+        return Wait(left)
     down = {one.args[0] for one in at.diagnosis.symptoms if one.name == "running" and not one.positive}
     if wrong := [name for name in alive if name in down]:
         return Dismiss(bad, f"{', '.join(wrong)} runs and answers, although it is said not to run")

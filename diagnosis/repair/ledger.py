@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Final
 
+import msgspec
+
+from ..kept_file import read_kept
 from ..model import Model
 from ..planning import Step
 from .actions import RepairAction
@@ -17,6 +21,24 @@ HOUR: Final = 3600.0
 """Seconds in which the actions of all cases together are counted."""
 Key = tuple[str, str]
 """Action and component."""
+
+
+class KeptMemory(msgspec.Struct, frozen=True):
+    """What a repairer knows also in the next program: how good its advice was, and what people have forbidden.
+
+    Attributes:
+        cases, useless, denied: as in `Memory`.
+        right, wrong, needless, missed, seconds_saved: as in `Score`.
+    """
+
+    cases: int = 0
+    useless: int = 0
+    denied: dict[str, str] = {}
+    right: int = 0
+    wrong: int = 0
+    needless: int = 0
+    missed: int = 0
+    seconds_saved: float = 0.0
 
 
 @dataclasses.dataclass(slots=True)
@@ -35,6 +57,8 @@ class Memory:
         score: how good the advice was.
         stories: what was told of each of the last cases.
         model: as it was changed at run time; None if it was not.
+        file: where scores and denials are kept beyond the program; None: nowhere.
+        kept: what stands there.
     """
 
     tried: dict[Key, list[float]] = dataclasses.field(default_factory=dict[Key, list[float]])
@@ -48,6 +72,19 @@ class Memory:
     score: Score = dataclasses.field(default_factory=Score)
     stories: Stories = dataclasses.field(default_factory=Stories)
     model: Model | None = None
+    file: Path | None = None
+    kept: KeptMemory = dataclasses.field(default_factory=KeptMemory)
+
+    def load(self, file: Path) -> None:
+        """Begin with what an earlier program has kept. Raises ValueError: the file is no such file. OSError."""
+        self.file, self.kept = file, read_kept(file, KeptMemory, "scores of repair") or KeptMemory()
+        kept = self.kept
+        self.cases, self.useless, self.denied = kept.cases, kept.useless, dict(kept.denied)
+        self.score = Score(kept.right, kept.wrong, kept.needless, kept.missed, kept.seconds_saved)
+
+    def to_keep(self) -> KeptMemory:
+        """What the next program is to know."""
+        return KeptMemory(self.cases, self.useless, dict(self.denied), **dataclasses.asdict(self.score))
 
 
 class Ledger:

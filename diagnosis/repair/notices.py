@@ -217,6 +217,8 @@ class RepairStatus(Message):
     needless: int = 0
     missed: int = 0
     seconds_saved: float = 0.0
+    reasons: dict[str, str] = msgspec.field(default_factory=dict)
+    """Why, of each component that is given up or denied."""
 
 
 class GetRepairStatus(Message[RepairStatus]):

@@ -20,6 +20,7 @@ from ...actors.kernel.actor import Actor, on, subscribe
 from ...actors.kernel.message import Message
 from ...supervision.arbiter import SUPERVISOR, Arbiter, Hand, arbiter_of, covers
 from ..engine import Diagnosis, State
+from ..kept_file import write_kept
 from ..literals import BadLiteral, Literal
 from ..messages import (
     DIAGNOSER,
@@ -106,6 +107,7 @@ class Repairer(Actor):
         self._case: Case | None = None
         self._approvals = Approvals(approve)
         self._wakers: list[asyncio.Future[None]] = []
+        self._keeping = asyncio.Lock()
         self._restarted: dict[str, float] = {}
 
     def on_start(self, restored: bool) -> None:
@@ -118,6 +120,24 @@ class Repairer(Actor):
             self._outlook.looks_until = self.now() + self._policy.look
         self.ctx.create_task(self._listen())
         self.ctx.create_task(self._catch_up(diagnoser))
+
+    async def on_stop(self, reason: object) -> None:
+        """Keep scores and denials for the next program."""
+        await self._keep()
+
+    async def _keep(self) -> None:
+        """Write what the next program is to know, if it has changed; that it cannot be written is told once."""
+        memory = self._memory
+        async with self._keeping:  # Two threads would write one file.
+            kept = memory.to_keep()
+            if memory.file is None or kept == memory.kept:
+                return
+            memory.kept = kept
+            try:
+                await asyncio.to_thread(write_kept, memory.file, kept)
+            except OSError as error:
+                text = f"The scores and denials of repair cannot be kept in {memory.file}: {error.strerror or error}."
+                self.ctx._cell.node.emit(say.RepairTold(self.ctx.path, 0, "NotKept", text))
 
     async def _listen(self) -> None:
         """Hear of each start at once, until this life ends: who looks from time to time hears of it too late."""
@@ -150,9 +170,10 @@ class Repairer(Actor):
             self._memory.score.missed += 1
 
     @on(_Started)
-    def _wait_for_grace(self, message: _Started) -> None:
+    async def _wait_for_grace(self, message: _Started) -> None:
         self.ctx.tell_after(self._policy.caution.grace + MOMENT, _GraceIsOver())
         self._wake()
+        await self._keep()
 
     async def _catch_up(self, diagnoser: str) -> None:
         """What is known, and what it means; a later life must not plan as if nothing were known."""
@@ -222,12 +243,13 @@ class Repairer(Actor):
         self._begin()
 
     @on(say.RetryRepair)
-    def _retry(self, message: say.RetryRepair) -> None:
+    async def _retry(self, message: say.RetryRepair) -> None:
         names = message.components or tuple(self._model.components)
         self._ledger.pardon(names)
         for name in names:
             self._memory.given_up.pop(name, None)
         self._begin()
+        await self._keep()
 
     @on(say.Approve)
     def _approved(self, message: say.Approve) -> None:
@@ -255,6 +277,7 @@ class Repairer(Actor):
             score.needless,
             score.missed,
             score.seconds_saved,
+            {**memory.given_up, **memory.denied},
         )
 
     @on(say.GetStories)
@@ -577,6 +600,7 @@ class Repairer(Actor):
             self._memory.stories.add(message.case, say.StoryEntry(time.time(), what, text, about(message)))
             self.ctx._cell.node.emit(say.RepairTold(self.ctx.path, message.case, what, text))
         await self.ctx.publish(say.TOPIC, message)
+        await self._keep()
 
     def _wake(self) -> None:
         wakers, self._wakers = self._wakers, []

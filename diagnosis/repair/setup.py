@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 from ...actors.backoff import Backoff
 from ...actors.kernel.actor import Start
@@ -29,6 +30,7 @@ def repairer(
     mode: str = NORMAL,
     stance: Stance = "on",
     approve: Approver | None = None,
+    file: str | Path | None = None,
 ) -> ChildSpec:
     """The spec of a repairer, for `tree(..., repairer=...)`.
 
@@ -40,19 +42,23 @@ def repairer(
         mode: at first; `SetMode` changes it.
         stance: how far repair goes at first: "off", "advise", "ask" or "on"; `SetStance` changes it.
         approve: is asked for approval, besides people; whoever answers first decides.
+        file: where the scores of advice and what people have denied are kept, for the next program.
 
     Raises:
-        ValueError: there is no such stance.
+        ValueError: there is no such stance, or the file is another one. OSError: it cannot be read.
         ModelError: something is wrong with the model. PlanningError: with the actions.
     """
     made = model if isinstance(model, Model) else Model(model)
     repertoire = actions if isinstance(actions, Repertoire) else Repertoire(actions)
+    memory = Memory(mode=mode, stance=check_stance(stance))
+    if file is not None:
+        memory.load(Path(file))
     options = {
         "addresses": dict(addresses or {}),
         "base": tuple(base),
         "planner": planner,
         "diagnoser": diagnoser,
-        "memory": Memory(mode=mode, stance=check_stance(stance)),
+        "memory": memory,
         "approve": approve,
     }
     return child(name, Start(Repairer, (made, repertoire, policy), options), backoff=Backoff(initial=0.1))

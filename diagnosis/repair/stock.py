@@ -65,6 +65,31 @@ def restart_child(
     return _action(name, run, addresses, more, pddl=_restart_text(name, cost))
 
 
+def restart_replica(
+    addresses: Mapping[str, str],
+    *,
+    name: str = "restart_replica",
+    cost: int = 1,
+    timeout: float = PATIENCE,
+    **options: Any,
+) -> RepairAction:
+    """`restart_replica(n)`: have those replicas of a protected actor begun anew that neither lead nor follow.
+
+    The one that leads works on meanwhile, and those that could take its place stay.
+
+    Args:
+        addresses: of each component that stands for replicas the address of the protected actor.
+        name: of the action.
+        cost: of the action.
+        timeout: seconds for each replica.
+        options: those of `RepairAction`.
+    """
+    run = functools.partial(_restart_replicas, addresses=addresses, timeout=timeout)
+    mechanisms = {component: f"{path}/ftm" for component, path in addresses.items()}
+    more = {"grace": 5.0, "timeout": 3 * timeout} | options
+    return _action(name, run, mechanisms, more, pddl=_mend_text(name, cost, "node"))
+
+
 def restart_subtree(
     addresses: Mapping[str, str],
     *,
@@ -161,6 +186,21 @@ async def _restart(act: Act, node: str, *, addresses: Mapping[str, str], timeout
         await _ordered(act, keeper, address, order, 2 * timeout)
     except ChildBusy as error:
         raise InOtherHands(address, "its supervisor", f"it is {error.state}") from error
+
+
+async def _restart_replicas(act: Act, node: str, *, addresses: Mapping[str, str], timeout: float) -> None:
+    address = addresses[node]
+    cell = act.ctx._cell.node.find(address)
+    states = None if cell is None else cell.host.place.replica_states()
+    ill = [name for name, state in (states or {}).items() if state not in ("leads", "follows")]
+    if not ill:
+        raise ActionFailed(str(act.step), f"{address} has no replica that neither leads nor follows")
+    for name in ill:
+        act.check()
+        path = f"{address}/ftm/{name}"
+        keeper, child = _keeper(act, path)
+        with contextlib.suppress(ChildBusy):  # It is being started already.
+            await _ordered(act, keeper, path, RestartChild(child, running=True, unless_parked=True), timeout)
 
 
 async def _bind(act: Act, node: str, *, bindings: Mapping[str, tuple[str, str, str]]) -> Undo | None:

@@ -222,6 +222,7 @@ class ServerState(msgspec.Struct, array_like=True, tag=1):
     stash_ids: list[int] = []
     traps: bool = False  # `ctx.trap_exits`
     absent: list[str] = []  # variables that `__init__` has made, and that are no more
+    variables: list[str] = []  # that the class had which has saved it, if that was another version, perhaps
 
 
 class StateDelta(msgspec.Struct, array_like=True, tag=2):

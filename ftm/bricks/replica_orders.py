@@ -46,6 +46,7 @@ class Install(Message[None]):
     is_last: bool
     log: list[tuple[str, int, int, TurnEnd]]
     traps: bool = False  # `ctx.trap_exits` of the life that it comes from
+    variables: tuple[str, ...] = ()  # that its class had when it was saved
 
 
 class SetPeer(Message[None]):

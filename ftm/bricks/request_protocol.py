@@ -318,7 +318,9 @@ class RequestProtocol(Transfer):
             data, self._pieces = b"".join(self._pieces), []
             server = self._standing.server
             await server.drop_life()
-            server.install(ServerState(message.turn, image_from(data), [], [], [], False, message.stash, message.traps))
+            stash, traps, variables = message.stash, message.traps, list(message.variables)
+            image = image_from(data)
+            server.install(ServerState(message.turn, image, [], [], [], False, stash, traps, variables=variables))
             self._standing.log.replace(message.log)
 
     @on(Lead)

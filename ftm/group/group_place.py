@@ -108,6 +108,14 @@ class GroupPlace(Place):
         leader = None if group is None else group.membership.primary
         return None if group is None or leader is None else group.replicas.worker_of(leader)
 
+    def replica_states(self) -> dict[str, str]:
+        """How each replica does; none while the actor is being recovered."""
+        group = self.group
+        if group is None or group.membership.is_over:
+            return {}
+        known = group.membership
+        return {name: known.state_of(name, group.replicas.life_of(name)) for name in known.names}
+
     def handed_to(self, parent: Parent) -> None:
         """The replicas stay: another supervisor hears of the end of the life."""
         self.parent = parent
@@ -393,10 +401,11 @@ class GroupPlace(Place):
             if not pieces and switch.ledger.state_turn >= 0:
                 pieces = [Restore(b"")]  # It begins afresh, but its turns are counted on.
             traps = traps or any(piece.traps for piece in pieces)
+            variables = tuple(name for piece in pieces for name in piece.variables)
             for index, piece in enumerate(pieces, 1):
                 is_last = index == len(pieces)
                 turn, stash = switch.ledger.state_turn, switch.ledger.stash
-                order = Install(known.epoch, turn, piece.data, stash, is_last, [], traps)
+                order = Install(known.epoch, turn, piece.data, stash, is_last, [], traps, variables)
                 await replicas.ask(first, order, LED_WITHIN)
             await replicas.ask(first, Lead(known.epoch, self.config), LED_WITHIN)
         except HoldfastError as error:

@@ -53,7 +53,7 @@ def protection_of(cell: Cell) -> ProtectionStatus:
             cell.path, stack, {}, None, place.epoch, place.config, False, place.ended_at, False, is_new
         )
     known, adaptation = group.membership, group.adaptation
-    replicas = {name: known.state_of(name, group.replicas.life_of(name)) for name in known.names}
+    replicas = place.replica_states()
     is_whole, since = group.replicas.whole_since()
     is_changing = adaptation.change is not None
     return ProtectionStatus(

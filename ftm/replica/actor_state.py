@@ -110,7 +110,8 @@ def snapshot_of(life: ServerLife, points: RewindPoints) -> list[Snapshot]:
     data = point.data.whole() if point is not None and is_known else save_state(life.cell.actor)
     stash = [fed.feed.id for fed in life.stash]
     parts, pause = pieces(data), time.perf_counter() - begin
+    kind, names = life.made_by()
     return [
-        Snapshot(life.turn, one, index == len(parts), stash, pause, traps=life.traps)
+        Snapshot(life.turn, one, index == len(parts), stash, pause, traps=life.traps, kind=kind, variables=names)
         for index, one in enumerate(parts, 1)
     ]

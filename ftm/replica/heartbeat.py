@@ -50,7 +50,8 @@ class Heart(Actor):
 
     def _take_pace(self) -> None:
         said = detection_in(self._standing.layers)
-        self._interval, self._longest = self._usual if said is None else (said.interval, said.watch_turns or 0.0)
+        self._interval, longest = self._usual if said is None else (said.interval, said.watch_turns or 0.0)
+        self._longest = longest or self._standing.server.turn_timeout
 
     @on(HeartbeatDue)
     def _beat(self, message: HeartbeatDue) -> None:

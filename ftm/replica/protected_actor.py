@@ -129,6 +129,7 @@ def is_dropped(life: ServerLife | None) -> bool:
 class Server(lifecycle.HerePlace):
     """The place of the protected actor: its lives, one after the other, what they run, and their port home."""
 
+    limits_turns = False  # The failure detector does, which knows who else could take the turn.
     is_trial = False  # Its lives are no lives of the actor: they only compute what another one has.
 
     def __init__(self, standing: Standing, method: Method) -> None:
@@ -153,6 +154,12 @@ class Server(lifecycle.HerePlace):
     def address(self) -> str:
         """Where the actor is for all others, and for itself."""
         return self.standing.address
+
+    @property
+    def turn_timeout(self) -> float:
+        """Seconds that the actor's class allows a turn; 0: as many as it wants."""
+        start = None if self.cell is None else self.cell.extra().start
+        return 0.0 if start is None else start.kind.turn_timeout or 0.0
 
     def report_to(self, driver: Driver) -> None:
         """Have this one drive the server from now on."""
@@ -347,7 +354,7 @@ class Server(lifecycle.HerePlace):
                 data = point.data.whole()
             except DamagedValue as error:
                 raise StartFailed(self.address, str(error)) from error
-            life.to_life(Restore(data))
+            life.to_life(Restore(data, variables=point.variables))
         turn = state.start_turn if point is None else point.turn
         life.begin(start, turn, [] if point is None else point.stash_ids)
         self.life = life
@@ -360,6 +367,10 @@ class Server(lifecycle.HerePlace):
             take_up(life, point, has_deltas=state.has_deltas)
         elif state.has_deltas:
             actor.get_delta()
+        if life.restored.is_mapped:  # What is begun with, and gone back to, is a state of the class as it is now.
+            made = self._whole(life)
+            self.points.stand_changed(made)
+            self._note_names(life, made)
         return life
 
     def abandon(self) -> None:

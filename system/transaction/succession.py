@@ -273,9 +273,9 @@ def _hand_over(old: Cell, new: Cell) -> None:
     node, its = old.node, old.extra()
     for name in links.hand_over(old, new):
         new.host.told(new, "replaces", {"was": name})
-    for name in list(its.belongings.names):
+    for name, scope in list(its.belongings.names.items()):
         node.unregister(name)
-        node.register(name, new)
+        node.register(name, new, scope=scope)
     for topic in list(its.belongings.topics):
         node.topics.unsubscribe(topic, old)
         node.topics.subscribe(topic, new)

@@ -27,6 +27,7 @@ class SameLoop:
 
     def __init__(self) -> None:
         self._loop, self._thread = asyncio.get_running_loop(), threading.get_ident()
+        self._last: set[asyncio.Task[None]] = set()
 
     def soon(self, call: Callable[[], None]) -> None:
         """Have something called soon; nothing happens if the loop has ended."""
@@ -56,6 +57,24 @@ class SameLoop:
             return result
         work.close()
         raise WouldWait(repr(work))
+
+    def run(self, work: Coroutine[Any, Any, T]) -> asyncio.Future[T]:
+        """Run a coroutine, for somebody who awaits it."""
+        return asyncio.ensure_future(work, loop=self._loop)
+
+    def finish(self, work: Coroutine[Any, Any, None], seconds: float) -> None:
+        """Run the last coroutine; whoever ends a program does not wait for it. What has not ended in time is cancelled.
+
+        Its errors are of what may be lost, which the next leader does not miss.
+        """
+        last = self._loop.create_task(asyncio.wait_for(work, seconds), name="the end of a journal")
+        self._last.add(last)
+        last.add_done_callback(self._ended)
+
+    def _ended(self, last: asyncio.Task[None]) -> None:
+        self._last.discard(last)
+        if not last.cancelled():
+            last.exception()
 
     def close(self) -> None:
         """Do nothing: the loop is the program's."""

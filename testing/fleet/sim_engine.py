@@ -62,12 +62,13 @@ class SimEngine:
     Args:
         broker: the servers.
         seconds: how long a lease lasts after each renewal.
+        link: of the program, if its connections share one.
     """
 
     name = PATH
 
-    def __init__(self, broker: SimBroker, *, seconds: float = 3.0) -> None:
-        self.link = SimLink()
+    def __init__(self, broker: SimBroker, *, seconds: float = 3.0, link: SimLink | None = None) -> None:
+        self.link = link or SimLink()
         asks = _Asks(broker, self.link)
         self.log, self.lease, self.blobs = SimLog(asks), SimLease(asks, seconds), SimBlobs(asks)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Callable, Coroutine
+from collections.abc import AsyncGenerator
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -15,140 +15,25 @@ import holdfast as hf
 from holdfast.actors.errors import AskDeadlock, BadMessage, BadReply, ConnectionLost, NotGranted
 from holdfast.actors.process.wire import frames
 from holdfast.cluster.lines.far_line import NEW
-from holdfast.cluster.lines.line import NOBODY, Boot, LineBatch
+from holdfast.cluster.lines.line import NOBODY, Boot, LineBatch, Note
 from holdfast.cluster.lines.lines import FORGET_SECONDS, SILENT_SECONDS, LineTaken
-from holdfast.system import system_connection
-from holdfast.testing.fleet.post import NO_POST_FAULTS, PostFaults, SimPost, SimTransport
-from tests.cluster.fleets import simulate
-
-
-class Add(hf.Message[int]):
-    amount: int
-
-
-class Total(hf.Message[int]): ...
-
-
-class Wait(hf.Message[int]):
-    seconds: float
-
-
-class No(hf.Refusal):
-    why: str
-
-
-class Refuse(hf.Message[None]): ...
-
-
-class Crash(hf.Message[None]): ...
-
-
-class Large(hf.Message[bytes]):
-    data: bytes
-
-
-class News(hf.Message[None]):
-    text: str
-
-
-class Account(hf.Actor):
-    def __init__(self) -> None:
-        self.total = 0
-
-    @hf.on(Add)
-    def add(self, message: Add) -> int:
-        self.total += message.amount
-        return self.total
-
-    @hf.on(Total)
-    def say(self, message: Total) -> int:
-        return self.total
-
-    @hf.on(Wait)
-    async def wait(self, message: Wait) -> int:
-        await asyncio.sleep(message.seconds)
-        return self.total
-
-    @hf.on(Large)
-    def large(self, message: Large) -> bytes:
-        return message.data * 3
-
-    @hf.on(Refuse)
-    def refuse(self, message: Refuse) -> None:
-        raise No("not today")
-
-    @hf.on(Crash)
-    def crash(self, message: Crash) -> None:
-        raise ValueError("broken")
-
-    @hf.on(News)
-    def news(self, message: News) -> None:
-        self.total += len(message.text)
-
-
-class Reach:
-    """Systems that are reached over one post."""
-
-    def __init__(self, patch: pytest.MonkeyPatch, seed: int, faults: PostFaults = NO_POST_FAULTS) -> None:
-        self.post = SimPost(seed, faults)
-        self.transports: list[SimTransport] = []
-        patch.setattr(system_connection, "open_lines", self._open)
-
-    async def _open(self, at: str, settings: object) -> tuple[SimTransport, str, str]:
-        self.transports.append(self.post.transport())
-        return self.transports[-1], f"inbox of {at}", at
-
-    @asynccontextmanager
-    async def bank_stack(self, store: Path) -> AsyncGenerator[Bank]:
-        """A bank that can end and begin anew."""
-        made = Bank(self, store)
-        await made.begin()
-        yield made
-        await made.end()
-
-    @asynccontextmanager
-    async def bank(self, store: Path | None = None) -> AsyncGenerator[hf.ActorSystem]:
-        """A system with a plain account and a recorded one."""
-        kept = None if store is None else f"sqlite:{store}"
-        async with hf.ActorSystem("bank", store=kept, reachable="bank", log=False) as system:
-            await system.start(hf.child("plain", hf.start(Account)))
-            await system.start(hf.child("kept", hf.start(Account), recovery=hf.hybrid()))
-            yield system
-
-
-class Bank:
-    """A system that ends and begins anew, on one store."""
-
-    def __init__(self, reach: Reach, store: Path) -> None:
-        self._reach, self._store = reach, store
-        self._stack = AsyncExitStack()
-        self.transport = reach.post.transport()
-
-    async def begin(self) -> None:
-        self._system = await self._stack.enter_async_context(self._reach.bank(self._store))
-        self.transport = self._reach.transports[-1]
-
-    async def end(self) -> None:
-        await self._stack.aclose()
-
-    async def again(self) -> None:
-        await self.end()
-        await self.begin()
-
-    async def total(self) -> int:
-        return await self._system.ref("/bank/kept", Account).ask(Total())
-
-
-Work = Callable[[Reach], Coroutine[Any, Any, None]]
-
-
-def run(work: Work, seed: int = 0, faults: PostFaults = NO_POST_FAULTS) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-
-        async def reached() -> None:
-            await work(Reach(patch, seed, faults))
-
-        simulate(reached, seed)
+from holdfast.testing.fleet.post import NO_POST_FAULTS, PostFaults
+from tests.cluster.reach import (
+    Account,
+    Add,
+    Clerk,
+    Crash,
+    Large,
+    News,
+    No,
+    Pay,
+    Reach,
+    Refuse,
+    Total,
+    Wait,
+    run,
+    shop_of,
+)
 
 
 @pytest.mark.parametrize("who", ["plain", "kept"])
@@ -185,7 +70,7 @@ async def sums_up(reach: Reach) -> None:
             assert await account.ask(Total(), timeout=600.0) == 151
         assert not system._homes.far._open
         await asyncio.sleep(600.0)
-        assert not system._homes.far._answers  # All are known to have arrived.
+        assert not any(mail.answers for mail in system._homes.far._mail.values())  # All are known to have arrived.
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -260,7 +145,7 @@ def test_whoever_has_called_and_is_silent_is_forgotten_and_may_come_back() -> No
             assert await account.ask(Add(1)) == 1
             reach.transports[1].is_cut = True
             await asyncio.sleep(FORGET_SECONDS + 5.0)
-            assert system.lines.at(bank._call.far._me) is None  # type: ignore[union-attr]
+            assert system.lines.at(bank._call.far._owner.name) is None  # type: ignore[union-attr]
             reach.transports[1].is_cut = False
             assert await account.ask(Add(1), timeout=60.0) == 2
 
@@ -382,7 +267,7 @@ def test_two_systems_of_one_name_are_not_reached_at_once() -> None:
 def test_what_an_earlier_run_has_sent_is_refused_however_late() -> None:
     async def work(reach: Reach) -> None:
         async with reach.bank() as system:
-            late = frames.Tell("/bank/plain", f"{__name__}:Add", Add(7))  # type: ignore[arg-type]
+            late = frames.Tell("/bank/plain", f"{Add.__module__}:Add", Add(7))  # type: ignore[arg-type]
             items = (NEW + msgspec.msgpack.encode(late),)
             for to in (NOBODY, Boot(system.lines.boot.era, "abcd"), Boot(1, "00")):
                 batch = LineBatch("client", Boot(5, "ff"), to, 0, 1, items)
@@ -392,42 +277,6 @@ def test_what_an_earlier_run_has_sent_is_refused_however_late() -> None:
             assert await system.ref("/bank/plain", Account).ask(Total()) == 0
 
     run(work)
-
-
-class Pay(hf.Message[int]):
-    amount: int
-    how: str
-
-
-class Clerk(hf.Actor):
-    """Recorded: pays into an account of another system."""
-
-    def __init__(self, account: hf.ActorRef[Account]) -> None:
-        self._account = account
-        self.paid = 0
-
-    @hf.on(Pay)
-    async def pay(self, message: Pay) -> int:
-        self.paid += message.amount
-        match message.how:
-            case "tell":
-                self._account.tell(Add(message.amount))
-            case "send":
-                await self._account.send(Add(message.amount))
-            case "ask":
-                await self._account.ask(Add(message.amount), timeout=3000.0)
-        return self.paid
-
-
-@asynccontextmanager
-async def shop_of(store: Path, name: str = "kept") -> AsyncGenerator[hf.ActorRef[Clerk]]:
-    """A system whose recorded clerk pays into an account of the bank."""
-    async with (
-        hf.ActorSystem("shop", store=f"sqlite:{store}", log=False) as shop,
-        hf.connect("bank", within=shop, timeout=600.0) as bank,
-    ):
-        account = bank.ref(f"/bank/{name}", Account)
-        yield await shop.start(hf.child("clerk", hf.start(Clerk, account), recovery=hf.hybrid()))
 
 
 @pytest.mark.parametrize("how", ["tell", "send", "ask"])
@@ -549,7 +398,7 @@ def test_what_is_too_large_is_refused_and_the_line_goes_on(who: str) -> None:
     run(work)
 
 
-NAME = f"{__name__}:Add"
+NAME = f"{Add.__module__}:Add"
 HOSTILE = {
     "a tell in the name of an actor here": lambda: frames.Tell("/bank/plain", NAME, Add(7), 0, "/bank/kept"),  # type: ignore[arg-type]
     "a tell in the name of a third system": lambda: frames.Tell("/bank/plain", NAME, Add(7), 0, "/shop/clerk"),  # type: ignore[arg-type]
@@ -589,5 +438,105 @@ def test_a_program_with_a_name_that_is_none_is_not_answered(name: str) -> None:
             reach.post.post("client", "inbox of bank", msgspec.msgpack.encode(batch), "client")
             await asyncio.sleep(1.0)
             assert not system.lines._lines
+
+    run(work)
+
+
+@asynccontextmanager
+async def two_systems() -> AsyncGenerator[tuple[hf.ActorSystem, hf.ActorSystem]]:
+    """Two systems that can be reached, each with an account."""
+    async with (
+        hf.ActorSystem("alpha", reachable="alpha", log=False) as alpha,
+        hf.ActorSystem("beta", reachable="beta", log=False) as beta,
+    ):
+        for system in (alpha, beta):
+            await system.start(hf.child("plain", hf.start(Account)))
+        yield alpha, beta
+
+
+@pytest.mark.parametrize("faults", [NO_POST_FAULTS, PostFaults(lost=0.2, doubled=0.2, late=0.2)], ids=["", "lossy"])
+@pytest.mark.parametrize("seed", range(5))
+def test_two_systems_may_open_a_connection_to_each_other_at_the_same_time(faults: PostFaults, seed: int) -> None:
+    """Both use one line; whoever closes its connection first leaves the other one's."""
+
+    async def work(reach: Reach) -> None:
+        async with two_systems() as (alpha, beta):
+            there, back = hf.connect("beta", within=alpha, timeout=60.0), hf.connect("alpha", within=beta, timeout=60.0)
+            await asyncio.gather(there.__aenter__(), back.__aenter__())
+            ours, theirs = there.ref("/beta/plain", Account), back.ref("/alpha/plain", Account)
+            for number in range(1, 21):
+                asked = [ref.ask(Add(1), timeout=600.0) for ref in (ours, theirs)]
+                assert await asyncio.gather(*asked) == [number, number]
+            assert (len(alpha.lines._lines), len(beta.lines._lines)) == (1, 1)
+            for closed, still in ((there, theirs), (back, ours)):
+                await closed.close()
+                await asyncio.sleep(10.0)
+                if closed is there:
+                    assert await still.ask(Add(1), timeout=600.0) == 21
+                    assert back.is_reachable
+                    async with hf.connect("beta", within=alpha, timeout=60.0) as again:
+                        assert await again.ref("/beta/plain", Account).ask(Total(), timeout=600.0) == 20
+                        assert await still.ask(Add(1), timeout=600.0) == 22
+            await asyncio.sleep(40.0)
+            assert (len(alpha.lines._lines), len(beta.lines._lines)) == (0, 0)
+
+    run(work, seed, faults)
+
+
+@pytest.mark.parametrize("first", ["there", "back"])
+def test_whichever_system_connects_first_the_other_one_may_too(first: str) -> None:
+    async def work(reach: Reach) -> None:
+        async with two_systems() as (alpha, beta):
+            calls = {"there": ("beta", alpha), "back": ("alpha", beta)}
+            names = [first, *(name for name in calls if name != first)]
+            one, two = (hf.connect(calls[name][0], within=calls[name][1]) for name in names)
+            async with one:
+                refs = {one: one.ref(f"/{one.system}/plain", Account)}
+                assert await refs[one].ask(Add(1)) == 1
+                async with two:
+                    refs[two] = two.ref(f"/{two.system}/plain", Account)
+                    assert [await refs[one].ask(Add(1)), await refs[two].ask(Add(1))] == [2, 1]
+                await asyncio.sleep(10.0)
+                assert await refs[one].ask(Add(1)) == 3
+
+    run(work)
+
+
+def test_nobody_takes_over_a_connection_by_a_greeting() -> None:
+    """Whoever greets a system under the name of one that it calls is not taken for that, whatever era it claims."""
+
+    async def work(reach: Reach) -> None:
+        async with two_systems() as (alpha, _), hf.connect("beta", within=alpha) as there:
+            account = there.ref("/beta/plain", Account)
+            assert await account.ask(Add(1)) == 1
+            evil = reach.post.transport()
+            heard: list[LineBatch] = []
+            await evil.hear(
+                evil.own_place(), lambda data, back: heard.append(msgspec.msgpack.decode(data, type=LineBatch))
+            )
+            for to in (NOBODY, alpha.lines.boot):
+                notes: tuple[Note, ...] = ("", "bye")
+                for note in notes:
+                    batch = LineBatch("beta", Boot(1 << 60, "ff"), to, 0, 1, (NEW + b"x",), note)
+                    evil.post("inbox of alpha", msgspec.msgpack.encode(batch), evil.own_place())
+            await asyncio.sleep(5.0)
+            assert await account.ask(Add(1)) == 2
+            assert {one.note for one in heard} == {""}
+            assert not any(one.items for one in heard)
+
+    run(work)
+
+
+def test_a_connection_that_is_closed_unheard_begins_anew() -> None:
+    """What says that it is closed gets lost; the next one, of the same run, is not taken for it."""
+
+    async def work(reach: Reach) -> None:
+        async with reach.bank(), hf.ActorSystem("shop", log=False) as shop:
+            for number in range(1, 10):
+                async with hf.connect("bank", within=shop) as bank:
+                    account = bank.ref("/bank/plain", Account)
+                    account.tell(Add(1))
+                    assert await account.ask(Total()) == number
+                    reach.transports[-1].is_cut = True
 
     run(work)

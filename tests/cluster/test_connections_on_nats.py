@@ -9,8 +9,11 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from nats.aio.msg import Msg
 
 import holdfast as hf
+from holdfast.actors.process.wire import frames
+from holdfast.cluster.lines.far_line import NEW
 from holdfast.cluster.lines.line import NOBODY, Boot, LineBatch
 from holdfast.cluster.nats.server_file import UserRole
 from tests.cluster.bank import Account, Gain, Report
@@ -108,6 +111,65 @@ async def test_what_a_recorded_actor_pays_arrives_once_whoever_dies(
     finally:
         await till.close()
         await bank.close()
+
+
+async def test_others_are_served_while_programs_attack(nats1: NatsServers, tmp_path: Path) -> None:
+    """One floods the leader with tells, one never takes its outcomes, one subscribes to everything, one only greets."""
+    name = nats1.new_system()
+    programs = Programs(nats1.store(name), tmp_path)
+    url, subject = nats1.store(name, UserRole.CLIENT), f"hf.{name}.root.in"
+    try:
+        leader = await programs.start()
+        await programs.leads(leader)
+        async with hf.connect(url, system="bank") as honest, hf.connect(url, system="bank") as greedy:
+            account = honest.ref("/bank/account", Account)
+            assert await account.ask(Gain(1), timeout=PATIENT) == 1
+            before = memory_of(leader.pid)
+            evil = await nats1.connect(name, UserRole.CLIENT)
+            answers: list[LineBatch] = []
+
+            async def hear(message: Msg) -> None:
+                answers.append(msgspec.msgpack.decode(message.data, type=LineBatch))
+
+            inbox = evil.new_inbox()
+            await evil.subscribe(inbox, cb=hear)
+
+            async def post(sender: str, to: Boot, first: int, *made: frames.Frame) -> None:
+                items = tuple(NEW + msgspec.msgpack.encode(one) for one in made)
+                batch = LineBatch(sender, Boot(1, "ff"), to, 0, first, items, "", 0, answers[0].line if answers else 0)
+                await evil.publish(subject, msgspec.msgpack.encode(batch), reply=inbox)
+
+            await post("evil", NOBODY, 1)
+            async with asyncio.timeout(PATIENT):
+                while not answers:
+                    await asyncio.sleep(0.01)
+            add, report = f"{Gain.__module__}:Gain", f"{Report.__module__}:Report"
+            body, none = msgspec.Raw(msgspec.msgpack.encode(Gain(0))), msgspec.Raw(msgspec.msgpack.encode(Report()))
+            first = 1
+            for round_ in range(40):
+                for _ in range(500):
+                    greedy.ref("/bank/account", Account).tell(Gain(0))
+                asks = [frames.Ask(first + n, "/bank/account", report, none, 60.0) for n in range(500)]
+                tells = [frames.Tell("/bank/audit", add, body) for _ in range(500)]
+                topics = [frames.Command("/evil/ear", "subscribe", {"topic": f"/{first + n}"}) for n in range(500)]
+                ties = [frames.Command("/bank/audit", "monitor", {"watcher": "/evil/eye"}) for _ in range(500)]
+                for made in (asks, tells, topics, ties):
+                    await post("evil", answers[0].boot, first, *made)
+                    first += len(made)
+                for number in range(50):
+                    await post(f"client~{50 * round_ + number:x}", NOBODY, 1)
+                assert await account.ask(Gain(1), timeout=PATIENT) == round_ + 2
+            await evil.close()
+            assert memory_of(leader.pid) - before < 150 << 20
+            async with hf.connect(url, system="bank", timeout=PATIENT) as late:
+                assert await late.ref("/bank/account", Account).ask(Gain(1), timeout=PATIENT) == 42
+    finally:
+        await programs.close()
+
+
+def memory_of(pid: int) -> int:
+    """The memory of a process, in bytes."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096
 
 
 async def test_nobody_has_a_leader_write_into_its_own_log(nats1: NatsServers) -> None:

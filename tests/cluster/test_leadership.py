@@ -14,7 +14,7 @@ from holdfast.cluster.leadership import Follower, LeaderElsewhere, Leading, lead
 from holdfast.cluster.log_records import CHANGES, DamagedLog, RecordMaker
 from holdfast.cluster.log_writer import Deposed
 from holdfast.cluster.ports import Unanswered
-from holdfast.cluster.replicated_journal import ReplicatedJournal
+from holdfast.cluster.replicated_journal import CLOSE_SECONDS, ReplicatedJournal
 from holdfast.testing.fleet.broker import BrokerFaults, SimBroker
 from holdfast.testing.fleet.same_loop import SameLoop, WouldWait
 from holdfast.testing.fleet.sim_engine import SimEngine
@@ -229,8 +229,9 @@ async def test_the_end_tells_whoever_waits(stage: Stage) -> None:
 
 async def test_a_simulated_journal_says_what_it_cannot_wait_for(stage: Stage) -> None:
     first = await stage.leader("first")
-    with pytest.raises(WouldWait, match=r"end at .* has to wait .* await it there"):
-        first.journal.close()
+    first.write()
+    with pytest.raises(WouldWait, match=r"_written at .* has to wait .* await it there"):
+        first.journal.sync()
 
 
 async def test_whoever_reads_long_keeps_the_lease_meanwhile() -> None:
@@ -371,3 +372,15 @@ async def test_a_large_snapshot_is_asked_for_again_until_it_comes() -> None:
     engine.blobs.get = get  # type: ignore[method-assign]
     assert (await asyncio.to_thread(journal.load, A)).snapshot == snapshot
     await asyncio.to_thread(journal.close)
+
+
+async def test_who_has_waited_for_silent_servers_does_not_wait_once_more_at_the_end(stage: Stage) -> None:
+    first = await stage.leader("first")
+    loop = asyncio.get_running_loop()
+    first.engine.link.cut()
+    first.write()
+    await asyncio.sleep(CLOSE_SECONDS + 0.5)
+    before = loop.time()
+    with pytest.raises(StoreFailed, match="1 writes may be lost"):
+        await first.journal.end()
+    assert loop.time() - before < 1.0

@@ -9,9 +9,10 @@ from __future__ import annotations
 from tests.removing import Check, as_tests
 
 LINES = "tests/cluster/test_lines.py"
+GREEDY = "tests/cluster/test_greedy_clients.py"
 CONNECTIONS = "tests/cluster/test_connections.py"
 
-CHECKS = {
+CHECKS: dict[str, Check] = {
     "an item that comes again is not taken again": Check(
         "cluster/lines/line.py",
         "for data in batch.items[self.got + 1 - batch.first :]:",
@@ -34,9 +35,9 @@ CHECKS = {
         "all_arrives_once",
     ),
     "what is for an earlier run of this program is refused": Check(
-        "cluster/lines/lines.py",
-        "elif batch.to != lines.boot or far is None or far.theirs != batch.boot:",
-        "elif far is None or far.theirs != batch.boot:",
+        "cluster/lines/calls.py",
+        "elif batch.to == lines.boot and far is not None and far.is_with(batch):",
+        "elif far is not None and far.is_with(batch):",
         CONNECTIONS,
         "an_earlier_run_has_sent",
     ),
@@ -44,13 +45,6 @@ CHECKS = {
         "cluster/lines/far_line.py",
         "return is_order(self.connection.names.from_wire(name))",
         "return False",
-        CONNECTIONS,
-        "order_another_about",
-    ),
-    "no other system ends an actor": Check(
-        "cluster/lines/far_line.py",
-        "case verb if verb in COMMANDS:",
-        "case verb if verb:",
         CONNECTIONS,
         "order_another_about",
     ),
@@ -98,7 +92,7 @@ CHECKS = {
     ),
     "whoever has called and is silent is forgotten": Check(
         "cluster/lines/lines.py",
-        "if quiet > FORGET_SECONDS and any(gate.has(far) for gate in self._gates):",
+        "if quiet > FORGET_SECONDS:",
         "if False:",
         CONNECTIONS,
         "silent_is_forgotten",
@@ -111,7 +105,7 @@ CHECKS = {
         "speaks_for_its_own_actors",
     ),
     "a program has a name that can be part of an address": Check(
-        "cluster/lines/lines.py",
+        "cluster/lines/calls.py",
         "if not back or not _is_sound(batch) or batch.sender == lines.name:",
         "if not back:",
         CONNECTIONS,
@@ -137,6 +131,156 @@ CHECKS = {
         "False",
         CONNECTIONS,
         "away_are_refused",
+    ),
+}
+
+CHECKS |= {
+    "a program that has too many messages waiting is held back": Check(
+        "cluster/lines/inflow.py",
+        "self.is_full = not self.has_room(1.0)",
+        "pass",
+        GREEDY,
+        "tells_too_much",
+    ),
+    "whoever is held back is told so": Check(
+        "cluster/lines/far_line.py",
+        'note = "full"',
+        "pass",
+        GREEDY,
+        "tells_too_much",
+    ),
+    "answers go past the messages that wait": Check(
+        "cluster/lines/far_line.py",
+        "        if _is_answer(data):",
+        "        if False:",
+        GREEDY,
+        "answers_go_past",
+    ),
+    "asks over the limit are refused": Check(
+        "cluster/lines/inflow.py",
+        "            if len(self._asks) >= self.limits.asks:\n                return False",
+        "            pass",
+        GREEDY,
+        "asks_over_the_limit",
+    ),
+    "asks that have run out do not count": Check(
+        "cluster/lines/inflow.py",
+        "if last > now}",
+        "if last}",
+        GREEDY,
+        "have_run_out",
+    ),
+    "subscriptions over the limit are refused": Check(
+        "cluster/lines/far_line.py",
+        "elif topics.has(topic, cell) or self.inflow.topics.may_add(",
+        "elif True or self.inflow.topics.may_add(",
+        GREEDY,
+        "subscribes_and_watches",
+    ),
+    "ties over the limit are refused": Check(
+        "cluster/lines/far_line.py",
+        '            case "monitor" | "link" if not self._may_tie(frame):',
+        '            case "monitor" | "link" if False:',
+        GREEDY,
+        "subscribes_and_watches",
+    ),
+    "whoever does not hold back loses its line": Check(
+        "cluster/lines/far_line.py",
+        "if inflow.held_bytes > MOST_HELD and self.line is not None:",
+        "if False:",
+        GREEDY,
+        "does_not_hold_back",
+    ),
+    "whoever does not take its outcomes gets no more": Check(
+        "cluster/lines/far_line.py",
+        "if self.line is not None and self.line.waiting_bytes > limits.message_bytes:",
+        "if False:",
+        GREEDY,
+        "never_takes_its_outcomes",
+    ),
+    "whoever takes nothing of what is sent to it loses its line": Check(
+        "cluster/lines/lines.py",
+        "if far.line is not None and (waits := far.line.stuck_for(STUCK_SECONDS, MOST_WAITING)):",
+        "if waits := 0:",
+        GREEDY,
+        "takes_nothing_of_what_it_is_told",
+    ),
+    "whoever accepts nothing of what is published loses its line": Check(
+        "cluster/lines/lines.py",
+        "if far.unaccepted_for() > STUCK_SECONDS:",
+        "if False:",
+        GREEDY,
+        "takes_nothing_of_what_is_published",
+    ),
+    "whoever only greets gives way to others": Check(
+        "cluster/lines/calls.py",
+        "stranger = next(iter(self._strangers), None)",
+        "stranger = None",
+        GREEDY,
+        "only_greets",
+    ),
+    "so many systems are taken note of": Check(
+        "cluster/lines/calls.py",
+        "if homes is not None and not homes.far.may_know(name, MOST_SYSTEMS):",
+        "if False:",
+        GREEDY,
+        "names_of_systems",
+    ),
+    "what is kept for a system that stays away has a limit": Check(
+        "checkpoint/home/ask_recovery.py",
+        "if len(mail.outs) >= limits.kept or mail.size + len(kept.body) > limits.kept_bytes:",
+        "if False:",
+        GREEDY,
+        "stays_away",
+    ),
+    "it is stored that what was kept is dropped": Check(
+        "checkpoint/home/ask_recovery.py",
+        'batch.add(FAR, ("dropped", system), self._positions)',
+        "pass",
+        GREEDY,
+        "stays_away",
+    ),
+    "outcomes that nobody takes are given up": Check(
+        "checkpoint/home/ask_recovery.py",
+        "while left > MOST_GONE or size > MOST_GONE_BYTES:",
+        "while False:",
+        GREEDY,
+        "never_take_them",
+    ),
+    "what was given up is not done again": Check(
+        "cluster/lines/far_line.py",
+        "if again and homes.far.has_forgotten(which):",
+        "if False:",
+        GREEDY,
+        "never_take_them",
+    ),
+    "a program is taken from for so long at a time": Check(
+        "cluster/lines/far_line.py",
+        "if inflow.left > 0 and not inflow.held and not inflow.is_full:",
+        "if not inflow.held and not inflow.is_full:",
+        GREEDY,
+        "so_long_at_a_time",
+    ),
+    "nobody takes over a connection by a greeting": Check(
+        "cluster/lines/calls.py",
+        "if far is not None and is_called and far.theirs != batch.boot:",
+        "if False:",
+        CONNECTIONS,
+        "takes_over_a_connection",
+    ),
+    "a system that calls answers whoever calls it": Check(
+        "cluster/lines/calls.py",
+        'self._answer(batch, back, far.numbers[0], "")\n            return',
+        "return",
+        CONNECTIONS,
+        "at_the_same_time",
+    ),
+    "a line that was begun anew is not taken for the one before it": Check(
+        "cluster/lines/calls.py",
+        "elif far.numbers[1] < batch.line:",
+        "elif False:",
+        CONNECTIONS,
+        "begins_anew",
     ),
 }
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,51 +13,7 @@ from holdfast.checkpoint.journal import NotCopied, StoreFailed
 from holdfast.cluster.joining import open_store
 from holdfast.cluster.store_copy import copy_store, kept_of
 from tests.cluster.servers import NatsServers
-
-
-class Put(hf.Message[int]):
-    text: str
-
-
-class Grow(hf.Message[int]):
-    megabytes: int
-
-
-class Shelf(hf.Actor):
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-        self.bulk = b""
-
-    @hf.on(Put)
-    def put(self, message: Put) -> int:
-        self.lines.append(message.text)
-        return len(self.lines)
-
-    @hf.on(Grow)
-    def grow(self, message: Grow) -> int:
-        self.bulk += bytes(range(256)) * 4096 * message.megabytes
-        return len(self.bulk)
-
-
-async def fill(store: str) -> None:
-    async with hf.ActorSystem("app", store=store, log=False) as system:
-        large = await system.start(hf.child("large", hf.start(Shelf), recovery=hf.hybrid(every=2)))
-        small = await system.start(hf.child("small", hf.start(Shelf), recovery=hf.replay_only()))
-        for n in range(5):
-            await large.ask(Grow(1))
-            await small.ask(Put(f"line {n}"))
-
-
-async def found_in(store: str) -> tuple[int, int]:
-    async with hf.ActorSystem("app", store=store, log=False) as system:
-        large = await system.start(hf.child("large", hf.start(Shelf), recovery=hf.hybrid(every=2)))
-        small = await system.start(hf.child("small", hf.start(Shelf), recovery=hf.replay_only()))
-        return await large.ask(Grow(0)), await small.ask(Put("one more"))
-
-
-def copied(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "holdfast.console.cli", "store", "copy", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+from tests.cluster.shelves import copied, fill, found_in
 
 
 async def test_a_store_goes_to_servers_and_back(nats1: NatsServers, tmp_path: Path) -> None:

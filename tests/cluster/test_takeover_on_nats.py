@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import random
 import signal
 from collections.abc import AsyncIterator
@@ -10,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+import holdfast as hf
+from holdfast.cluster.nats.server_file import UserRole, public_key, seed_file
+from tests.cluster.bank import Account, Gain
 from tests.cluster.fleet import Client, Programs
 from tests.cluster.servers import NatsServers
 
@@ -109,3 +113,42 @@ async def test_one_of_three_servers_may_go(nats3: NatsServers, tmp_path: Path, v
         done.set()
         await client.close()
         await programs.close()
+
+
+async def test_a_leader_that_may_not_write_any_more_gives_way(own_nats1: NatsServers) -> None:
+    """That is no outage: it says so, gives the lease back, and a program that may write leads."""
+    name = own_nats1.new_system()
+    store = own_nats1.store(name)
+    async with hf.ActorSystem(name, store=store, log=False) as system:
+        account = await system.start(hf.child("account", hf.start(Account), recovery=hf.hybrid()))
+        assert await account.ask(Gain(1)) == 1
+        events, whole = system.events(), []
+
+        def denied(text: str) -> str:
+            whole.append(text)
+            log = f"hf.{name}.root.log"
+            key = public_key(seed_file(own_nats1.folder, name, UserRole.NODE).read_text().strip())
+            at = text.index(key)
+            return text[:at] + text[at:].replace("publish: {", f'publish: {{ deny: ["{log}"], ', 1)
+
+        own_nats1.reload(0, denied)
+        refused = False
+        while not refused:  # Until the server has taken up its file.
+            try:
+                await account.ask(Gain(0), timeout=20.0)
+            except hf.HoldfastError:
+                refused = True
+        stopped = await events.until(hf.events.JournalStopped, timeout=20.0)
+        assert "permissions violation" in stopped.reason
+        own_nats1.reload(0, lambda text: whole[0])
+        async with asyncio.timeout(60.0):
+            while True:
+                try:
+                    async with hf.ActorSystem(name, store=store, log=False) as after:
+                        account = await after.start(hf.child("account", hf.start(Account), recovery=hf.hybrid()))
+                        assert await account.ask(Gain(0)) == 1
+                        break
+                except hf.errors.StoreInUse:
+                    await asyncio.sleep(0.1)
+        with contextlib.suppress(hf.errors.StoreError):
+            await system.shutdown()

@@ -103,6 +103,54 @@ async def test_repair_waits_for_an_approval_from_the_command_line_and_tells_its_
     assert (status, "no repair of app runs" in errors) == (FAILED, True)
 
 
+class Wait(hf.Message[int]):
+    behind: tuple[str, ...] = ()
+
+
+class Link(hf.Actor):
+    """Asks the next one, who asks the next one; the last one does not answer."""
+
+    @hf.on(Wait)
+    async def wait(self, message: Wait) -> int:
+        if not message.behind:
+            await asyncio.Event().wait()
+        return await self.ctx.find(message.behind[0], Link).ask(Wait(message.behind[1:]), timeout=600.0)
+
+
+async def test_diagnose_says_who_waits_since_when_and_what_was_denied(system: hf.ActorSystem, path: Path) -> None:
+    pipe = [hf.child(name, hf.start(Link)) for name in ("reader", "parser", "writer", "cache")]
+    await system.start(hf.supervisor("pipe", children=pipe))
+    watching = await diagnosis.watch(
+        system, seconds=0.0, repair="ask", policy=Policy(look=0.0), manner=QUICK, approve=lambda wanted: "not today",
+        trust={"test": 2.0},
+    )  # fmt: skip
+    with system.events() as events:
+        reader = system.ref("/app/pipe/reader", Link)
+        writer = system.ref("/app/pipe/writer", Link)
+        asking = asyncio.gather(
+            reader.ask(Wait(("/app/pipe/parser", "/app/pipe/cache")), timeout=600.0),
+            writer.ask(Wait(("/app/pipe/cache",)), timeout=600.0),
+            return_exceptions=True,
+        )
+        seen = Observation(parse("not progress(pipe/cache)"), system._node.loop.time(), "test", 60.0)
+        await system.publish(diagnosis.OBSERVATIONS, seen)
+        await told_of(events, "GaveUp")
+    status, output, errors = await holdfast("diagnose", "/app/pipe/cache", "--socket", path)
+    assert (status, errors) == (DONE, "")
+    assert "`/app/pipe/cache` has not answered for " in output
+    [waits] = [line for line in output.splitlines() if "three actors wait for it: " in line]
+    assert all(f"/app/pipe/{name}" in waits for name in ("parser", "writer", "reader"))
+    assert "suspected since " in output
+    assert "plan: For pipe/cache repair will do restart_child(pipe/cache)." in output
+    assert "denied: not today (`holdfast repair retry pipe/cache` takes that back)" in output
+    _, output, _ = await holdfast("diagnose", "--socket", path, "--json")
+    [suspect] = json.loads(output)[0]["suspects"]
+    assert (suspect["waiting_count"], suspect["unanswered_seconds"] > 0) == (3, True)
+    await system.stop(watching.tree)
+    system.ref("/app/pipe/cache", Link).kill()
+    assert len(await asking) == 2
+
+
 async def told_of(events: EventStream, what: str) -> None:
     """Wait until repair has told something of this kind."""
     async with asyncio.timeout(60.0):

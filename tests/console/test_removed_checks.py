@@ -151,10 +151,17 @@ CHECKS = {
     ),
     "a recorded state that is left behind is told": Check(
         "console/declare/tree_plan.py",
-        "        change.lose(plan.left_behind())\n",
+        "        change.lose(lost)\n",
         "",
         DECLARE,
         "test_what_is_recorded_of_one_that_moves",
+    ),
+    "a reload leaves no recorded state behind": Check(
+        "console/declare/tree_plan.py",
+        "    if keep_all and lost:\n",
+        "    if False:\n",
+        SERVICE,
+        "leaves_nothing_behind",
     ),
     "who types an address at which nobody was is told": Check(
         "console/operate/remembering.py",

@@ -246,6 +246,20 @@ async def test_a_tree_in_a_file_is_run_reloaded_and_kept_in_a_store(project: Pat
         assert "STATUS=reload failed: tree.toml, line 1, colour" in await service.reload()
 
 
+async def test_a_reload_leaves_nothing_behind(project: Path) -> None:
+    """Where `holdfast apply` asks, nobody can be asked."""
+    async with running("tree.toml") as service:
+        before = await service.state()
+        (project / "other.py").write_text("from clock import Clock\n\n\nclass Watch(Clock):\n    pass\n")
+        above = '["/app/top"]\nclass = "holdfast:Supervisor"\n'
+        elsewhere = FILE.replace("/app/clock", "/app/top/clock").replace("clock:Clock", "other:Watch")
+        (project / "tree.toml").write_text(above + elsewhere)
+        told = await service.reload()
+        assert "STATUS=reload failed" in told
+        assert "/app/top/clock begins anew as Watch, and what is recorded of /app/clock (Clock) is left behind" in told
+        assert (await service.state())["count"] > before["count"]
+
+
 async def test_it_ends_when_its_main_returns(project: Path) -> None:
     status, _, errors = await holdfast("run", "tree:brief")
     assert (status, "app runs, control endpoint" in errors) == (DONE, True)

@@ -11,6 +11,10 @@ from tests.removing import Check, as_tests
 ENGINE = "tests/diagnosis/test_engine.py"
 OBSERVATIONS = "tests/diagnosis/test_observations.py"
 RUNTIME = "tests/diagnosis/observers/test_runtime.py"
+BACKLOG = "tests/diagnosis/observers/test_backlog.py"
+REPLICAS = "tests/diagnosis/live/test_replicas.py"
+BRIDGES = "tests/diagnosis/bridges/test_bridges.py"
+BOARD = "tests/diagnosis/board/test_board.py"
 FLOW = "tests/diagnosis/observers/test_flow.py"
 
 CHECKS = {
@@ -44,7 +48,7 @@ CHECKS = {
     ),
     "that an actor runs says nothing of its work": Check(
         "diagnosis/engine/cone.py",
-        'literal.name not in ("running", "room")',
+        "literal.name not in NO_WORK",
         "True",
         ENGINE,
         "is_unknown",
@@ -62,6 +66,55 @@ CHECKS = {
         "while (following := None) is not None:",
         RUNTIME,
         "behind_two_that_wait",
+    ),
+    "what grows and then is worked off is no leak": Check(
+        "diagnosis/observers/backlog.py",
+        "has_grown = is_larger and still_rises and is_long and",
+        "has_grown = is_larger and is_long and",
+        BACKLOG,
+        "a_long_rise",
+    ),
+    "a burst is no leak": Check(
+        "diagnosis/observers/backlog.py",
+        "has_grown = is_larger and still_rises and is_long and",
+        "has_grown = is_long and",
+        BACKLOG,
+        "a_burst",
+    ),
+    "a rise is compared with what was usual": Check(
+        "diagnosis/observers/backlog.py",
+        "max(SHORTEST, LONGER * self.longest)",
+        "SHORTEST",
+        BACKLOG,
+        "a_long_rise",
+    ),
+    "who does not keep up because it waits for another one is not accused": Check(
+        "diagnosis/observers/runtime.py",
+        "overrun = self._ends(growing, {}, waiting)",
+        "overrun = set(growing)",
+        BACKLOG,
+        "Through",
+    ),
+    "a missing replica is no fault of the actor": Check(
+        "diagnosis/generate.py",
+        "Expectation(str(atom(name)), (replicas_of(name),))",
+        "Expectation(str(atom(name)), (name,))",
+        REPLICAS,
+        "life_after_life",
+    ),
+    "catching up is compared with what was usual": Check(
+        "diagnosis/observers/replicas.py",
+        "max(self._catching, LONGER * group.catching)",
+        "self._catching",
+        REPLICAS,
+        "four_times",
+    ),
+    "replicas that lead or follow are left alone": Check(
+        "diagnosis/repair/stock.py",
+        'if state not in ("leads", "follows")]',
+        "]",
+        REPLICAS,
+        "begun_anew",
     ),
     "who crashes because of another one is not to blame": Check(
         "diagnosis/observers/runtime.py",
@@ -97,6 +150,62 @@ CHECKS = {
         "            pass",
         RUNTIME,
         "nothing_is_told",
+    ),
+    "a start forgets what was seen of those that it is about, and of nobody else": Check(
+        "diagnosis/observers/flow.py",
+        "            if topic in names:\n                flow.begin(self.now)\n",
+        "            flow.begin(self.now)\n            flow.began = float('inf')\n",
+        FLOW,
+        "a_clock_that_has_stopped",
+    ),
+    "an alert needs the token": Check(
+        "diagnosis/bridges/alert_app.py",
+        "if not hmac.compare_digest(given, self._authorization):",
+        "if False:",
+        BRIDGES,
+        "of_prometheus",
+    ),
+    "an alert ends only with the last one about its component": Check(
+        "diagnosis/bridges/alerts.py",
+        "elif all(one.component != component for one in self._firing.values()):",
+        "else:",
+        BRIDGES,
+        "an_alert_by_the_topic or of_prometheus",
+    ),
+    "a request has an end": Check(
+        "diagnosis/bridges/alert_app.py",
+        "if len(body) > MOST_BYTES:",
+        "if False:",
+        BRIDGES,
+        "of_prometheus",
+    ),
+    "a token does not go over a network in clear": Check(
+        "diagnosis/bridges/delivery.py",
+        "not (insecure or is_loopback(parts.hostname))",
+        "False",
+        BRIDGES,
+        "cannot_work",
+    ),
+    "what was not taken is posted again": Check(
+        "diagnosis/bridges/webhook.py",
+        "if not (is_taken or is_refused):",
+        "if False:",
+        BRIDGES,
+        "posted_again",
+    ),
+    "a board takes no token in clear": Check(
+        "diagnosis/board/board_tls.py",
+        "not (is_encrypted or insecure or is_loopback(host))",
+        "False",
+        BOARD,
+        "in_clear",
+    ),
+    "a board that asks for certificates wants one": Check(
+        "diagnosis/board/board_tls.py",
+        "        context.verify_mode = ssl.CERT_REQUIRED\n",
+        "        pass\n",
+        BOARD,
+        "by_tls",
     ),
     "silence without input is no fault": Check(
         "diagnosis/observers/flow.py",

@@ -27,6 +27,7 @@ SLOW = "tests/supervision/test_slow_restarts.py"
 UPGRADE = "tests/system/upgrade/test_check_upgrade.py"
 COLLECTIONS = "tests/system/test_full_collections.py"
 ORDERS = "tests/effects/test_orders_while_resting.py"
+TURNS = "tests/supervision/test_turn_timeout.py"
 EFFECTS = "tests/effects/test_effect_processes.py"
 
 CHECKS = {
@@ -36,6 +37,34 @@ CHECKS = {
         "",
         "tests/migration/test_dying_processes.py",
         "dies_before_its_actor_is_at_rest",
+    ),
+    "a turn that takes longer than its class allows is cancelled": Check(
+        "actors/kernel/lifecycle.py",
+        "            if wait <= 0:\n",
+        "            if wait <= 0 and False:\n",
+        TURNS,
+        "crashes_its_actor_to_the_instant",
+    ),
+    "who swallows that is abandoned": Check(
+        "actors/kernel/lifecycle.py",
+        "                loop.call_later(GRACE, abandon, turn)\n                return\n",
+        "                return\n",
+        TURNS,
+        "swallows_its_cancellation",
+    ),
+    "starts, ends and rests are no such turns": Check(
+        "actors/kernel/lifecycle.py",
+        "        return not is_turn or cell.ctx is None or cell.ctx._rests()\n",
+        "        return not is_turn or cell.ctx is None\n",
+        TURNS,
+        "a_turn_that_rests",
+    ),
+    "behind a mechanism the failure detector ends such turns": Check(
+        "ftm/replica/protected_actor.py",
+        "    limits_turns = False",
+        "    limits_turns = True",
+        TURNS,
+        "another_replica_takes_the_turn",
     ),
     "a replaced state has the variables of the one before": Check(
         "actors/control/live_state.py",

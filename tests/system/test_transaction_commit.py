@@ -675,7 +675,7 @@ async def test_names_are_in_force_as_the_last_step_says(system: hf.ActorSystem) 
         change.stop(a)
         change.register("second", d)
     assert {name: cell.path for name, cell in system._node.names.items()} == {"first": b.path, "second": d.path}
-    assert d._cell.extra().belongings.names == ["second"]
+    assert [*d._cell.extra().belongings.names] == ["second"]
 
 
 async def test_a_start_that_waited_in_the_queue_of_a_restarted_supervisor_is_taken_back(

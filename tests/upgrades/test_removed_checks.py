@@ -102,6 +102,19 @@ CHECKS = {
     "a variable that may have been renamed is not dropped": Check(
         "checkpoint/snapshot/key_variables.py", "    if gone and come:\n", "    if False:\n", TABLE, "test_states"
     ),
+    "a replica goes back to a state of the class as it is now": Check(
+        "ftm/replica/protected_actor.py",
+        "        if life.restored.is_mapped:",
+        "        if False:",
+        TABLE,
+        "test_states",
+    ),
+    "a replica's snapshot says which variables its class had": Check(
+        "ftm/replica/actor_state.py", "kind=kind, variables=names", "", TABLE, "test_states"
+    ),
+    "a replica hears which variables the class had": Check(
+        "ftm/replica/protected_actor.py", ", variables=point.variables", "", TABLE, "test_states"
+    ),
     "only other code helps a child that does not fit": Check(
         "supervision/supervisor.py",
         "        if is_in_vain(str(reason)):\n",

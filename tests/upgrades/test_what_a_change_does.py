@@ -177,6 +177,12 @@ class Set(hf.Message):
     items: list[int]
 
 
+class Fail(hf.Message[None]): ...
+
+
+class More(hf.Message[None]): ...
+
+
 class A(hf.Actor):
     def __init__(self) -> None:
         self.items: list[int] = []
@@ -185,6 +191,17 @@ class A(hf.Actor):
     @hf.on(Set)
     def set(self, message: Set) -> None:
         self.items, self.size = message.items, len(message.items)
+
+    @hf.on(Fail)
+    def fail(self, message: Fail) -> None:
+        for name in set(vars(self)) - {"ctx"}:
+            setattr(self, name, 7)
+        raise ValueError("it goes back to where it was")
+
+    @hf.on(More)
+    def more(self, message: More) -> None:
+        [goods] = [value for value in vars(self).values() if isinstance(value, list)]
+        goods.append(3)
 
     @hf.on(Get, readonly=True)
     def get(self, message: Get) -> list[Any]:
@@ -226,31 +243,44 @@ STATES = {
 }
 
 
-@pytest.mark.parametrize("isolation", ["task", "process"])
+WAYS: dict[str, dict[str, Any]] = {
+    "task": {},
+    "process": {"isolation": "process"},
+    "masked": {"mechanism": hf.ftm.TR()},
+    "replicated": {"mechanism": hf.ftm.PBR()},
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("row", STATES)
-async def test_states(tmp_path: Path, row: str, isolation: Any) -> None:
-    store, case = Generations(tmp_path), STATES[row]
-    async with store.run(STATE) as (system, actor, old):
+async def test_states(tmp_path: Path, row: str, way: str) -> None:
+    store, case, options = Generations(tmp_path), STATES[row], WAYS[way]
+    async with store.run(STATE, mechanism=options.get("mechanism")) as (system, actor, old):
         actor.tell(old.Set([1, 2]))
         await actor.ask(old.Get(), timeout=LONG)
         await system.checkpoint(actor, timeout=LONG)
+        await actor.ask(old.More(), timeout=LONG)  # It is handled again, on the state as it is now.
     text = changed(STATE, case.change)
     if "A = None" in text:
         text = text.replace("A = None\n", "") + "\n\nA = B\n"
     if case.refused:
         before = recorded(store.store)
         with pytest.raises(hf.StartFailed) as refused:
-            async with store.run(text, isolation=isolation):
+            async with store.run(text, **options):
                 pass
         assert "does not fit the code" in str(refused.value)
         assert case.refused in str(refused.value)
         assert recorded(store.store) == before
         text, case = STATE, Row({}, {"items": [1, 2], "size": 2})
-    async with store.run(text, isolation=isolation) as (_, actor, new):
-        assert await actor.ask(new.Get(), timeout=LONG) == [case.becomes]
-        told = [event.changes for event in store.told(hf.events.RecordsMapped)]
+    async with store.run(text, **options) as (_, actor, new):
+        grown = {name: [*value, 3] if isinstance(value, list) else value for name, value in case.becomes.items()}
+        assert await actor.ask(new.Get(), timeout=LONG) == [grown]
+        with pytest.raises(hf.errors.RemoteCrash):
+            await actor.ask(new.Fail(), timeout=LONG)
+        assert await actor.ask(new.Get(), timeout=LONG) == [grown]
+        told = {event.changes for event in store.told(hf.events.RecordsMapped)}  # at each start
         assert told == (
-            ["upgraded.A has no size any more: what was saved of it is dropped"] if "removed" in row else []
+            {"upgraded.A has no size any more: what was saved of it is dropped"} if "removed" in row else set()
         )
 
 

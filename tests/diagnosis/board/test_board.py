@@ -2,7 +2,8 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
 from urllib.parse import urlsplit
 from zlib import crc32
 
@@ -34,6 +35,7 @@ from holdfast.diagnosis.board import (
     MuteBoard,
     NoSuchChannel,
     PowerCycle,
+    SimulatedBoard,
     StuckChannel,
     SwitchChannel,
     WrongCurrent,
@@ -50,6 +52,7 @@ from holdfast.diagnosis.board.board_frames import (
     encode,
 )
 from holdfast.testing import probe
+from tests.cluster.certificates import certificates
 
 BASE, PC = 0, 1
 QUICK = hf.Backoff(initial=0.01, maximum=0.05, jitter=0.0)
@@ -364,6 +367,57 @@ async def test_without_the_token_nothing_is_done(system: hf.ActorSystem) -> None
     assert BASE in (await state(guarded)).on
     guess = encode(3, AuthenticateFrame("guess"))
     assert await spoken_to(guarded, guess) == ([(0, RefusedFrame("this is not the token"))], True)
+
+
+async def test_a_board_is_spoken_to_by_tls_and_only_if_it_is_who_it_should_be(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    ours, theirs = certificates(tmp_path / "board"), certificates(tmp_path / "client")
+    files = {"certificate": ours.certificate, "key": ours.key, "ca": theirs.ca}
+    guarded = system.spawn(hf.start(BoardSimulator, token="sesame", **files))
+    url = (await state(guarded)).url
+    assert url.startswith("tls://127.0.0.1:")
+    options = {"timeout": LONG, "backoff": QUICK, "token": "sesame"}
+    own = {"certificate": theirs.certificate, "key": theirs.key}
+    async with Board(url, **options, ca=ours.ca, **own) as board:  # type: ignore[arg-type]  # each of its own type
+        await board.switch(BASE, True)
+    assert BASE in (await state(guarded)).on
+    quick = {**options, "timeout": 1.0}
+    async with Board(url, **quick, ca=theirs.ca, **own) as board:  # type: ignore[arg-type]  # each of its own type
+        with pytest.raises(BoardUnreachable, match="certificate verify failed"):
+            await board.switch(BASE, False)
+    async with Board(url, **quick, ca=ours.ca) as board:  # type: ignore[arg-type]  # each of its own type
+        with pytest.raises((BoardUnreachable, BoardLost, BoardSilent)):
+            await board.switch(BASE, False)
+    plain = url.replace("tls:", "tcp:")
+    async with Board(plain, **quick) as board:  # type: ignore[arg-type]  # each of its own type
+        with pytest.raises((BoardUnreachable, BoardLost, BoardSilent)):
+            await board.switch(BASE, False)
+    assert BASE in (await state(guarded)).on
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda **options: Board("tcp://10.0.0.7:1", token="sesame", **options),
+        lambda **options: board_server.BoardServer(
+            SimulatedBoard((), clock=lambda: 0.0), "10.0.0.7", token="sesame", **options
+        ),
+    ],
+    ids=["client", "board"],
+)
+def test_a_token_does_not_go_over_a_network_in_clear(make: Callable[..., object]) -> None:
+    with pytest.raises(ValueError, match=r"the token would go over the network to 10\.0\.0\.7 in clear"):
+        make()
+    make(insecure=True)
+
+
+@pytest.mark.parametrize(
+    ("files", "said"), [({"certificate": "c"}, "belong together"), ({"ca": "none"}, "cannot be read")]
+)
+def test_certificates_that_cannot_be_used_are_refused(files: dict[str, str], said: str) -> None:
+    with pytest.raises(hf.SpecError, match=said):
+        Board("tls://127.0.0.1:1", **files)  # type: ignore[arg-type]  # files, and nothing else
 
 
 async def test_a_killed_simulator_hangs_up(system: hf.ActorSystem, simulator: hf.ActorRef[BoardSimulator]) -> None:

@@ -13,7 +13,7 @@ PATIENCE = 1.0
 
 @dataclasses.dataclass
 class Faults:
-    """What is wrong with whom, by the last part of the address: "freeze", "slow", "mute" or "crash"."""
+    """What is wrong with whom, by the last part of the address: "freeze", "slow", "lag", "mute" or "crash"."""
 
     of: dict[str, str] = dataclasses.field(default_factory=dict)
 
@@ -24,6 +24,8 @@ class Faults:
                 await asyncio.Event().wait()
             case "slow":
                 await asyncio.sleep(2.5 * PATIENCE)
+            case "lag":
+                await asyncio.sleep(0.5)
             case "crash":
                 raise RuntimeError(f"{name} is broken")
             case "mute":
@@ -109,17 +111,17 @@ class Device(hf.Actor):
 
 
 class Sink(hf.Actor):
-    """Takes what comes on a topic."""
+    """Takes what comes on a topic: nobody ever asks it, and nobody hears of it."""
 
-    def __init__(self, topic: str):
-        self._topic = topic
+    def __init__(self, faults: Faults, topic: str):
+        self._faults, self._topic = faults, topic
 
     def on_start(self, restored: bool) -> None:
         self.ctx.subscribe(self._topic)
 
     @hf.on(Item)
-    def take(self, message: Item) -> None:
-        pass
+    async def take(self, message: Item) -> None:
+        await self._faults.strike(self.ctx.path.rpartition("/")[2])
 
 
 def child(name: str, kind: Callable[..., Any], *args: Any, **kwargs: Any) -> hf.ChildSpec:
@@ -144,7 +146,7 @@ def _pipeline(faults: Faults) -> list[hf.ChildSpec]:
         child("reader", Stage, faults, "/raw"),
         child("parser", Stage, faults, "/rows", hears="/raw", asks=("/app/all/cache",)),
         child("writer", Patient, faults, "/written", hears="/rows", asks=("/app/all/cache",)),
-        child("sink", Sink, "/written"),
+        child("sink", Sink, faults, "/written"),
     ]
 
 
@@ -155,9 +157,9 @@ def _gateway(faults: Faults) -> list[hf.ChildSpec]:
         child("meter", Device, faults, "/power", 0.5),
         child("uplink", Patient, faults, "/commands", asks=("/app/all/registry",)),
         child("rules", Patient, faults, "/alarms", hears="/temperature", asks=("/app/all/registry",)),
-        child("board", Sink, "/alarms"),
-        child("bill", Sink, "/power"),
-        child("motor", Sink, "/commands"),
+        child("board", Sink, faults, "/alarms"),
+        child("bill", Sink, faults, "/power"),
+        child("motor", Sink, faults, "/commands"),
     ]
 
 
@@ -168,7 +170,7 @@ def _matching(faults: Faults) -> list[hf.ChildSpec]:
         child("gate", Patient, faults, "/orders", asks=("/app/all/risk",)),
         child("book", Stage, faults, "/trades", hears="/orders", each=2),
         child("clearing", Stage, faults, "/cleared", hears="/trades", asks=("/app/all/ledger",)),
-        child("report", Sink, "/cleared"),
+        child("report", Sink, faults, "/cleared"),
     ]
 
 
@@ -187,7 +189,8 @@ SYSTEMS = (
                 "cache": "freeze slow crash",
                 "reader": "freeze mute crash",
                 "parser": "freeze mute crash",
-                "writer": "freeze mute crash",
+                "writer": "freeze mute crash lag",
+                "sink": "freeze crash lag",
             }
         ),
     ),
@@ -201,7 +204,8 @@ SYSTEMS = (
                 "thermometer": "freeze mute crash",
                 "meter": "freeze mute crash",
                 "uplink": "freeze mute crash",
-                "rules": "freeze mute crash",
+                "rules": "freeze mute crash lag",
+                "motor": "freeze crash lag",
             }
         ),
     ),
@@ -215,7 +219,8 @@ SYSTEMS = (
                 "risk": "freeze slow crash",
                 "gate": "freeze mute crash",
                 "book": "freeze mute crash",
-                "clearing": "freeze mute crash",
+                "clearing": "freeze mute crash lag",
+                "report": "freeze crash lag",
             }
         ),
     ),

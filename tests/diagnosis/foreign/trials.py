@@ -1,8 +1,10 @@
 """One trial: a foreign system under traffic, perhaps with a fault, and what diagnosis says of it."""
 
 import asyncio
+import contextlib
 import dataclasses
 import random
+from collections.abc import Collection
 
 import holdfast as hf
 from holdfast import diagnosis
@@ -21,12 +23,16 @@ WITHIN = 30.0
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What was said: false alarms before the fault, who was named first, for certain or not, and after how long."""
+    """What was said: false alarms before the fault, who was named first, for certain or not, and after how long.
+
+    `found`: those who are faulty that were named, while whoever was named before them was mended.
+    """
 
     false_alarms: tuple[str, ...]
     first: tuple[str, ...] = ()
     certain: tuple[str, ...] = ()
     seconds: float = float("inf")
+    found: frozenset[str] = frozenset()
 
 
 class Listener(hf.Actor):
@@ -62,8 +68,33 @@ async def _traffic(entry: hf.ActorRef[Stage], kind: str, rng: random.Random) -> 
         await asyncio.sleep(pause * rng.uniform(0.7, 1.3))
 
 
-async def trial(foreign: Foreign, fault: tuple[str, str] | None, kind: str, seed: int, healthy: float = 0.0) -> Outcome:
-    """Let a system run, change its traffic, and strike it; it is looked at `healthy` seconds longer before that."""
+async def _named(said: list[tuple[float, Diagnosis]], until: float, struck: Collection[str]) -> set[str]:
+    """Those of the struck whom the best candidate of a diagnosis names; none: nobody is named in time."""
+    while asyncio.get_running_loop().time() < until:
+        for _, one in said:
+            if named := {*_names(one.candidates[0].bad)} & {*struck}:
+                return named
+        await asyncio.sleep(0.1)
+    return set()
+
+
+async def _mend(system: hf.ActorSystem, faults: Faults, names: Collection[str]) -> None:
+    """Take away what is wrong with these, and begin them anew, as a person would who was told of them."""
+    for name in names:
+        del faults.of[name]
+        with contextlib.suppress(hf.HoldfastError):  # It is being restarted at just this moment.
+            await system.ref("/app/all", hf.Supervisor).ask(hf.RestartChild(name, running=True))
+
+
+def _names(components: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(name.rpartition("/")[2] for name in components)
+
+
+async def trial(foreign: Foreign, struck: dict[str, str], kind: str, seed: int, healthy: float = 0.0) -> Outcome:
+    """Let a system run, change its traffic, and strike it; it is looked at `healthy` seconds longer before that.
+
+    `struck`: what is wrong with whom then, all at once; with nobody the trial ends before.
+    """
     faults = Faults()
     said: list[tuple[float, Diagnosis]] = []
     loop = asyncio.get_running_loop()
@@ -76,18 +107,21 @@ async def trial(foreign: Foreign, fault: tuple[str, str] | None, kind: str, seed
             await diagnosis.watch(system, seconds=3.0)
             await asyncio.sleep(WARM + CHANGED + healthy)
             false_alarms = tuple(str(one) for _, one in said)
-            if fault is None:
+            if not struck:
                 return Outcome(false_alarms)
             said.clear()
-            struck = loop.time()
-            faults.of[fault[0]] = fault[1]
-            while not said and loop.time() - struck < WITHIN:
-                await asyncio.sleep(0.1)
+            began = loop.time()
+            faults.of |= struck
+            found = set[str]()
+            for _ in struck:
+                if named := await _named(said, loop.time() + WITHIN, struck.keys() - found):
+                    found |= named
+                    if found != struck.keys():
+                        await _mend(system, faults, named)
             if not said:
                 return Outcome(false_alarms)
             at, first = said[0]
-            names = tuple(name.rpartition("/")[2] for name in first.candidates[0].bad)
-            certain = tuple(name.rpartition("/")[2] for name in first.certain)
-            return Outcome(false_alarms, names, certain, at - struck)
+            names = _names(first.candidates[0].bad)
+            return Outcome(false_alarms, names, _names(first.certain), at - began, frozenset(found))
         finally:
             driving.cancel()

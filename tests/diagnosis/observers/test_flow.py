@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import holdfast as hf
-from holdfast.diagnosis import OBSERVATIONS, observer
+from holdfast.diagnosis import GRACE, OBSERVATIONS, Grace, observer
 from holdfast.diagnosis.literals import Literal, ok
 from holdfast.diagnosis.observations import Observation
 from holdfast.diagnosis.observers import Baselines, FlowObserver
@@ -111,6 +111,17 @@ async def test_a_topic_that_is_dead_while_its_input_comes_is_not_ok_until_it_flo
     await world.set_each(2)
     await world.send(30, 0.1)
     assert world.said[ok("/out")]
+
+
+@pytest.mark.parametrize("names", [("/elsewhere",), ("/in",)])
+async def test_a_clock_that_has_stopped_is_seen_though_somebody_is_started_meanwhile(
+    world: World, names: tuple[str, ...]
+) -> None:
+    """Each start gives grace, and those who crash again and again would hide what others do, or never did again."""
+    await world.send(100, 0.1)
+    await world.system.publish(GRACE, Grace(names, 1.0))
+    await asyncio.sleep(15.0)
+    assert world.said[ok("/in")] is False
 
 
 async def test_of_a_topic_of_which_half_is_lost_too_little_goes_out(world: World) -> None:

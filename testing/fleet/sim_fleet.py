@@ -1,0 +1,254 @@
+"""A simulated fleet: programs with whole systems, which stand by, lead and take over on simulated servers.
+
+A program runs on the virtual clock, in the loop of the test. Servers and the post between programs are simulated, and a
+seed decides what goes wrong with them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import Callable, Coroutine
+from types import TracebackType
+from typing import Any, TypeAlias
+
+from ...actors.errors import HoldfastError
+from ...cluster.leadership import LeadershipLost, Standby
+from ...cluster.lines.lines import Transport
+from ...cluster.ports import Engine
+from ...cluster.servers import JoinLoop
+from ...system.system import ActorSystem
+from .broker import NO_FAULTS, BrokerFaults, SimBroker
+from .post import NO_POST_FAULTS, PostFaults, SimPost, SimTransport
+from .same_loop import SameLoop
+from .sim_engine import SimEngine, SimLink
+
+Body: TypeAlias = "Callable[[SimProgram], Coroutine[Any, Any, None]]"
+"""What a program does: its `main`, which gets the program."""
+LONGEST_END = 60.0
+"""Virtual seconds that the end of a program may take."""
+
+
+class ProgramHangs(HoldfastError, text="program {name} of the fleet has not ended {seconds:g} s after it was told to"):
+    """A program that was told to end does not."""
+
+    name: str
+    seconds: float
+
+
+class SimServers:
+    """The simulated servers of one system, as one program, or a client, reaches them; see `cluster.servers.Servers`.
+
+    Attributes:
+        system: what the system is called.
+        link: what gets through to the log, the lease and the large values, and back.
+        transports: ways to other programs; each may be cut.
+    """
+
+    def __init__(self, broker: SimBroker, post: SimPost, system: str) -> None:
+        self.system = system
+        self.link = SimLink()
+        self.transports: list[SimTransport] = []
+        self._broker, self._post = broker, post
+        self._is_cut = False
+
+    def engine_loop(self, name: str) -> JoinLoop:
+        """The loop of the test."""
+        return SameLoop()
+
+    async def open_engine(self, *, is_new: bool = True) -> Engine:
+        """Connect to the log, the lease and the large values."""
+        return SimEngine(self._broker, link=self.link)
+
+    async def open_lines(self) -> tuple[Transport, str]:
+        """Connect to the post; the system listens at an inbox of its own."""
+        made = self._post.transport()
+        made.is_cut = self._is_cut
+        self.transports.append(made)
+        return made, f"inbox of {self.system}"
+
+    def cut(self, *, log: bool = True, lines: bool = True) -> None:
+        """Have nothing get through any more, to the servers of the log or to other programs, until `heal`."""
+        if log:
+            self.link.cut()
+        if lines:
+            self._is_cut = True
+            for one in self.transports:
+                one.is_cut = True
+
+    def heal(self) -> None:
+        """Have everything get through again."""
+        self._is_cut = False
+        self.link.heal()
+        for one in self.transports:
+            one.is_cut = False
+
+
+class SimProgram:
+    """A program of a simulated fleet; `SimFleet.start` makes it.
+
+    Attributes:
+        name: for people.
+        servers: how it reaches the servers: `cut`, `heal`, and `link.freeze` and `link.thaw`.
+        system: its system, once `open` has made one.
+        is_killed: whether it was.
+    """
+
+    def __init__(self, name: str, servers: SimServers, body: Body) -> None:
+        self.name, self.servers, self._body = name, servers, body
+        self.system: ActorSystem | None = None
+        self.is_killed = False
+        self._task = asyncio.get_running_loop().create_task(self._run(), name=name)
+
+    def open(self, name: str | None = None, *, standby: Standby | None = "warm", **options: Any) -> ActorSystem:
+        """The system of this program: enter it with `async with`, which waits until the program leads.
+
+        Args:
+            name: of the system, by default that of its servers.
+            standby: how it waits; None does not.
+            options: further arguments of `ActorSystem`.
+        """
+        named, told = name or self.servers.system, {"log": False, **options}
+        self.system = ActorSystem(named, store=self.servers, standby=standby, **told)
+        return self.system
+
+    @property
+    def leads(self) -> bool:
+        """Tell whether its system runs: it may have been deposed without knowing it yet."""
+        return self.system is not None and self.system._root is not None and not self.system.has_failed
+
+    async def _run(self) -> None:
+        try:
+            while not self.is_killed:
+                try:
+                    await self._body(self)
+                except LeadershipLost:  # As `hf.run(main, again=True)`: it stands by once more.
+                    continue
+                return
+        except BaseException:
+            if not self.is_killed:
+                raise
+
+    def kill(self) -> None:
+        """End it as SIGKILL does: nothing of it reaches anybody any more, and what it has sent still arrives.
+
+        What it does in the test's own process while its tasks end is seen by nobody but by the test: use `hf.connect`
+        rather than refs of its system.
+        """
+        self.is_killed = True
+        self.servers.cut()
+        self._task.cancel()
+
+    def stop(self) -> None:
+        """Have it end in good order, as SIGTERM does."""
+        self._task.cancel()
+
+    async def ended(self) -> None:
+        """Wait until it has ended.
+
+        Raises:
+            ProgramHangs: it does not. Or whatever its body raises.
+        """
+        done, _ = await asyncio.wait([self._task], timeout=LONGEST_END)
+        if not done:
+            raise ProgramHangs(self.name, LONGEST_END)
+        if not self._task.cancelled():
+            self._task.result()
+
+    def check(self) -> None:
+        """Raise what its body has raised, if it has ended so."""
+        if self._task.done() and not self._task.cancelled():
+            self._task.result()
+
+
+class SimFleet:
+    """Programs, and the simulated servers by which they are one system, or several. For the virtual clock.
+
+    Use it as an async context manager, or by the fixture `sim_fleet`.
+
+    Attributes:
+        draw: draws what a test does to the fleet, by its seed.
+        post: carries what programs send each other.
+        programs: all that were started and not killed.
+
+    Args:
+        seed: decides all that is drawn.
+        faults: how often what goes wrong with the servers of each system.
+        post_faults: the same of what programs send each other.
+    """
+
+    def __init__(
+        self, seed: int = 0, *, faults: BrokerFaults = NO_FAULTS, post_faults: PostFaults = NO_POST_FAULTS
+    ) -> None:
+        self.seed, self._faults = seed, faults
+        self.draw = random.Random(f"fleet {seed}")
+        self.post = SimPost(seed, post_faults)
+        self.programs: list[SimProgram] = []
+        self._brokers: dict[str, SimBroker] = {}
+        self._ending: list[SimProgram] = []
+        self._started = 0
+
+    def broker(self, system: str = "app") -> SimBroker:
+        """The servers of a system, which outlive every program: `faults`, `go_away`, `expire_lease`."""
+        found = self._brokers.get(system)
+        if found is None:
+            found = self._brokers[system] = SimBroker(self.seed, self._faults)
+        return found
+
+    def servers(self, system: str = "app") -> SimServers:
+        """The servers of a system, for `hf.connect(fleet.servers("app"))` or for a program of your own."""
+        return SimServers(self.broker(system), self.post, system)
+
+    def start(self, body: Body, system: str = "app") -> SimProgram:
+        """Start one program more: `body` is its `main`, and runs again when another program has come to lead.
+
+        Args:
+            body: gets the program, and enters `program.open(...)`.
+            system: of which system the servers are.
+        """
+        self._started += 1
+        program = SimProgram(f"program {self._started}", self.servers(system), body)
+        self.programs.append(program)
+        return program
+
+    def kill(self, program: SimProgram) -> None:
+        """End a program as SIGKILL does."""
+        self.programs.remove(program)
+        self._ending.append(program)
+        program.kill()
+
+    def leader(self) -> SimProgram | None:
+        """The program that leads, as far as is known here: the last one that has begun to."""
+        return next((one for one in reversed(self.programs) if one.leads), None)
+
+    def check(self) -> None:
+        """Raise what the body of any program has raised."""
+        for program in self.programs:
+            program.check()
+
+    async def __aenter__(self) -> SimFleet:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """End all programs; with servers that are well, whatever was wrong with them before.
+
+        Raises:
+            ProgramHangs: one does not end. Or whatever the body of one has raised.
+        """
+        for broker in self._brokers.values():
+            broker.faults = NO_FAULTS
+        left, self.programs = self.programs, []
+        for program in left:
+            program.servers.heal()
+            program.servers.link.thaw()
+            program.stop()
+        for program in self._ending:
+            program.servers.link.thaw()
+        for program in (*self._ending, *left):
+            await program.ended()
+        await asyncio.sleep(LONGEST_END)  # What was late has arrived, and journals have let go of their servers.
