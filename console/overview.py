@@ -109,7 +109,7 @@ async def look_at(system: ActorSystem, *, parts: bool, paths: Iterable[str] | No
     top = Found(f"/{system.name}", system._root, None, os.getpid())
     rows: list[ActorRow] = []
     far: dict[int, Cell] = {}
-    for number, one in enumerate(walk(top, parts=parts) if paths is None else found_at(system, paths), 1):
+    for number, one in enumerate(walk(top, parts=parts) if paths is None else found_at(system, paths, parts=parts), 1):
         if one.cell is not None and not one.cell.is_dead and is_far(one.cell):
             far[len(rows)] = one.cell
         rows.append(row_of(one))
@@ -149,13 +149,27 @@ def walk(top: Found, *, parts: bool) -> Iterator[Found]:
         waiting.extend(reversed(below.values()))
 
 
-def found_at(system: ActorSystem, paths: Iterable[str]) -> Iterator[Found]:
-    """What is found at these addresses; those at which nobody is known are left out."""
+def found_at(system: ActorSystem, paths: Iterable[str], *, parts: bool) -> Iterator[Found]:
+    """What is found at these addresses; those at which nobody is known are left out, and parts of the runtime too."""
     for path in paths:
         try:
-            yield find(system, path)
+            one = find(system, path)
         except NoSuchActor:
             continue
+        if parts or one.cell is None or not is_part(one.cell):
+            yield one
+
+
+def is_part(cell: Cell) -> bool:
+    """Whether an actor is a part of the runtime itself: of recovery, or of what a mechanism is made of."""
+    while cell_kind(cell) is not RecoverySupervisor:
+        above = cell.parent
+        if above is None:
+            return False
+        if isinstance(above.spec, ChildSpec) and above.spec.mechanism is not None:
+            return True
+        cell = above
+    return True
 
 
 def find(system: ActorSystem, path: str) -> Found:

@@ -10,10 +10,11 @@ try:
     from .serving import open_dashboard
     from .web_app import Dashboard, dashboard
 except ModuleNotFoundError as missing:
-    if missing.name not in ("starlette", "uvicorn"):
+    package = (missing.name or "").partition(".")[0]
+    if package not in ("starlette", "uvicorn"):
         raise
     raise ImportError(
-        f"holdfast.console.dashboard needs the package {missing.name}: pip install 'holdfast[dashboard]'"
+        f"holdfast.console.dashboard needs the package {package}: pip install 'holdfast[dashboard]'"
     ) from missing
 
 __all__ = ["Dashboard", "dashboard", "open_dashboard", "token_of"]

@@ -10,7 +10,7 @@ from collections.abc import AsyncGenerator
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Final, Protocol
 
-from ...actors.errors import HoldfastError, SpecError
+from ...actors.errors import HoldfastError, RemoteCrash, SpecError, error_text, type_name
 from ...system.system import ActorSystem
 from ..client_session import ClientSession
 from ..remote import CHANGES, NotReached, RemoteSystem
@@ -55,6 +55,10 @@ class OwnAnswers:
                 return await work
         except TimeoutError as late:
             raise SpecError("dashboard", f"the system has not answered within {timeout:g} s: try again") from late
+        except HoldfastError:
+            raise
+        except Exception as error:  # Whatever a user's code raises is told as over the control endpoint.
+            raise RemoteCrash(type_name(type(error)), error_text(error)) from error
 
     @contextlib.asynccontextmanager
     async def session(self) -> AsyncGenerator[OwnAnswers]:

@@ -176,7 +176,7 @@ class Gathering:
         """Say what is on a viewer's screen: that is looked at more often, if it cannot be all."""
         viewer = self._viewers.get(number)
         if viewer is not None:
-            viewer.watched = frozenset(list(paths)[:MOST_WATCHED])
+            viewer.watched = frozenset(path for path in list(paths)[:MOST_WATCHED] if path in self.picture.rows)
             self._hurry.set()
 
     def hurry(self, paths: Collection[str]) -> None:
@@ -227,10 +227,9 @@ class Gathering:
         while True:
             try:
                 await work()
-            except HoldfastError as error:
-                if (
-                    work == self._look_on and str(error) != self._problem
-                ):  # If it does not answer, none of them gets on.
+            except (HoldfastError, msgspec.MsgspecError) as error:  # The latter: a system of another version.
+                # One of the works tells it: if the system does not answer, none of them gets on.
+                if work == self._look_on and str(error) != self._problem:
                     self._problem = str(error)
                     self._tell("problem", {"text": self._problem})
                 await asyncio.sleep(AGAIN)

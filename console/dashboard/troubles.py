@@ -97,6 +97,8 @@ OF_ALL: Final = frozenset({"store", "events left out"})
 """Causes of which every actor tells; they are told once, of the root."""
 OF_ITS_OWN: Final = "Its journal"
 """How a sentence about the store begins that is about one actor."""
+UNKNOWN: Final = Advice(ODD, "Look closer.")
+"""Of a cause that only the system knows, which is of another version."""
 NOT_THERE: Final = Advice(ILL, "Mend the cause, and start it again.", ("start",))
 SILENT: Final = Advice(
     ILL, "Its process does not answer: see whether it is stopped or busy; kill it if it stays so.", ("kill",)
@@ -258,7 +260,7 @@ def _is_of_use(seen: Seen, path: str, order: str) -> bool:
 
 def _advice(seen: Seen, path: str, cause: str) -> Advice:
     """What the table says of a cause, or less or more of it, by how the actor is now."""
-    row, usual = seen.rows.get(path), ADVICE[cause]
+    row, usual = seen.rows.get(path), ADVICE.get(cause, UNKNOWN)
     is_there = row is not None and row.state not in ("stopped", "silent")
     match cause:
         case "its own faults" if not is_there:

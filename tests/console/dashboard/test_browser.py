@@ -323,7 +323,6 @@ def test_metrics_are_drawn(page: Page) -> None:
     at(page, "metrics")
     expect(page.locator(".plot", has_text="actors").first.locator("path.spark")).to_have_count(1)
     expect(page.locator(".plot", has_text="/app (pid").first).to_contain_text("MB")
-    picture(page, "metrics")
 
 
 def test_what_actors_call_themselves_and_say_is_text(page: Page, served: Served) -> None:
@@ -471,7 +470,6 @@ def test_a_plan_of_repair_is_approved(context: BrowserContext) -> None:
         other.tell("/app/shop/clerk", "hang")
         card = page.locator("article", has=page.get_by_role("button", name="Approve case"))
         expect(card).to_contain_text("restart_child(shop/clerk)")
-        picture(page, "approval")
         at(page, "diagnosis")
         expect(page.get_by_role("img", name=re.compile("symptoms"))).to_be_visible()
         expect(page.get_by_role("img", name=re.compile("steps of a case"))).to_be_visible()

@@ -13,6 +13,7 @@ from holdfast.console.dashboard import gathering as gathering_module
 from holdfast.console.dashboard.answers import Answers, OwnAnswers, SocketAnswers
 from holdfast.console.dashboard.gathering import MOST_PENDING, MOST_VIEWERS, Gathering, TooManyViewers, Viewer
 from holdfast.console.endpoint import control_endpoint
+from holdfast.console.overview import look_at
 from holdfast.console.wire import About, AnyRequest, Overview
 from tests.console.dashboard.conversing import READERS, Browser, EventReader
 from tests.system.trees import Boom, counter, ref
@@ -77,6 +78,27 @@ async def test_what_is_told_is_heard_of_at_once_and_asked_why(system: hf.ActorSy
         [trouble] = told["troubles"]
         assert (trouble["address"], trouble["grade"]) == ("/app/left/a", "odd")
         assert "RuntimeError: boom at" in trouble["sentences"][0]
+
+
+async def test_parts_of_the_runtime_are_not_shown(system: hf.ActorSystem, operator: Browser) -> None:
+    """Their events are heard of as all are, and a look at their addresses finds nobody."""
+    async with operator.stream() as stream:
+        first = await seen(stream)
+        await system.start(counter("kept", recovery=hf.hybrid()))
+        found: list[str] = []
+        while "/app/kept" not in found:
+            told = await stream.until("change", lambda data: data.get("rows"))
+            found += [row[0] for row, _ in told["rows"]]
+        assert system.ref("/app/recovery", hf.Actor).path == "/app/recovery"
+        assert not [path for path in found if "recovery" in path]
+        look = await look_at(system, parts=False, paths=["/app/recovery", "/app/kept", "/app/recovery/controller"])
+        assert [row.path for row in look.rows] == ["/app/kept"]
+        assert (await look_at(system, parts=True, paths=["/app/recovery"])).rows != []
+        # What is nobody's is not looked at either: a look that fails would be everybody's loss.
+        answer = await operator.post("/watch", {"viewer": first["viewer"], "paths": ["", "x", "/app/left/a"]})
+        assert answer.status_code == 204
+        await system.suspend(ref(system, "/app/left/a"))
+        await stream.until("change", lambda data: any(row[0][2] == "suspended" for row in data.get("rows", [])))
 
 
 async def test_another_order_is_a_new_picture(system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -240,8 +262,6 @@ async def test_it_is_the_same_over_the_control_endpoint(system: hf.ActorSystem, 
 
 
 async def in_tree(system: hf.ActorSystem) -> list[dict[str, Any]]:
-    from holdfast.console.overview import look_at
-
     return [{"path": row.path} for row in (await look_at(system, parts=False)).rows]
 
 

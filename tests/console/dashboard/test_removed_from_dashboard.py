@@ -233,6 +233,13 @@ CHECKS = {
         GATHERING,
         "test_another_order_is_a_new_picture",
     ),
+    "parts of the runtime are not shown": Check(
+        "console/overview.py",
+        "        if parts or one.cell is None or not is_part(one.cell):",
+        "        if True:",
+        GATHERING,
+        "test_parts_of_the_runtime",
+    ),
     "it is asked before something is lost": Check(
         f"{FOLDER}orders.py",
         "    if warnings and not order.is_confirmed and not order.is_dry_run:",

@@ -156,6 +156,11 @@ def test_who_was_stopped_by_order_can_be_started() -> None:
     assert (lives.grade, lives.orders) == ("news", ())
 
 
+def test_a_cause_that_only_a_newer_system_knows_is_told() -> None:
+    [one] = troubles(seen(row("/app/x")), {"/app/x": [("the moon", "/app/x is moonstruck.")]})
+    assert (one.grade, one.sentences, one.advice) == ("odd", ("/app/x is moonstruck.",), ("Look closer.",))
+
+
 def test_a_process_that_says_nothing_is_told() -> None:
     [one] = troubles(seen(row("/app/x", state="silent", pid=9)), {"/app/x": []})
     assert (one.grade, one.sentences, one.orders) == ("ill", ("The process 9 of /app/x does not answer.",), ("kill",))
