@@ -182,7 +182,7 @@ def check(value: Any, kind: str, package: str) -> None:
         assert value in NUMBERS[kind]
     else:
         name = kind if "/" in kind else f"{package}/{kind}"
-        fields = dict(reversed(line.split()) for line in DEFINITIONS[name].splitlines())
+        fields = {field: of for of, field in map(str.split, DEFINITIONS[name].splitlines())}
         assert value.keys() == fields.keys()
         for field, of in fields.items():
             check(value[field], of, name.partition("/")[0])
@@ -255,7 +255,7 @@ def test_messages_of_ros_get_each_field_and_a_byte_is_a_byte() -> None:
     )
     pair = dataclasses.make_dataclass("KeyValue", [("key", str, ""), ("value", str, "")])
     texts = [(name, str, "") for name in ("name", "message", "hardware_id")]
-    values = ("values", list[Any], dataclasses.field(default_factory=list))
+    values: tuple[str, Any, Any] = ("values", list[Any], dataclasses.field(default_factory=list))
     status = dataclasses.make_dataclass("DiagnosticStatus", [("level", bytes, b"\0"), *texts, values])
     array = dataclasses.make_dataclass(
         "DiagnosticArray",
@@ -274,7 +274,7 @@ def test_messages_of_ros_get_each_field_and_a_byte_is_a_byte() -> None:
     check(plain, "diagnostic_msgs/DiagnosticArray", "diagnostic_msgs")
     made = dataclasses.asdict(as_ros(plain, array, status, pair))
     assert made["status"][0].pop("level") == b"\x02"
-    assert plain["status"][0].pop("level") == 2  # type: ignore[index,union-attr,attr-defined]  # plain data
+    assert plain["status"][0].pop("level") == 2  # type: ignore[index]  # plain data
     assert made == plain
 
 
