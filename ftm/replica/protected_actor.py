@@ -368,9 +368,9 @@ class Server(lifecycle.HerePlace):
         elif state.has_deltas:
             actor.get_delta()
         if life.restored.is_mapped:  # What is begun with, and gone back to, is a state of the class as it is now.
-            made = self._whole(life)
-            self.points.stand_changed(made)
-            self._note_names(life, made)
+            present = self._whole(life)
+            self.points.stand_changed(present)
+            self._note_names(life, present)
         return life
 
     def abandon(self) -> None:

@@ -39,7 +39,7 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
 
 
 class Waiter(hf.Actor):
-    turn_timeout = 1.0
+    turn_timeout: ClassVar[float | None] = 1.0
 
     def __init__(self) -> None:
         self.count = 0
