@@ -60,7 +60,6 @@ from holdfast.actors.process.resource_limits import Limits
 from holdfast.actors.values.renamed import renamed
 from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
 from holdfast.checkpoint.recovery_file import load_recovery
-from holdfast.cluster.lines.inflow import ConnectionLimits
 from holdfast.supervision.admin import DeleteChild, RestartChild, StartChild, TerminateChild, WhichChildren
 from holdfast.supervision.config import load_tree
 from holdfast.supervision.dynamic import dynamic
@@ -86,7 +85,6 @@ __all__ = [
     "Backoff",
     "Binding",
     "ChildSpec",
-    "ConnectionLimits",
     "Crash",
     "DeleteChild",
     "ExitReason",

@@ -3,6 +3,7 @@
 from ..actors.control.live_state import Opaque
 from ..actors.control.orders import Status
 from ..actors.control.tracing import Statistics
+from ..cluster.lines.inflow import ConnectionLimits
 from ..cluster.lines.lines import PeerLook
 from .history.evidence import PutAside
 from .history.lives import PastLife
@@ -15,6 +16,7 @@ from .transaction.operation import Operation, Step
 
 __all__ = [
     "Change",
+    "ConnectionLimits",
     "HistoryPage",
     "Opaque",
     "Operation",

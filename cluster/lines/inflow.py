@@ -31,7 +31,7 @@ FULL_SECONDS: Final = 0.02
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ConnectionLimits:
-    """How much one connected program may have outstanding in a system, whoever it is.
+    """Limit how much one connected program may have outstanding in a system, whoever it is.
 
     What is over `messages` or `message_bytes` waits at that program, and what is over the other limits is refused.
 

@@ -110,7 +110,7 @@ class Reach:
 
     @asynccontextmanager
     async def bank(
-        self, store: Path | None = None, limits: hf.ConnectionLimits = DEFAULT_LIMITS
+        self, store: Path | None = None, limits: hf.system.ConnectionLimits = DEFAULT_LIMITS
     ) -> AsyncGenerator[hf.ActorSystem]:
         """A system with a plain account and a recorded one."""
         kept = None if store is None else f"sqlite:{store}"
@@ -182,7 +182,7 @@ class Clerk(hf.Actor):
 
 @asynccontextmanager
 async def shop_of(
-    store: Path, name: str = "kept", limits: hf.ConnectionLimits = DEFAULT_LIMITS
+    store: Path, name: str = "kept", limits: hf.system.ConnectionLimits = DEFAULT_LIMITS
 ) -> AsyncGenerator[hf.ActorRef[Clerk]]:
     """A system whose recorded clerk pays into an account of the bank."""
     async with (

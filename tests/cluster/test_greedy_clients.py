@@ -19,7 +19,7 @@ from holdfast.cluster.lines.line import NOBODY, Boot, LineBatch
 from holdfast.events import ConnectionLimited, DeadLetter, KeptForSystem
 from tests.cluster.reach import Account, Add, Large, News, Pay, Reach, Total, Wait, run, shop_of
 
-FEW = hf.ConnectionLimits(messages=100, asks=20, subscriptions=3, ties=3, kept=10)
+FEW = hf.system.ConnectionLimits(messages=100, asks=20, subscriptions=3, ties=3, kept=10)
 
 
 class Slow(hf.Actor):
@@ -263,7 +263,7 @@ def test_who_does_not_hold_back_loses_its_line(monkeypatch: pytest.MonkeyPatch) 
 
 def test_who_never_takes_its_outcomes_gets_no_more_and_then_loses_its_line() -> None:
     async def work(reach: Reach) -> None:
-        few = hf.ConnectionLimits(asks=1000, message_bytes=1 << 20)
+        few = hf.system.ConnectionLimits(asks=1000, message_bytes=1 << 20)
         async with reach.bank(limits=few) as system, hf.connect("bank") as other:
             evil = Hostile(reach, "evil")
             await evil.greet()
@@ -394,7 +394,7 @@ def test_what_is_kept_for_a_system_that_stays_away_is_bounded_and_can_be_dropped
 def test_limits_are_whole_numbers_from_1_on(name: str) -> None:
     for wrong in (0, -1, 1.5, True, "many"):
         with pytest.raises(hf.SpecError, match=f"{name} must be a whole number from 1 on"):
-            hf.ConnectionLimits(**{name: wrong})  # type: ignore[arg-type]
+            hf.system.ConnectionLimits(**{name: wrong})  # type: ignore[arg-type]
     with pytest.raises(hf.SpecError, match="connection_limits must be a ConnectionLimits"):
         hf.ActorSystem("app", connection_limits=10)  # type: ignore[arg-type]
 
