@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import ssl
 import stat
 import time
 from pathlib import Path
@@ -15,6 +16,7 @@ from starlette.routing import Mount
 import holdfast as hf
 from holdfast.console.dashboard import Dashboard, dashboard, open_dashboard, token_of
 from holdfast.console.dashboard import access as access_module
+from tests.cluster.certificates import certificates
 from tests.console.dashboard.conversing import HOME, OPERATORS, READERS, Browser
 
 pytestmark = pytest.mark.usefixtures("system")
@@ -229,6 +231,28 @@ async def test_others_reach_it_with_tls_only(app: Dashboard, tmp_path: Path) -> 
         with pytest.raises(hf.errors.SpecError, match="in use"):
             async with open_dashboard(app, port=int(url.rstrip("/").rpartition(":")[2])):
                 pass
+
+
+async def test_over_tls_the_cookie_goes_over_tls_only(app: Dashboard, tmp_path: Path) -> None:
+    """A real handshake; whoever speaks plain text to it gets nothing, and holds up nobody."""
+    files = certificates(tmp_path / "tls")
+    options = {"certfile": files.certificate, "keyfile": files.key}
+    async with open_dashboard(app, host="0.0.0.0", **options) as url:
+        there = url.replace("0.0.0.0", "127.0.0.1")
+        assert there.startswith("https://")
+        trusting = ssl.create_default_context(cafile=files.ca)
+        async with httpx.AsyncClient(base_url=there, verify=trusting) as client:
+            headers = {"Origin": there.rstrip("/"), "Content-Type": "application/json"}
+            answer = await client.post("/session", headers=headers, json={"token": OPERATORS})
+            assert answer.is_success, answer.text
+            assert "; secure" in answer.headers["set-cookie"].lower()
+            assert (await client.get("/session")).json()["role"] == "operate"
+        async with httpx.AsyncClient(base_url=there) as stranger:
+            with pytest.raises(httpx.ConnectError, match="(?i)certificate"):
+                await stranger.get("/")
+        async with httpx.AsyncClient(base_url=there.replace("https:", "http:")) as plain:
+            with pytest.raises(httpx.TransportError):
+                await plain.get("/")
 
 
 async def test_a_system_on_another_loop_is_told_so(system: hf.ActorSystem) -> None:
