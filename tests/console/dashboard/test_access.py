@@ -236,8 +236,7 @@ async def test_others_reach_it_with_tls_only(app: Dashboard, tmp_path: Path) -> 
 async def test_over_tls_the_cookie_goes_over_tls_only(app: Dashboard, tmp_path: Path) -> None:
     """A real handshake; whoever speaks plain text to it gets nothing, and holds up nobody."""
     files = certificates(tmp_path / "tls")
-    options = {"certfile": files.certificate, "keyfile": files.key}
-    async with open_dashboard(app, host="0.0.0.0", **options) as url:
+    async with open_dashboard(app, host="0.0.0.0", certfile=files.certificate, keyfile=files.key) as url:
         there = url.replace("0.0.0.0", "127.0.0.1")
         assert there.startswith("https://")
         trusting = ssl.create_default_context(cafile=files.ca)
@@ -248,7 +247,7 @@ async def test_over_tls_the_cookie_goes_over_tls_only(app: Dashboard, tmp_path: 
             assert "; secure" in answer.headers["set-cookie"].lower()
             assert (await client.get("/session")).json()["role"] == "operate"
         async with httpx.AsyncClient(base_url=there) as stranger:
-            with pytest.raises(httpx.ConnectError, match="(?i)certificate"):
+            with pytest.raises(httpx.ConnectError, match=r"(?i)certificate"):
                 await stranger.get("/")
         async with httpx.AsyncClient(base_url=there.replace("https:", "http:")) as plain:
             with pytest.raises(httpx.TransportError):
