@@ -35,6 +35,8 @@ T = TypeVar("T")
 
 KEPT = "specification "
 """How the notes begin; the address of a child of the root follows, or that of the root itself."""
+FEW = 100
+"""Specs of children that may have ended, before it is looked which have."""
 TOGETHER = 50
 """So many specs are packed before others have their turn."""
 
@@ -60,6 +62,7 @@ class Specifications:
             for address, value in self._kept.items()
         }
         self._declared: dict[str, ChildSpec] = {}  # as the program says
+        self._most_declared = FEW
         self._seen: dict[str, ChildSpec] = {}  # the specs of which it is known what is to be kept
         self._packer = Packer()
         self._root, self._root_flags = "", Flags()  # as the program says
@@ -114,13 +117,25 @@ class Specifications:
         is_newer = address in self._loaded and wanted is declared
         self._loaded.pop(address, None)
         self._added.discard(address)
-        self._declared[address] = declared
+        if self._is_kept:
+            self._declared[address] = declared
+            self._forget_ended()
         if wanted is declared:
             self._keep(address, None)
         if is_newer and not fresh:
             self._homes.node.emit(SpecificationSuperseded(address))
-        self._see(address)
+        if self._is_kept:
+            self._see(address)
         self._arrange()
+
+    def _forget_ended(self) -> None:
+        """Forget children that have gone for good, now and then: a program may start others without end."""
+        if len(self._declared) > self._most_declared:
+            there = self._there()
+            for address in [one for one in self._declared if one not in there and one not in self._kept]:
+                del self._declared[address]
+                self._seen.pop(address, None)
+            self._most_declared = 2 * len(self._declared) + FEW
 
     def _see(self, address: str) -> None:
         one = self._children().get(address.rpartition("/")[2])

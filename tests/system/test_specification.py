@@ -120,6 +120,25 @@ async def test_the_next_root_has_what_is_in_force(tmp_path: Path, name: str) -> 
         assert shape(system) != now
 
 
+@pytest.mark.parametrize("is_kept", [False, True])
+async def test_a_program_that_starts_children_without_end_does_not_grow(tmp_path: Path, is_kept: bool) -> None:
+    store = {"store": f"sqlite:{tmp_path}/app.db"} if is_kept else {}
+    async with hf.ActorSystem("app", log=False, **store) as system:
+        kept = await system.start(counter("kept"))
+        async with system.transaction() as change:
+            change.respecify(kept, shutdown=7.0)
+        for number in range(500):
+            await system.terminate(await system.start(counter(f"c{number}", restart="temporary")))
+        known = system._specifications
+        assert len(known._declared) <= 250
+        assert len(known._seen) <= 250
+        assert ("/app/kept" in known._declared) == is_kept
+    if is_kept:
+        async with hf.ActorSystem("app", log=False, **store) as system:
+            await system.start(counter("kept"))
+            assert system._specifications._there()["/app/kept"].shutdown == 7.0
+
+
 async def test_a_transaction_on_top_of_another_one_is_kept_too(tmp_path: Path) -> None:
     async with program(tmp_path / "store") as system:
         before = shape(system)
