@@ -128,12 +128,12 @@ class Access:
             NotAllowed: it is no token, or too many were wrong a moment ago.
         """
         now = time.monotonic()
-        self._wrong = [at for at in self._wrong if now - at < WRONG_PERIOD]
-        if len(self._wrong) >= MOST_WRONG:
-            raise NotAllowed(429, f"too many wrong tokens: wait {WRONG_PERIOD:g} s")
         given = token.encode()
         roles: list[Role] = [role for role, one in self._tokens.items() if hmac.compare_digest(one.encode(), given)]
-        if not roles:
+        if not roles:  # Whoever has a right one is let in, whatever others have tried.
+            self._wrong = [at for at in self._wrong if now - at < WRONG_PERIOD]
+            if len(self._wrong) >= MOST_WRONG:
+                raise NotAllowed(429, f"too many wrong tokens: wait {WRONG_PERIOD:g} s")
             self._wrong.append(now)
             raise NotAllowed(401, "this is no token of this dashboard")
         key = secrets.token_urlsafe(TOKEN_BYTES)

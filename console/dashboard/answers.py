@@ -6,9 +6,10 @@ import asyncio
 import contextlib
 import os
 import time
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable
 from contextlib import AbstractAsyncContextManager
-from typing import Any, Final, Protocol
+from pathlib import Path
+from typing import Any, Final, Protocol, TypeAlias
 
 from ...actors.errors import HoldfastError, RemoteCrash, SpecError, error_text, type_name
 from ...system.system import ActorSystem
@@ -20,6 +21,10 @@ MOST_CONNECTIONS: Final = 8
 """Connections to a control endpoint at a time; it serves 32, and the commands of operators need some."""
 FRESH: Final = 300.0
 """Seconds after which an idle connection is not used again: the endpoint closes it after ten minutes."""
+
+
+Endpoint: TypeAlias = "str | os.PathLike[str] | Callable[[], Path]"
+"""Where the control endpoint of a system is, or who finds it."""
 
 
 class Answers(Protocol):
@@ -75,10 +80,14 @@ class OwnAnswers:
 
 
 class SocketAnswers:
-    """Asks a system over its control endpoint, on a few connections."""
+    """Asks a system over its control endpoint, on a few connections.
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self._path = path
+    Args:
+        where: the path of the endpoint, or a function that finds it: the next program of that name has another one.
+    """
+
+    def __init__(self, where: Endpoint) -> None:
+        self._where = where
         self._free = asyncio.Semaphore(MOST_CONNECTIONS)
         self._idle: list[tuple[float, RemoteSystem]] = []
         self._is_closed = False
@@ -96,12 +105,17 @@ class SocketAnswers:
 
     async def _connected(self) -> RemoteSystem:
         """A new connection; the kernel may have it wait."""
-        connecting = asyncio.ensure_future(asyncio.to_thread(RemoteSystem, self._path))
+        connecting = asyncio.ensure_future(asyncio.to_thread(self._reach))
         try:
             return await asyncio.shield(connecting)
         except asyncio.CancelledError:
             connecting.add_done_callback(_close)  # The thread goes on, and nobody would close what it brings.
             raise
+
+    def _reach(self) -> RemoteSystem:
+        """Connect, in a thread of its own."""
+        where = self._where
+        return RemoteSystem(where() if callable(where) else where)
 
     def _kept(self) -> RemoteSystem | None:
         """A connection that was used a short time ago."""
@@ -130,7 +144,7 @@ class SocketAnswers:
     @contextlib.asynccontextmanager
     async def session(self) -> AsyncGenerator[Answers]:
         """A session of its own, for requests that belong together: one connection, which ends with it."""
-        own = SocketAnswers(self._path)
+        own = SocketAnswers(self._where)
         own._free = asyncio.Semaphore(1)
         try:
             yield own

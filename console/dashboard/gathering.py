@@ -42,6 +42,8 @@ MOST_AT_ONCE: Final = 500
 """Actors of a look at some: if more have changed, all are looked at."""
 MOST_WATCHED: Final = 200
 """Rows on one viewer's screen."""
+SILENT: Final = 3.0
+"""Seconds after which the viewers are told that the system does not answer."""
 ANSWER: Final = 10.0
 """Seconds that the system has for an answer; then it is told that it does not answer, and asked again."""
 AGAIN: Final = 1.0
@@ -54,6 +56,8 @@ MOST_PENDING: Final = 64
 """What a viewer may be behind; one that has not read so much is dropped."""
 MOST_VIEWERS: Final = 50
 """Viewers at a time."""
+MOST_OF_ONE: Final = 16
+"""Viewers at a time of one login."""
 BEAT: Final = 10.0
 """Seconds after which something is sent to a viewer if nothing has changed, so that it is seen when it has gone."""
 
@@ -67,8 +71,8 @@ class TooManyViewers(HoldfastError, text="{count} viewers look at the system alr
 class Viewer:
     """What one open page has not been sent yet; who does not read it is dropped, and never waited for."""
 
-    def __init__(self, number: int) -> None:
-        self.number = number
+    def __init__(self, number: int, login: str) -> None:
+        self.number, self.login = number, login
         self.watched: frozenset[str] = frozenset()
         """The addresses on its screen."""
         self._pending: deque[bytes] = deque()
@@ -127,6 +131,8 @@ class Gathering:
         self._told: dict[str, float] = {}
         self._put_aside: list[PutAside] = []
         self._is_seen = False
+        self._is_judged = False
+        """Whether those who look ill were asked: before that nobody can say that all is well."""
         self._hurried: set[str] = set()
         self._later: set[str] = set()
         self._has_changed = False
@@ -134,11 +140,19 @@ class Gathering:
 
     # -- viewers ------------------------------------------------------------------------------------------------------
 
-    def add(self) -> Viewer:
-        """One more viewer; the first one has the gathering begin. Raises TooManyViewers."""
-        if len(self._viewers) >= MOST_VIEWERS:
-            raise TooManyViewers(len(self._viewers))
-        viewer = Viewer(self._next_number)
+    def add(self, login: str) -> Viewer:
+        """One more viewer; the first one has the gathering begin.
+
+        Args:
+            login: who looks: one login takes no more than a few of all views.
+
+        Raises:
+            TooManyViewers: there is none left, for this login or at all.
+        """
+        own = sum(one.login == login for one in self._viewers.values())
+        if own >= MOST_OF_ONE or len(self._viewers) >= MOST_VIEWERS:
+            raise TooManyViewers(own if own >= MOST_OF_ONE else len(self._viewers))
+        viewer = Viewer(self._next_number, login)
         self._next_number += 1
         self._viewers[viewer.number] = viewer
         if not self._tasks:
@@ -215,6 +229,7 @@ class Gathering:
                 "processes": picture.processes,
                 "troubles": self._troubles,
                 "quarantine": self._put_aside,
+                "is_judged": self._is_judged,
                 "events": list(self._events),
                 "problem": self._problem,
             },
@@ -229,9 +244,8 @@ class Gathering:
                 await work()
             except (HoldfastError, msgspec.MsgspecError) as error:  # The latter: a system of another version.
                 # One of the works tells it: if the system does not answer, none of them gets on.
-                if work == self._look_on and str(error) != self._problem:
-                    self._problem = str(error)
-                    self._tell("problem", {"text": self._problem})
+                if work == self._look_on:
+                    self._say_problem(str(error))
                 await asyncio.sleep(AGAIN)
 
     async def _look_on(self) -> None:
@@ -264,14 +278,28 @@ class Gathering:
             except TimeoutError:
                 pass
 
+    def _say_problem(self, text: str) -> None:
+        if text != self._problem:
+            self._problem = text
+            self._tell("problem", {"text": text})
+
     async def _look(self, paths: tuple[str, ...] | None) -> SystemLook:
-        found: SystemLook = LOOK.decode(await self._answers.ask(Overview(paths=paths), ANSWER))
+        told = f"nothing for more than {SILENT:g} s; what is shown is how it was"
+        late = asyncio.get_running_loop().call_later(SILENT, self._say_problem, told)
+        try:
+            found: SystemLook = LOOK.decode(await self._answers.ask(Overview(paths=paths), ANSWER))
+        finally:
+            late.cancel()
         return found
 
     def _take(self, look: SystemLook, asked: Collection[str] | None) -> None:
         now = time.time()
         if asked is not None:
             change = self.picture.take_some(look, asked, now)
+            if self._problem:  # It was silent, and answers again.
+                self._problem = ""
+                self._tell_all()
+                return
         else:
             whole = self.picture.take(look, now)
             if whole is None or not self._is_seen or self._problem:
@@ -359,8 +387,8 @@ class Gathering:
         except SpecError:  # It keeps no history: what can be seen of them has to do.
             answers = {path: seen_causes(seen, path) for path in asked}
         found = sorted([*self._diagnosed, *troubles(seen, answers)], key=grade_of)
-        if (found, self._put_aside) != (self._troubles, before):
-            self._troubles = found
+        if (found, self._put_aside) != (self._troubles, before) or not self._is_judged:
+            self._troubles, self._is_judged = found, True
             self._tell("troubles", {"troubles": found, "quarantine": self._put_aside})
         return set(asked)
 

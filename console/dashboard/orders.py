@@ -56,6 +56,9 @@ MOST_PATHS: Final = 1000
 MECHANISM: Final = re.compile(r"[A-Za-z][A-Za-z0-9_+-]*")
 """Names of mechanisms: a file with one would be code, which the page does not send."""
 TREE: Final = "the page"
+AGAIN: Final = (
+    "it may end its actor again, each time, and its supervisor give up, if the cause is not mended; this is tried"
+)
 """What a tree that was written in the page is called in errors."""
 
 
@@ -212,13 +215,14 @@ async def _settle(answers: Answers, order: Order) -> Done:
     if len(order.paths) != 1 or len(order.words) > 1 or not all(word.isdecimal() for word in order.words):
         raise SpecError("dashboard", f"{order.verb} takes one address, and the number of a message or none")
     (path,), number = order.paths, int(order.words[0]) if order.words else None
-    if verb == "drop" and not order.is_confirmed:
+    if not order.is_confirmed:
         raw = await answers.ask(AskQuarantined(path), PATIENCE)
         put_aside = [one for one in msgspec.convert(raw, list[PutAside]) if number in (None, one.id)]
+        warning = "this is dropped" if verb == "drop" else AGAIN
         if put_aside:
-            return Done(warnings=[f"this is dropped: {quarantine_line(one)}" for one in put_aside])
+            return Done(warnings=[f"{warning}: {quarantine_line(one)}" for one in put_aside])
     told = await answers.ask(SettleQuarantined(verb, path, number), PATIENCE)
-    words = "handled again" if verb == "retry" else "dropped"
+    words = "dropped" if verb == "drop" else "given to its actor again; if that dies of it again, it comes back here"
     done = msgspec.convert(told["done"], list[PutAside])
     return Done(said=[f"{words}: {quarantine_line(one)}" for one in done], failed=list(told["failed"]))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Collection, Iterable
 from typing import Any, Final
 
@@ -14,6 +15,8 @@ SAME_TURN: Final = 0.3
 """Seconds by which the beginning of a turn may seem to move from look to look: its row is the same one."""
 MEASURED: Final = 1.0
 """Seconds over which the use of a processor is measured."""
+TURNING: Final = re.compile("[\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+"""Marks that have the text behind them run the other way."""
 NOTHING: Final = ActorRow("", "", "", "", 0, 0, 0, "", 0.0, "", (), (), "", False)
 
 Row = ActorRow
@@ -165,5 +168,12 @@ def _changed(before: dict[str, Row], rows: dict[str, Row]) -> list[RowAdded]:
 
 
 def plain(value: Any) -> bytes:
-    """A value as JSON; what JSON has no word for is told as text."""
-    return msgspec.json.encode(value, enc_hook=str)
+    """A value as JSON; what JSON has no word for is told as text.
+
+    Marks that turn the direction of what stands behind them are shown by their numbers: a text of an actor may not
+    turn round the words of others.
+    """
+    data = msgspec.json.encode(value, enc_hook=str)
+    if data.isascii():
+        return data
+    return TURNING.sub(lambda mark: f"⟨U+{ord(mark[0]):04X}⟩", data.decode()).encode()

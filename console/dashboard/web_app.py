@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 from collections.abc import Awaitable, Callable, Iterable
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -35,7 +34,7 @@ from ..wire import (
     OrderRepair,
 )
 from .access import Access, Login, NotAllowed, Role, check_role, token_of
-from .answers import Answers, OwnAnswers, SocketAnswers
+from .answers import Answers, Endpoint, OwnAnswers, SocketAnswers
 from .gathering import BEAT, Gathering, Viewer, framed
 from .orders import Order, carry_out
 from .picture import plain
@@ -97,7 +96,7 @@ class Sought(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def dashboard(
-    target: ActorSystem | str | os.PathLike[str],
+    target: ActorSystem | Endpoint,
     *,
     operators: str | Path | None = None,
     readers: str | Path | None = None,
@@ -109,7 +108,8 @@ def dashboard(
     It is served on the event loop of the system. Nothing is gathered while nobody looks.
 
     Args:
-        target: the running system; or the path of its control endpoint, if that is in another process.
+        target: the running system; or the path of its control endpoint, if that is in another process, or a function
+            that finds it each time that it is connected to.
         operators: the token of those who may change the system, of at least 16 signs; or the `Path` of a file with it,
             which is made with a new one, for this user alone, if it is not there.
         readers: the same of those who may only look.
@@ -225,7 +225,7 @@ class Dashboard:
     # -- what changes -------------------------------------------------------------------------------------------------
 
     async def _live(self, request: Request, login: Login) -> Response:
-        return Stream(self._gathering)
+        return Stream(self._gathering, login)
 
     async def _watch(self, request: Request, login: Login) -> Response:
         seen = await _body(request, Watched)
@@ -276,13 +276,13 @@ def _bounded(asked: Any) -> Any:
 class Stream(Response):
     """The stream of one viewer: it is dropped when it takes nothing for `UNREAD` seconds, and waits for nobody else."""
 
-    def __init__(self, gathering: Gathering) -> None:
+    def __init__(self, gathering: Gathering, login: Login) -> None:
         super().__init__()
-        self._gathering = gathering
+        self._gathering, self._login = gathering, login
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send what changes until the viewer goes, or is dropped."""
-        viewer = self._gathering.add()
+        viewer = self._gathering.add(self._login.csrf)
         try:
             await sent_until_gone(receive, send, viewer.gone, lambda: self._send(viewer, send))
         finally:

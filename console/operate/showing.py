@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import secrets
 import webbrowser
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Annotated
 import typer
 
 from ..remote import RemoteSystem
+from ..runtime_folder import found_sockets
 from .reaching import FAILED, GREETING_SECONDS, Socket, System, chosen, ended, told
 
 
@@ -47,6 +49,9 @@ def dashboard(
         path = chosen(system, socket)
         with RemoteSystem(path) as remote:
             remote.greet(GREETING_SECONDS)
+        names_found = [one.system for one in found_sockets() if one.path == path]
+        # The next program of that name has another endpoint.
+        target = functools.partial(chosen, names_found[0], None) if names_found and socket is None else path
         try:
             from .. import dashboard as room
         except ImportError as error:
@@ -54,9 +59,9 @@ def dashboard(
         token = secrets.token_urlsafe() if token_file is None else room.token_of(token_file, "token_file")
         given = [*(names or ()), host]
         app = (
-            room.dashboard(path, readers=token, hosts=given, readers_see_state=True)
+            room.dashboard(target, readers=token, hosts=given, readers_see_state=True)
             if read_only
-            else room.dashboard(path, operators=token, hosts=given)
+            else room.dashboard(target, operators=token, hosts=given)
         )
 
         async def serve() -> None:

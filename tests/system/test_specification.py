@@ -122,7 +122,7 @@ async def test_the_next_root_has_what_is_in_force(tmp_path: Path, name: str) -> 
 
 @pytest.mark.parametrize("is_kept", [False, True])
 async def test_a_program_that_starts_children_without_end_does_not_grow(tmp_path: Path, is_kept: bool) -> None:
-    store = {"store": f"sqlite:{tmp_path}/app.db"} if is_kept else {}
+    store: dict[str, Any] = {"store": f"sqlite:{tmp_path}/app.db"} if is_kept else {}
     async with hf.ActorSystem("app", log=False, **store) as system:
         kept = await system.start(counter("kept"))
         async with system.transaction() as change:

@@ -18,8 +18,9 @@ export function firstView(main) {
   main.replaceChildren(attention, tree.bar, tree.element);
   const draw = () => {
     const bad = live.troubles.filter((one) => one.grade !== "news"), told = live.troubles.filter((one) => one.grade === "news");
-    const isReady = live.rows.size > 0;
+    const isReady = live.rows.size > 0 && live.isJudged && live.isConnected && !live.problem;
     well.hidden = bad.length > 0;
+    well.classList.toggle("faint", !isReady);
     well.textContent = isReady ? `All is well, as far as is known: ${plural(live.rows.size, "actor")}, nothing to do.` : "Waiting for the system…";
     show(worst, arranged(bad));
     news.hidden = !told.length;

@@ -8,7 +8,7 @@ const KEPT_EVENTS = 500, KEPT_POINTS = 300;
 
 export const live = new EventTarget();
 Object.assign(live, {
-  system: "", pid: 0, viewer: 0, skew: 0, isConnected: false, problem: "",
+  system: "", pid: 0, viewer: 0, skew: 0, isConnected: false, isJudged: false, problem: "",
   rows: new Map(), tops: [], processes: new Map(), troubles: [], quarantine: [], events: [], series: new Map(), structure: 0,
 });
 
@@ -121,7 +121,7 @@ export function connect() {
       live.tops.length = 0;
       live.structure += 1;
       for (const values of told.rows) put(values);
-      Object.assign(live, { system: told.system, pid: told.pid, viewer: told.viewer, problem: told.problem, troubles: told.troubles, quarantine: told.quarantine, events: told.events });
+      Object.assign(live, { system: told.system, pid: told.pid, viewer: told.viewer, problem: told.problem, troubles: told.troubles, quarantine: told.quarantine, isJudged: told.is_judged, events: told.events });
       live.skew = told.now - Date.now() / 1000;
       processes(told.processes);
       tell("connection", "rows", "troubles", "events");
@@ -143,6 +143,7 @@ export function connect() {
     troubles(told) {
       live.troubles = told.troubles;
       live.quarantine = told.quarantine;
+      live.isJudged = true;
       tell("troubles");
     },
     problem(told) { live.problem = told.text; tell("connection"); },

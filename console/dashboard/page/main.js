@@ -51,11 +51,12 @@ function show() {
 function head() {
   const bad = live.troubles.filter((one) => one.grade !== "news"), isIll = bad.some((one) => one.grade === "ill");
   const dot = document.getElementById("state");
-  const state = !live.isConnected || live.problem ? "" : isIll ? "ill" : bad.length ? "odd" : "well";
+  const isUnsure = !live.isConnected || live.problem || !live.isJudged;
+  const state = isUnsure ? "" : isIll ? "ill" : bad.length ? "odd" : "well";
   dot.className = `dot ${state}`;
   dot.setAttribute("aria-label", { ill: "something has to be done", odd: "something is worth a look", well: "all is well" }[state] || "not connected");
   document.getElementById("system").textContent = live.system ? `/${live.system}` : "holdfast";
-  const acts = bad.length ? (bad.length === 1 ? "1 needs attention" : `${bad.length} need attention`) : "all well";
+  const acts = bad.length ? (bad.length === 1 ? "1 needs attention" : `${bad.length} need attention`) : isUnsure ? "…" : "all well";
   const summary = live.rows.size ? `${plural(live.rows.size, "actor")}, ${acts}` : "";
   const box = document.getElementById("summary");
   if (box.textContent !== summary) box.textContent = summary;

@@ -219,6 +219,7 @@ def test_a_message_in_quarantine_is_dropped_when_one_says_so(page: Page, served:
     page.get_by_role("button", name="Cancel").click()
     expect(page.locator("#put-aside")).to_have_text(" 1")
     verb(page, "quarantine-retry")
+    confirm(page, "and its supervisor give up")
     expect(page.locator("main td", has_text="2 tests.console").first).to_be_visible()  # It has ended the process again.
     verb(page, "quarantine-drop")
     confirm(page, "this is dropped:")

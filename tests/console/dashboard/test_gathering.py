@@ -11,7 +11,14 @@ from holdfast.actors.errors import HoldfastError
 from holdfast.console.dashboard import dashboard, web_app
 from holdfast.console.dashboard import gathering as gathering_module
 from holdfast.console.dashboard.answers import Answers, OwnAnswers, SocketAnswers
-from holdfast.console.dashboard.gathering import MOST_PENDING, MOST_VIEWERS, Gathering, TooManyViewers, Viewer
+from holdfast.console.dashboard.gathering import (
+    MOST_OF_ONE,
+    MOST_PENDING,
+    MOST_VIEWERS,
+    Gathering,
+    TooManyViewers,
+    Viewer,
+)
 from holdfast.console.endpoint import control_endpoint
 from holdfast.console.overview import look_at
 from holdfast.console.wire import About, AnyRequest, Overview
@@ -25,11 +32,14 @@ class Counted:
     def __init__(self, inner: Answers) -> None:
         self.inner, self.asked = inner, list[AnyRequest]()
         self.fails = False
+        self.holds: asyncio.Event | None = None  # what is asked waits for it
         self.session = inner.session
 
     async def ask(self, request: AnyRequest, timeout: float) -> Any:
         if self.fails:
             raise HoldfastError("it is away")
+        if self.holds is not None:
+            await self.holds.wait()
         value = await self.inner.ask(request, timeout)
         self.asked.append(request)
         return value
@@ -107,7 +117,7 @@ async def test_another_order_is_a_new_picture(system: hf.ActorSystem, monkeypatc
     monkeypatch.setattr(gathering_module, "RAREST", 3600.0)
     answers = Counted(OwnAnswers(system))
     gathering = Gathering(answers)
-    viewer = gathering.add()
+    viewer = gathering.add("one")
     await told_by(viewer, b"snapshot")
     while answers.looks() < 2:
         await asyncio.sleep(0)
@@ -122,7 +132,7 @@ async def test_another_order_is_a_new_picture(system: hf.ActorSystem, monkeypatc
 async def test_five_viewers_cost_one_gathering_and_nobody_costs_none(system: hf.ActorSystem) -> None:
     answers = Counted(OwnAnswers(system))
     gathering = Gathering(answers)
-    viewers = [gathering.add() for _ in range(5)]
+    viewers = [gathering.add("one") for _ in range(5)]
     for viewer in viewers:
         assert b"snapshot" in await viewer.next()
     while answers.looks() < 3:
@@ -139,7 +149,7 @@ async def test_five_viewers_cost_one_gathering_and_nobody_costs_none(system: hf.
 
 async def test_who_does_not_read_is_dropped_and_others_are_not(system: hf.ActorSystem) -> None:
     gathering = Gathering(OwnAnswers(system))
-    slow, quick = gathering.add(), gathering.add()
+    slow, quick = gathering.add("one"), gathering.add("one")
     await quick.next()
     for number in range(MOST_PENDING + 1):
         gathering._tell("problem", {"text": str(number)})
@@ -164,10 +174,10 @@ async def test_a_stream_that_takes_nothing_ends(
 
 async def test_there_are_so_many_viewers_and_no_more(system: hf.ActorSystem) -> None:
     gathering = Gathering(OwnAnswers(system))
-    for _ in range(MOST_VIEWERS):
-        gathering.add()
+    for number in range(MOST_VIEWERS):
+        gathering.add(f"{number // MOST_OF_ONE}")
     with pytest.raises(TooManyViewers):
-        gathering.add()
+        gathering.add("one")
     await gathering.close()
 
 
@@ -185,15 +195,55 @@ async def test_a_system_that_does_not_answer_is_told_and_asked_again(
     monkeypatch.setattr(gathering_module, "AGAIN", 0.01)
     answers = Counted(OwnAnswers(system))
     gathering = Gathering(answers)
-    viewer = gathering.add()
+    viewer = gathering.add("one")
     assert b"event: snapshot" in await told_by(viewer, b"snapshot")
     answers.fails = True
     assert b"it is away" in await told_by(viewer, b"problem")
-    late = gathering.add()
+    late = gathering.add("one")
     assert b'"problem":"it is away"' in await late.next()
     answers.fails = False
     assert b'"problem":""' in await told_by(viewer, b"snapshot")
     await gathering.close()
+
+
+async def test_a_system_that_is_silent_is_told_before_its_time_is_over(
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one that is stopped by SIGSTOP: nothing fails, and nothing comes."""
+    monkeypatch.setattr(gathering_module, "SILENT", 0.01)
+    answers = Counted(OwnAnswers(system))
+    gathering = Gathering(answers)
+    viewer = gathering.add("one")
+    assert b'"is_judged":false' in await told_by(viewer, b"snapshot")
+    await told_by(viewer, b"event: troubles")
+    answers.holds = asyncio.Event()
+    assert b"nothing for more than 0.01 s" in await told_by(viewer, b"event: problem")
+    answers.holds.set()
+    told = await told_by(viewer, b"event: snapshot")
+    assert b'"problem":""' in told
+    assert b'"is_judged":true' in told
+    await gathering.close()
+
+
+async def test_one_login_does_not_take_all_views(system: hf.ActorSystem) -> None:
+    gathering = Gathering(OwnAnswers(system))
+    for _ in range(MOST_OF_ONE):
+        gathering.add("greedy")
+    with pytest.raises(TooManyViewers):
+        gathering.add("greedy")
+    gathering.add("other")
+    await gathering.close()
+
+
+async def test_the_next_program_of_a_name_is_found(tmp_path: Path) -> None:
+    at = [tmp_path / "first.sock"]
+    answers = SocketAnswers(lambda: at[0])
+    for number, name in enumerate(("first", "second")):
+        at[0] = tmp_path / f"{name}.sock"
+        async with hf.ActorSystem(f"app{number}", log=False) as system, control_endpoint(system, at[0]):
+            about = await answers.ask(About(), 10.0)
+            assert about["name"] == f"app{number}"
+    await answers.close()
 
 
 async def told_by(viewer: Viewer, what: bytes) -> bytes:
@@ -213,7 +263,7 @@ async def test_in_a_large_system_the_screen_is_looked_at_more_often(
     monkeypatch.setattr(gathering_module, "RAREST_SOME", 0.05)
     answers = Counted(OwnAnswers(system))
     gathering = Gathering(answers)
-    viewer = gathering.add()
+    viewer = gathering.add("one")
     await told_by(viewer, b"snapshot")
     await system.suspend(ref(system, "/app/left/c"))
     gathering.watch(viewer.number, ["/app/left/c"])

@@ -118,3 +118,4 @@ def test_the_use_of_a_processor_is_of_the_time_between_two_looks() -> None:
 
 def test_what_json_has_no_word_for_is_text() -> None:
     assert msgspec.json.decode(plain({"x": object})) == {"x": "<class 'object'>"}
+    assert msgspec.json.decode(plain("no \u202eelbuort, but ümlaute")) == "no ⟨U+202E⟩elbuort, but ümlaute"

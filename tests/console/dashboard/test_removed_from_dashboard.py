@@ -39,8 +39,8 @@ CHECKS = {
     ),
     "a wrong token is none": Check(
         f"{FOLDER}access.py",
-        "        if not roles:\n",
-        "        if False:\n",
+        "        if not roles:  # Whoever",
+        "        if False:  # Whoever",
         ACCESS,
         "test_without_a_token",
     ),
@@ -207,7 +207,7 @@ CHECKS = {
     ),
     "there are so many viewers": Check(
         f"{FOLDER}gathering.py",
-        "        if len(self._viewers) >= MOST_VIEWERS:",
+        "        if own >= MOST_OF_ONE or len(self._viewers) >= MOST_VIEWERS:",
         "        if False:",
         GATHERING,
         "test_there_are_so_many_viewers",
@@ -316,6 +316,27 @@ CHECKS = {
         'case "its own faults" if False:',
         TROUBLES,
         "test_a_fault_is_graver",
+    ),
+    "a system that is silent is told of": Check(
+        "console/dashboard/gathering.py",
+        "call_later(SILENT, self._say_problem, told)",
+        "call_later(1e6, self._say_problem, told)",
+        GATHERING,
+        "is_silent_is_told",
+    ),
+    "nobody says that all is well before it was asked": Check(
+        "console/dashboard/gathering.py",
+        '                "is_judged": self._is_judged,\n',
+        '                "is_judged": True,\n',
+        GATHERING,
+        "is_silent_is_told",
+    ),
+    "marks that turn texts round are shown": Check(
+        "console/dashboard/picture.py",
+        "    if data.isascii():\n",
+        "    if True:\n",
+        PICTURE,
+        "what_json_has_no_word_for",
     ),
 }
 
