@@ -178,7 +178,8 @@ class Safety:
     def _say(self, receiver: Receiver, cell: Cell, *, entered: bool, is_first: bool = False) -> None:
         """Put the word into the mailbox; `is_first`: ahead of what a life that begins finds there, where it can be."""
         if entered:
-            mailbox.take_out(cell, receiver.told[0])  # The life that was to hear it has ended before.
+            if is_first:
+                mailbox.take_out(cell, receiver.told[0])  # The life that was to hear it has ended before.
             receiver.outbox.clear()
             receiver.life = _next_life(cell)
         message = self._message(receiver, cell, entered)
