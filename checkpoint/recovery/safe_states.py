@@ -25,7 +25,6 @@ from ..recovery_settings import SafeState
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node
-    from ..home.switch import Switch
 
 Key = tuple[str, tuple[str, bytes] | None, tuple[str, bytes] | None]
 """A receiver, and the messages it is told with."""
@@ -48,7 +47,7 @@ class Receiver:
         self.because = ""
         self.timeout = timeout
         self.life: tuple[Cell, int] | None = None  # that was told; None: it is not told yet
-        self.told: tuple[Any, Switch | None] = None, None  # what was said to it, and the journal where that stands
+        self.told: tuple[Any, object] = None, None  # what was said to it, and the journal where that stands
         self.timer: asyncio.TimerHandle | None = None
         self.outbox: list[bool] = []  # what could not be put in its mailbox yet
 
