@@ -166,6 +166,8 @@ def begin(
         node.emit(ActorStarted(cell.path, cell.life))
     for topic in start.kind._topics:
         node.topics.subscribe(topic, cell)
+    if node.on_life is not None:
+        node.on_life(cell)
     if start.kind.on_start is Actor.on_start:
         up(cell)
         return None

@@ -90,6 +90,28 @@ def put_back(cell: Cell, items: Iterable[Any]) -> None:
     queue.extendleft(reversed(commands))
 
 
+def put_first(cell: Cell, message: Any) -> None:
+    """Put a message ahead of all others, whatever room there is: a life that begins has to handle it first."""
+    put_back(cell, (message,))
+    if cell.more is not None and cell.more.bound is not None:
+        cell.more.bound.count += 1
+
+
+def is_queued(cell: Cell, message: Any) -> bool:
+    """Whether this very message waits in the queue."""
+    return any(item is message for item in cell.queue or ())
+
+
+def take_out(cell: Cell, message: Any) -> None:
+    """Take this very message out of the queue, if it waits there. Called between two lives."""
+    for index, item in enumerate(cell.queue or ()):
+        if item is message:
+            del cell.queue[index]  # type: ignore[union-attr]  # there is one, for something was found in it
+            if cell.more is not None and cell.more.bound is not None:
+                cell.more.bound.count -= 1
+            return
+
+
 class Senders:
     """Who waits for room to send, first in, first served: one wakes for each free place, and tries again.
 

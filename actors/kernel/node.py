@@ -190,6 +190,7 @@ class Node(RunLoop):
         self.root: Cell | None = None
         self.arbiter: Any = None  # who may act on which address, once somebody has asked for it
         self.awaited: dict[str, list[Callable[[], object]]] = {}  # what is done when somebody else has a path
+        self.on_life: Callable[[Cell], None] | None = None  # told of each life that begins, before it has a message
 
     def connect(self, ports: Ports) -> None:
         """Give the node what it asks of those around it, before its first actor."""

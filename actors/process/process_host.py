@@ -281,6 +281,8 @@ class FlightHome(WorkerHome):
             if more.bound is not None:
                 more.bound = RemoteBound(more.bound)
                 cell.admit = admit_remote_bounded
+        if cell.node.on_life is not None:
+            cell.node.on_life(cell)
 
     def subscribe(self, cell: Cell, topics: Iterable[str]) -> None:
         for topic in topics:

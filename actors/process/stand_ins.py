@@ -41,6 +41,7 @@ class Inner:
             BadFrame: that address is not for this process to give.
         """
         cell = self._cells.get(path)
+        is_new = cell is None or cell.life != life
         if cell is None:
             parent, name = self._place(home, path)
             self._free(home, path)
@@ -54,6 +55,8 @@ class Inner:
         above = cell_kind(home)
         if above is None or not above._is_part:  # Who is protected is bound at its own address, not in its replicas.
             claim(cell, bound)
+        if is_new and self._node.on_life is not None:
+            self._node.on_life(cell)
 
     def homed(self, home: Cell, path: str, cell: Cell | None, host: Host) -> Cell:
         """An address below `home` whose own home is here: its cell outlives the process.

@@ -98,7 +98,13 @@ class JournalHome(RecordedHome):
             self.recovery = recoveries.starts(cell.path, self.method)
             hold(entered.switch)
             entered.switch.life.waits_for_release = recoveries.needs(self.recovery, "release")
+        if cell.node.on_life is not None:
+            cell.node.on_life(cell)
         return entered
+
+    @property
+    def keeps_turns(self) -> bool:
+        return self.method.replays
 
     @property
     def is_gated(self) -> bool:

@@ -17,6 +17,11 @@ class RecordedHome(WorkerHome):
     switch: Switch | None
     """There is none before the first life begins."""
 
+    @property
+    def keeps_turns(self) -> bool:
+        """Whether the next life knows all that the last one has handled."""
+        raise NotImplementedError
+
 
 def switch_of(cell: Cell) -> Switch | None:
     """The switch of a recorded actor's cell."""

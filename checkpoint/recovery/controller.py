@@ -7,14 +7,11 @@ import inspect
 from typing import Any
 
 from ...actors.errors import error_text, type_name
-from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.actor import on
 from ...actors.kernel.message import Message
-from ...actors.kernel.ref import ActorRef
 from ..recovery_settings import Hook
 from .part import RecoveryPart
 from .recoveries import ENTER, LEAVE, STAGES, Point, Recovery
-from .safe_states import Receiver
 
 
 class LookAtRecovery(Message):
@@ -43,10 +40,6 @@ class RecoveryController(RecoveryPart):
         self._in_hand: set[tuple[int, int, str]] = set()
         recoveries.attach(wake)
         cell.ended().add_done_callback(lambda _: recoveries.detach(wake))
-        recoveries.safety.on_entered = self._watch
-        for receiver in recoveries.safety.safe():
-            recoveries.safety.check(receiver)
-            self._watch(receiver)
         for recovery in recoveries.all():
             self._see_to(recovery)
         recoveries.tell()
@@ -113,19 +106,3 @@ class RecoveryController(RecoveryPart):
             raise
         except Exception as error:
             recoveries.hook_failed(recovery, point, f"{type_name(type(error))}: {error_text(error)}")
-
-    # -- receivers --------------------------------------------------------------------------------------------------
-
-    def _watch(self, receiver: Receiver) -> None:
-        """A receiver that begins a new life meanwhile has to be told again."""
-        if not self.ctx._closed:
-            self.ctx.monitor(self.ctx._cell.node.cell_at(receiver.path).ref)
-
-    def on_down(self, source: ActorRef[Any], reason: ExitReason, recovering: bool) -> None:
-        """A receiver's life has ended."""
-        safety = self._homes.recoveries.safety
-        mine = [receiver for receiver in safety.safe() if receiver.path == source.path]
-        for receiver in mine:
-            safety.check(receiver)
-        if mine and not source._cell.is_dead and not recovering:
-            self.ctx.monitor(source)

@@ -1,24 +1,26 @@
 """Counts who is in safe state and why: entered with the first recovery, left with the last.
 
 One owner with a count (T27). Each step is taken at once or not at all, so whoever takes it, a receiver is told once.
+A receiver is an address. Each life that begins there meanwhile is told before it handles a message (T26), and only who
+was told of the beginning is told of the end.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import HoldfastError, MailboxFull, UnknownMessage, type_name
 from ...actors.events import SafeStateEntered, SafeStateLeft, SafeStateMissed, SafeStateOverdue
 from ...actors.kernel import mailbox
 from ...actors.kernel.actor import Actor
-from ...actors.kernel.cell import DOWN, Cell
+from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.kernel.codec import Parcel
-from ...actors.kernel.lifecycle import LOCAL
+from ...actors.kernel.lifecycle import MailboxHome
 from ...actors.kernel.node import cell_kind
+from ...actors.process.process_host import FlightHome
 from ...actors.safe_state import SafeStateChange
-from ..home.recorded_home import switch_of
+from ..home.recorded_home import RecordedHome, switch_of
 from ..recovery_settings import SafeState
 
 if TYPE_CHECKING:
@@ -28,19 +30,24 @@ Key = tuple[str, tuple[str, bytes] | None, tuple[str, bytes] | None]
 """A receiver, and the messages it is told with."""
 
 
+def _next_life(cell: Cell) -> tuple[Cell, int]:
+    """The life at a cell, or the one that begins there next."""
+    return cell, cell.life + (cell.state is DOWN)
+
+
 class Receiver:
     """One that is safe, or is being told that it is not any more."""
 
-    __slots__ = ("because", "holders", "is_missed", "is_told", "life", "outbox", "path", "timeout", "timer", "words")
+    __slots__ = ("because", "holders", "is_missed", "life", "outbox", "path", "timeout", "timer", "told", "words")
 
     def __init__(self, key: Key, timeout: float) -> None:
         self.path, self.words = key[0], key[1:]
         self.holders: dict[str, None] = {}  # the recoveries that want it to be safe, oldest first
         self.is_missed = False  # whether telling it makes nobody safe
-        self.is_told = False  # whether the last word it was given is that it has to be safe
         self.because = ""
         self.timeout = timeout
-        self.life = 0
+        self.life: tuple[Cell, int] | None = None  # that was told; None: it is not told yet
+        self.told: tuple[Any, object] = None, None  # what was said to it, and the journal where that stands
         self.timer: asyncio.TimerHandle | None = None
         self.outbox: list[bool] = []  # what could not be put in its mailbox yet
 
@@ -51,7 +58,6 @@ class Safety:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._receivers: dict[Key, Receiver] = {}
-        self.on_entered: Callable[[Receiver], None] = lambda receiver: None
 
     def enter(self, path: str, state: SafeState, timeout: float) -> None:
         """The recovery of `path` wants its receivers to be safe; a second time changes nothing."""
@@ -64,24 +70,50 @@ class Safety:
             receiver = self._receivers.get(key)
             if receiver is None:
                 receiver = self._receivers[key] = Receiver(key, timeout)
+                self._node.on_life = self._begins
             receiver.holders[path] = None
-            if not receiver.is_told:
+            if receiver.life is None:
                 self._enter(receiver, path)
 
     def _enter(self, receiver: Receiver, path: str) -> None:
-        receiver.is_told, receiver.because = True, path
+        receiver.because = path
         receiver.timer = self._node.loop.call_later(receiver.timeout, self._overdue, receiver)
-        problem = self._problem(receiver)
+        cell = self._node.cell_at(receiver.path)
+        problem = self._problem(receiver, cell)
         receiver.is_missed = bool(problem)
-        self._say(receiver, entered=True)
+        self._say(receiver, cell, entered=True)
         self._node.emit(
             SafeStateMissed(receiver.path, path, problem) if problem else SafeStateEntered(receiver.path, path)
         )
-        self.on_entered(receiver)
 
-    def _problem(self, receiver: Receiver) -> str:
+    def _begins(self, cell: Cell) -> None:
+        """A life begins: if it has to be safe, nobody has told it so, unless a journal has it or it waits already."""
+        path = cell.path
+        for receiver in self._receivers.values():
+            if receiver.path != path or receiver.life == _next_life(cell) or self._is_kept(receiver, cell):
+                continue
+            problem, was_missed = self._problem(receiver, cell), receiver.is_missed
+            receiver.is_missed = bool(problem)
+            if not problem:
+                self._say(receiver, cell, entered=True, is_first=True)
+                if was_missed:
+                    self._node.emit(SafeStateEntered(path, receiver.because))
+            elif not was_missed:
+                self._node.emit(SafeStateMissed(path, receiver.because, problem))
+
+    @staticmethod
+    def _is_kept(receiver: Receiver, cell: Cell) -> bool:
+        """Whether the next life at a cell knows what the receiver was told, for a journal has it."""
+        home = cell.host.home
+        return (
+            isinstance(home, RecordedHome)
+            and home.keeps_turns
+            and home.switch is not None
+            and home.switch is receiver.told[1]
+        )
+
+    def _problem(self, receiver: Receiver, cell: Cell) -> str:
         """Why telling this receiver makes nobody safe, as far as it is known here; "" if it does."""
-        cell = self._node.cell_at(receiver.path)
         if cell.is_dead:
             return "nobody lives there"
         kind, enter = cell_kind(cell), receiver.words[0]
@@ -103,29 +135,30 @@ class Safety:
                 if receiver.timer is not None:
                     receiver.timer.cancel()
                 receiver.because = path
-                self._say(receiver, entered=False)
                 if not receiver.is_missed:
+                    self._leave(receiver)
                     self._node.emit(SafeStateLeft(receiver.path, path))
+        if not self._receivers:
+            self._node.on_life = None
+
+    def _leave(self, receiver: Receiver) -> None:
+        """Tell the receiver of the end, unless the life that begins there next has not heard of the beginning."""
+        cell = self._node.cell_at(receiver.path)
+        if receiver.outbox:
+            receiver.outbox.clear()
+            return
+        is_between = cell.state in (DOWN, GONE) and receiver.life != _next_life(cell)
+        if is_between and not self._is_kept(receiver, cell) and not mailbox.is_queued(cell, receiver.told[0]):
+            return
+        self._say(receiver, cell, entered=False)
 
     def holds(self, path: str) -> tuple[str, ...]:
         """Who is safe because of the recovery of `path`."""
         return tuple(receiver.path for receiver in self._receivers.values() if path in receiver.holders)
 
-    def safe(self) -> list[Receiver]:
-        """The receivers that are safe now."""
-        return list(self._receivers.values())
-
-    def check(self, receiver: Receiver) -> None:
-        """A receiver that keeps no journal and has begun a new life does not know that it has to be safe."""
-        if receiver not in self._receivers.values():
-            return
-        cell = self._node.cell_at(receiver.path)
-        ended = cell.state is DOWN or cell.life != receiver.life
-        if ended and switch_of(cell) is None:
-            self._say(receiver, entered=True, again=True)
-
     def close(self) -> None:
         """Nobody needs to be told any more."""
+        self._node.on_life = None
         for receiver in self._receivers.values():
             if receiver.timer is not None:
                 receiver.timer.cancel()
@@ -141,17 +174,20 @@ class Safety:
         bound = more.bindings.get(to) if more is not None else None
         return bound.path if bound is not None else dict(state.ports).get(to)
 
-    def _say(self, receiver: Receiver, *, entered: bool, again: bool = False) -> None:
-        if receiver.outbox and not entered:
-            receiver.outbox.clear()  # It has not heard of the beginning: it need not hear of the end.
-            return
-        cell = self._node.cell_at(receiver.path)
-        receiver.life = cell.life + (cell.state is DOWN)
+    def _say(self, receiver: Receiver, cell: Cell, *, entered: bool, is_first: bool = False) -> None:
+        """Put the word into the mailbox; `is_first`: ahead of what a life that begins finds there, where it can be."""
+        if entered:
+            if is_first:
+                mailbox.take_out(cell, receiver.told[0])  # The life that was to hear it has ended before.
+            receiver.outbox.clear()
+            receiver.life = _next_life(cell)
         message = self._message(receiver, cell, entered)
         if message is None:
             return
-        if again and cell.state is DOWN and cell.host is LOCAL and (cell.more is None or cell.more.bound is None):
-            mailbox.put_back(cell, [message])  # Ahead of what it was told to do before.
+        if entered:
+            receiver.told = message, switch_of(cell)
+        if is_first and isinstance(cell.host.home, (MailboxHome, FlightHome)):
+            mailbox.put_first(cell, message)  # Ahead of what it was told to do before.
             return
         try:
             cell.admit(cell, message)
@@ -188,7 +224,7 @@ class Safety:
     def _again(self, receiver: Receiver) -> None:
         if receiver.outbox:
             entered = receiver.outbox.pop()
-            self._say(receiver, entered=entered)
+            self._say(receiver, self._node.cell_at(receiver.path), entered=entered)
 
     # -- the dead man's switch --------------------------------------------------------------------------------------
 
@@ -196,5 +232,5 @@ class Safety:
         """The receiver's own switch has raised the alarm, if it is told by its hook and has not begun anew since."""
         receiver.timer = None
         cell = self._node.cell_at(receiver.path)
-        if receiver.words[0] is not None or cell.life != receiver.life:
+        if receiver.words[0] is not None or receiver.life != (cell, cell.life):
             self._node.emit(SafeStateOverdue(receiver.path, receiver.timeout, receiver.because))

@@ -50,6 +50,10 @@ class TransientHome(JournalHome):
         self.copy = None
         return entered
 
+    @property
+    def keeps_turns(self) -> bool:
+        return False
+
     def life_ended(self, switch: Switch, reason: ExitReason) -> None:
         switch.calls.renounce(AskFailed(switch.path, str(reason)))  # Replies that it owed will not come.
 

@@ -96,7 +96,7 @@ async def test_a_receiver_that_is_restarted_meanwhile_is_told_again() -> None:
         ref = await wheels(system)
         robot = await planner(system, "task")
         robot.kill()
-        await until(lambda: bool(system._homes.recoveries.safety.safe()))
+        await until(lambda: bool(system._homes.recoveries.safety.holds(robot.path)))
         await words(ref)
         ref.tell(Faint())
         ref.tell(Resume())
@@ -119,7 +119,7 @@ async def test_a_receiver_without_room_is_told_when_it_has_some() -> None:
         await system.suspend(ref)
         ref.tell(Resume())
         robot.kill()
-        await until(lambda: bool(system._homes.recoveries.safety.safe()))
+        await until(lambda: bool(system._homes.recoveries.safety.holds(robot.path)))
         await system.resume(ref)
         await until(lambda: ref._cell.actor.words == ["resume", "safe"])  # type: ignore[union-attr]
         go_on.set()

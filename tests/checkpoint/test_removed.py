@@ -788,7 +788,7 @@ CHECKS = {
     ),
     "T27: safe state is entered by the first of several recoveries": Check(
         "checkpoint/recovery/safe_states.py",
-        "            if not receiver.is_told:\n",
+        "            if receiver.life is None:\n",
         "            if True:\n",
         "tests/checkpoint/test_controller_safe_state.py",
         "test_of_two_recoveries_at_a_time and task",
@@ -809,10 +809,17 @@ CHECKS = {
     ),
     "T26: a receiver that begins anew is told again": Check(
         "checkpoint/recovery/safe_states.py",
-        "        if ended and switch_of(cell) is None:\n",
-        "        if False:\n",
+        "                self._node.on_life = self._begins\n",
+        "",
         "tests/checkpoint/test_controller_safe_state.py",
         "test_a_receiver_that_is_restarted_meanwhile",
+    ),
+    "T26: the first life at a new address is another one than the first at the old": Check(
+        "checkpoint/recovery/safe_states.py",
+        "receiver.life == _next_life(cell) or self",
+        "(receiver.life or (cell, 0))[1] == cell.life or self",
+        "tests/checkpoint/test_safe_state_lives.py",
+        "test_a_new_life_is_told_once and above and task",
     ),
     "T18: the receiver has a watchdog of its own": Check(
         "actors/safe_state.py",
