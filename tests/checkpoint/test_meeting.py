@@ -285,8 +285,7 @@ async def test_who_has_asked_below_a_restarted_supervisor_is_told_that_the_actor
         await add(system, "one")
         at(system).tell(Do([f"gate {gate}"]))
         await until(gate.exists)
-        asked = asyncio.create_task(at(system).ask(Do(["add never"]), timeout=20.0))
-        await asyncio.sleep(0)  # It is in the mailbox now, behind the gate.
+        asked = at(system).ask(Do(["add never"]), timeout=20.0)  # In the mailbox, behind the gate.
         with system.events() as stream:
             top(system).kill()
             await back(stream, hf.events.ChildRestarted, "/app/top")
