@@ -33,10 +33,10 @@ WRONG: list[tuple[Callable[[], object], str, str]] = [
     (lambda: kid(7), "child 7", "the id must be text without '/' and control characters"),
     (lambda: hf.child("kid", Idle), "child 'kid'", "start must come from start(Class, ...)"),  # type: ignore[arg-type]
     (
-        lambda: hf.child("kid", hf.start(Idle, 1, 2)),
+        lambda: hf.child("kid", hf.start(Idle, 1, 2)),  # type: ignore[call-arg]
         "child 'kid'",
         "Idle, ...): too many positional arguments; it takes (",
-    ),  # type: ignore[call-arg]
+    ),
     (lambda: hf.child("kid", hf.start(Idle, last=1)), "child 'kid'", "unexpected keyword argument 'last'"),  # type: ignore[call-arg]
     (lambda: kid(restart="always"), "child 'kid'", "restart must be one of permanent, transient, temporary, not 'alw"),
     (lambda: kid(restart=["permanent"]), "child 'kid'", "restart must be one of permanent, transient, temporary"),
