@@ -2,7 +2,7 @@
 
 HoldfastError
 ├── SendError            not enqueued, or surely not run: safe to send again
-│   ├── ActorStopped     the address has ended for good, or its process died with the message still queued
+│   ├── ActorStopped     nobody lives at the address, or its process died with the message still queued
 │   ├── MailboxFull      the mailbox is at capacity
 │   ├── UnknownMessage   the receiver has no handler for this type
 │   ├── BadMessage       a field cannot be coded, or has the wrong type, or the frame is too large
@@ -114,7 +114,10 @@ class SendError(HoldfastError):
 
 
 class ActorStopped(SendError):
-    """The address has ended for good: start the actor again, or send elsewhere."""
+    """Nobody lives at the address: start the actor again, or send elsewhere.
+
+    If its supervisor is being restarted, the actor may be back soon without your help.
+    """
 
     actor: str
     reason: str = ""
@@ -342,8 +345,9 @@ RAISED_AGAIN = "handling it again raised"
 DIVERGED = "diverged at turn"
 """In the text of every divergence, and so in the reason of a start that has failed because of one."""
 DIVERGES = (
-    "the handler's code was changed, or it reads what no snapshot holds (an attribute with a leading underscore that a "
-    "turn has set, or the world): use ctx.now(), ctx.random and ctx.uuid(), or set deterministic = False"
+    "the handler's code or an argument of the constructor was changed, or the handler reads what no snapshot holds (an "
+    "attribute with a leading underscore that a turn has set, or the world): use ctx.now(), ctx.random and ctx.uuid(), "
+    "or set deterministic = False"
 )
 """Why a replay goes another way."""
 

@@ -50,8 +50,11 @@ class Prospects:
                 continue
             one.awaited = path
             circle = self._circle(AwaitedStart(who, path))
-            if circle is None or len(circle) == 1:
+            if circle is None:
                 raise StartFailed(who, f"binding {port!r}: {NoSuchActor(path)}")
+            if len(circle) == 1:
+                late = "yet, because it is started after this child: put it, or its supervisor, first in the list"
+                raise StartFailed(who, f"binding {port!r}: {NoSuchActor(path)} {late}")
             if circle:
                 chain = ", ".join(f"{wait.who} waits for {wait.target}" for wait in circle)
                 raise StartFailed(who, f"binding {port!r}: nobody of these can begin before another one: {chain}")

@@ -13,7 +13,7 @@ from ..actors.backoff import Backoff
 from ..actors.errors import SpecError, type_name
 from ..actors.events import ShutdownError
 from ..actors.exit_reasons import KILLED, SHUTDOWN, ExitReason
-from ..actors.kernel.actor import Actor, Start
+from ..actors.kernel.actor import Actor, Start, signature_of
 from ..actors.kernel.cell import Cell, Scope
 from ..actors.kernel.lifecycle import GRACE
 from ..actors.kernel.mailbox import Bounded
@@ -123,7 +123,9 @@ class ChildSpec(Generic[A_co]):
         try:
             self.start.check(is_partial=self.id == NAMELESS)  # Of a template: the rest comes with each start.
         except TypeError as error:
-            raise SpecError(where, f"start({type_name(self.start.kind)}, ...): {error}") from error
+            raise SpecError(
+                where, f"start({type_name(self.start.kind)}, ...): {error}; it takes {signature_of(self.start.kind)}"
+            ) from error
         _choose(where, "restart", self.restart, Restart)
         _choose(where, "isolation", self.isolation, Isolation)
         check_shutdown(where, self.shutdown)
@@ -366,6 +368,8 @@ def checked(
     for spec in specs:
         check_spec(where, spec, auto_shutdown, nameless=nameless)
         if spec.id in seen:
+            if spec.id == NAMELESS:
+                raise SpecError(where, "a dynamic supervisor takes one template, the child without an id, and not two")
             raise SpecError(where, f"two children have the id {spec.id!r}")
         seen.add(spec.id)
     return specs

@@ -65,7 +65,7 @@ def admit_gone(cell: Cell, item: Any) -> None:
     if successor is not None:
         successor.admit(successor, item)
     elif isinstance(item, Item):
-        item.undelivered(cell, "for good")
+        item.undelivered(cell, "nobody lives at its address now")
     else:
         cell.node.dead_letter(cell, item, "the actor has stopped")
 

@@ -573,7 +573,12 @@ def said_of(out: Out) -> str:
 
     >>> said_of(Out(1, "tell", "/app/cart", "shop:Sold")), said_of(Out(1, "effect", "charge"))
     ('tell of shop:Sold to /app/cart', 'effect charge')
+    >>> said_of(Out(1, "timer", "0.1", "shop:Expire", seconds=1800.0))
+    'timer of shop:Expire after 1800.0 s'
     """
+    if out.verb == "timer":  # `to` is the number by which its home knows it.
+        again = f" and then every {out.interval} s" if out.interval else ""
+        return f"timer of {out.name} after {out.seconds} s{again}"
     return f"{out.verb} of {out.name} to {out.to}" if ":" in out.name else f"{out.verb} {out.to}".strip()
 
 

@@ -301,7 +301,8 @@ class JournalHome(RecordedHome):
         for topic in (*self.parent.topics(cell), *self.switch.topics):
             cell.node.topics.unsubscribe(topic, inlet(self.switch, topic))
         diverged, reason = self.switch.life.diverged, str(cell.extra().reason)
-        unfit = reason if UNFIT in reason else "for good"
+        gone = "its supervisor has ended, and may start it again" if restarting else "nobody lives at its address now"
+        unfit = reason if UNFIT in reason else gone
         drop_all(self.switch, unfit if diverged is None else str(diverged), keep_tells=restarting)
         let_go(self.switch)
         self.switch.ties.untie()

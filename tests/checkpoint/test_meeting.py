@@ -276,6 +276,25 @@ async def test_static_children_of_a_restarted_supervisor_are_restored_and_keep_t
         assert await seen(system, "other") == ["else"]
 
 
+async def test_who_has_asked_below_a_restarted_supervisor_is_told_that_the_actor_may_come_back(
+    store: str | None, gate: Path
+) -> None:
+    """It is not said to be gone for good: the same address is there again a moment later."""
+    async with running(store) as system:
+        await system.start(tree("task", doing("task")))
+        await add(system, "one")
+        at(system).tell(Do([f"gate {gate}"]))
+        await until(gate.exists)
+        asked = at(system).ask(Do(["add never"]), timeout=20.0)  # In the mailbox, behind the gate.
+        with system.events() as stream:
+            top(system).kill()
+            await back(stream, hf.events.ChildRestarted, "/app/top")
+        with pytest.raises(hf.ActorStopped, match="its supervisor has ended, and may start it again"):
+            await asked
+        let_through(gate)
+        assert await seen(system) == ["one"]
+
+
 # -- one window, and who answers meanwhile ----------------------------------------------------------------------------
 
 

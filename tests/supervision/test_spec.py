@@ -32,7 +32,11 @@ WRONG: list[tuple[Callable[[], object], str, str]] = [
     (lambda: hf.ActorSystem("a\u202e"), "ActorSystem", "the name must be text without '/' and control characters"),
     (lambda: kid(7), "child 7", "the id must be text without '/' and control characters"),
     (lambda: hf.child("kid", Idle), "child 'kid'", "start must come from start(Class, ...)"),  # type: ignore[arg-type]
-    (lambda: hf.child("kid", hf.start(Idle, 1, 2)), "child 'kid'", "Idle, ...): too many positional arguments"),  # type: ignore[call-arg]
+    (
+        lambda: hf.child("kid", hf.start(Idle, 1, 2)),  # type: ignore[call-arg]
+        "child 'kid'",
+        "Idle, ...): too many positional arguments; it takes (",
+    ),
     (lambda: hf.child("kid", hf.start(Idle, last=1)), "child 'kid'", "unexpected keyword argument 'last'"),  # type: ignore[call-arg]
     (lambda: kid(restart="always"), "child 'kid'", "restart must be one of permanent, transient, temporary, not 'alw"),
     (lambda: kid(restart=["permanent"]), "child 'kid'", "restart must be one of permanent, transient, temporary"),
@@ -63,6 +67,11 @@ WRONG: list[tuple[Callable[[], object], str, str]] = [
     (lambda: top(period=float("inf")), "supervisor 'top'", "period must be a finite number of seconds > 0, not inf"),
     (lambda: top(period="5"), "supervisor 'top'", "period must be a finite number of seconds > 0, not '5'"),
     (lambda: top(children=[kid(), kid()]), "supervisor 'top'", "two children have the id 'kid'"),
+    (
+        lambda: hf.Plan([hf.child(None, hf.start(Idle)), hf.child(None, hf.start(Idle))]),
+        "supervisor",
+        "a dynamic supervisor takes one template, the child without an id, and not two",
+    ),
     (lambda: top(children=[hf.start(Idle)]), "supervisor 'top'", "children must come from child(...) or supervisor("),
     (
         lambda: top(restart="never"),

@@ -663,8 +663,8 @@ CHECKS = {
     ),
     "nobody waits for one that is started behind it": Check(
         "supervision/awaited.py",
-        "            if circle is None or len(circle) == 1:\n",
-        "            if circle is None:\n",
+        "            if len(circle) == 1:\n",
+        "            if False:\n",
         AWAITED,
         "test_who_is_bound_to_one_that_is_started_behind_it",
     ),
