@@ -5,7 +5,7 @@ import contextlib
 import dataclasses
 import io
 import json
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from typing import Any
 
 import aiohttp
@@ -76,7 +76,7 @@ class Receiver:
             return await self.posts.get()
 
     @contextlib.asynccontextmanager
-    async def served(self, port: int = 0) -> AsyncIterator[int]:
+    async def served(self, port: int = 0) -> AsyncGenerator[int]:
         app = web.Application()
         app.router.add_post("/hook", self._take)
         runner = web.AppRunner(app)
@@ -210,7 +210,7 @@ class RosServer:
         return heard
 
     @contextlib.asynccontextmanager
-    async def served(self, port: int = 0) -> AsyncIterator[int]:
+    async def served(self, port: int = 0) -> AsyncGenerator[int]:
         app = web.Application()
         app.router.add_get("/", self._serve)
         runner = web.AppRunner(app, shutdown_timeout=0.1)
@@ -291,7 +291,7 @@ def body(*alerts: WebhookAlert) -> bytes:
 
 
 @contextlib.asynccontextmanager
-async def served(app: AlertApp) -> AsyncIterator[str]:
+async def served(app: AlertApp) -> AsyncGenerator[str]:
     """The application under a real server on loopback."""
     server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error", lifespan="on"))
     server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign,assignment]  # pytest has them
