@@ -213,7 +213,7 @@ CHECKS = {
         "elif all(one.component != component for one in self._firing.values()):",
         "else:",
         BRIDGES,
-        "an_alert_by_the_topic or of_prometheus",
+        "of_two_alerts",
     ),
     "a request has an end": Check(
         "diagnosis/bridges/alert_app.py",
