@@ -288,7 +288,10 @@ class DiagnoserActor(Actor):
         aside = [f"{source} contradicts several others, and is not believed" for source in diagnosis.set_aside]
         torn = [*map(str, diagnosis.contradictions), *aside]
         if diagnosis.state is not State.FAULTY:
-            return Explained("\n".join(torn) or _STATES[diagnosis.state], refused=refused)
+            text = "\n".join(torn) or _STATES[diagnosis.state]
+            if diagnosis.state is State.HEALTHY and diagnosis.unknown:
+                text += f"; of the work of {', '.join(diagnosis.unknown)} nothing is seen"
+            return Explained(text, refused=refused)
         with beside_a_loop():
             why = engine.explain(observed, seconds=self._most.explaining)
             probes = engine.next_observations(observed, diagnosis, seconds=self._most.explaining)[:SUGGESTED]

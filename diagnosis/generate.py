@@ -20,10 +20,22 @@ from ..actors.kernel.ref import ActorRef
 from ..supervision.spec import ChildSpec
 from ..supervision.supervisor import Supervisor
 from .assembly import observer
-from .literals import caught_up, crashes, keeps_up, led, made_atom, progress, replies, room, waits_for, whole
+from .literals import (
+    caught_up,
+    crashes,
+    keeps_up,
+    led,
+    made_atom,
+    progress,
+    replies,
+    room,
+    waits_for,
+    whole,
+    word_for,
+)
 from .messages import DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, ROS_DIAGNOSTICS, STARTS
 from .model import Component, Declaration, Expectation, Kind
-from .observers.flow import Baselines, FlowObserver, FlowSource
+from .observers.flow import MOST_ARRIVALS, Arrival, Baselines, FlowObserver, FlowSource
 from .observers.hearing import Heard, listen
 from .observers.node_observer import NodeObserver
 from .observers.observer import Manner, Observer
@@ -76,17 +88,20 @@ class Generated(msgspec.Struct, frozen=True):
     """A declaration of a model to begin with, made from a running system, and how it came about.
 
     Attributes:
-        declaration: each actor is a component. A topic depends on the publisher's subscriptions and, through replies
-            (`replies(NAME)`), on those it is bound to or was seen to ask.
+        declaration: each actor is a component; its name is its address below the root as a word (`word_for`). A topic
+            depends on the publisher's subscriptions and, through replies (`replies(NAME)`), on those it is bound to or
+            was seen to ask.
         addresses: component to address.
         wiring: component to how it is connected.
         left_out: dependencies that would close a circle; a fault goes round in it, so one has to be cut.
+        arrivals: the topic and the loop time of each message that was heard, in order.
     """
 
     declaration: Declaration
     addresses: dict[str, str]
     wiring: dict[str, Wired]
     left_out: tuple[str, ...] = ()
+    arrivals: tuple[Arrival, ...] = ()
 
 
 async def generate(
@@ -103,14 +118,16 @@ async def generate(
     node = system._node
     heard: dict[str, set[str]] = {}
     wanted = [topic for topic in dict.fromkeys((*node.topics.names(), *topics)) if topic not in OURS]
-    cell = node.spawn(Start(TopicListener, (tuple(wanted), heard)))
+    arrivals: list[Arrival] = []
+    cell = node.spawn(Start(TopicListener, (tuple(wanted), heard, arrivals)))
     try:
         await asyncio.sleep(seconds)
     finally:
         out = [*leave_out, cell.path]
         cell.request_stop()
         await cell.ended()
-    return declared(_wiring(node, heard, out, {}))
+    found = declared(_wiring(node, heard, out, {}))
+    return msgspec.structs.replace(found, arrivals=tuple(arrivals))
 
 
 class LiveWiring:
@@ -122,6 +139,7 @@ class LiveWiring:
         made: topic to how it comes about.
         heard: address to the topics on which it was heard.
         asked: component to those that it was seen to ask.
+        arrivals: what was heard before anybody observed; whoever learns from it takes it out.
     """
 
     def __init__(self, found: Generated, leave_out: Collection[str] = ()) -> None:
@@ -130,15 +148,16 @@ class LiveWiring:
         self.made: dict[str, FlowSource] = {}
         self.heard = {wired.path: set(wired.publishes) for wired in found.wiring.values()}
         self.asked: dict[str, set[str]] = {}
+        self.arrivals = [*found.arrivals]
         self._out = leave_out
         self.use(found)
 
     def use(self, found: Generated) -> None:
         """Have observers go by this from their next look on."""
         self._wiring = found.wiring
-        _replace(self.addresses, found.addresses)
-        _replace(self.protected, {name: wired.path for name, wired in found.wiring.items() if wired.is_protected})
-        _replace(self.made, _made(found.wiring, set().union(*self.heard.values())))
+        replace(self.addresses, found.addresses)
+        replace(self.protected, {name: wired.path for name, wired in found.wiring.items() if wired.is_protected})
+        replace(self.made, _made(found.wiring, set().union(*self.heard.values())))
 
     def look_again(self, node: Node) -> Generated | None:
         """What the system is like now; None if it is as before."""
@@ -159,7 +178,8 @@ def _is_missed(node: Node, wired: Wired) -> bool:
     return is_kept or name in (above.children or {})
 
 
-def _replace(old: dict[str, T], new: Mapping[str, T]) -> None:
+def replace(old: dict[str, T], new: Mapping[str, T]) -> None:
+    """Have a dict that others hold say what another one says."""
     old.clear()
     old.update(new)
 
@@ -176,12 +196,12 @@ def _made(wiring: Mapping[str, Wired], known: Collection[str]) -> dict[str, Flow
 
 
 class TopicListener(Actor):
-    """Notes who publishes on which topics."""
+    """Notes who publishes on which topics, and when."""
 
     deterministic = False
 
-    def __init__(self, topics: tuple[str, ...], heard: dict[str, set[str]]) -> None:
-        self._listens_to, self._publishers = topics, heard
+    def __init__(self, topics: tuple[str, ...], heard: dict[str, set[str]], arrivals: list[Arrival]) -> None:
+        self._listens_to, self._publishers, self._arrivals = topics, heard, arrivals
 
     def on_start(self, restored: bool) -> None:
         """Subscribe to the topics that are to be listened to."""
@@ -192,6 +212,8 @@ class TopicListener(Actor):
     def _heard(self, message: Heard) -> None:
         if message.sender is not None:
             self._publishers.setdefault(message.sender, set()).add(message.topic)
+        if len(self._arrivals) < MOST_ARRIVALS:
+            self._arrivals.append((message.topic, self.ctx._cell.node.loop.time()))
 
 
 def _wiring(
@@ -201,7 +223,7 @@ def _wiring(
     if root is None:
         return {}
     cells = [cell for cell in _below(root, out) if not _is_ours(cell)]
-    names = {cell.path: cell.path[len(root.path) + 1 :] for cell in cells}
+    names = {cell.path: word_for(cell.path[len(root.path) + 1 :]) for cell in cells}
     return {names[cell.path]: _wired(cell, names, heard, asked) for cell in cells}
 
 
@@ -245,10 +267,10 @@ def declared(wiring: dict[str, Wired]) -> Generated:
     inputs: dict[str, list[str]] = {}  # what an actor publishes or replies is made from these
     published = {topic for wired in wiring.values() for topic in wired.publishes}
     for name, wired in wiring.items():
-        heard = [topic for topic in wired.subscribes if topic in published and topic not in wired.publishes]
+        heard = [word_for(topic) for topic in wired.subscribes if topic in published and topic not in wired.publishes]
         needed = dict.fromkeys((*wired.bound.values(), *wired.asks))
         inputs[name] = [*heard, *(str(replies(other)) for other in needed if other != name and other in wiring)]
-    outputs = {name: [*wired.publishes, str(replies(name))] for name, wired in wiring.items()}
+    outputs = {name: [*map(word_for, wired.publishes), str(replies(name))] for name, wired in wiring.items()}
     left_out = _cut_circles(inputs, outputs)
     makers = Counter(out for outs in outputs.values() for out in outs)
     components = tuple(
@@ -370,7 +392,8 @@ def observers_for(
     manner = manner or Manner(agreement=Agreement(2, 3))
     wiring = wiring or LiveWiring(generated)
     nodes = {"hung_after": hung_after, "manner": manner}
-    flow = {"heard": wiring.heard, "leave_out": OURS, "patience": window, "baselines": baselines or Baselines()}
+    usual = {"baselines": baselines or Baselines(), "arrivals": wiring.arrivals}
+    flow = {"heard": wiring.heard, "leave_out": OURS, "patience": window, **usual}
     return (
         observer("nodes", Start(NodeObserver, (wiring.addresses,), nodes)),
         observer("runtime", Start(RuntimeObserver, (wiring.addresses,), {"asked": wiring.asked})),

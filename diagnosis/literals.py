@@ -11,6 +11,7 @@ import difflib
 import re
 from collections.abc import Iterable, Iterator
 from typing import Final
+from urllib.parse import quote
 
 import msgspec
 
@@ -147,6 +148,20 @@ def made_atom(word: str) -> Literal:
     ('ok(/prices)', 'replies(cache)')
     """
     return parse(word) if "(" in word else ok(word)
+
+
+def word_for(name: str) -> str:
+    """Make a word of any name that an actor or a topic may have, so that literals can be written with it.
+
+    Spaces, brackets, commas, `%` and what cannot be printed are spelled as in a URL; no two names have the same word.
+
+    >>> word_for("/lab/left arm (new)"), word_for("/odom")
+    ('/lab/left%20arm%20%28new%29', '/odom')
+    """
+    return "".join(
+        char if char.isprintable() and char not in " (),%" else quote(char, safe="", errors="surrogatepass")
+        for char in name
+    )
 
 
 def matched(one: str, other: str) -> Literal:

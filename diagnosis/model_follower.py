@@ -2,18 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from ..actors.kernel.actor import Actor, on
 from ..actors.kernel.message import Message
-from .generate import Generated, LiveWiring
+from .generate import Generated, LiveWiring, replace, replicas_of
 from .model import Replace
 from .model_server import ChangeModel, ModelServer
 from .observers.node_observer import at_root
 
 EVERY: Final = 1.0
 """Seconds between two looks at the tree."""
+
+
+class Reach:
+    """Holds where repair finds the components; repair goes by it, and the follower keeps it true.
+
+    Attributes:
+        addresses: component to address.
+        above: component to the supervisor that can be restarted with it; the root cannot.
+        groups: component that stands for replicas to the address of the protected actor.
+    """
+
+    def __init__(self, root: str, given: Mapping[str, str]) -> None:
+        self._root, self._given = root, dict(given)
+        self.addresses: dict[str, str] = {}
+        self.above: dict[str, str] = {}
+        self.groups: dict[str, str] = {}
+
+    def use(self, found: Mapping[str, str]) -> None:
+        """Have repair go by these addresses from its next step on; those that a person has given stay."""
+        replace(self.addresses, {**found, **self._given})
+        above = {component: path.rpartition("/")[0] for component, path in self.addresses.items()}
+        replace(self.above, {component: path for component, path in above.items() if path not in ("", self._root)})
+        replace(self.groups, {replicas_of(component): path for component, path in self.addresses.items()})
 
 
 class _LookAgain(Message):
@@ -27,12 +50,13 @@ class ModelFollower(Actor):
         wiring: what observers note, and what they go by.
         server: the last part of the model server's address, beside this actor.
         adapt: completes a generated declaration, such as by limits.
+        reach: what repair goes by.
     """
 
     deterministic = False
 
-    def __init__(self, wiring: LiveWiring, server: str, adapt: Callable[[Generated], Generated]) -> None:
-        self._wiring, self._server, self._adapt = wiring, server, adapt
+    def __init__(self, wiring: LiveWiring, server: str, adapt: Callable[[Generated], Generated], reach: Reach) -> None:
+        self._wiring, self._server, self._adapt, self._reach = wiring, server, adapt, reach
 
     def on_start(self, restored: bool) -> None:
         """Begin to look. Raises SpecError in a process of its own."""
@@ -49,3 +73,4 @@ class ModelFollower(Actor):
         change = ChangeModel((Replace(declaration),), "the system has changed")
         await self.ctx.find(path, ModelServer).ask(change)
         self._wiring.use(found)
+        self._reach.use(found.addresses)

@@ -25,12 +25,11 @@ from .generate import (
     generate,
     has_replicas,
     observers_for,
-    replicas_of,
 )
 from .literals import ok
 from .messages import DIAGNOSER, Explained, GetDiagnosis, GetExplanation, GetObserved
 from .model import Declaration, Expectation, History, System
-from .model_follower import ModelFollower
+from .model_follower import ModelFollower, Reach
 from .observations import Observed
 from .observers import (
     Baselines,
@@ -72,14 +71,14 @@ class Watch:
 
     Attributes:
         tree: the supervisor of all that watches; stop it to watch no longer.
-        addresses: component to address.
-        generated: what was found, if the model was generated.
+        addresses: component to address; of a generated model they follow the system.
+        generated: what was found at first, if the model was generated.
     """
 
     def __init__(
         self, tree: ActorRef[Any], node: Node, addresses: Mapping[str, str], generated: Generated | None
     ) -> None:
-        self.tree, self.addresses, self.generated = tree, dict(addresses), generated
+        self.tree, self.addresses, self.generated = tree, addresses, generated
         self._node = node
 
     @property
@@ -178,17 +177,20 @@ async def watch(
     generated = await generate(system, seconds=seconds) if model is None else None
     watchers = [*observers]
     live = None if generated is None else LiveWiring(generated)
+    reach = Reach("" if system._node.root is None else system._node.root.path, addresses or {})
+    reach.use({} if generated is None else generated.addresses)
+    where = reach.addresses
     if generated is not None and live is not None:
         declaration = generated.declaration
         watchers += observers_for(
             generated, window=window, hung_after=hung_after, manner=manner, wiring=live, baselines=baselines
         )
-        follower = child("follower", Start(ModelFollower, (live, SERVER, _completed(limits, alerts=alerts))))
+        completed = _completed(limits, alerts=alerts)
+        follower = child("follower", Start(ModelFollower, (live, SERVER, completed, reach)))
         options["others"] = (*options.get("others", ()), follower)
     else:
         assert model is not None
         declaration = model.declaration() if isinstance(model, System) else model
-    where = (dict(generated.addresses) if generated is not None else {}) | dict(addresses or {})
     groups = {name: path for name, path in where.items() if has_replicas(system._node.find(path))}
     if generated is None and where:
         watchers.append(observer("nodes", Start(NodeObserver, (where,), {"hung_after": hung_after, "manner": manner})))
@@ -204,7 +206,7 @@ async def watch(
         watchers.append(observer("alerts", Start(AlertObserver, (heard,))))
     mend = None
     if repair != "off":
-        ways = _actions(system._node, where, actions)
+        ways = _actions(reach, actions)
         mend = repairer(
             declaration, ways, policy, name=REPAIRER, addresses=where, stance=repair, approve=approve, file=repair_file
         )
@@ -252,13 +254,9 @@ def _property(component: str, one: Property) -> str:
     return f"{component}.{one.value}"
 
 
-def _actions(node: Node, addresses: Mapping[str, str], more: Iterable[RepairAction]) -> list[RepairAction]:
+def _actions(reach: Reach, more: Iterable[RepairAction]) -> list[RepairAction]:
     """What a person gave, and restarts for whoever has a supervisor."""
     given = {action.name: action for action in more}
-    root = "" if node.root is None else node.root.path
-    above = {component: path.rpartition("/")[0] for component, path in addresses.items()}
-    subtrees = {component: path for component, path in above.items() if path not in ("", root)}
-    groups = {replicas_of(component): path for component, path in addresses.items()}
-    stock = (restart_child(addresses), restart_subtree(subtrees), restart_replica(groups))
+    stock = (restart_child(reach.addresses), restart_subtree(reach.above), restart_replica(reach.groups))
     ours = {action.name: action for action in stock}
     return list((ours | given).values())

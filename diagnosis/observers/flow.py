@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import Collection, Mapping
 from copy import copy
@@ -13,7 +14,7 @@ import msgspec
 
 from ...actors.kernel.actor import on
 from ..kept_file import read_kept, write_kept
-from ..literals import ok
+from ..literals import ok, word_for
 from .hearing import Heard, listen
 from .observer import Manner, Observer
 
@@ -27,7 +28,10 @@ BLOCK: Final = 200
 """Messages that come in over which those that go out are counted."""
 BLOCKS: Final = 5
 """Blocks from which it is known how much goes out at least."""
-HOURS: Final = 24
+MOST_ARRIVALS: Final = 50_000
+"""Messages that are noted while nobody observes yet."""
+Arrival = tuple[str, float]
+"""The topic of a message that was heard, and when that was, in seconds on the loop clock."""
 
 
 class Usual(msgspec.Struct):
@@ -134,6 +138,7 @@ class FlowObserver(Observer):
         leave_out: topics that are not listened to.
         patience: seconds of silence that are never too long.
         baselines: what is usual.
+        arrivals: what was heard before; it is learned from once, and taken out.
         manner: see `Observer`.
     """
 
@@ -145,6 +150,7 @@ class FlowObserver(Observer):
         leave_out: Collection[str] = (),
         patience: float = 2.0,
         baselines: Baselines | None = None,
+        arrivals: list[Arrival] | None = None,
         manner: Manner | None = None,
     ) -> None:
         super().__init__(manner=manner or Manner(every=0.2))
@@ -153,6 +159,7 @@ class FlowObserver(Observer):
         self._made, self._heard_of = made, {} if heard is None else heard
         self._leave_out, self._patience = frozenset(leave_out), patience
         self._baselines = baselines or Baselines()
+        self._arrivals = [] if arrivals is None else arrivals
         self._flows: dict[str, _Flow] = {}
         self._users: dict[str, list[_Flow]] = {}
         self._ears: set[str] = set()
@@ -166,11 +173,14 @@ class FlowObserver(Observer):
 
     def hear(self, topic: str, message: Any) -> None:
         """Learn how long the topic was silent, and how much has come in meanwhile."""
+        self._arrived(topic, self.now)
+
+    def _arrived(self, topic: str, now: float) -> None:
         flow = self._flows.get(topic)
         if flow is not None:
             if flow.last is not None:
-                self._learned(topic).take(self.now - flow.last, flow.came_in)
-            flow.last, flow.came_in = self.now, 0
+                self._learned(topic).take(now - flow.last, flow.came_in)
+            flow.last, flow.came_in = now, 0
             flow.out_of_block += 1
         for user in self._users.get(topic, ()):
             user.came_in += 1
@@ -179,7 +189,7 @@ class FlowObserver(Observer):
     def afresh(self, names: Collection[str]) -> None:
         """What came before somebody acted says nothing of after; other topics have nothing to do with it."""
         for topic, flow in self._flows.items():
-            if topic in names:
+            if word_for(topic) in names:
                 flow.begin(self.now)
 
     async def look(self) -> None:
@@ -197,8 +207,9 @@ class FlowObserver(Observer):
         for topic, made in self._made.items():
             for wanted in made.inputs:
                 self._users.setdefault(wanted, []).append(self._flows[topic])
+        self._learn_from_before()
         for topic, made in self._made.items():
-            self.verdict(ok(topic), self._flows_well(topic, made))
+            self.verdict(ok(word_for(topic)), self._flows_well(topic, made))
         if self.now - self._saved > 60.0:
             self._saved = self.now
             await self._baselines.save()
@@ -206,6 +217,19 @@ class FlowObserver(Observer):
     async def on_stop(self, reason: Any) -> None:
         """Keep what was learned beyond this life."""
         await self._baselines.save()
+
+    def _learn_from_before(self) -> None:
+        """Learn what was usual while the model was made; from then until now nobody listened, so that is no silence."""
+        if self._arrivals:
+            for topic, when in self._arrivals:
+                flow = self._flows.get(topic)
+                if flow is not None and flow.last is not None and not self._made[topic].inputs:
+                    # As if its publishers had had turns at each look: too much is no false alarm.
+                    flow.came_in = math.ceil((when - flow.last) / self.manner.every)
+                self._arrived(topic, when)
+            self._arrivals.clear()
+            for flow in self._flows.values():
+                flow.begin(self.now)
 
     def _learned(self, topic: str) -> Usual:
         return self._baselines.of(topic, self.ctx._cell.node.clock.wall())

@@ -70,7 +70,7 @@ class Repairer(Actor):
         model: the components.
         actions: what can be done.
         policy: how far it may go.
-        addresses: of components that are actors or subtrees; what has none is not anybody's but ours.
+        addresses: of components that are actors or subtrees; what has none is not anybody's but ours. It may change.
         base: addresses besides its own without which there is no repair: they and what is above or below them are
             never touched (T64).
         planner: finds plans.
@@ -99,7 +99,8 @@ class Repairer(Actor):
         self._memory = memory or Memory()
         self._model, self._policy = self._memory.model or model, policy or Policy()
         self._actions = actions if isinstance(actions, Repertoire) else Repertoire(actions)
-        self._addresses, self._base = dict(addresses or {}), tuple(base)
+        self._addresses: Mapping[str, str] = {} if addresses is None else addresses
+        self._base = tuple(base)
         self._planner = planner or ClingoPlanner()
         self._diagnoser = diagnoser
         self._ledger = Ledger(self._policy, self._memory)

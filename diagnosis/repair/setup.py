@@ -54,7 +54,7 @@ def repairer(
     if file is not None:
         memory.load(Path(file))
     options = {
-        "addresses": dict(addresses or {}),
+        "addresses": {} if addresses is None else addresses,
         "base": tuple(base),
         "planner": planner,
         "diagnoser": diagnoser,

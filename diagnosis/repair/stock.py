@@ -85,9 +85,12 @@ def restart_replica(
         options: those of `RepairAction`.
     """
     run = functools.partial(_restart_replicas, addresses=addresses, timeout=timeout)
-    mechanisms = {component: f"{path}/ftm" for component, path in addresses.items()}
-    more = {"grace": 5.0, "timeout": 3 * timeout} | options
-    return _action(name, run, mechanisms, more, pddl=_mend_text(name, cost, "node"))
+
+    def mechanism(component: str) -> str | None:
+        return f"{addresses[component]}/ftm" if component in addresses else None
+
+    more = {"grace": 5.0, "timeout": 3 * timeout, "reach": mechanism} | options
+    return _action(name, run, addresses, more, pddl=_mend_text(name, cost, "node"))
 
 
 def restart_subtree(

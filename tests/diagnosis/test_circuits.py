@@ -103,5 +103,5 @@ def test_the_minimal_diagnoses_of_c17_are_those_of_its_clauses(engine: Diagnoser
 
 def test_they_are_just_those_with_which_the_gates_could_have_said_what_is_observed(engine: Diagnoser) -> None:
     for values in CASES:
-        wires = dict(zip((*INPUTS, *OUTPUTS), values, strict=True))
+        wires: dict[str, bool] = dict(zip((*INPUTS, *OUTPUTS), values, strict=True))
         assert found(engine, values) == minimal([one for one in faulty_sets() if fits(wires, one)]), values

@@ -1,5 +1,7 @@
 """Literals have one spelling, and names that the model does not declare are errors (T53)."""
 
+from urllib.parse import unquote
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,6 +18,7 @@ from holdfast.diagnosis.literals import (
     on,
     parse,
     running,
+    word_for,
 )
 
 WORDS = Vocabulary([ok("/odom"), running("jn"), on("ja"), matched("odom.yaw", "imu.yaw"), inc("odom.yaw")])
@@ -55,6 +58,18 @@ def test_spaces_and_the_sign_of_logic_are_read(text: str) -> None:
 )
 def test_what_is_printed_is_read_as_the_same(literal: Literal) -> None:
     assert parse(str(literal)) == literal
+
+
+@given(st.text(min_size=1))
+def test_any_name_has_a_word_of_its_own_that_can_be_written(name: str) -> None:
+    literal = ~ok(word_for(name))
+    assert parse(str(literal)) == literal
+    assert unquote(word_for(name)) == name
+
+
+def test_a_word_is_a_name_as_far_as_it_can_be() -> None:
+    assert word_for("/lab/it's-Köln_☃.2") == "/lab/it's-Köln_☃.2"
+    assert word_for("left arm, \u3000100%(\ud800)") == "left%20arm%2C%20%E3%80%80100%25%28%ED%A0%80%29"
 
 
 @pytest.mark.parametrize(

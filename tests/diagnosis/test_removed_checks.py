@@ -13,6 +13,7 @@ OBSERVATIONS = "tests/diagnosis/test_observations.py"
 RUNTIME = "tests/diagnosis/observers/test_runtime.py"
 BACKLOG = "tests/diagnosis/observers/test_backlog.py"
 REPLICAS = "tests/diagnosis/live/test_replicas.py"
+FOLLOWING = "tests/diagnosis/live/test_following.py"
 BRIDGES = "tests/diagnosis/bridges/test_bridges.py"
 BOARD = "tests/diagnosis/board/test_board.py"
 FLOW = "tests/diagnosis/observers/test_flow.py"
@@ -153,10 +154,52 @@ CHECKS = {
     ),
     "a start forgets what was seen of those that it is about, and of nobody else": Check(
         "diagnosis/observers/flow.py",
-        "            if topic in names:\n                flow.begin(self.now)\n",
+        "            if word_for(topic) in names:\n                flow.begin(self.now)\n",
         "            flow.begin(self.now)\n            flow.began = float('inf')\n",
         FLOW,
         "a_clock_that_has_stopped",
+    ),
+    "what was heard while the model was made is learned from": Check(
+        "diagnosis/observers/flow.py",
+        "        self._learn_from_before()\n",
+        "",
+        FLOW,
+        "heard_before",
+    ),
+    "the time in which nobody listened is no silence": Check(
+        "diagnosis/observers/flow.py",
+        "            for flow in self._flows.values():\n                flow.begin(self.now)\n",
+        "",
+        FLOW,
+        "heard_before",
+    ),
+    "repair follows the system": Check(
+        "diagnosis/model_follower.py",
+        "        self._reach.use(found.addresses)\n",
+        "",
+        FOLLOWING,
+        "of_any_name",
+    ),
+    "components are named by words": Check(
+        "diagnosis/generate.py",
+        "names = {cell.path: word_for(cell.path[len(root.path) + 1 :]) for cell in cells}",
+        "names = {cell.path: cell.path[len(root.path) + 1 :] for cell in cells}",
+        FOLLOWING,
+        "of_any_name",
+    ),
+    "topics are named by words": Check(
+        "diagnosis/generate.py",
+        "[*map(word_for, wired.publishes), str(replies(name))]",
+        "[*wired.publishes, str(replies(name))]",
+        FOLLOWING,
+        "of_any_name",
+    ),
+    "what is said of a topic is said of its word": Check(
+        "diagnosis/observers/flow.py",
+        "self.verdict(ok(word_for(topic)), ",
+        "self.verdict(ok(topic), ",
+        FOLLOWING,
+        "of_any_name",
     ),
     "an alert needs the token": Check(
         "diagnosis/bridges/alert_app.py",
@@ -170,7 +213,7 @@ CHECKS = {
         "elif all(one.component != component for one in self._firing.values()):",
         "else:",
         BRIDGES,
-        "an_alert_by_the_topic or of_prometheus",
+        "of_two_alerts",
     ),
     "a request has an end": Check(
         "diagnosis/bridges/alert_app.py",

@@ -5,7 +5,7 @@ import contextlib
 import dataclasses
 import io
 import json
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from typing import Any
 
 import aiohttp
@@ -51,6 +51,19 @@ async def watching() -> AsyncIterator[tuple[hf.ActorSystem, diagnosis.Watch]]:
         yield system, await diagnosis.watch(system, seconds=0.0, manner=QUICK, alerts=True, repair="off")
 
 
+class TakenBack(hf.Actor):
+    """Notes what an observer says no longer."""
+
+    def __init__(self, noted: list[str]) -> None:
+        self._noted = noted
+
+    @hf.subscribe(diagnosis.OBSERVATIONS)
+    @hf.on(Observation)
+    def _note(self, message: Observation) -> None:
+        if not message.time_to_live and "alerts" in str(message.literal):
+            self._noted.append(str(message.literal))
+
+
 async def accuse(system: hf.ActorSystem, name: str, *, is_good: bool = False) -> None:
     literal = parse(f"{'' if is_good else 'not '}progress(desk/{name})")
     await system.publish(diagnosis.OBSERVATIONS, Observation(literal, system._node.loop.time(), "test", 600.0))
@@ -76,7 +89,7 @@ class Receiver:
             return await self.posts.get()
 
     @contextlib.asynccontextmanager
-    async def served(self, port: int = 0) -> AsyncIterator[int]:
+    async def served(self, port: int = 0) -> AsyncGenerator[int]:
         app = web.Application()
         app.router.add_post("/hook", self._take)
         runner = web.AppRunner(app)
@@ -210,7 +223,7 @@ class RosServer:
         return heard
 
     @contextlib.asynccontextmanager
-    async def served(self, port: int = 0) -> AsyncIterator[int]:
+    async def served(self, port: int = 0) -> AsyncGenerator[int]:
         app = web.Application()
         app.router.add_get("/", self._serve)
         runner = web.AppRunner(app, shutdown_timeout=0.1)
@@ -291,7 +304,7 @@ def body(*alerts: WebhookAlert) -> bytes:
 
 
 @contextlib.asynccontextmanager
-async def served(app: AlertApp) -> AsyncIterator[str]:
+async def served(app: AlertApp) -> AsyncGenerator[str]:
     """The application under a real server on loopback."""
     server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error", lifespan="on"))
     server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign,assignment]  # pytest has them
@@ -353,6 +366,20 @@ async def test_an_alert_by_the_topic_lasts_until_it_is_resolved_or_forgotten(wat
     await system.publish(ALERTS, OutsideAlert("desk/book", False, "Errors", "1"))
     await advance(1.0)
     assert (await watch.diagnosis()).state is not State.FAULTY
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_of_two_alerts_the_first_that_ends_takes_nothing_back(watching: Any) -> None:
+    system, _ = watching
+    for key in ("1", "2"):
+        await system.publish(ALERTS, OutsideAlert("desk/book", True, "Errors", key))
+    await advance(1.0)
+    taken_back: list[str] = []
+    system.spawn(hf.start(TakenBack, taken_back))
+    for key, ended in (("1", []), ("2", ["not ok(desk/book.alerts)"])):
+        await system.publish(ALERTS, OutsideAlert("desk/book", False, "Errors", key))
+        await advance(1.0)
+        assert taken_back == ended
 
 
 @pytest.mark.asyncio(loop_factories=["virtual"])

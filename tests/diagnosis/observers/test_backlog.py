@@ -28,6 +28,10 @@ def test_a_burst_is_no_leak_however_large_it_is(size: int) -> None:
     assert not queue(Backlog(), [size, *[0] * 3_000], size / 200)
 
 
+def test_a_burst_after_which_as_much_comes_as_is_handled_is_no_leak() -> None:
+    assert not queue(Backlog(), [0] * 10 + [1_000] + [1] * 3_000, 10.0)
+
+
 def test_what_grows_without_end_is_a_leak_also_in_bursts() -> None:
     rng = random.Random(1)
     bursts = [rng.randint(5, 40) if rng.random() < 0.06 else 0 for _ in range(3_000)]

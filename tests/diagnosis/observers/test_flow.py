@@ -12,7 +12,7 @@ from holdfast.diagnosis import GRACE, OBSERVATIONS, Grace, observer
 from holdfast.diagnosis.literals import Literal, ok
 from holdfast.diagnosis.observations import Observation
 from holdfast.diagnosis.observers import Baselines, FlowObserver
-from holdfast.diagnosis.observers.flow import FlowSource
+from holdfast.diagnosis.observers.flow import ENOUGH, FlowSource
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 
@@ -143,3 +143,25 @@ async def test_what_was_learned_is_kept_by_the_hour_and_a_damaged_file_is_refuse
     path.write_bytes(b"{")
     with pytest.raises(ValueError, match=r"usual.json has no baselines .* remove it"):
         Baselines(path)
+
+
+def heard(until: float) -> list[tuple[str, float]]:
+    """What was heard before: one message in each tenth of a second, until a loop time."""
+    return [("/in", until - number / 10) for number in range(2 * ENOUGH, 0, -1)]
+
+
+async def test_what_was_heard_before_counts_as_learned_and_the_time_until_now_as_no_silence() -> None:
+    said: dict[Literal, bool] = {}
+    async with hf.ActorSystem("t", log=False, seed=1) as system:
+        system.spawn(hf.start(Notes, said))
+        await asyncio.sleep(100.0)
+        arrivals = heard(asyncio.get_running_loop().time() - 60.0)
+        baselines = Baselines()
+        start = hf.start(FlowObserver, MADE, leave_out=(OBSERVATIONS,), arrivals=arrivals, baselines=baselines)
+        await system.start(observer("topics", start))
+        await asyncio.sleep(1.0)
+        assert not said
+        assert not arrivals
+        assert baselines.of("/in", 0.0).longest_gap == pytest.approx(0.1)
+        await asyncio.sleep(3.0)
+        assert said == {ok("/in"): False}

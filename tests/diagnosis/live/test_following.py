@@ -1,0 +1,110 @@
+"""Children that come after `watch` began, and names of every kind: the model, the observers and repair follow."""
+
+import asyncio
+from collections.abc import AsyncIterator
+
+import pytest
+
+import holdfast as hf
+from holdfast import diagnosis
+from holdfast.actors.events import ActorCrashed
+from holdfast.diagnosis.engine import State
+from holdfast.diagnosis.generate import generate
+from holdfast.diagnosis.literals import word_for
+from holdfast.testing import advance
+
+pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
+
+NAMES = ["left arm", "a (b), c", 'it\'s "q"', "100%", "Köln ☃ 左", "\u3000", "ok(x)", "x" * 200]
+
+
+class Tick(hf.Message):
+    pass
+
+
+class Item(hf.Message):
+    pass
+
+
+class Freeze(hf.Message):
+    pass
+
+
+class Talker(hf.Actor):
+    """Publishes on a topic of its own name, until it freezes; a new life goes on."""
+
+    def on_start(self, restored: bool) -> None:
+        self.timer = self.ctx.every(0.1, Tick())
+
+    @hf.on(Tick)
+    async def _tick(self, message: Tick) -> None:
+        await self.ctx.publish(f"/{self.ctx.path.rpartition('/')[2]}", Item())
+
+    @hf.on(Freeze)
+    def _freeze(self, message: Freeze) -> None:
+        self.timer.cancel()
+
+
+class Ear(hf.Actor):
+    """Is there for what is published; topics without subscribers are not listened to."""
+
+    def __init__(self, topic: str) -> None:
+        self._topic = topic
+
+    def on_start(self, restored: bool) -> None:
+        self.ctx.subscribe(self._topic)
+
+    @hf.on(Item)
+    def _take(self, message: Item) -> None:
+        pass
+
+
+@pytest.fixture
+async def system() -> AsyncIterator[hf.ActorSystem]:
+    async with hf.ActorSystem("t", log=False, seed=1) as running:
+        yield running
+
+
+async def crashes_of_diagnosis(system: hf.ActorSystem, act: float) -> int:
+    """Let time pass; the crashes below diagnosis meanwhile."""
+    stream = system._node.events.listen()
+    await advance(act)
+    count = sum(isinstance(event, ActorCrashed) for event in stream.take())
+    stream.close()
+    return count
+
+
+async def test_actors_of_any_name_are_diagnosed_and_repaired_whenever_they_come(system: hf.ActorSystem) -> None:
+    """Half of them are there at first; each freezes and is restarted, and nobody else is."""
+    first, later = NAMES[::2], NAMES[1::2]
+    for name in NAMES:
+        system.spawn(hf.start(Ear, f"/{name}"))
+    keeper = await system.start(hf.supervisor("all", children=[hf.child(name, hf.start(Talker)) for name in first]))
+    watching = await diagnosis.watch(system, seconds=2.5, repair="on")
+    for name in later:
+        await keeper.ask(hf.StartChild(hf.child(name, hf.start(Talker))))
+    assert await crashes_of_diagnosis(system, 10.0) == 0
+    assert watching.addresses == {f"all/{word_for(name)}": f"/t/all/{name}" for name in NAMES}
+    found = await watching.diagnosis()
+    assert found.state is State.HEALTHY
+    assert set(found.components) == set(watching.addresses)
+    for name in NAMES:
+        talker = system.ref(f"/t/all/{name}", Talker)
+        talker.tell(Freeze())
+        await advance(4.5)
+        assert (await watching.diagnosis()).certain in {(f"all/{word_for(name)}",), ()}
+        async with asyncio.timeout(60.0):
+            while (await system.get_status(talker)).life == 1:
+                await advance(0.5)
+    await advance(5.0)
+    assert [(await system.get_status(system.ref(f"/t/all/{name}", Talker))).life for name in NAMES] == [2] * len(NAMES)
+    assert [story.entries[-1].what for story in await watching.stories()][-len(NAMES) :] == ["Repaired"] * len(NAMES)
+
+
+async def test_topics_and_replies_are_named_by_words(system: hf.ActorSystem) -> None:
+    await system.start(hf.child("left arm", hf.start(Talker)))
+    system.spawn(hf.start(Ear, "/left arm"))
+    await advance(0.1)
+    found = await generate(system, seconds=0.5)
+    assert found.addresses == {"left%20arm": "/t/left arm"}
+    assert found.declaration.components[0].out.keys() == {"/left%20arm", "replies(left%20arm)"}
