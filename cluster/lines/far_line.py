@@ -79,7 +79,14 @@ SPEAKER: Final = {
 LONGEST_TOPIC: Final = 4096
 """In characters, of a topic that another program may subscribe to."""
 _DECODER: Final[msgspec.msgpack.Decoder[frames.AnyFrame]] = msgspec.msgpack.Decoder(frames.AnyFrame)
-_MESSAGES: Final = frozenset(map(frames.tagged, (frames.Tell, frames.Ask, frames.Offer, frames.Publish)))
+_MESSAGES: Final = frozenset(
+    (
+        frames.tagged(frames.Tell),
+        frames.tagged(frames.Ask),
+        frames.tagged(frames.Offer),
+        frames.tagged(frames.Publish),
+    )
+)
 """How the frames of messages begin."""
 
 
