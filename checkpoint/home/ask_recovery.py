@@ -409,10 +409,12 @@ class FarMail:
         """Whether the outcomes of the run that has asked were given up: nobody knows whether this was done."""
         return which.run in self._forgotten
 
-    def answers_kept(self, system: str) -> int:
-        """How many outcomes are kept for recorded actors of a system, which have not said that they have them."""
+    def keeps_answers(self, system: str, count: int) -> bool:
+        """Whether so many outcomes are kept for recorded actors of a system, which do not say that they have them."""
         mail = self._mail.get(system)
-        return 0 if mail is None else sum(which.run == LASTING for which in mail.answers)
+        if mail is None or len(mail.answers) < count:  # They are looked at one by one only if they may be so many.
+            return False
+        return sum(which.run == LASTING for which in mail.answers) >= count
 
     # -- what is told to other systems ------------------------------------------------------------------------------
 

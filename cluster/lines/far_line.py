@@ -79,6 +79,15 @@ SPEAKER: Final = {
 LONGEST_TOPIC: Final = 4096
 """In characters, of a topic that another program may subscribe to."""
 _DECODER: Final[msgspec.msgpack.Decoder[frames.AnyFrame]] = msgspec.msgpack.Decoder(frames.AnyFrame)
+_MESSAGES: Final = frozenset(
+    (
+        frames.tagged(frames.Tell),
+        frames.tagged(frames.Ask),
+        frames.tagged(frames.Offer),
+        frames.tagged(frames.Publish),
+    )
+)
+"""How the frames of messages begin."""
 
 
 class FindName(Message[str]):
@@ -666,21 +675,22 @@ class FarLine(Peer):
         """The actor here that something is for."""
         return self.node.cell_at(self.connection.names.from_wire(to))
 
-    def _waits(self, to: frames.Name, then: Callable[[], None]) -> bool:
-        """Whether the receiver is not there yet, but may be soon: then it is done when it is."""
+    def _receiver_now(self, to: frames.Name, then: Callable[[], None]) -> Cell | None:
+        """The actor here that something is for; None if it is not there yet, but may be soon: `then` is called then."""
         path = self.connection.names.from_wire(to)
         homes = self._owner.homes
         if homes is not None and homes.is_unopened(path):
             homes.far.when_opened(path, then)
-            return True
+            return None
         cell = self.node.find(path)
-        return (cell is None or cell.is_dead) and self._owner.await_actor(path, then)
+        if (cell is None or cell.is_dead) and self._owner.await_actor(path, then):
+            return None
+        return self.node.nowhere(path) if cell is None else cell
 
     def _take_tell(self, frame: frames.Tell, again: bool) -> None:
         if self._refuses_order(frame.name):
             self.node.dead_letter(self._receiver(frame.to), frame, "an order of another system")
-        elif not self._waits(frame.to, lambda: self._take_tell(frame, again)):
-            cell = self._receiver(frame.to)
+        elif (cell := self._receiver_now(frame.to, lambda: self._take_tell(frame, again))) is not None:
             self.on_tell(cell, frame, None)
             self.inflow.sent(cell, memoryview(frame.body).nbytes)
 
@@ -706,7 +716,7 @@ class FarLine(Peer):
         if (
             frame.number == ASKED
             and self._owner.homes is not None
-            and self._owner.homes.far.answers_kept(self.name) >= limits.asks
+            and self._owner.homes.far.keeps_answers(self.name, limits.asks)
         ):
             return f"{limits.asks} outcomes are kept for its recorded actors, which do not say that they have them"
         return ""
@@ -726,11 +736,10 @@ class FarLine(Peer):
         if frame.name == FIND_NAME:
             self._find_name(frame)
             return
-        if self._waits(frame.to, lambda: self._ask_now(frame, again)):
+        cell = self._receiver_now(frame.to, lambda: self._ask_now(frame, again))
+        if cell is None:
             return
-        cell = self._receiver(frame.to)
         homes = self._owner.homes
-        which = self._named(frame)
         if again and (homes is None or switch_of(cell) is None):
             if frame.number == TOLD:
                 self.connection.send(frames.Reply(frame.id, msgspec.Raw(ACCEPTED.body)))  # Once at most.
@@ -738,6 +747,7 @@ class FarLine(Peer):
                 self._fail(frame, ConnectionLost(path, str(NoConnection(self._owner.name))))
             return
         if homes is not None and (again or frame.number != PASSING):
+            which = self._named(frame)
             known = homes.far.outcome(which)
             if known is not None:
                 self.deliver(which, known)
@@ -747,7 +757,7 @@ class FarLine(Peer):
                 self._fail(frame, ConnectionLost(path, "its outcome was given up, for nobody took it for long"))
                 return
         if frame.number == TOLD:
-            self._take_kept(cell, frame, which)
+            self._take_kept(cell, frame, self._named(frame))
         else:
             self.on_ask(cell, frame, None)
         self.inflow.sent(cell, memoryview(frame.body).nbytes)
@@ -825,8 +835,8 @@ class FarLine(Peer):
     def _take_offer(self, frame: frames.Offer, again: bool) -> None:
         if self._refuses_order(frame.name):
             self._fail(frame, UnknownMessage(str(frame.to), str(frame.name).replace(":", ".")))
-        elif not self._waits(frame.to, lambda: self._take_offer(frame, again)):
-            self._offer_to([self._receiver(frame.to)], frame)
+        elif (cell := self._receiver_now(frame.to, lambda: self._take_offer(frame, again))) is not None:
+            self._offer_to([cell], frame)
 
     def _take_publication(self, frame: frames.Publish, again: bool) -> None:
         if self._refuses_order(frame.name):
@@ -908,6 +918,8 @@ def _passes(frame: frames.Frame) -> bool:
 
 def _is_answer(data: bytes) -> bool:
     """The same of an item that has come; malformed ones are for whoever takes them."""
+    if data[1:3] in _MESSAGES:  # Most that wait are messages, and they are decoded when it is their turn.
+        return False
     try:
         frame = _DECODER.decode(memoryview(data)[1:])
     except msgspec.MsgspecError:

@@ -68,16 +68,6 @@ DEFAULT_LIMITS: Final = ConnectionLimits()
 """Of a system that says nothing."""
 
 
-class _AtActor:
-    """What one program has sent an actor here, oldest first, as far as it may still wait there."""
-
-    __slots__ = ("cell", "sizes")
-
-    def __init__(self, cell: Cell) -> None:
-        self.cell = cell
-        self.sizes: deque[int] = deque()
-
-
 class Belongings:
     """How many of something the actors of a program have: at most so many as were added since they were counted."""
 
@@ -123,8 +113,9 @@ class Inflow:
         self.beginning: asyncio.Handle | None = None
         self.told: set[str] = set()
         self.topics, self.ties = Belongings(), Belongings()
-        self._actors: dict[str, _AtActor] = {}
+        self._sizes: dict[Cell, deque[int]] = {}  # of messages that may still wait at an actor, oldest first
         self._count = self._size = 0
+        self._most, self._most_bytes = limits.messages, limits.message_bytes
         self._asks: dict[int, float] = {}
 
     def hold(self, data: bytes) -> None:
@@ -140,31 +131,25 @@ class Inflow:
 
     def sent(self, cell: Cell, size: int) -> None:
         """A message of so many bytes goes to an actor."""
-        at = self._actors.get(cell.path)
-        if at is None or at.cell is not cell:
-            if at is not None:
-                self._forget(at)
-            at = self._actors[cell.path] = _AtActor(cell)
-        at.sizes.append(size)
+        sizes = self._sizes.get(cell)
+        if sizes is None:
+            sizes = self._sizes[cell] = deque()
+        sizes.append(size)
         self._count += 1
         self._size += size
-        if self._count > self.limits.messages or self._size > self.limits.message_bytes:
+        if self._count > self._most or self._size > self._most_bytes:
             self.is_full = not self.has_room(1.0)
 
     def has_room(self, share: float = 0.5) -> bool:
         """Whether at most this share of what may wait at actors does so now."""
-        for path, at in list(self._actors.items()):
-            waits = 0 if at.cell.is_dead else at.cell.host.load(at.cell)
-            while len(at.sizes) > waits:
-                self._size -= at.sizes.popleft()
+        for cell, sizes in list(self._sizes.items()):
+            waits = 0 if cell.is_dead else cell.host.load(cell)
+            while len(sizes) > waits:
+                self._size -= sizes.popleft()
                 self._count -= 1
-            if not at.sizes:
-                del self._actors[path]
-        return self._count <= share * self.limits.messages and self._size <= share * self.limits.message_bytes
-
-    def _forget(self, at: _AtActor) -> None:
-        self._count -= len(at.sizes)
-        self._size -= sum(at.sizes)
+            if not sizes:
+                del self._sizes[cell]
+        return self._count <= share * self._most and self._size <= share * self._most_bytes
 
     # -- asks -------------------------------------------------------------------------------------------------------
 

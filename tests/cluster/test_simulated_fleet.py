@@ -18,7 +18,7 @@ from holdfast.testing.fleet.sim_engine import SimBlobs
 from holdfast.testing.fleet.sim_fleet import SimFleet, SimProgram
 from tests.cluster.fleets import simulate
 
-SEEDS = int(os.environ.get("HOLDFAST_SYSTEM_FLEETS", "12"))
+SEEDS = int(os.environ.get("HOLDFAST_SYSTEM_FLEETS", "6"))
 
 
 class Put(hf.Message[int]):

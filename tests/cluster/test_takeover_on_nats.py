@@ -13,6 +13,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.cluster.nats.server_file import UserRole, public_key, seed_file
+from holdfast.cluster.ports import AccessRefused
 from tests.cluster.bank import Account, Gain
 from tests.cluster.fleet import Client, Programs
 from tests.cluster.servers import NatsServers
@@ -148,7 +149,7 @@ async def test_a_leader_that_may_not_write_any_more_gives_way(own_nats1: NatsSer
                         account = await after.start(hf.child("account", hf.start(Account), recovery=hf.hybrid()))
                         assert await account.ask(Gain(0)) == 1
                         break
-                except hf.errors.StoreInUse:
+                except (hf.errors.StoreInUse, AccessRefused):  # Or the server has not taken up its file yet.
                     await asyncio.sleep(0.1)
         with contextlib.suppress(hf.errors.StoreError):
             await system.shutdown()
