@@ -50,7 +50,8 @@ campaign: $(VENV)/.dev
 	    tests/actors/process/hostile/test_removed_claims.py tests/telemetry/test_removed_checks.py \
 	    tests/diagnosis/test_removed_checks.py tests/console/dashboard/test_removed_from_dashboard.py
 	HOLDFAST_REPAIRS=25 HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -s -p no:xdist -o faulthandler_timeout=0 \
-	    tests/diagnosis/repair/test_no_worse.py tests/diagnosis/repair/test_removed_repair.py
+	    tests/diagnosis/repair/test_no_worse.py tests/diagnosis/repair/test_removed_repair.py \
+	    tests/diagnosis/live/test_replicas.py
 	HOLDFAST_FOREIGN=20 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=0 tests/diagnosis/foreign
 	$(BIN)/python -m tests.diagnosis.foreign.days 24
 	HOLDFAST_BUILDS=1 $(BIN)/python -m pytest -q -s tests/packaging
