@@ -87,6 +87,8 @@ BURST = 10
 WAIT = 1.0
 """Seconds after a crash in which its supervisor is expected to say what it knows of it."""
 
+SHOWN = {code: f"\\x{code:02x}" for code in (*range(9), *range(11, 32), *range(127, 160))}
+"""Control characters as they are shown: the text of an error is written to terminals, and may not steer them."""
 LOGGER = "holdfast"
 """The name of the logger."""
 
@@ -165,6 +167,8 @@ class LogSink:
             return
         level, name = WRITTEN[kind]
         fields: Fields = {**self._describe(event), **more, "system": self._system}
+        if kind is not LogLine:  # What a program prints is its own affair.
+            fields = {key: one.translate(SHOWN) if isinstance(one, str) else one for key, one in fields.items()}
         if left_out:
             fields["left_out"] = left_out
         structlog = _structlog()

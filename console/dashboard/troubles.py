@@ -53,7 +53,7 @@ class Advice(msgspec.Struct, frozen=True):
 ADVICE: Final[dict[str, Advice]] = {
     "a supervisor above has given up": Advice(ILL, "Mend what failed, and start the supervisor again.", ("start",)),
     "it has given up": Advice(ILL, "Mend what failed, and start it again.", ("start",)),
-    "its own faults": Advice(ODD, "Mend the code at this line, or what it was handling."),
+    "its own faults": Advice(ODD, "Mend the code that failed, or the message that it was handling."),
     "ended by others": Advice(NEWS_ONLY, "Start it again, if it was not meant to end.", ("start",)),
     "the root was killed": Advice(NEWS_ONLY, "What was recorded is there again."),
     "quarantine": Advice(
@@ -104,7 +104,9 @@ SILENT: Final = Advice(
     ILL, "Its process does not answer: see whether it is stopped or busy; kill it if it stays so.", ("kill",)
 )
 SETTLED: Final = Advice(NEWS_ONLY, "It was settled: nothing is to be done.")
-MENDED: Final = Advice(NEWS_ONLY, "It goes on in a new life. Mend the code at this line, or what it was handling.")
+MENDED: Final = Advice(
+    NEWS_ONLY, "It goes on in a new life. Mend the code that failed, or the message that it was handling."
+)
 
 
 class Trouble(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -75,6 +75,17 @@ async def test_a_crash_is_logged_with_its_traceback(records: list[Record]) -> No
     assert len(records) == 1
 
 
+async def test_the_text_of_an_error_steers_no_terminal(records: list[Record]) -> None:
+    async with hf.ActorSystem("shop") as system:
+        ref = await system.start(hf.child("fragile", hf.start(Fragile)))
+        ref.tell(Boom("\x1b[2Jgone\r\x07, in\ntwo lines"))
+        assert await ref.ask(Ping()) == "pong"
+    (crash,) = of(records, "actor crashed")
+    assert crash["reason"] == "ValueError: \\x1b[2Jgone\\x0d\\x07, in\ntwo lines"
+    assert "\x1b" not in crash["exception"]
+    assert "\\x1b[2Jgone" in crash["exception"]
+
+
 async def test_each_crash_has_one_record_and_it_counts_the_restarts(records: list[Record]) -> None:
     async with hf.ActorSystem() as system:
         top = hf.supervisor("top", intensity=1, restart="temporary", children=[hf.child("x", hf.start(Fragile))])
