@@ -229,8 +229,12 @@ class Safety:
     # -- the dead man's switch --------------------------------------------------------------------------------------
 
     def _overdue(self, receiver: Receiver) -> None:
-        """The receiver's own switch has raised the alarm, if it is told by its hook and has not begun anew since."""
+        """The receiver's own switch has raised the alarm, if it is told by its hook and has not begun anew since.
+
+        Where nobody could be told, nobody waits for the end.
+        """
         receiver.timer = None
         cell = self._node.cell_at(receiver.path)
-        if receiver.words[0] is not None or receiver.life != (cell, cell.life):
+        has_begun_anew = receiver.life != (cell, cell.life) and not receiver.is_missed
+        if receiver.words[0] is not None or has_begun_anew:
             self._node.emit(SafeStateOverdue(receiver.path, receiver.timeout, receiver.because))

@@ -69,7 +69,7 @@ def test_any_name_has_a_word_of_its_own_that_can_be_written(name: str) -> None:
 
 def test_a_word_is_a_name_as_far_as_it_can_be() -> None:
     assert word_for("/lab/it's-Köln_☃.2") == "/lab/it's-Köln_☃.2"
-    assert word_for("left arm, \u3000100%(\ud800)") == "left%20arm%2C%20%E3%80%80100%25%28%ED%A0%80%29"
+    assert word_for("left arm, \u3000100%(\udc00)") == "left%20arm%2C%20%E3%80%80100%25%28%ED%B0%80%29"
 
 
 @pytest.mark.parametrize(
