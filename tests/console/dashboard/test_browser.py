@@ -421,7 +421,7 @@ def test_everything_is_reached_by_the_keyboard_alone(page: Page) -> None:
 def test_a_pattern_of_the_command_line_chooses(page: Page) -> None:
     search = page.get_by_role("searchbox")
     search.fill("/app/shop/**[kind=Worker, recovery=hybrid]")
-    expect(page.locator(".bar [role=status]")).to_have_text("2 of 1911 actors")
+    expect(page.locator(".bar [role=status]")).to_have_text(re.compile(r"2 of \d+ actors"))
     search.fill("/app/[x>1]")
     expect(page.locator(".bar [role=status]")).to_contain_text("there is no field 'x'")
     context_errors = page.locator(".row")
