@@ -92,7 +92,6 @@ class ReplicatedJournal:
         self._is_open = True
         self._is_awake = False
         self._keeper = leading.keeper
-        self._fetched: dict[str, bytes] = {}
         loop.wait(self._begin(leading))
 
     async def _begin(self, leading: Leading) -> None:
@@ -123,7 +122,7 @@ class ReplicatedJournal:
                         pause = min(2 * pause, LONGEST_PAUSE)
                         continue
                     if data is not None:
-                        self._fetched[name] = data
+                        self._blobs.fetched[name] = data
                         size += len(data)
                     break
 
@@ -415,7 +414,7 @@ class ReplicatedJournal:
                 unsent = next((data for write in self._joint for known, data in write.puts if known == name), None)
         if unsent is not None:
             return unsent
-        if (fetched := self._fetched.pop(name, None)) is not None:
+        if (fetched := self._blobs.fetched.pop(name, None)) is not None:
             return fetched
         try:
             # Again and again: at a takeover servers may be choosing a leader, and who cannot read cannot lead.

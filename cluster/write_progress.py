@@ -50,6 +50,7 @@ class BlobsUnderWay:
 
     Attributes:
         size: bytes that are not sent yet.
+        fetched: values that were read ahead, until somebody wants them.
 
     Args:
         known: those to which the log refers; what else there is nobody needs.
@@ -57,6 +58,7 @@ class BlobsUnderWay:
 
     def __init__(self, known: Iterable[str]) -> None:
         self.size = 0
+        self.fetched: dict[str, bytes] = {}
         self._unsent: dict[str, bytes] = {}
         self._order: deque[tuple[int, str]] = deque()
         self._known: set[str] | None = set(known)

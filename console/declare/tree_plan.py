@@ -236,7 +236,8 @@ class TreePlan:
         """The spec of one that is new, with all that is new below it."""
         assert one.spec is not None
         register = one.spec.register if one.names is None else next(iter(one.names), None)
-        spec = dataclasses.replace(one.spec, bindings=self._bound_early(one, fresh), register=register)
+        scope = "system" if register is None else one.spec.scope
+        spec = dataclasses.replace(one.spec, bindings=self._bound_early(one, fresh), register=register, scope=scope)
         below = [inner for inner in fresh.values() if inner.above == one.path]
         if not spec.is_supervisor or not below or len(spec.start.args) != 2:
             return spec
