@@ -159,14 +159,14 @@ def is_at(where: str, path: str) -> bool:
     return where == path or where.startswith(f"{path.rstrip('/')}/")
 
 
-class Waiting(NamedTuple):
+class WaitingActor(NamedTuple):
     """Who waits for an actor: since when its oldest ask has no answer (loop clock), and all who wait in the end."""
 
     since: float
     actors: tuple[str, ...]
 
 
-def waiting_for(asks: Sequence[tuple[str, str | None, float]], address: str) -> Waiting | None:
+def waiting_for(asks: Sequence[tuple[str, str | None, float]], address: str) -> WaitingActor | None:
     """Who waits for an actor, directly or for another one that does; None: nobody.
 
     Args:
@@ -174,7 +174,7 @@ def waiting_for(asks: Sequence[tuple[str, str | None, float]], address: str) -> 
         address: of the actor.
 
     >>> waiting_for([("/a/c", "/a/b", 2.0), ("/a/b", "/a/a", 1.0)], "/a/c")
-    Waiting(since=2.0, actors=('/a/b', '/a/a'))
+    WaitingActor(since=2.0, actors=('/a/b', '/a/a'))
     """
     since = min((made for asked, _, made in asks if asked == address), default=None)
     if since is None:
@@ -186,7 +186,7 @@ def waiting_for(asks: Sequence[tuple[str, str | None, float]], address: str) -> 
             if asked == one and asker is not None and asker not in found:
                 found[asker] = None
                 todo.append(asker)
-    return Waiting(since, tuple(found)[1:])
+    return WaitingActor(since, tuple(found)[1:])
 
 
 def _open_asks(system: ActorSystem) -> list[tuple[str, str | None, float]]:

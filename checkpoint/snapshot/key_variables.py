@@ -77,7 +77,7 @@ def _parts(actor: Actor, state: StateForm) -> list[tuple[str, object]]:
     return [(f"{where}.{name}", value) for name, value in state.value.items()]
 
 
-class PutBack(NamedTuple):
+class StatePutBack(NamedTuple):
     """What became of a saved state.
 
     Attributes:
@@ -94,7 +94,7 @@ def restore_state(
     data: bytes | ByteParts,
     variables: tuple[list[str], list[str]] = ([], []),
     meant: Callable[[Any], Any] = as_it_is,
-) -> PutBack:
+) -> StatePutBack:
     """Put a saved state back; one of an older schema is handed to the class's `migrate` first.
 
     Args:
@@ -120,7 +120,7 @@ def restore_state(
             is_mapped = named.keys() != state.keys() or not named.keys() >= set(variables[1])
             saved = version, form, named
     put_back(actor, meant(saved))
-    return PutBack(dropped, is_mapped)
+    return StatePutBack(dropped, is_mapped)
 
 
 def as_named_now(

@@ -68,7 +68,7 @@ DEFAULT_LIMITS: Final = ConnectionLimits()
 """Of a system that says nothing."""
 
 
-class Belongings:
+class FarBelongings:
     """How many of something the actors of a program have: at most so many as were added since they were counted."""
 
     __slots__ = ("_most_there",)
@@ -112,7 +112,7 @@ class Inflow:
         self.is_full = False
         self.beginning: asyncio.Handle | None = None
         self.told: set[str] = set()
-        self.topics, self.ties = Belongings(), Belongings()
+        self.topics, self.ties = FarBelongings(), FarBelongings()
         self._sizes: dict[Cell, deque[int]] = {}  # of messages that may still wait at an actor, oldest first
         self._count = self._size = 0
         self._most, self._most_bytes = limits.messages, limits.message_bytes

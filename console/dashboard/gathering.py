@@ -18,7 +18,7 @@ from ..overview import LOOK, SystemLook
 from ..wire import AskCauses, AskDiagnosis, AskHistory, AskQuarantined, NotDiagnosed, Overview
 from .answers import Answers
 from .picture import Picture, plain
-from .troubles import NEWS, TELLING, Seen, Trouble, diagnosed_troubles, grade_of, seen_causes, suspects, troubles
+from .troubles import NEWS, TELLING, SeenSystem, Trouble, diagnosed_troubles, grade_of, seen_causes, suspects, troubles
 
 SHARE: Final = 0.01
 """The part of one processor that looks at what is on the screens may take, unless they became rarer than a second."""
@@ -369,11 +369,11 @@ class Gathering:
             except TimeoutError:
                 pass  # Somebody may look ill without anything having been told: a turn that goes on and on.
 
-    def _seen(self) -> Seen:
+    def _seen(self) -> SeenSystem:
         """What is known before anybody is asked."""
         memory = {one.pid: one.memory_bytes for one in self.picture.processes}
         addresses = frozenset(one.address for one in self._put_aside)
-        return Seen(time.time(), f"/{self.picture.system}", self.picture.rows, memory, addresses, self._told)
+        return SeenSystem(time.time(), f"/{self.picture.system}", self.picture.rows, memory, addresses, self._told)
 
     async def _ask_suspects(self) -> set[str]:
         """One round: who looks ill is asked why, and what has changed of the answers is told. Returns whom it asked."""

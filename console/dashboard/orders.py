@@ -62,7 +62,7 @@ AGAIN: Final = (
 """What a tree that was written in the page is called in errors."""
 
 
-class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PageOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """An order from the page.
 
     Attributes:
@@ -82,7 +82,7 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     is_dry_run: bool = False
 
 
-class Done(msgspec.Struct, frozen=True):
+class OrderDone(msgspec.Struct, frozen=True):
     """What has become of an order.
 
     Attributes:
@@ -102,7 +102,7 @@ class Done(msgspec.Struct, frozen=True):
     failed: list[str] = []
 
 
-async def carry_out(answers: Answers, order: Order) -> Done:
+async def carry_out(answers: Answers, order: PageOrder) -> OrderDone:
     """Do what an order says, unless something would be lost and nobody has said yes.
 
     Raises:
@@ -124,7 +124,7 @@ async def carry_out(answers: Answers, order: Order) -> Done:
         case "repair-approve" | "repair-deny" | "repair-retry" | "repair-set":
             verb: RepairVerb = msgspec.convert(order.verb.removeprefix("repair-"), RepairVerb)
             await answers.ask(OrderRepair(verb, order.words, ONE_RESTART), PATIENCE)
-            return Done(said=[f"repair {verb} {' '.join(order.words)}".rstrip()])
+            return OrderDone(said=[f"repair {verb} {' '.join(order.words)}".rstrip()])
         case "apply":
             return await _apply(answers, order)
         case _:
@@ -136,8 +136,11 @@ async def _rows(answers: Answers) -> list[ActorRow]:
 
 
 async def _warned(
-    answers: Answers, order: Order, verb: str, do: Callable[[Answers, Order, list[ActorRow]], Awaitable[Done]]
-) -> Done:
+    answers: Answers,
+    order: PageOrder,
+    verb: str,
+    do: Callable[[Answers, PageOrder, list[ActorRow]], Awaitable[OrderDone]],
+) -> OrderDone:
     """Warn in the words of the command line, or do it."""
     all_rows = await _rows(answers)
     rows = meant(all_rows, order.paths)
@@ -145,7 +148,7 @@ async def _warned(
         rows = tops(rows)
     warnings = WARNINGS[verb](rows, all_rows) if verb in WARNINGS else []
     if warnings and not order.is_confirmed and not order.is_dry_run:
-        return Done(warnings=warnings)
+        return OrderDone(warnings=warnings)
     return await do(answers, order, rows)
 
 
@@ -160,19 +163,19 @@ def meant(all_rows: list[ActorRow], paths: tuple[str, ...]) -> list[ActorRow]:
     return [known[path] for path in dict.fromkeys(paths)]
 
 
-async def _transact(answers: Answers, order: Order, rows: list[ActorRow]) -> Done:
+async def _transact(answers: Answers, order: PageOrder, rows: list[ActorRow]) -> OrderDone:
     change = RemoteChange()
     _collect(change, order, [row.path for row in rows] or list(order.paths))
     told = await answers.ask(Transact(change.operations, order.is_dry_run, PATIENCE), PATIENCE)
     return _told(told)
 
 
-def _told(told: dict[str, Any]) -> Done:
+def _told(told: dict[str, Any]) -> OrderDone:
     steps = [str(step[3]) for step in told["steps"]]
-    return Done(steps=steps, difference=list(told["difference"]), lost=list(told["lost"]))
+    return OrderDone(steps=steps, difference=list(told["difference"]), lost=list(told["lost"]))
 
 
-def _collect(change: RemoteChange, order: Order, paths: list[str]) -> None:
+def _collect(change: RemoteChange, order: PageOrder, paths: list[str]) -> None:
     match order.verb, order.words:
         case "start", ():
             for path in paths:
@@ -195,22 +198,22 @@ def _collect(change: RemoteChange, order: Order, paths: list[str]) -> None:
             raise SpecError("dashboard", f"{verb} does not take {' '.join(words) or 'nothing'}")
 
 
-async def _restart(answers: Answers, order: Order, rows: list[ActorRow]) -> Done:
+async def _restart(answers: Answers, order: PageOrder, rows: list[ActorRow]) -> OrderDone:
     """One after another; whoever is behind one that does not come up is left alone."""
     said: list[str] = []
     for row in rows:
         ended = await answers.ask(RestartActor(row.path, ONE_RESTART, order.verb == "kill"), PATIENCE)
         said.append(f"restarted {row.path}: its life was ended by {ended}")
-    return Done(said=said)
+    return OrderDone(said=said)
 
 
-async def _checkpoint(answers: Answers, order: Order) -> Done:
+async def _checkpoint(answers: Answers, order: PageOrder) -> OrderDone:
     for path in order.paths:
         await answers.ask(ControlActor("checkpoint", path, [], ONE_RESTART), PATIENCE)
-    return Done(said=[f"saved {path}" for path in order.paths])
+    return OrderDone(said=[f"saved {path}" for path in order.paths])
 
 
-async def _settle(answers: Answers, order: Order) -> Done:
+async def _settle(answers: Answers, order: PageOrder) -> OrderDone:
     verb: Literal["retry", "drop"] = "retry" if order.verb == "quarantine-retry" else "drop"
     if len(order.paths) != 1 or len(order.words) > 1 or not all(word.isdecimal() for word in order.words):
         raise SpecError("dashboard", f"{order.verb} takes one address, and the number of a message or none")
@@ -220,14 +223,14 @@ async def _settle(answers: Answers, order: Order) -> Done:
         put_aside = [one for one in msgspec.convert(raw, list[PutAside]) if number in (None, one.id)]
         warning = "this is dropped" if verb == "drop" else AGAIN
         if put_aside:
-            return Done(warnings=[f"{warning}: {quarantine_line(one)}" for one in put_aside])
+            return OrderDone(warnings=[f"{warning}: {quarantine_line(one)}" for one in put_aside])
     told = await answers.ask(SettleQuarantined(verb, path, number), PATIENCE)
     words = "dropped" if verb == "drop" else "given to its actor again; if that dies of it again, it comes back here"
     done = msgspec.convert(told["done"], list[PutAside])
-    return Done(said=[f"{words}: {quarantine_line(one)}" for one in done], failed=list(told["failed"]))
+    return OrderDone(said=[f"{words}: {quarantine_line(one)}" for one in done], failed=list(told["failed"]))
 
 
-async def _apply(answers: Answers, order: Order) -> Done:
+async def _apply(answers: Answers, order: PageOrder) -> OrderDone:
     """As `holdfast plan`, and `holdfast apply` of a tree."""
     planned = await answers.ask(DeclareTree(order.text, TREE, True, PATIENCE), PATIENCE)
     paths = {step[2] for step in planned["steps"] if step[1] in ("remove", "stop")}

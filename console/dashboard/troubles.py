@@ -42,7 +42,7 @@ ILL, ODD, NEWS_ONLY = "ill", "odd", "news"
 """How grave it is: somebody has to act; look; it is told only."""
 
 
-class Advice(msgspec.Struct, frozen=True):
+class TroubleAdvice(msgspec.Struct, frozen=True):
     """What a cause calls for: how grave it is, what to do in a sentence, and which orders help."""
 
     grade: str
@@ -50,37 +50,39 @@ class Advice(msgspec.Struct, frozen=True):
     orders: tuple[str, ...] = ()
 
 
-ADVICE: Final[dict[str, Advice]] = {
-    "a supervisor above has given up": Advice(ILL, "Mend what failed, and start the supervisor again.", ("start",)),
-    "it has given up": Advice(ILL, "Mend what failed, and start it again.", ("start",)),
-    "its own faults": Advice(ODD, "Mend the code that failed, or the message that it was handling."),
-    "ended by others": Advice(NEWS_ONLY, "Start it again, if it was not meant to end.", ("start",)),
-    "the root was killed": Advice(NEWS_ONLY, "What was recorded is there again."),
-    "quarantine": Advice(
+ADVICE: Final[dict[str, TroubleAdvice]] = {
+    "a supervisor above has given up": TroubleAdvice(
+        ILL, "Mend what failed, and start the supervisor again.", ("start",)
+    ),
+    "it has given up": TroubleAdvice(ILL, "Mend what failed, and start it again.", ("start",)),
+    "its own faults": TroubleAdvice(ODD, "Mend the code that failed, or the message that it was handling."),
+    "ended by others": TroubleAdvice(NEWS_ONLY, "Start it again, if it was not meant to end.", ("start",)),
+    "the root was killed": TroubleAdvice(NEWS_ONLY, "What was recorded is there again."),
+    "quarantine": TroubleAdvice(
         ILL,
         "Mend the cause, then have the message handled again; or drop it.",
         ("quarantine-retry", "quarantine-drop"),
     ),
-    "recovery fails": Advice(ILL, "Mend what it tells, then restart it.", ("restart",)),
-    "suspended": Advice(ODD, "Resume it, when you are done.", ("resume",)),
-    "restarting": Advice(ODD, "Wait; if it does not come back, its history says why."),
-    "its turn waits": Advice(
+    "recovery fails": TroubleAdvice(ILL, "Mend what it tells, then restart it.", ("restart",)),
+    "suspended": TroubleAdvice(ODD, "Resume it, when you are done.", ("resume",)),
+    "restarting": TroubleAdvice(ODD, "Wait; if it does not come back, its history says why."),
+    "its turn waits": TroubleAdvice(
         ILL, "Put a time limit around this line. Until then, end the turn: whoever has asked hears of it.", ("kill",)
     ),
-    "mailbox": Advice(ODD, "Have it do less for each message, spread the work, or bound its mailbox."),
-    "memory": Advice(
+    "mailbox": TroubleAdvice(ODD, "Have it do less for each message, spread the work, or bound its mailbox."),
+    "memory": TroubleAdvice(
         ODD, "See what its state holds, and have it hold less. Until then, begin anew.", ("state", "restart")
     ),
-    "replicas": Advice(NEWS_ONLY, "Nothing is to be done: the protection is whole."),
-    "replicas that are away": Advice(ILL, "See whether it comes back by itself; if not, its history says why."),
-    "store": Advice(ILL, "Make room beside the store; it tries again by itself. Do not touch its files."),
-    "restarts of children": Advice(ODD, "Ask the child why."),
-    "children that are not there": Advice(ODD, "Start it again, if it was not meant to end."),
-    "children that start or stop": Advice(ODD, "Wait; if it hangs, see at which line."),
-    "children in trouble": Advice(NEWS_ONLY, "Ask the child why."),
-    "children that had to be killed": Advice(NEWS_ONLY, "Mend what hangs in its end."),
-    "children that wait": Advice(ODD, "Ask the child why."),
-    "events left out": Advice(NEWS_ONLY, "Somebody tells very much: look at the events."),
+    "replicas": TroubleAdvice(NEWS_ONLY, "Nothing is to be done: the protection is whole."),
+    "replicas that are away": TroubleAdvice(ILL, "See whether it comes back by itself; if not, its history says why."),
+    "store": TroubleAdvice(ILL, "Make room beside the store; it tries again by itself. Do not touch its files."),
+    "restarts of children": TroubleAdvice(ODD, "Ask the child why."),
+    "children that are not there": TroubleAdvice(ODD, "Start it again, if it was not meant to end."),
+    "children that start or stop": TroubleAdvice(ODD, "Wait; if it hangs, see at which line."),
+    "children in trouble": TroubleAdvice(NEWS_ONLY, "Ask the child why."),
+    "children that had to be killed": TroubleAdvice(NEWS_ONLY, "Mend what hangs in its end."),
+    "children that wait": TroubleAdvice(ODD, "Ask the child why."),
+    "events left out": TroubleAdvice(NEWS_ONLY, "Somebody tells very much: look at the events."),
 }
 """Of each cause that `why` knows, what to do."""
 OF_CHILDREN: Final = frozenset(
@@ -97,14 +99,14 @@ OF_ALL: Final = frozenset({"store", "events left out"})
 """Causes of which every actor tells; they are told once, of the root."""
 OF_ITS_OWN: Final = "Its journal"
 """How a sentence about the store begins that is about one actor."""
-UNKNOWN: Final = Advice(ODD, "Look closer.")
+UNKNOWN: Final = TroubleAdvice(ODD, "Look closer.")
 """Of a cause that only the system knows, which is of another version."""
-NOT_THERE: Final = Advice(ILL, "Mend the cause, and start it again.", ("start",))
-SILENT: Final = Advice(
+NOT_THERE: Final = TroubleAdvice(ILL, "Mend the cause, and start it again.", ("start",))
+SILENT: Final = TroubleAdvice(
     ILL, "Its process does not answer: see whether it is stopped or busy; kill it if it stays so.", ("kill",)
 )
-SETTLED: Final = Advice(NEWS_ONLY, "It was settled: nothing is to be done.")
-MENDED: Final = Advice(
+SETTLED: Final = TroubleAdvice(NEWS_ONLY, "It was settled: nothing is to be done.")
+MENDED: Final = TroubleAdvice(
     NEWS_ONLY, "It goes on in a new life. Mend the code that failed, or the message that it was handling."
 )
 
@@ -133,7 +135,7 @@ class Trouble(msgspec.Struct, frozen=True, omit_defaults=True):
     view: str = ""
 
 
-class Seen(msgspec.Struct, frozen=True):
+class SeenSystem(msgspec.Struct, frozen=True):
     """What is known before anybody is asked: the rows, who has messages in quarantine, and when something was told.
 
     Of `rows`, `turn_seconds` is the moment at which the turn began, in Unix time, as a `Picture` has it.
@@ -147,7 +149,7 @@ class Seen(msgspec.Struct, frozen=True):
     told: Mapping[str, float]
 
 
-def suspects(seen: Seen) -> list[str]:
+def suspects(seen: SeenSystem) -> list[str]:
     """The addresses that are asked why, those that look worst first; the root is always among them."""
     weights: dict[str, float] = {seen.root: 9.0}
     for path, at in seen.told.items():
@@ -162,7 +164,7 @@ def suspects(seen: Seen) -> list[str]:
     return sorted(weights, key=lambda path: -weights[path])[:MOST]
 
 
-def _weight(seen: Seen, row: ActorRow) -> float:
+def _weight(seen: SeenSystem, row: ActorRow) -> float:
     if row.state == "silent":
         return 6.0
     if row.turn and seen.now - row.turn_seconds >= LONG_TURN:
@@ -175,7 +177,7 @@ def _weight(seen: Seen, row: ActorRow) -> float:
     return 2.5 if is_full else 0.0
 
 
-def troubles(seen: Seen, answers: Mapping[str, Sequence[tuple[str, str]]]) -> list[Trouble]:
+def troubles(seen: SeenSystem, answers: Mapping[str, Sequence[tuple[str, str]]]) -> list[Trouble]:
     """What needs attention, the gravest first; whoever is well is left out.
 
     Args:
@@ -200,7 +202,7 @@ def grade_of(one: Trouble) -> int:
     return GRADES.index(one.grade)
 
 
-def seen_causes(seen: Seen, path: str) -> list[tuple[str, str]]:
+def seen_causes(seen: SeenSystem, path: str) -> list[tuple[str, str]]:
     """What is wrong with an actor as far as its row shows it, for a system that keeps no history and cannot say why."""
     row = seen.rows.get(path)
     if row is None or row.state == "silent":
@@ -225,7 +227,7 @@ def _is_own(one: tuple[str, str]) -> bool:
     return cause not in OF_CHILDREN and (cause not in OF_ALL or sentence.startswith(OF_ITS_OWN))
 
 
-def _is_told(seen: Seen, path: str, one: tuple[str, str], told: set[str]) -> bool:
+def _is_told(seen: SeenSystem, path: str, one: tuple[str, str], told: set[str]) -> bool:
     """Whether a sentence stays: what concerns all is told of the root, and children that are asked speak themselves."""
     cause, sentence = one
     if cause in OF_CHILDREN:
@@ -238,7 +240,7 @@ def _names(sentence: str, name: str) -> bool:
     return re.search(rf"(?<![\w/-]){re.escape(name)}(?![\w-])", sentence) is not None
 
 
-def _trouble(seen: Seen, path: str, said: list[tuple[str, str]]) -> Trouble | None:
+def _trouble(seen: SeenSystem, path: str, said: list[tuple[str, str]]) -> Trouble | None:
     if not said:
         return None
     given = [_advice(seen, path, cause) for cause, _ in said]
@@ -248,11 +250,11 @@ def _trouble(seen: Seen, path: str, said: list[tuple[str, str]]) -> Trouble | No
     return Trouble(path, grade, tuple(sentence for _, sentence in said), _texts(weighty), orders)
 
 
-def _texts(given: Iterable[Advice]) -> tuple[str, ...]:
+def _texts(given: Iterable[TroubleAdvice]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(one.text for one in given))
 
 
-def _is_of_use(seen: Seen, path: str, order: str) -> bool:
+def _is_of_use(seen: SeenSystem, path: str, order: str) -> bool:
     """Whether an order can do anything for an actor as it is now."""
     row = seen.rows.get(path)
     if order == "start":
@@ -260,7 +262,7 @@ def _is_of_use(seen: Seen, path: str, order: str) -> bool:
     return row is not None or order.startswith("quarantine")
 
 
-def _advice(seen: Seen, path: str, cause: str) -> Advice:
+def _advice(seen: SeenSystem, path: str, cause: str) -> TroubleAdvice:
     """What the table says of a cause, or less or more of it, by how the actor is now."""
     row, usual = seen.rows.get(path), ADVICE.get(cause, UNKNOWN)
     is_there = row is not None and row.state not in ("stopped", "silent")

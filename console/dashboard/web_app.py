@@ -36,7 +36,7 @@ from ..wire import (
 from .access import Access, Login, NotAllowed, Role, check_role, token_of
 from .answers import Answers, Endpoint, OwnAnswers, SocketAnswers
 from .gathering import BEAT, Gathering, Viewer, framed
-from .orders import Order, carry_out
+from .orders import PageOrder, carry_out
 from .picture import plain
 
 PAGE: Final = Path(__file__).parent / "page"
@@ -82,7 +82,7 @@ class Token(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     token: str
 
 
-class Watched(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class WatchedRows(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What is on the screen of a viewer."""
 
     viewer: int
@@ -225,10 +225,10 @@ class Dashboard:
     # -- what changes -------------------------------------------------------------------------------------------------
 
     async def _live(self, request: Request, login: Login) -> Response:
-        return Stream(self._gathering, login)
+        return ViewerStream(self._gathering, login)
 
     async def _watch(self, request: Request, login: Login) -> Response:
-        seen = await _body(request, Watched)
+        seen = await _body(request, WatchedRows)
         self._gathering.watch(seen.viewer, seen.paths)
         return Response(status_code=204)
 
@@ -257,7 +257,7 @@ class Dashboard:
         return answered({"value": await self._answers.ask(question, ANSWER)})
 
     async def _act(self, request: Request, login: Login) -> Response:
-        order = await _body(request, Order)
+        order = await _body(request, PageOrder)
         try:
             return answered(await carry_out(self._answers, order))
         finally:
@@ -273,7 +273,7 @@ def _bounded(asked: Any) -> Any:
     return asked
 
 
-class Stream(Response):
+class ViewerStream(Response):
     """The stream of one viewer: it is dropped when it takes nothing for `UNREAD` seconds, and waits for nobody else."""
 
     def __init__(self, gathering: Gathering, login: Login) -> None:

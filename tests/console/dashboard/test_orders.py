@@ -6,7 +6,7 @@ from typing import Any, get_args
 import pytest
 
 import holdfast as hf
-from holdfast.console.dashboard.orders import VERBS, Order, Verb
+from holdfast.console.dashboard.orders import VERBS, PageOrder, Verb
 from holdfast.console.overview import look_at
 from tests.console.dashboard.conversing import Browser
 from tests.system.trees import Add, Life, ref
@@ -144,4 +144,4 @@ async def test_an_order_is_for_so_many_actors(operator: Browser) -> None:
 
 def test_each_verb_is_listed() -> None:
     assert get_args(Verb) == VERBS
-    assert Order("suspend").is_confirmed is False
+    assert PageOrder("suspend").is_confirmed is False

@@ -16,7 +16,7 @@ from holdfast.console.dashboard.troubles import (
     NOT_THERE,
     OF_CHILDREN,
     TELLING,
-    Seen,
+    SeenSystem,
     diagnosed_troubles,
     seen_causes,
     suspects,
@@ -40,10 +40,10 @@ def seen(
     memory: dict[int, int] | None = None,
     quarantined: frozenset[str] = frozenset(),
     told: dict[str, float] | None = None,
-) -> Seen:
+) -> SeenSystem:
     """What is known of a system with a root and these actors."""
     known = {one.path: one for one in (row("/app"), *rows)}
-    return Seen(NOW, "/app", known, memory or {}, quarantined, told or {})
+    return SeenSystem(NOW, "/app", known, memory or {}, quarantined, told or {})
 
 
 def test_there_is_advice_for_each_cause_and_for_no_other() -> None:
