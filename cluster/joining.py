@@ -15,7 +15,7 @@ from ..checkpoint.engine_calls import Called
 from ..checkpoint.journal import DamagedStore, StoreEngine, StoreFailed, StoreInUse
 from ..checkpoint.store_key import StoreKey, read_store_key
 from ..checkpoint.store_opening import open_journal
-from .leadership import LeaderElsewhere, Standby, give_up, lead, leader_name
+from .leadership import LeaderElsewhere, Patience, Standby, give_up, lead, leader_name
 from .log_records import DamagedLog
 from .log_writer import FIRST_PAUSE, LONGEST_PAUSE, Deposed
 from .ports import Engine, Unanswered
@@ -91,8 +91,7 @@ async def join(
     opened: list[Engine] = []  # filled in there: whoever is cancelled here would not get to know of it
     unanswered = NowAndThen(lambda problem: _tell(loop, silent, problem))
     try:
-        insists = unanswered if standby is not None else None
-        joined = await thread.run(_connected(connected, insists, opened))
+        joined = await thread.run(_connected(connected, unanswered, opened, Patience(waits=standby is not None)))
         leading = await thread.run(
             lead(
                 joined,
@@ -168,16 +167,17 @@ class NowAndThen:
 
 
 async def _connected(
-    connect: Callable[[], Awaitable[Engine]], unanswered: NowAndThen | None, opened: list[Engine]
+    connect: Callable[[], Awaitable[Engine]], unanswered: NowAndThen, opened: list[Engine], patience: Patience
 ) -> Engine:
-    """Connect; again and again if somebody waits for it, who is told why it takes so long. Take it down in `opened`."""
-    pause = FIRST_PAUSE
+    """Connect, again and again; whoever waits for it is told why it takes so long. Take it down in `opened`."""
+    pause, loop = FIRST_PAUSE, asyncio.get_running_loop()
     while True:
+        asked = loop.time()
         try:
             opened.append(await connect())
             return opened[0]
         except Unanswered as error:
-            if unanswered is None:
+            if patience.is_over(asked):
                 raise
             unanswered(error.problem)
         await asyncio.sleep(pause)

@@ -53,6 +53,8 @@ MOST_READERS: Final = 5
 """Readers that have to begin a log with a record that begins nothing, before it is the log that is damaged."""
 PATIENCE_SECONDS: Final = 30.0
 """How long a program that is not to wait tries to write that it leads."""
+MOMENT_SECONDS: Final = 2.0
+"""How long a program that is not to wait bears servers that cannot answer: they elect a leader, or take up a file."""
 RENEWALS: Final = 6
 """How often a leader renews its lease in the time that it lasts."""
 TRUSTED: Final = 0.75
@@ -221,6 +223,26 @@ def _nobody(what: str) -> None:
     """Tell nobody what is waited for."""
 
 
+class Patience:
+    """Says how long to go on asking servers that do not answer. Only for a running loop.
+
+    Args:
+        waits: for ever; else it is over MOMENT_SECONDS after they have not answered for the first time.
+    """
+
+    def __init__(self, *, waits: bool) -> None:
+        self._waits = waits
+        self._until = math.inf
+
+    def is_over(self, since: float | None = None) -> bool:
+        """They have not answered, now or since then: whether to give up."""
+        if self._waits:
+            return False
+        now = asyncio.get_running_loop().time()
+        self._until = min(self._until, (now if since is None else since) + MOMENT_SECONDS)
+        return now >= self._until
+
+
 async def lead(
     engine: Engine,
     me: str,
@@ -241,13 +263,14 @@ async def lead(
     Raises:
         LeaderElsewhere: another leads, and nobody is to wait for it.
         DamagedLog: what stands in the log cannot be used.
-        Unanswered: the engine cannot be reached, and nobody is to wait for it.
+        Unanswered: the engine cannot be reached for a moment, and nobody is to wait for it.
     """
     follower = Follower(engine)
     following = asyncio.ensure_future(follower.follow()) if standby == "warm" else None
+    patience = Patience(waits=standby is not None)
     try:
         while True:
-            keeper = await _take_lease(engine, me, standby, waits, unanswered, following)
+            keeper = await _take_lease(engine, me, standby, waits, unanswered, following, patience)
             if following is not None:
                 await end_tasks(following)
                 if not following.cancelled():
@@ -255,10 +278,10 @@ async def lead(
                 await follower.begin_anew()
             renewing = asyncio.ensure_future(keeper.renew_while_reading(follower))
             try:
-                patience = math.inf if standby is not None else PATIENCE_SECONDS
-                maker = await _begin_epoch(engine, me, follower, keeper, patience)
+                insists = math.inf if standby is not None else PATIENCE_SECONDS
+                maker = await _begin_epoch(engine, me, follower, keeper, insists)
             except Unanswered as error:
-                if standby is None:
+                if patience.is_over():
                     raise
                 unanswered(error.problem)
                 maker = None
@@ -290,6 +313,7 @@ async def _take_lease(
     waits: Callable[[str], None],
     unanswered: Callable[[str], None],
     following: asyncio.Future[None] | None,
+    patience: Patience,
 ) -> LeaseKeeper:
     """Wait for the lease, and return what keeps it."""
     loop = asyncio.get_running_loop()
@@ -311,7 +335,7 @@ async def _take_lease(
                 continue
             leader = await engine.lease.holder()
         except Unanswered as error:
-            if standby is None:
+            if patience.is_over():
                 raise
             unanswered(error.problem)
             has_failed = following is not None

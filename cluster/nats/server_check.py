@@ -6,6 +6,7 @@ a warning; `holdfast nats check` prints them all.
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Sequence
 from time import monotonic
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import msgspec
 
 from ...actors.errors import SpecError
+from ..leadership import MOMENT_SECONDS
 from ..ports import Unanswered, UnsafeServer
 from .access import NatsAccess, access_of
 from .server_file import MOST_BYTES, NEEDS, VARZ
@@ -27,6 +29,7 @@ OLDEST: Final = (2, 12)
 """The first version that loses no acknowledged write when a server is killed."""
 LEAST_BYTES: Final = 1024 * 1024
 """Messages of this size must be taken: parts of records are smaller, with some room."""
+_PAUSE: Final = 0.1
 _ENGINE: Final = "NATS"
 _NOT_ENABLED: Final = (10039, 10076)
 """Answers of the API where JetStream is off, for the account or for the server."""
@@ -221,13 +224,11 @@ async def look_at(client: Client, access: NatsAccess, *, seconds: float = 5.0) -
     Raises:
         Unanswered: a server has not answered in time, or has no leader now.
     """
-    from nats.errors import NoRespondersError
-
-    try:
-        info = await _asked(client, "INFO", _Info, {}, seconds)
-        has_jetstream = _refusal(info) is None
-    except NoRespondersError:
-        has_jetstream = False
+    has_jetstream = await _has_jetstream(client, seconds)
+    until = monotonic() + MOMENT_SECONDS  # While a server takes up its file, all of its accounts are without.
+    while not has_jetstream and monotonic() < until:
+        await asyncio.sleep(_PAUSE)
+        has_jetstream = await _has_jetstream(client, seconds)
     return Seen(
         version=str(client.connected_server_version),
         max_payload=client.max_payload,
@@ -235,6 +236,15 @@ async def look_at(client: Client, access: NatsAccess, *, seconds: float = 5.0) -
         servers=await _servers(client, access),
         streams=await _streams(client, seconds) if has_jetstream else (),
     )
+
+
+async def _has_jetstream(client: Client, seconds: float) -> bool:
+    from nats.errors import NoRespondersError
+
+    try:
+        return _refusal(await _asked(client, "INFO", _Info, {}, seconds)) is None
+    except NoRespondersError:
+        return False
 
 
 def problems_of(seen: Seen, access: NatsAccess) -> list[ServerProblem]:

@@ -10,7 +10,7 @@ import pytest
 from holdfast.actors.errors import HoldfastError
 from holdfast.checkpoint.journal import StaleEpoch, StoreFailed
 from holdfast.cluster.engine_thread import EngineThread
-from holdfast.cluster.leadership import Follower, LeaderElsewhere, Leading, lead
+from holdfast.cluster.leadership import MOMENT_SECONDS, Follower, LeaderElsewhere, Leading, lead
 from holdfast.cluster.log_records import CHANGES, DamagedLog, RecordMaker
 from holdfast.cluster.log_writer import Deposed
 from holdfast.cluster.ports import Unanswered
@@ -188,6 +188,13 @@ async def test_nobody_waits_for_a_leader_unless_told_to(stage: Stage) -> None:
     stage.broker.go_away(10.0)
     with pytest.raises(Unanswered):
         await lead(SimEngine(stage.broker), "second", standby=None)
+
+
+async def test_who_is_not_to_wait_bears_servers_that_are_away_for_a_moment(stage: Stage) -> None:
+    """An election, or a file that they take up, is no reason to refuse a start."""
+    stage.broker.go_away(MOMENT_SECONDS / 2)
+    leading = await lead(SimEngine(stage.broker), "first", standby=None)
+    assert leading.maker.epoch == 1
 
 
 async def test_a_log_that_has_lost_its_beginning_is_refused(stage: Stage) -> None:

@@ -13,6 +13,20 @@ LEADERSHIP = "tests/cluster/test_leadership.py"
 FLEETS = "tests/cluster/test_takeover.py"
 
 CHECKS = {
+    "servers that are away for a moment stop no start": Check(
+        "cluster/leadership.py",
+        "self._until = min(self._until, (now if since is None else since) + MOMENT_SECONDS)",
+        "self._until = now",
+        LEADERSHIP,
+        "bears_servers_that_are_away_for_a_moment",
+    ),
+    "a server that takes up its file is not taken for one without JetStream": Check(
+        "cluster/nats/server_check.py",
+        "    while not has_jetstream and monotonic() < until:",
+        "    while False:",
+        "tests/cluster/test_server_check.py",
+        "takes_up_its_file",
+    ),
     "a silent connection is not closed in good order": Check(
         "cluster/nats/connecting.py",
         "            transport._io_writer.transport.abort()\n",

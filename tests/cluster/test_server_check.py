@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import nats
 import pytest
+from nats.aio.client import Client
 from nats.js.api import StorageType, StreamConfig
 
 from holdfast.cluster.nats import server_check
@@ -112,6 +114,36 @@ async def test_a_server_without_jetstream_is_refused(own_nats1: NatsServers, tmp
     )
     with pytest.raises(UnsafeServer, match="JetStream is off"):
         await refuse_unsafe(client, ACCESS)
+    await client.close()
+
+
+async def test_a_server_that_takes_up_its_file_is_not_refused(
+    own_nats1: NatsServers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While it does so JetStream is off for all accounts for a moment."""
+    system, whole, refused = own_nats1.new_system(), list[str](), asyncio.Event()
+    client = await own_nats1.connect(system)
+    has_jetstream = server_check._has_jetstream
+
+    async def watched(client: Client, seconds: float) -> bool:
+        found = await has_jetstream(client, seconds)
+        if not found:
+            refused.set()
+        return found
+
+    def without(text: str) -> str:
+        whole.append(text)
+        return text.replace("jetstream: enabled", "jetstream: disabled")
+
+    own_nats1.reload(0, without)
+    while await has_jetstream(client, 5.0):
+        await asyncio.sleep(0.01)
+    monkeypatch.setattr(server_check, "_has_jetstream", watched)
+    monkeypatch.setattr(server_check, "MOMENT_SECONDS", 60.0)
+    checked = asyncio.ensure_future(refuse_unsafe(client, own_nats1.access(system)))
+    await asyncio.wait_for(refused.wait(), 30.0)
+    own_nats1.reload(0, lambda text: whole[0])
+    assert await asyncio.wait_for(checked, 30.0) == []
     await client.close()
 
 
