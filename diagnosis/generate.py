@@ -134,6 +134,7 @@ class LiveWiring:
     """Holds how a running system is connected, as observers see it and go by it; it outlives their lives.
 
     Attributes:
+        found: what observers go by at the moment.
         addresses: component to address.
         protected: component to address, of those whose lives replicas live.
         made: topic to how it comes about.
@@ -154,7 +155,7 @@ class LiveWiring:
 
     def use(self, found: Generated) -> None:
         """Have observers go by this from their next look on."""
-        self._wiring = found.wiring
+        self.found = found
         replace(self.addresses, found.addresses)
         replace(self.protected, {name: wired.path for name, wired in found.wiring.items() if wired.is_protected})
         replace(self.made, _made(found.wiring, set().union(*self.heard.values())))
@@ -162,10 +163,10 @@ class LiveWiring:
     def look_again(self, node: Node) -> Generated | None:
         """What the system is like now; None if it is as before."""
         wiring = _wiring(node, self.heard, self._out, self.asked)
-        for name, wired in self._wiring.items():
+        for name, wired in self.found.wiring.items():
             if name not in wiring and _is_missed(node, wired):
                 wiring[name] = wired  # It has failed for good: that is no change of what the system should be.
-        return None if wiring == self._wiring else declared(wiring)
+        return None if wiring == self.found.wiring else declared(wiring)
 
 
 def _is_missed(node: Node, wired: Wired) -> bool:
@@ -400,8 +401,3 @@ def observers_for(
         observer("replicas", Start(ReplicaObserver, (wiring.protected,))),
         observer("topics", Start(FlowObserver, (wiring.made,), {**flow, "manner": manner})),
     )
-
-
-def child_name(what: str, name: str) -> str:
-    """A name for who looks at a topic or a component; an address has no `/` in its parts."""
-    return f"{what} {name.strip('/').replace('/', '.')}"
