@@ -37,7 +37,8 @@ class Reach:
         replace(self.addresses, {**found, **self._given})
         above = {component: path.rpartition("/")[0] for component, path in self.addresses.items()}
         replace(self.above, {component: path for component, path in above.items() if path not in ("", self._root)})
-        replace(self.groups, {replicas_of(component): path for component, path in self.addresses.items()})
+        groups = {replicas_of(component): path for component, path in self.addresses.items()}
+        replace(self.groups, {name: path for name, path in groups.items() if name not in self.addresses})
 
 
 class _LookAgain(Message):

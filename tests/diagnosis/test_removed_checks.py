@@ -19,6 +19,55 @@ BOARD = "tests/diagnosis/board/test_board.py"
 FLOW = "tests/diagnosis/observers/test_flow.py"
 
 CHECKS = {
+    "limits go with an actor that is moved": Check(
+        "diagnosis/live_limits.py",
+        "brought.get(component) or self._by_pattern(component)",
+        "self._by_pattern(component)",
+        FOLLOWING,
+        "limits_go_with",
+    ),
+    "actors that change places are seen to": Check(
+        "diagnosis/model_follower.py",
+        "if found is not known or limits != self._limits.applied:",
+        "if found is not known:",
+        FOLLOWING,
+        "change_places",
+    ),
+    "lives of another actor are no restarts": Check(
+        "diagnosis/observers/property.py",
+        "if cell is not self._lived:",
+        "if False:",
+        FOLLOWING,
+        "lives_of_another",
+    ),
+    "limits of nobody are refused": Check(
+        "diagnosis/live_limits.py",
+        "if name not in known and _OF_PATTERNS.isdisjoint(name):",
+        "if False:",
+        FOLLOWING,
+        "there_is_not",
+    ),
+    "an actor has no name of replicas": Check(
+        "diagnosis/generate.py",
+        'return f"{word.removesuffix(_REPLICAS)}%2E{_REPLICAS[1:]}" if word.endswith(_REPLICAS) else word',
+        "return word",
+        REPLICAS,
+        "told_apart",
+    ),
+    "a component of one's own has no name of replicas": Check(
+        "diagnosis/generate.py",
+        'raise ModelError(tuple(f"{name}: {why}" for name in taken))',
+        "pass",
+        REPLICAS,
+        "is_refused",
+    ),
+    "an actor is not repaired as replicas": Check(
+        "diagnosis/model_follower.py",
+        "for name, path in groups.items() if name not in self.addresses}",
+        "for name, path in groups.items()}",
+        REPLICAS,
+        "takes_nobody",
+    ),
     "what is contested is unknown, and the rest is diagnosed": Check(
         "diagnosis/engine/minimal_diagnoses.py",
         "state = State.FAULTY if is_faulty else State.CONTRADICTORY",

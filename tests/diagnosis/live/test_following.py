@@ -31,6 +31,10 @@ class Freeze(hf.Message):
     pass
 
 
+class Fall(hf.Message):
+    pass
+
+
 class Talker(hf.Actor):
     """Publishes on a topic of its own name, until it freezes; a new life goes on."""
 
@@ -44,6 +48,10 @@ class Talker(hf.Actor):
     @hf.on(Freeze)
     def _freeze(self, message: Freeze) -> None:
         self.timer.cancel()
+
+    @hf.on(Fall)
+    def _fall(self, message: Fall) -> None:
+        raise RuntimeError("as told")
 
 
 class Ear(hf.Actor):
@@ -118,7 +126,10 @@ SHORT = {Property.MAILBOX: Limits(high=10.0)}
 async def pair(system: hf.ActorSystem, *names: str) -> list[hf.ActorRef[hf.Supervisor]]:
     """Two supervisors; the first one has talkers of these names."""
     talkers = [hf.child(name, hf.start(Talker)) for name in names]
-    return [await system.start(hf.supervisor(name, children=some)) for name, some in (("one", talkers), ("two", []))]
+    return [
+        await system.start(hf.supervisor(name, children=some, intensity=100))
+        for name, some in (("one", talkers), ("two", []))
+    ]
 
 
 async def pile_up(system: hf.ActorSystem, watching: diagnosis.Watch, path: str) -> set[str]:
@@ -169,15 +180,33 @@ async def test_limits_of_a_component_that_there_is_not_are_refused(system: hf.Ac
         await diagnosis.watch(system, seconds=0.5, limits={"one/lefd": SHORT})
 
 
-async def test_actors_that_change_places_take_their_limits_with_them(system: hf.ActorSystem) -> None:
-    """The wiring is as before: that alone tells nobody that they have been exchanged."""
-    one, two = await pair(system, "both")
-    await two.ask(hf.StartChild(hf.child("both", hf.start(Talker))))
-    watching = await diagnosis.watch(system, seconds=0.5, limits={"[o]ne/both": SHORT})
+async def exchange(system: hf.ActorSystem) -> None:
+    """Have `/t/one/both` and `/t/two/both` change places at once."""
     aside = await system.start(hf.supervisor("aside"))
     async with system.transaction() as change:
         change.move("/t/one/both", aside)
-        change.move("/t/two/both", one)
-        change.move("/t/aside/both", two)
+        change.move("/t/two/both", "/t/one")
+        change.move("/t/aside/both", "/t/two")
     await advance(3.0)
+
+
+async def test_actors_that_change_places_take_their_limits_with_them(system: hf.ActorSystem) -> None:
+    """The wiring is as before: that alone tells nobody that they have been exchanged."""
+    _, two = await pair(system, "both")
+    await two.ask(hf.StartChild(hf.child("both", hf.start(Talker))))
+    watching = await diagnosis.watch(system, seconds=0.5, limits={"[o]ne/both": SHORT})
+    await exchange(system)
     assert await pile_up(system, watching, "/t/two/both") == {"ok(two/both.mailbox)"}
+
+
+async def test_lives_of_another_actor_at_the_address_are_no_restarts(system: hf.ActorSystem) -> None:
+    _, two = await pair(system, "both")
+    await two.ask(hf.StartChild(hf.child("both", hf.start(Talker))))
+    for _ in range(5):
+        system.ref("/t/one/both", Talker).tell(Fall())
+        await advance(1.0)
+    watching = await diagnosis.watch(system, seconds=0.5, limits={"*/both": {Property.RESTARTS: Limits(high=3.5)}})
+    await advance(3.0)
+    await exchange(system)
+    seen = {str(atom) for atom in (await watching.observed()).negative if str(atom).endswith(".restarts)")}
+    assert seen == set()
