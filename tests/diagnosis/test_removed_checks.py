@@ -17,8 +17,16 @@ FOLLOWING = "tests/diagnosis/live/test_following.py"
 BRIDGES = "tests/diagnosis/bridges/test_bridges.py"
 BOARD = "tests/diagnosis/board/test_board.py"
 FLOW = "tests/diagnosis/observers/test_flow.py"
+FOREIGN = "tests/diagnosis/foreign/test_foreign.py"
 
 CHECKS = {
+    "what was guessed of bursts is forgotten": Check(
+        "diagnosis/observers/flow.py",
+        "return learned.most_in if self.seen >= ENOUGH else max(learned.most_in, self.guess)",
+        "return max(learned.most_in, self.guess)",
+        FOREIGN,
+        "in_bursts",
+    ),
     "limits go with an actor that is moved": Check(
         "diagnosis/live_limits.py",
         "brought.get(component) or self._by_pattern(component)",
