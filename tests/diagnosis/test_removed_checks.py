@@ -232,14 +232,14 @@ CHECKS = {
     ),
     "repair follows the system": Check(
         "diagnosis/model_follower.py",
-        "        self._reach.use(found.addresses)\n",
+        "            self._reach.use(found.addresses)\n",
         "",
         FOLLOWING,
         "of_any_name",
     ),
     "components are named by words": Check(
         "diagnosis/generate.py",
-        "names = {cell.path: word_for(cell.path[len(root.path) + 1 :]) for cell in cells}",
+        "names = {cell.path: component_for(cell.path[len(root.path) + 1 :]) for cell in cells}",
         "names = {cell.path: cell.path[len(root.path) + 1 :] for cell in cells}",
         FOLLOWING,
         "of_any_name",
