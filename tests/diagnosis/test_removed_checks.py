@@ -20,6 +20,13 @@ FLOW = "tests/diagnosis/observers/test_flow.py"
 FOREIGN = "tests/diagnosis/foreign/test_foreign.py"
 
 CHECKS = {
+    "turns that nobody saw are guessed": Check(
+        "diagnosis/observers/flow.py",
+        "return learned.most_in if self.seen >= ENOUGH else max(learned.most_in, self.guess)",
+        "return learned.most_in",
+        FLOW,
+        "nobody_saw_before",
+    ),
     "what was guessed of bursts is forgotten": Check(
         "diagnosis/observers/flow.py",
         "return learned.most_in if self.seen >= ENOUGH else max(learned.most_in, self.guess)",
