@@ -126,6 +126,8 @@ class FarParent(Parent):
         if wanted.bound is not None and not isinstance(cell.extra().bound, RemoteBound):
             cell.extra().bound = Bound(wanted.bound.capacity, wanted.bound.overflow)
         try:
+            if wanted.register is not None:
+                cell.node.name_life(cell, wanted.register)
             host = self._host_for(cell, wanted)
             cell.host = host
             context = cell.node.base_context.copy()  # Not in that of the socket, which is whoever's had the process.
@@ -165,6 +167,8 @@ class FarParent(Parent):
         if self.wanted is not wanted:
             return
         problem = "" if error is None else error.reason if isinstance(error, StartFailed) else str(error)
+        if error is not None and self.cell is not None:
+            lifecycle.free_names(self.cell)
         if error is not None and wanted.at_root is not None:
             self.wanted = None
         self.port().to_life(Started(wanted.number, problem, isinstance(error, StartIgnored)))
@@ -486,5 +490,6 @@ def _tell_end(cell: Cell, reason: ExitReason, *, recovers: bool) -> None:
     """Tell of the end of a life whose supervisor is in another process: that one decides what follows."""
     more = cell.extra()
     cell.state, more.reason = DOWN, reason
+    lifecycle.free_names(cell)
     links.announce(cell, reason, recovering=recovers)
     lifecycle.tell_enders(more, reason)
