@@ -65,7 +65,7 @@ class Inner:
     def undone(self, path: str) -> None:
         """The life at an address is over, or could not be built, and others may follow."""
         cell = self._cells.get(path)
-        if cell is not None and cell.host is self._host:  # Else it has left the process, and goes on elsewhere.
+        if cell is not None:
             lifecycle.free_names(cell)
 
     def _known(self, home: Cell, path: str, kind: str) -> Cell:

@@ -63,7 +63,7 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
 
 async def by_name(system: hf.ActorSystem) -> hf.ActorRef[Clerk]:
     """Whoever has the name, once somebody has it and answers: between two lives nobody does."""
-    async with asyncio.timeout(60.0):
+    async with asyncio.timeout(30.0):
         while True:
             try:
                 ref: hf.ActorRef[Clerk] = system.whereis("bank")
@@ -160,6 +160,15 @@ async def test_a_name_has_one_holder_wherever_others_want_it(system: hf.ActorSys
     assert await has_it(system, "/app/away/two")
     await supervisor(system, "away").ask(hf.TerminateChild("two"), 20)
     assert await has_it(system, path)
+
+
+async def test_a_name_ends_with_the_process(system: hf.ActorSystem) -> None:
+    far = hf.supervisor("far", intensity=1000, isolation="process", restart="temporary", children=[clerk()])
+    await system.start(far)
+    await killed(system, system.pid_of(supervisor(system, "far")))
+    is_free(system)
+    await system.start(clerk())
+    await has_it(system, "/app/one")
 
 
 class Fails(hf.Actor):

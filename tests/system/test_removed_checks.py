@@ -923,12 +923,12 @@ CHECKS = {
         SUPERVISORS,
         "test_all_below_it and to and process",
     ),
-    "the name of an actor below another one in a process is free when it ends": Check(
+    "the name of an actor below another one in a process is free when that ends": Check(
         "actors/kernel/lifecycle.py",
         "        free_names(cell)  # Of a life",
         "        pass  # Of a life",
-        SUPERVISORS,
-        "test_who_is_tied_to_it",
+        FAR_NAMED,
+        "test_a_name_ends_with_the_process",
     ),
     "a link through a ref from before is one with who is there now": Check(
         "actors/kernel/context.py",
@@ -1063,13 +1063,6 @@ CHECKS = {
         "            pass\n",
         FAR_NAMED,
         "test_nobody_has_it_between_two_lives and recorded",
-    ),
-    "one that has left has it elsewhere": Check(
-        "actors/process/stand_ins.py",
-        "        if cell is not None and cell.host is self._host:  # Else",
-        "        if cell is not None:  # Else",
-        FAR_NAMED,
-        "test_the_name_stays_when_what_protects",
     ),
     "a child that is added has a name that is free now": Check(
         "system/transaction/structure.py",
