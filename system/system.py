@@ -248,7 +248,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             root.ended().add_done_callback(self._root_ended)
             await self._specifications.start_added(lambda spec: root.ref.ask(StartChild(spec), LONG))
             if (at := options.reached_at) is not None:
-                self._transport = await serve(self._lines, at, options.nats)
+                waits = options.standby is not None
+                self._transport = await serve(self._lines, at, options.nats, waits=waits, silent=self._silent)
         except BaseException as error:  # Nobody is in the body yet who would hear of a failure, or end what has begun.
             await self.__aexit__(type(error), error, error.__traceback__)
             raise
@@ -295,12 +296,16 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             options.standby,
             options.nats.told(),
             waits=lambda leader: node.emit(StandingBy(where, leader)),
-            silent=lambda reason: node.emit(ServersSilent(where, reason)),
+            silent=self._silent,
             deposed=self._deposed,
             key=options.store_key,
         )
         node.emit(LeadershipTaken(where, journal.epoch))
         return Called(journal)
+
+    def _silent(self, reason: str) -> None:
+        """The servers do not answer, and the start waits for them."""
+        self._node.emit(ServersSilent(f"/{self.name}", reason))
 
     def _deposed(self, by: Deposed) -> None:
         """Another program leads: the tree ends, and the body hears of it."""
