@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import functools
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -174,36 +175,30 @@ async def watch(
         ValueError: there is no such stance of repair, or the file of repair is another one.
     """
     check_stance(repair)
-    generated = await generate(system, seconds=seconds) if model is None else None
-    watchers = [*observers]
-    live = None if generated is None else LiveWiring(generated)
     reach = Reach("" if system._node.root is None else system._node.root.path, addresses or {})
-    reach.use({} if generated is None else generated.addresses)
-    where = reach.addresses
-    if generated is not None and live is not None:
-        declaration = generated.declaration
+    complete = functools.partial(_completed, limits or {}, alerts)
+    watchers, generated = [*observers], None
+    if model is None:
+        generated = await generate(system, seconds=seconds)
+        reach.use(generated.addresses)
+        declaration, live = generated.declaration, LiveWiring(generated)
+        heard = live.addresses
         watchers += observers_for(
             generated, window=window, hung_after=hung_after, manner=manner, wiring=live, baselines=baselines
         )
-        completed = _completed(limits, alerts=alerts)
-        follower = child("follower", Start(ModelFollower, (live, SERVER, completed, reach)))
+        follower = child("follower", Start(ModelFollower, (live, SERVER, complete, reach)))
         options["others"] = (*options.get("others", ()), follower)
     else:
-        assert model is not None
-        declaration = model.declaration() if isinstance(model, System) else model
-    groups = {name: path for name, path in where.items() if has_replicas(system._node.find(path))}
-    if generated is None and where:
-        watchers.append(observer("nodes", Start(NodeObserver, (where,), {"hung_after": hung_after, "manner": manner})))
-        watchers.append(observer("runtime", Start(RuntimeObserver, (where,))))
-        watchers.append(observer("replicas", Start(ReplicaObserver, (groups,))))
-        declaration = evident(declaration, where, protected=groups)
-    if limits:
-        declaration = expecting(declaration, limits)
-        watchers += property_observers(limits, where, manner)
+        declaration, heard = model.declaration() if isinstance(model, System) else model, reach.addresses
+        if heard:
+            groups = {name: path for name, path in heard.items() if has_replicas(system._node.find(path))}
+            declaration = evident(declaration, heard, protected=groups)
+            watchers += _observers_of_lives(heard, groups, hung_after, manner)
+    where = reach.addresses
+    watchers += property_observers(limits or {}, where, manner)
     if alerts:
-        declaration = _with_alerts(declaration, where)
-        heard = where if live is None else live.addresses
         watchers.append(observer("alerts", Start(AlertObserver, (heard,))))
+    declaration = _expecting_all(declaration, where, limits or {}, alerts=alerts)
     mend = None
     if repair != "off":
         ways = _actions(reach, actions)
@@ -214,22 +209,32 @@ async def watch(
     return Watch(started, system._node, where, generated)
 
 
-def _completed(limits: LimitsOf | None, *, alerts: bool) -> Callable[[Generated], Generated]:
-    """What is added to each model that is generated anew; limits of components that have gone are left out."""
-
-    def adapt(found: Generated) -> Generated:
-        kept = {name: some for name, some in (limits or {}).items() if name in found.addresses}
-        declaration = expecting(found.declaration, kept)
-        if alerts:
-            declaration = _with_alerts(declaration, found.addresses)
-        return msgspec.structs.replace(found, declaration=declaration)
-
-    return adapt
+def _observers_of_lives(
+    addresses: Mapping[str, str], groups: Mapping[str, str], hung_after: float | None, manner: Manner | None
+) -> Iterable[ChildSpec]:
+    """Describe who observes whether the components of a given model run; `groups` are those that have replicas."""
+    yield observer("nodes", Start(NodeObserver, (addresses,), {"hung_after": hung_after, "manner": manner}))
+    yield observer("runtime", Start(RuntimeObserver, (addresses,)))
+    yield observer("replicas", Start(ReplicaObserver, (groups,)))
 
 
-def _with_alerts(declaration: Declaration, components: Iterable[str]) -> Declaration:
-    """Return the declaration again, in which nobody outside complains about a component that works."""
-    more = tuple(Expectation(str(no_alert(name)), (name,)) for name in components)
+def _completed(limits: LimitsOf, alerts: bool, found: Generated) -> Generated:
+    """Return a model that is generated anew, with what is expected of its components besides."""
+    declaration = _expecting_all(found.declaration, found.addresses, limits, alerts=alerts)
+    return msgspec.structs.replace(found, declaration=declaration)
+
+
+def _expecting_all(
+    declaration: Declaration, addresses: Mapping[str, str], limits: LimitsOf, *, alerts: bool
+) -> Declaration:
+    """Return the declaration again: components keep their limits, and with `alerts` nobody outside complains of them.
+
+    Limits of components that have no address, as they have gone, are left out.
+    """
+    declaration = expecting(declaration, {name: some for name, some in limits.items() if name in addresses})
+    if not alerts:
+        return declaration
+    more = tuple(Expectation(str(no_alert(name)), (name,)) for name in addresses)
     return msgspec.structs.replace(declaration, expectations=(*declaration.expectations, *more))
 
 
