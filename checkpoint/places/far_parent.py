@@ -167,8 +167,6 @@ class FarParent(Parent):
         if self.wanted is not wanted:
             return
         problem = "" if error is None else error.reason if isinstance(error, StartFailed) else str(error)
-        if error is not None and self.cell is not None:
-            lifecycle.free_names(self.cell)
         if error is not None and wanted.at_root is not None:
             self.wanted = None
         self.port().to_life(Started(wanted.number, problem, isinstance(error, StartIgnored)))

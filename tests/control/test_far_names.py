@@ -217,6 +217,18 @@ class Early(Clerk):
         return self.found
 
 
+@pytest.mark.parametrize("place", ["task", "recorded task"])
+async def test_who_finds_it_is_as_its_spec_says(system: hf.ActorSystem, place: str) -> None:
+    far = await system.start(hf.supervisor("far", intensity=1000, isolation="process"))
+    options, kind = PLACES[place][1], hf.start(Clerk)
+    await far.ask(hf.StartChild(hf.child("one", kind, register="one", scope="fleet", **options)), 20)
+    await far.ask(hf.StartChild(hf.child("two", kind, register="two", **options)), 20)
+    assert system._node.shown("one").path == "/app/far/one"
+    with pytest.raises(hf.errors.NoSuchActor):
+        system._node.shown("two")
+    assert system.whereis("two").path == "/app/far/two"
+
+
 @pytest.mark.parametrize("place", ["task", "recorded task", "process"])
 async def test_it_has_the_name_when_it_starts(system: hf.ActorSystem, place: str) -> None:
     system.spawn(hf.start(Looks), "looks")

@@ -1057,13 +1057,6 @@ CHECKS = {
         FAR_NAMED,
         "test_nobody_has_it_between_two_lives and recorded",
     ),
-    "or until it has not come to be": Check(
-        "checkpoint/places/far_parent.py",
-        "            lifecycle.free_names(self.cell)\n",
-        "            pass\n",
-        FAR_NAMED,
-        "test_nobody_has_it_between_two_lives and recorded",
-    ),
     "a child that is added has a name that is free now": Check(
         "system/transaction/structure.py",
         "        raise NameTaken(name)\n",

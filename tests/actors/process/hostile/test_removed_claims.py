@@ -67,26 +67,19 @@ CHECKS = {
         "tests/actors/process/hostile/test_hostile.py",
         "test_a_breach_ends_the_worker_and_nobody_else",
     ),
-    "a process gives names to its own actors": Check(
-        GATE,
-        '    _below(gate, to, frame)\n    text(frame, "kind")\n    gate.require_name',
-        '    text(frame, "kind")\n    gate.require_name',
-        CLAIMS,
-        "test_a_name_that_it_may_not_give_is_a_breach and other",
-    ),
-    "only if it has a supervisor": Check(
+    "a process has names given if it has a supervisor": Check(
         GATE,
         "        if kind is None or not kind._supervises:\n",
         "        if False:\n",
-        "tests/actors/process/hostile/test_hostile.py",
-        "test_a_breach_ends_the_worker_and_nobody_else",
+        CLAIMS,
+        "test_a_process_without_a_supervisor_gives_no_names",
     ),
     "and such as are names": Check(
         GATE,
         '        if name.startswith("/") or len(name)',
         "        if False and len(name)",
         CLAIMS,
-        "test_a_name_that_it_may_not_give_is_a_breach and world",
+        "test_nor_by_what_it_wants_of_a_child",
     ),
     "also by what it wants of a child": Check(
         "checkpoint/home/life_ports.py",
