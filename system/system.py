@@ -30,7 +30,7 @@ from ..actors.process.worker_pool import Workers
 from ..checkpoint.engine_calls import Called
 from ..checkpoint.home.homes import Homes
 from ..checkpoint.home.journal_home import JournalHome
-from ..checkpoint.journal import Journal, StoreEngine
+from ..checkpoint.journal import Journal, StaleEpoch, StoreEngine
 from ..checkpoint.method import Durability
 from ..checkpoint.places.far_parent import FarParent
 from ..checkpoint.places.life_here import recorded_here
@@ -208,15 +208,20 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         try:
             check_system(engine, self.name)
             self._homes = Homes(node, engine, durability=options.durability, file=file, hooks=options.recovery_hooks)
-        except HoldfastError:
+            self._specifications = Specifications(self._homes, is_kept=options.store is not None)
+            self._mechanism_notes = MechanismNotes(self._homes)
+            epoch = engine.epoch if engine.safe_at == "sync" else None
+            self._lines = Lines(node, self.name, new_boot(epoch), self._homes, options.connection_limits)
+            if options.history:
+                store = self._homes if self._homes.journal.durable else None
+                self._history = HistoryRecorder(node, store, log_payloads=options.log_payloads)
+        except HoldfastError as error:
             with contextlib.suppress(HoldfastError):  # What it says now is only what follows from that.
                 engine.close()
             if self._sink is not None:
                 self._sink.close()
+            self._refuse_deposed(error, engine)
             raise
-        if options.history:
-            store = self._homes if self._homes.journal.durable else None
-            self._history = HistoryRecorder(node, store, log_payloads=options.log_payloads)
         RecoveryTree(node, self._homes).begin_with_first_home()
         self._workers = self._make_pool(node)
         if file is not None:
@@ -224,10 +229,6 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         self._moves = Moves(node)
         self._watch = LoopWatch(node, options.watch_lag, options.watch_turns)
         self._watch.open()
-        self._specifications = Specifications(self._homes, is_kept=options.store is not None)
-        self._mechanism_notes = MechanismNotes(self._homes)
-        epoch = engine.epoch if engine.safe_at == "sync" else None
-        self._lines = Lines(node, self.name, new_boot(epoch), self._homes, options.connection_limits)
         node.connect(
             Ports(
                 host_for=self._host_for,
@@ -251,7 +252,12 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
                 waits = options.standby is not None
                 self._transport = await serve(self._lines, at, options.nats, waits=waits, silent=self._silent)
         except BaseException as error:  # Nobody is in the body yet who would hear of a failure, or end what has begun.
-            await self.__aexit__(type(error), error, error.__traceback__)
+            try:
+                await self.__aexit__(type(error), error, error.__traceback__)
+            except StoreError as store_error:
+                self._refuse_deposed(store_error, engine)
+                raise
+            self._refuse_deposed(error, engine)
             raise
         return self
 
@@ -302,6 +308,11 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         )
         node.emit(LeadershipTaken(where, journal.epoch))
         return Called(journal)
+
+    def _refuse_deposed(self, error: BaseException, engine: StoreEngine) -> None:
+        """A start has failed. Raises LeadershipLost if that is because another program has come to lead meanwhile."""
+        if isinstance(error, StaleEpoch) and engine.safe_at == "sync":
+            raise LeadershipLost(self.name, "another program", error.current) from error
 
     def _silent(self, reason: str) -> None:
         """The servers do not answer, and the start waits for them."""

@@ -276,6 +276,11 @@ class Cell(_Hot):
         return self.state is GONE or (self.state is DOWN and self.spec is None)
 
     @property
+    def coming_life(self) -> int:
+        """The number of the life that is lived here, or between two lives that of the next one."""
+        return self.life + (self.state is DOWN)
+
+    @property
     def living(self) -> Cell:
         """Who lives at this address: this one, or who has followed it there when it had ended; itself if nobody has."""
         return self if self.state is not GONE else self.node.successor(self) or self

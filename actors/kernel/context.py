@@ -90,7 +90,10 @@ class ActorContext:
 
     @property
     def life(self) -> int:
-        """The number of this life at the address, from 1."""
+        """The number of this life at the address, from 1.
+
+        A replay runs in another life, so a journaled turn must not reply, send or keep it: its replay would diverge.
+        """
         return self._cell.life
 
     @property

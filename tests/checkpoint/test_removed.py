@@ -830,7 +830,7 @@ CHECKS = {
     ),
     "T26: the first life at a new address is another one than the first at the old": Check(
         "checkpoint/recovery/safe_states.py",
-        "receiver.life == _next_life(cell) or self",
+        "receiver.life == (cell, cell.coming_life) or self",
         "(receiver.life or (cell, 0))[1] == cell.life or self",
         "tests/checkpoint/test_safe_state_lives.py",
         "test_a_new_life_is_told_once and above and task",

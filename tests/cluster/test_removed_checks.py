@@ -27,6 +27,13 @@ CHECKS = {
         "tests/cluster/test_simulated_fleet.py",
         "begins_to_lead_waits_for_servers",
     ),
+    "who is deposed while it starts has lost the leadership": Check(
+        "system/system.py",
+        'if isinstance(error, StaleEpoch) and engine.safe_at == "sync":',
+        "if False:",
+        "tests/cluster/test_simulated_fleet.py",
+        "deposed_while_it_starts",
+    ),
     "a server that takes up its file is not taken for one without JetStream": Check(
         "cluster/nats/server_check.py",
         "    while not has_jetstream and monotonic() < until:",
