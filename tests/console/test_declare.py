@@ -217,6 +217,8 @@ async def test_what_is_kept_stays_whatever_it_is(app: hf.ActorSystem) -> None:
         ),
         ('["/app/a/b"]\nclass = "tests.system.trees:Counter"', r"its supervisor /app/a has no table in this file"),
         ('["/app/a"]\nclass = "tests.system.trees:Add"', r"line 2, /app/a, class: tests.system.trees:Add is no actor"),
+        ('["/app/a"]\nclass = "no_such:Class"', r"/app/a, class: class no_such:Class is not there .*'\)$"),
+        ('name = "top"\nchildren = []', r"line 1, name: this is one supervisor as hf.load_tree reads it"),
     ],
 )
 def test_an_error_names_line_and_key(text: str, problem: str) -> None:
