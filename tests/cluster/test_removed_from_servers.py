@@ -172,8 +172,8 @@ CHECKS = {
     ),
     "a start that is cancelled ends what it has begun": Check(
         "system/system.py",
-        "                await self.__aexit__(type(error), error, error.__traceback__)\n",
-        "                pass\n",
+        "            await self.__aexit__(type(error), error, error.__traceback__)\n            raise",
+        "            raise",
         CONNECTING,
         "test_a_start_that_is_cancelled",
     ),
