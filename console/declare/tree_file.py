@@ -168,7 +168,9 @@ class TreeFile:
         if not isinstance(args, list):
             raise self.error(path, "args must be a list", "args")
         start: Start[Any] = Start(kind, tuple(args), dict(kwargs))
-        return child(path.rpartition("/")[2], start, autostart=given.get("running", True), **options)
+        register = next(iter(self._texts(path, "names", given.get("names", []))), None)  # Others are of its life.
+        running = given.get("running", True)
+        return child(path.rpartition("/")[2], start, autostart=running, register=register, **options)
 
     def _recovery(self, path: str, given: object) -> Any:
         settings = cast("dict[str, Any]", dict(given) if isinstance(given, dict) else {"method": given})

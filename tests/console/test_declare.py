@@ -12,7 +12,7 @@ from holdfast.console.declare.tree_file import TreeFile
 from holdfast.console.declare.tree_plan import declare
 from holdfast.console.endpoint import control_endpoint
 from tests.console.commands import holdfast
-from tests.system.trees import Add, Double, ref
+from tests.system.trees import Add, Boom, Counter, Double, ref
 
 DONE, FAILED, UNUSABLE = 0, 1, 2
 SHOP = """
@@ -101,6 +101,49 @@ async def test_each_difference_is_one_step_and_state_is_kept(
     assert (await app.get_status(one)).life == 1
     await steps(app, SHOP)
     assert await steps(app, SHOP) == []
+
+
+FLEET = """
+["/app"]
+supervisor = "one_for_one"
+intensity = 1000
+
+["/app/a"]
+class = "tests.system.trees:Counter"
+args = [5]
+names = ["first"]
+"""
+
+
+async def test_a_file_says_which_names_an_actor_has_and_not_who_finds_it(app: hf.ActorSystem) -> None:
+    """A name of the next lives, too: the program has given it by the spec, with a scope that the file does not know."""
+    one = await app.start(hf.child("a", hf.start(Counter, 5), register="first", scope="fleet"))
+
+    async def lives_again() -> list[str]:
+        """The names of its next life."""
+        with pytest.raises(hf.RemoteCrash):
+            await one.ask(Boom())
+        assert await one.ask(Add(1)) == 6
+        return list(app._node.names)
+
+    assert await steps(app, FLEET) == []
+    assert await lives_again() == ["first"]
+    assert app._node.shown("first") is one._cell
+    for file, names in ((FLEET.replace("first", "till"), ["till"]), (FLEET.replace('"first"', ""), [])):
+        assert await steps(app, file)
+        assert await steps(app, file) == []
+        assert list(app._node.names) == await lives_again() == names
+    await steps(app, FLEET)
+    assert await lives_again() == ["first"]
+    with pytest.raises(hf.errors.NoSuchActor):
+        app._node.shown("first")  # It was taken away, with who has found it.
+
+
+async def test_a_new_actor_of_a_file_is_found_in_its_system(app: hf.ActorSystem) -> None:
+    assert await steps(app, FLEET) == ["add /app/a"]
+    assert app.whereis("first").path == "/app/a"
+    with pytest.raises(hf.errors.NoSuchActor):
+        app._node.shown("first")
 
 
 async def test_what_is_not_in_the_file_is_removed_and_children_of_dynamic_supervisors_stay(
