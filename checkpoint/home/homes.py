@@ -142,7 +142,7 @@ class Homes:
             return
         source.deliveries += 1
         try:
-            source.positions += self.journal.append([(switch.path, ("tried", source.id, source.deliveries))])
+            source.stands_at(*self.journal.append([(switch.path, ("tried", source.id, source.deliveries))]))
         except HoldfastError as error:
             raise StartFailed(switch.path, str(error)) from error
         hands.word(self.addresses.key(switch.path))[0] = 0

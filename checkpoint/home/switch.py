@@ -207,13 +207,14 @@ class Switch:
         if self.intake.bound is not None:
             self.intake.bound.added(source)
         if self.journal.durable:
-            source.positions, source.held = [], True
+            source.held = True
             self.intake.last = source
             if name and name not in self.shapes.noted:
                 self.note_shape(name, batch)
                 self.note_reply(name, batch)
             if batch is not None:
                 self.outputs.rows.close()
+                source.positions = []
                 batch.add(self.path, source.entry(), source.positions)
             else:
                 self.outputs.rows.admit(source)

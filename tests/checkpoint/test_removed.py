@@ -178,7 +178,7 @@ CHECKS = {
     ),
     "what a snapshot contains is not handled again though its row stays": Check(
         "checkpoint/home/input_ledger.py",
-        "        if key in self.shared.over:\n            row.over.append(key)\n            return\n",
+        "        if key in self.shared.over:\n            row.over += (key,)\n            return\n",
         "",
         "tests/checkpoint/test_turn_rows.py",
         "test_a_snapshot_may_contain_a_part_of_a_row",
