@@ -90,10 +90,11 @@ class Switch:
     def __init__(
         self, homes: Homes, cell: Cell, method: Method, journal: HomeJournal, saved: Saved | None = None
     ) -> None:
-        self.homes, self.node, self.path = homes, homes.node, cell.path
+        self.homes, self.node = homes, homes.node
+        self.path = path = cell.path
         self.cell: Cell | None = cell
         self.method, self.journal = method, journal
-        self.ledger = InputLedger(cell.path)
+        self.ledger = InputLedger(path)
         self.life = PresentLife()
         self.intake = Intake()
         self.calls = PendingCalls(self)
