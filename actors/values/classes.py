@@ -6,7 +6,7 @@ import dataclasses
 import enum
 import sys
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import lru_cache, partial
 from importlib import import_module
 from itertools import chain
@@ -71,7 +71,7 @@ def class_mark(kind: Any) -> ExtType | None:
 
 
 @lru_cache(1024)
-def slots_of(kind: type) -> Mapping[str, Any]:
+def slots_of(kind: type) -> dict[str, Any]:
     """Descriptors of all slots, by name, inherited ones first. (The same object each time: nobody changes it.)"""
     found = chain.from_iterable(vars(base).items() for base in reversed(kind.__mro__))
     return {name: slot for name, slot in found if type(slot) is types.MemberDescriptorType}
