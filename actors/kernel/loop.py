@@ -251,6 +251,8 @@ class RunLoop:
         _leave_task(self.loop, runner.task)
         self.turns_held += 1
         suspended = Suspended(cell, item, turn, waiting, runner)
+        if suspended.marked is not None:
+            suspended.marked._turn_waits()
         cell.extra().turn = suspended
         runner.take(suspended)
 
@@ -391,6 +393,7 @@ class Suspended:
         "is_left",
         "item",
         "killed",
+        "marked",
         "overran",
         "rebinds",
         "runner",
@@ -402,6 +405,8 @@ class Suspended:
     def __init__(self, cell: Cell, item: Any, coroutine: Any, waiting: Any, runner: Runner) -> None:
         self.cell, self.item, self.coroutine, self.waiting, self.runner = cell, item, coroutine, waiting, runner
         self.killed = self.is_left = False  # (left: cancelled, and it does not matter how it ends)
+        ctx = cell.ctx  # Of this life: the cell may have another one before its coroutine ends.
+        self.marked = ctx if ctx is not None and ctx._marks_waits else None  # who is told when it waits, and goes on
         self.overran: BaseException | None = None  # what it has raised, however its coroutine ends
         self.since: float = cell.node.now  # on the loop's clock, of the slice it began in
         self.rebinds: dict[str, Cell] | None = None  # bindings that change when this turn is over
@@ -508,12 +513,20 @@ class Runner(Coroutine[Any, Any, None]):
     def _step(self, turn: Suspended, context: Context, step: Callable[[Any], Any], value: Any) -> Any:
         """Step a started coroutine inside its actor's context; what it waits for is handed to the running task."""
         error: BaseException | None = None
+        waiting, is_over, marked = None, True, turn.marked
+        if marked is not None:
+            marked._turn_goes_on()
         try:
-            return context.run(step, value)
+            waiting = context.run(step, value)
+            is_over = False
         except StopIteration:
             pass
         except BaseException as raised:  # The turn's own outcome, whatever it is: its actor gets it.
             error = raised
+        if marked is not None:
+            marked._turn_waits()  # If it was killed, nobody closes it.
+        if not is_over:
+            return waiting
         self._turn = self._context = None
         self._loop.turn_over(turn, error)
         return self._wait() if self._loop.idle_again(self) else self._leave()

@@ -34,6 +34,7 @@ from ...actors.kernel.ref import ActorRef, current
 from ...actors.seconds import check_seconds
 from ...actors.values import encode_value
 from ..protocol import REPLY, SINCE_THEN, Answer, EndWanted, Feed, Perform, Performed, PipeDone
+from ..turn_word import WAITS
 from .life_state import Asked
 from .recorded_inbox import INIT, STARTED, Fed
 
@@ -153,6 +154,7 @@ class RecordedContext(ActorContext):
 
     _may_fail_fast = False
     _may_rest = True
+    _marks_waits = True
 
     recorded: Life
     _drawn: int  # the turn that `_random` belongs to
@@ -454,6 +456,12 @@ class RecordedContext(ActorContext):
 
     def _rests(self) -> bool:
         return self.recorded.waits.resting > 0 or not self.recorded.is_live
+
+    def _turn_waits(self) -> None:
+        self.recorded.mark(WAITS)
+
+    def _turn_goes_on(self) -> None:
+        self.recorded.mark()
 
     def _leaves_turn(self) -> bool:
         more = self._cell.more

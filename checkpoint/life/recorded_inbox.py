@@ -14,7 +14,6 @@ from ...actors.kernel.envelope import LEAVE, Item, ReplyHandle
 from ...actors.kernel.message import Message, Refusal, reply_type
 from ..protocol import CRASH, DROPPED, LATER, OK, START, STASHED, Answer, Feed, Go
 from ..snapshot.key_variables import check_saved
-from .marked_turn import MarkedTurn
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node
@@ -56,7 +55,7 @@ class Fed(Item):
         if type(result) is Coroutine_:
             if life.guard is not None:
                 result = life.guard.drive(result)
-            return item.finish(result if life.page is None else MarkedTurn(life, feed, result))
+            return item.finish(result)
         item.end_with(result)
         return None
 

@@ -304,9 +304,10 @@ class Life:
         if self.page is not None:
             self.page[0] = feed.id + 1
 
-    def mark(self, feed: Feed, how: int = 0) -> None:
-        """Say on the page that the turn of an input is at work, or (WAITS) that it waits."""
-        if self.page is not None and feed is self.feed:  # Else its life was abandoned.
+    def mark(self, how: int = 0) -> None:
+        """Say on the page that the turn in hand is at work, or (WAITS) that it waits."""
+        feed = self.feed
+        if self.page is not None and feed is not None:  # Else it is over, or its life was abandoned.
             self.page[0] = (
                 0 if how and self.waits.resting else feed.id + 1 | how
             )  # What rests for days ends no process.
