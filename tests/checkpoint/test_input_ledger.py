@@ -216,6 +216,7 @@ class Ledgers(RuleBasedStateMachine):
         self.deaths[running] = self.deaths.get(running, 0) + 1
         assert (poison is source) == (self.deaths[running] >= MOST)
         if poison is None:
+            assert source.positions is not None
             self.write(("tried", running, source.deliveries), source.positions)
         else:  # Its turn ends with what it has sent.
             number = self.ledger.turn + 1

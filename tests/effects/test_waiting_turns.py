@@ -135,13 +135,15 @@ async def test_a_turn_that_goes_on_rests_no_longer(tmp_path: Path, kind: type[Fl
         ref = await system.start(flow(kind))
         asked = ref.ask(Wait(), IN_TIME)
         await waits(system, ref.path)
-        if kind is Went:
-            ref.tell(Go())
         actor = system._node.cell_at(ref.path).actor
         assert isinstance(actor, Flow)
+        if kind is Went:
+            assert actor.ctx._rests()
+            ref.tell(Go())
         async with asyncio.timeout(IN_TIME):
             while actor.stage != stage:
                 await asyncio.sleep(0.001)
+        assert not actor.ctx._rests(), "a stop would cut it off, and no time limit would count"
         looked = asyncio.ensure_future(ref.ask(Look(), IN_TIME))
         for _ in range(20):
             await asyncio.sleep(0)
