@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import msgspec
 
@@ -100,6 +100,20 @@ class Turn(msgspec.Struct, gc=False, eq=False):
         """Its entry in the journal: of the state and the reply only what there is to say."""
         more = (self.state, self.reply) if self.reply else (self.state,) if self.state else ()
         return "end", number, self.input.id, self.status, tuple(self.digests), *more
+
+
+class Contained(NamedTuple):
+    """What of a journal a snapshot contains.
+
+    Attributes:
+        turn: after which it was made.
+        inputs: those that have ended by then.
+        rows: that inputs share, each with those of them that it contains and that no earlier one has contained.
+    """
+
+    turn: int
+    inputs: Sequence[Input] = ()
+    rows: Mapping[RowPlace, list[int]] = {}
 
 
 def spread(entry: Entry) -> Iterable[tuple[Any, ...]]:

@@ -185,7 +185,7 @@ CHECKS = {
     ),
     "what an earlier snapshot contains is over in the next one too": Check(
         "checkpoint/home/input_ledger.py",
-        "        return over + [key for row in self.shared.parted if row not in contained for key in row.over]\n",
+        "        return over + [key for row in self.shared.parted if row not in rows for key in row.over]\n",
         "        return over\n",
         "tests/checkpoint/test_input_ledger.py",
         "test_a_row_of_which_much_is_over",
