@@ -25,7 +25,9 @@ EXPIRED = 1e-9
 
 
 NO_POSITIONS: list[int] = []
-"""Of an input that is nowhere in a journal. Never added to: those that are get a list of their own."""
+"""Of an input that has no row of its own in a journal. Never added to: those that have one get a list of their own."""
+NO_DIGESTS: list[int] = []
+"""Of a turn that has let nothing out. Never added to."""
 
 
 class RowPlace(msgspec.Struct, gc=False, eq=False):
@@ -42,24 +44,28 @@ class RowPlace(msgspec.Struct, gc=False, eq=False):
     over: list[int]
 
 
-class Input(msgspec.Struct, gc=False, eq=False):
-    """One journaled input. (Not seen by the garbage collector: there can be many, and nothing here refers back.)"""
+class Input(Feed, gc=False, eq=False):
+    """One journaled input: what is fed, and what its home knows of it.
 
-    id: int
-    kind: str
-    name: str
-    body: bytes
-    time: float
-    sender: str | None
+    A life in the process of its home gets the input itself, if there is no more to say; another one what `feed` makes.
+    (Not seen by the garbage collector: there can be many, and nothing here refers back.)
+
+    Attributes:
+        ask: who waits for its answer.
+        deliveries: deaths of the process in this very turn.
+        positions: of rows of its own.
+        row: that it shares, perhaps.
+        held: whether it is not as safe yet as it has to be: it must not be fed.
+        was_cut: whether a life has ended in its turn.
+        was_stashed: whether a turn has put it aside.
+    """
+
     ask: Ask | None = None
-    chain: tuple[tuple[str, int], ...] = ()
-    turn: int = 0  # the turn that ended it
-    deliveries: int = 0  # deaths of the process in this very turn
-    origin: str = ""  # the timer or pipe it comes from
-    positions: list[int] = NO_POSITIONS  # of rows of its own
-    row: RowPlace | None = None  # that it shares, perhaps
-    held: bool = False  # not as safe yet as it has to be: it must not be fed
-    was_cut: bool = False  # a life has ended in its turn
+    deliveries: int = 0
+    positions: list[int] = NO_POSITIONS
+    row: RowPlace | None = None
+    held: bool = False
+    was_cut: bool = False
     was_stashed: bool = False
 
     @property
@@ -78,11 +84,12 @@ class Input(msgspec.Struct, gc=False, eq=False):
 
         `was_asked`: it was an ask when it was handled first, and is replayed as one.
         """
-        ask = self.ask
+        ask, kind, origin = self.ask, self.kind, self.origin
         deadline = 0.0 if ask is None or has_begun else ask.deadline or EXPIRED
-        origin = self.origin if self.kind in (TICK, PIPE) else ""
+        if origin and kind not in (TICK, PIPE):
+            origin = ""
         return Feed(
-            self.id, turn, self.kind, self.name, self.body, self.time, self.sender,
+            self.id, turn, kind, self.name, self.body, self.time, self.sender,
             was_asked or ask is not None, self.chain, pipes, deadline, origin, has_begun,
         )  # fmt: skip
 

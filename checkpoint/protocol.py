@@ -10,13 +10,16 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
 from ..actors.exit_reasons import ExitReason, unpack_exit
 from ..actors.kernel.mailbox import Bounded
 from .method import Method
+
+if TYPE_CHECKING:
+    from .inputs import Input
 
 # Kinds of inputs: every call into user code that may change state.
 MESSAGE, START, TICK, EXIT, DOWN, PIPE = "message", "start", "tick", "exit", "down", "pipe"
@@ -72,6 +75,10 @@ class Answer(msgspec.Struct, array_like=True, gc=False):
     kind: str = NOTHING
     name: str = ""
     body: bytes = b""
+
+
+NO_ANSWER = Answer()
+"""Of a turn that nobody has asked for."""
 
 
 def timed(answer: Answer, when: float) -> Answer:
@@ -466,6 +473,10 @@ class LifePort(Protocol):
     @property
     def is_far(self) -> bool:
         """Whether that life is in another process."""
+        ...
+
+    def take(self, source: Input) -> None:
+        """Hand a new input to the life, as what it has to know of it; it is handled in order."""
         ...
 
     def to_life(self, record: ToLife) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ...actors.errors import DIVERGES, RAISED_AGAIN, ReplayDiverged
-from ..inputs import NO_POSITIONS, OVERHEAD, Contained, Input, RowPlace, Turn, spread
+from ..inputs import NO_DIGESTS, NO_POSITIONS, OVERHEAD, Contained, Input, RowPlace, Turn, spread
 from ..life.replay_guard import StateDiverged
 from ..long_waits import due_entry
 from ..protocol import (
@@ -188,7 +188,7 @@ class InputLedger:
         """Number an input, which is open from now on."""
         key = self.next_id
         self.next_id = key + 1
-        source = self.open[key] = Input(key, kind, name, body, time, sender)
+        source = self.open[key] = Input(key, -1, kind, name, body, time, sender)
         if origin:
             source.origin = origin
         self.journal_bytes += len(body) + OVERHEAD
@@ -248,12 +248,16 @@ class InputLedger:
 
     def end_turn(self, source: Input, number: int, status: str, state: int = 0, reply: int = 0) -> Turn:
         """End a turn, with the outputs that it has released."""
-        turn = self.turns[number] = Turn(source, status, self.released, state, reply)
-        self.released, self.begun = [], -1
-        self.lasts = False
-        self.dues.clear()
-        self.turn = source.turn = number
-        source.deliveries = 0
+        digests = NO_DIGESTS
+        if self.released:
+            digests, self.released = self.released, []
+        turn = self.turns[number] = Turn(source, status, digests, state, reply)
+        self.begun, self.lasts = -1, False
+        if self.dues:
+            self.dues.clear()
+        self.turn = number
+        if source.deliveries:
+            source.deliveries = 0
         if status == STASHED:
             source.was_stashed = True
         else:
@@ -455,7 +459,7 @@ class InputLedger:
         shared.gone.clear()
         self.newest, self.stash = meta, meta.stash
         ended = [past for number, past in self.turns.items() if number <= turn and past.status != STASHED]
-        self.journal_bytes -= sum([past.input.size for past in ended])
+        self.journal_bytes -= sum([len(past.input.body) for past in ended]) + OVERHEAD * len(ended)
         self.turns = {number: past for number, past in self.turns.items() if number > turn}
         for known in (self.positions, shared.ends, self.pipes_done):
             for number in [number for number in known if number <= turn]:
@@ -553,7 +557,7 @@ class InputLedger:
         if key in self.shared.over:
             row.over.append(key)
             return
-        source = self.open[key] = Input(key, kind, name, body, when, sender)
+        source = self.open[key] = Input(key, -1, kind, name, body, when, sender)
         source.origin, source.positions, source.row = origin, [], row
         row.left += 1
         self.next_id = max(self.next_id, key + 1)

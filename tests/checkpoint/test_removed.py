@@ -837,8 +837,8 @@ CHECKS = {
     ),
     "S2: nothing new reaches an actor that is recovered": Check(
         "checkpoint/home/switch.py",
-        "        if life.is_released and life.port is not None and",
-        "        if life.port is not None and",
+        "        if life.is_released and port is not None and",
+        "        if port is not None and",
         "tests/checkpoint/test_controller_held.py",
         "test_tells_beyond_the_capacity and task",
     ),
