@@ -399,6 +399,18 @@ def read(meta: Meta, journal: dict[int, tuple[Any, ...]]) -> InputLedger:
     return found
 
 
+def test_what_ends_without_a_turn_is_contained_once() -> None:
+    """It was put aside in a turn before: its row stays for the message that nobody has handled."""
+    ledger, journal = InputLedger("/app/doer"), dict[int, tuple[Any, ...]]()
+    (aside, handled, waits), journal[1] = row_of(ledger, 1, 3)
+    ledger.end_turn(aside, 0, STASHED)
+    ledger.withdraw(aside)
+    ledger.drop_input(aside)
+    ledger.end_turn(handled, 1, OK)
+    meta = snapshot(ledger, 1, journal)
+    assert [*read(meta, journal).open] == [waits.id]
+
+
 def test_a_row_of_which_much_is_over_for_long() -> None:
     """One message of a row was put aside: the others are over in each snapshot, until that one is."""
     ledger, journal = InputLedger("/app/doer"), dict[int, tuple[Any, ...]]()
