@@ -411,6 +411,21 @@ def test_what_ends_without_a_turn_is_contained_once() -> None:
     assert [*read(meta, journal).open] == [waits.id]
 
 
+def test_what_is_handled_behind_an_image_stays() -> None:
+    """It had been put aside when the image was begun, and has been handled when that is kept."""
+    ledger, journal = InputLedger("/app/doer"), dict[int, tuple[Any, ...]]()
+    (aside, handled), journal[1] = row_of(ledger, 1, 2)
+    ledger.end_turn(aside, 0, STASHED)
+    ledger.end_turn(handled, 1, OK)
+    journal[2] = ledger.end_turn(aside, 2, OK).entry(2)
+    ledger.positions_of(2).append(2)
+    meta = snapshot(ledger, 1, journal)
+    assert meta.over == [handled.id]
+    found = read(meta, journal)
+    assert [(number, turn.input.id) for number, turn in found.turns.items()] == [(2, aside.id)]
+    assert not found.open
+
+
 def test_a_row_of_which_much_is_over_for_long() -> None:
     """One message of a row was put aside: the others are over in each snapshot, until that one is."""
     ledger, journal = InputLedger("/app/doer"), dict[int, tuple[Any, ...]]()

@@ -195,14 +195,14 @@ CHECKS = {
         "                inputs.pop(past.input.id, None)\n",
         "                pass\n",
         "tests/checkpoint/test_input_ledger.py",
-        "TestLedgers",
+        "test_what_is_handled_behind_an_image",
     ),
     "what is only put aside is not contained": Check(
         "checkpoint/home/input_ledger.py",
         "            del inputs[key]\n",
         "            pass\n",
         "tests/checkpoint/test_input_ledger.py",
-        "TestLedgers",
+        "test_a_row_of_which_much_is_over",
     ),
     "an ask is fed as one": Check(
         "checkpoint/life/recorded_life.py",
