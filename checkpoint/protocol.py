@@ -10,16 +10,13 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import msgspec
 
 from ..actors.exit_reasons import ExitReason, unpack_exit
 from ..actors.kernel.mailbox import Bounded
 from .method import Method
-
-if TYPE_CHECKING:
-    from .inputs import Input
 
 # Kinds of inputs: every call into user code that may change state.
 MESSAGE, START, TICK, EXIT, DOWN, PIPE = "message", "start", "tick", "exit", "down", "pipe"
@@ -460,28 +457,6 @@ ToHome = (
     | Closed
     | Marked
 )
-
-
-class LifePort(Protocol):
-    """The way to the present life."""
-
-    @property
-    def begins(self) -> bool:
-        """Whether what is handed to it may be begun at any time from then on. If not, it says itself when."""
-        ...
-
-    @property
-    def is_far(self) -> bool:
-        """Whether that life is in another process."""
-        ...
-
-    def take(self, source: Input) -> None:
-        """Hand a new input to the life, as what it has to know of it; it is handled in order."""
-        ...
-
-    def to_life(self, record: ToLife) -> None:
-        """Hand a record to the life; it is handled in order."""
-        ...
 
 
 PIECE = 4 * 1024 * 1024

@@ -44,7 +44,6 @@ from ..protocol import (
     Go,
     Hooked,
     Ignored,
-    LifePort,
     Live,
     Marked,
     Out,
@@ -76,7 +75,7 @@ from .journal_limit import Limit
 from .life_ports import SENT
 from .outputs import Outputs
 from .pending_asks import PendingCalls, SwitchAsk, answer_ask, origin_of
-from .present_life import PresentLife, is_end_of
+from .present_life import LifePort, PresentLife, is_end_of
 from .replay import PacedReplay, is_as_before, is_same_reply
 from .replay_filter import declared, turns_to_replay
 
