@@ -436,8 +436,8 @@ class Switch:
                     self.images.mark(record)
                 case Ignored():
                     life.fail(StartIgnored(self.path, record.why))
-                case Wanted() | Closed():
-                    pass  # for whoever begins lives, or hands them over
+                case Wanted() | Closed() | TurnEnd():
+                    pass  # for whoever begins lives, or hands them over; the end of a turn was taken above
         except ReplayDiverged as error:
             life.diverged = error
             if life.fail(error):
