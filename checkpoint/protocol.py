@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 
@@ -73,6 +73,10 @@ class Answer(msgspec.Struct, array_like=True, gc=False):
     kind: str = NOTHING
     name: str = ""
     body: bytes = b""
+
+
+NO_ANSWER = Answer()
+"""Of a turn that nobody has asked for."""
 
 
 def timed(answer: Answer, when: float) -> Answer:
@@ -455,24 +459,6 @@ ToHome = (
     | Closed
     | Marked
 )
-
-
-class LifePort(Protocol):
-    """The way to the present life."""
-
-    @property
-    def begins(self) -> bool:
-        """Whether what is handed to it may be begun at any time from then on. If not, it says itself when."""
-        ...
-
-    @property
-    def is_far(self) -> bool:
-        """Whether that life is in another process."""
-        ...
-
-    def to_life(self, record: ToLife) -> None:
-        """Hand a record to the life; it is handled in order."""
-        ...
 
 
 PIECE = 4 * 1024 * 1024

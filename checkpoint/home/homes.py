@@ -143,9 +143,10 @@ class Homes:
             return
         source.deliveries += 1
         try:
-            source.stands_at(*self.journal.append([(switch.path, ("tried", source.id, source.deliveries))]))
+            tried = self.journal.append([(switch.path, ("tried", source.id, source.deliveries))])
         except HoldfastError as error:
             raise StartFailed(switch.path, str(error)) from error
+        source.positions = [*(source.positions or ()), *tried]
         hands.word(self.addresses.key(switch.path))[0] = 0
         if source.deliveries >= switch.method.max_deliveries:
             put_into_quarantine(switch, source)

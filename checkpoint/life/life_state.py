@@ -136,10 +136,6 @@ class TurnWaits:
     moment: float = 0.0
     resting: int = 0
 
-    def begin(self) -> None:
-        """Have waited for nothing, since another turn begins."""
-        self.moment, self.resting = 0.0, 0
-
     def rested(self) -> None:
         """Something has come that a turn has waited for, perhaps an earlier one."""
         self.resting = max(0, self.resting - 1)

@@ -421,7 +421,7 @@ class RecordedContext(ActorContext):
         if life.hook == STARTED:  # In a process, what was put aside may not be here yet.
             life.restored.unstashes = True
         stash, life.stash = life.stash, []
-        again = [Fed(life, once_more(fed.feed), fed.message, fed.sender) for fed in stash]
+        again = [Fed(life, once_more(fed.feed), fed.message, fed.sender, fed.feed.chain) for fed in stash]
         life.returned = {fed.feed.id: fed for fed in again} | life.returned  # in front of those put back before
         if life.is_live:
             life.handle_returned()

@@ -10,7 +10,7 @@ import functools
 import hashlib
 import time
 from collections.abc import Callable
-from typing import Any, Final, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, Final, NoReturn, Protocol
 
 from ...actors.control.trace_tail import follow
 from ...actors.effects import EffectCall
@@ -39,6 +39,7 @@ from ..protocol import (
     FAILED,
     MESSAGE,
     MOMENT,
+    NO_ANSWER,
     OK,
     REPLY,
     START,
@@ -75,6 +76,9 @@ from .readonly_guard import check_readonly
 from .recorded_context import Pending, RecordedContext
 from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
 from .replay_guard import digest_of
+
+if TYPE_CHECKING:
+    from ..inputs import Input
 
 NOT_SAVED: Final = -2
 """In place of the turn after which the last snapshot was made: none has the state as it is."""
@@ -190,6 +194,10 @@ class Life:
 
     # -- records from home ------------------------------------------------------------------------------------------
 
+    def take(self, source: Input) -> None:
+        """Take a new input from a home in this process: as it is, if a feed would not say more or less."""
+        self._take(source if source.ask is None and not source.origin else source.feed())
+
     def to_life(self, record: ToLife) -> None:
         """Take what the home says, in order."""
         match record:
@@ -221,15 +229,15 @@ class Life:
         cell = self.cell
         returned = self.returned.get(feed.id)  # until its turn begins: it may be taken from the queue again
         if returned is not None:
-            fed = Fed(self, feed, returned.message, returned.sender)
+            fed = Fed(self, feed, returned.message, returned.sender, feed.chain)
         else:
             sender = None if feed.sender is None else cell.node.cell_at(feed.sender)
-            fed = Fed(self, feed, None, sender)
+            fed = Fed(self, feed, None, sender, feed.chain)
         if feed.chain and feed.turn < 0:  # What is handled again is no new work.
             follow(fed)
         if feed.kind == TICK and feed.origin in self.timers.cancelled and feed.turn < 0:
             return  # Its timer was cancelled while it was on its way; the home drops it too.
-        if feed.id in self.restored.stash_ids and feed.turn < 0 and not self.is_live:
+        if not self.is_live and feed.turn < 0 and feed.id in self.restored.stash_ids:
             if self.restored.unstashes:
                 self.returned[feed.id] = fed
             else:
@@ -238,8 +246,13 @@ class Life:
         self._queue(fed)
 
     def _queue(self, item: Item) -> None:
-        mailbox.queue_of(self.cell).append(item)
-        self.cell.schedule()
+        cell = self.cell
+        queue = cell.queue
+        if queue is None:
+            queue = mailbox.queue_of(cell)
+        queue.append(item)
+        if not cell.scheduled:
+            cell.schedule()
 
     def _outcome(self, record: Outcome) -> None:
         if record.taken >= 0:
@@ -299,8 +312,10 @@ class Life:
             self.turn += 1
         if self.returned:
             self.returned.pop(feed.id, None)  # It has come again: its feed may have been here before it was put back.
-        self.feed, self.outs, self.last_k, self.stage.ending = feed, [], 0, None
-        self.waits.begin()
+        self.feed, self.last_k, self.stage.ending = feed, 0, None
+        self.waits.moment, self.waits.resting = 0.0, 0
+        if self.outs:  # What a turn that was left in the middle has said does not count.
+            self.outs = []
         if self.page is not None:
             self.page[0] = feed.id + 1
 
@@ -322,10 +337,9 @@ class Life:
             if self.method.check_replay and self.cell.actor and status in (OK, STASHED)
             else 0
         )
-        self.feed = None
+        outs, self.feed, self.outs = self.outs, None, []
         ends = None if status == FAILED else self.stage.ending
-        self.port.to_home(TurnEnd(self.turn, feed.id, status, self.outs, answer, state, ends))
-        self.outs = []
+        self.port.to_home(TurnEnd(self.turn, feed.id, status, outs, answer, state, ends))
         if self.page is not None:
             self.page[0] = 0
         if self.is_live and self.stage.begun >= 0:
@@ -377,7 +391,7 @@ class Life:
         self.enter(STOP)  # That is what is left.
         # The start of a protected actor tells it, and under replay it must not happen at all.
         is_heard = feed.is_ask or feed.kind == START or feed.turn >= 0
-        self.close_turn(FAILED, self.answer_error(remote_crash(error)) if is_heard else Answer())
+        self.close_turn(FAILED, self.answer_error(remote_crash(error)) if is_heard else NO_ANSWER)
 
     def answer_error(self, error: BaseException) -> Answer:
         """An error as the asker will get it."""

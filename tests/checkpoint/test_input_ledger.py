@@ -234,11 +234,12 @@ class Ledgers(RuleBasedStateMachine):
         turn = data.draw(st.integers(ledger.state_turn + 1, ledger.turn))
         later = {past.input.id for number, past in ledger.turns.items() if number > turn and past.status == STASHED}
         stash = sorted(key for key in ledger.stashed() & ledger.open.keys() if key not in later)
-        over = ledger.over_after(turn)
+        contained = ledger.contained_in(turn)
+        over = ledger.over_after(contained)
         meta = Meta(FORMAT, turn, ledger.next_id, stash, {}, [], 1, b"state", turn, over=over)
-        for position in ledger.contained_in(turn):
+        for position in ledger.needless(contained):
             self.journal.pop(position, None)
-        ledger.begin_with(meta)
+        ledger.begin_with(meta, contained)
         self.cut_at = meta
         needed = {source.id for source in ledger.handled_and_open()} | {key for _, key in ledger.shared.gone}
         for entry in self.journal.values():
@@ -382,11 +383,12 @@ def row_of(ledger: InputLedger, position: int, count: int) -> tuple[list[Input],
 
 def snapshot(ledger: InputLedger, turn: int, journal: dict[int, tuple[Any, ...]]) -> Meta:
     stash = sorted(ledger.stashed() & ledger.open.keys())
-    over = ledger.over_after(turn)
+    contained = ledger.contained_in(turn)
+    over = ledger.over_after(contained)
     meta = Meta(FORMAT, turn, ledger.next_id, stash, {}, [], 1, b"state", turn, over=over)
-    for position in ledger.contained_in(turn):
+    for position in ledger.needless(contained):
         journal.pop(position, None)
-    ledger.begin_with(meta)
+    ledger.begin_with(meta, contained)
     return meta
 
 
@@ -396,6 +398,33 @@ def read(meta: Meta, journal: dict[int, tuple[Any, ...]]) -> InputLedger:
     for position, entry in journal.items():
         assert found.read_entry(position, entry)
     return found
+
+
+def test_what_ends_without_a_turn_is_contained_once() -> None:
+    """It was put aside in a turn before: its row stays for the message that nobody has handled."""
+    ledger, journal = InputLedger("/app/doer"), dict[int, tuple[Any, ...]]()
+    (aside, handled, waits), journal[1] = row_of(ledger, 1, 3)
+    ledger.end_turn(aside, 0, STASHED)
+    ledger.withdraw(aside)
+    ledger.drop_input(aside)
+    ledger.end_turn(handled, 1, OK)
+    meta = snapshot(ledger, 1, journal)
+    assert [*read(meta, journal).open] == [waits.id]
+
+
+def test_what_is_handled_behind_an_image_stays() -> None:
+    """It had been put aside when the image was begun, and has been handled when that is kept."""
+    ledger, journal = InputLedger("/app/doer"), dict[int, tuple[Any, ...]]()
+    (aside, handled), journal[1] = row_of(ledger, 1, 2)
+    ledger.end_turn(aside, 0, STASHED)
+    ledger.end_turn(handled, 1, OK)
+    journal[2] = ledger.end_turn(aside, 2, OK).entry(2)
+    ledger.positions_of(2).append(2)
+    meta = snapshot(ledger, 1, journal)
+    assert meta.over == [handled.id]
+    found = read(meta, journal)
+    assert [(number, turn.input.id) for number, turn in found.turns.items()] == [(2, aside.id)]
+    assert not found.open
 
 
 def test_a_row_of_which_much_is_over_for_long() -> None:
@@ -410,7 +439,7 @@ def test_a_row_of_which_much_is_over_for_long() -> None:
         assert sorted(meta.over) == [1, 2]
         found = read(meta, journal)
         assert [*found.open] == [0]
-        assert sorted(found.over_after(turn)) == [1, 2], "the next program knows it, too"
+        assert sorted(found.over_after(found.contained_in(turn))) == [1, 2], "the next program knows it, too"
         [later], journal[turn + 10] = row_of(ledger, turn + 10, 1)
         ledger.end_turn(later, turn + 1, OK)
     ledger.end_turn(sources[0], 6, OK)
