@@ -427,10 +427,11 @@ class LoopLagged(Event, frozen=True, eq=False):
 
 
 class LogLine(Event, frozen=True, eq=False):
-    """A line an actor's process wrote to stdout or stderr, or a log record of it."""
+    """A line that an actor's process wrote to its `stream`, stdout or stderr; `life` is the one that wrote it."""
 
     stream: str
     text: str
+    life: int = 0
 
 
 class MessageIn(Event, frozen=True, eq=False):
@@ -560,7 +561,8 @@ class EventHub:
         self._changed = changed  # told whether there is anybody at all
         self.has_listeners = False  # else events are not even made
         self.hears_letters = False  # the same of dead letters,
-        self.hears_starts = False  # and of the first lives at addresses
+        self.hears_starts = False  # and of the first lives at addresses,
+        self.hears_lines = False  # and of lines that processes print
         self._streams: list[EventStream] = []
         self._sinks: list[Callable[[Event], None]] = []
         self._recorder: Callable[[Event], None] | None = None
@@ -623,6 +625,7 @@ class EventHub:
         self.has_listeners = anybody or (records and "others" not in self._resting)
         self.hears_letters = anybody or (records and "letters" not in self._resting)
         self.hears_starts = anybody or (records and not self._resting & {"starts", "others"})
+        self.hears_lines = anybody or records
         self._changed(self.has_listeners)
 
     def close(self) -> None:

@@ -29,6 +29,7 @@ from .wire import (
     AskDiagnosis,
     AskHistory,
     AskLives,
+    AskLogs,
     AskQuarantined,
     AskWhy,
     BadRequest,
@@ -51,6 +52,7 @@ from .wire import (
 
 if TYPE_CHECKING:
     from ..system.history.pages import HistoryPage
+    from ..system.last_lines.line_page import LogPage
     from ..system.system import ActorSystem
 
 LONGEST = 3600.0
@@ -122,6 +124,8 @@ class ClientSession:
                 return {"steps": [], "difference": [], "lost": []} if change is None else as_told(change)
             case AskHistory():
                 return msgspec.to_builtins(await self._history(request))
+            case AskLogs():
+                return msgspec.to_builtins(await self._logs(request))
             case AskLives():
                 return msgspec.to_builtins(system.lives(request.path))
             case AskWhy():
@@ -164,6 +168,15 @@ class ClientSession:
             return page
         after, wait = page.next, min(request.wait, LONGEST)
         return await self._system.follow_history(asked.path, kinds=asked.kinds, after=after, timeout=wait)
+
+    async def _logs(self, request: AskLogs) -> LogPage:
+        """A page of last lines; the question is checked as everybody's is."""
+        system, asked = self._system, request.question
+        path, level, after, limit = asked.path, asked.level, asked.after, asked.limit
+        if after is None or not request.wait:
+            return system.logs(path, level=level, since=asked.since, after=after, limit=limit)
+        wait = min(request.wait, LONGEST)
+        return await system.follow_logs(path, level=level, after=after, limit=limit, timeout=wait)
 
     def _settle(self, request: SettleQuarantined) -> dict[str, Any]:
         """Retry or drop what is meant, each message by itself; which of them it was, and why others were not."""

@@ -90,6 +90,7 @@ for command in (
     looking.top,
     looking.inspect,
     following.trace,
+    following.logs,
     changing.suspend,
     changing.resume,
     changing.restart,

@@ -56,6 +56,8 @@ from .controls import Controls
 from .full_collections import seldom_collected
 from .history.calls import HistoryCalls
 from .history.recorder import HistoryRecorder, expect_end
+from .last_lines.line_calls import LineCalls
+from .last_lines.line_memory import LineMemory
 from .live_moves import Moves
 from .logs import LogSink
 from .mechanism_notes import MechanismNotes, check_no_part
@@ -88,7 +90,7 @@ LONG = 365 * 86_400.0
 """Seconds `start` and `stop` wait: no limit of their own, the child specs say how long a start or an end may take."""
 
 
-class ActorSystem(Recorded, Controls, HistoryCalls):
+class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
     """A tree of actors: an async context manager that lives in whatever loop it is entered in.
 
     Args:
@@ -196,8 +198,9 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         options = self._options
         file = options.read_recovery_file()
         node = self._running = Node(self.name, asyncio.get_running_loop(), seed=options.seed)
+        lines = LineMemory(node.clock.wall) if options.history else None
         if options.log:
-            self._sink = LogSink(self.name, node.loop, log_payloads=options.log_payloads)
+            self._sink = LogSink(self.name, node.loop, log_payloads=options.log_payloads, lines=lines)
             node.events.add_sink(self._sink)
         try:
             engine = await self._open_store(node)
@@ -216,7 +219,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             raise
         if options.history:
             store = self._homes if self._homes.journal.durable else None
-            self._history = HistoryRecorder(node, store, log_payloads=options.log_payloads)
+            self._history = HistoryRecorder(node, store, log_payloads=options.log_payloads, lines=lines)
         RecoveryTree(node, self._homes).begin_with_first_home()
         self._workers = self._make_pool(node)
         if file is not None:

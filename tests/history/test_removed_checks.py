@@ -52,7 +52,7 @@ CHECKS = {
         "test_ends_that_never_come_are_forgotten",
     ),
     "a follower that goes is forgotten": Check(
-        "system/history/recorder.py",
+        "system/last_lines/followers.py",
         "        future.add_done_callback(self._forget)\n",
         "",
         OUTSIDE,
