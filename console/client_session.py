@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import socket
 import time
 from typing import TYPE_CHECKING, Any, assert_never
 
@@ -40,6 +41,7 @@ from .wire import (
     FollowActor,
     InspectActor,
     NextEvents,
+    NotRunningHere,
     OrderRepair,
     Overview,
     RestartActor,
@@ -95,9 +97,19 @@ class ClientSession:
     async def answer(self, request: AnyRequest) -> Any:
         """Carry out a request. Raises whatever goes wrong."""
         system = self._system
+        if not isinstance(request, About) and (why := _why_not_here(system)):
+            raise NotRunningHere(os.getpid(), system.name, why)
         match request:
             case About():
-                return {"name": system.name, "pid": os.getpid(), "since": self._since, "actors": len(system.tree())}
+                return {
+                    "name": system.name,
+                    "node": socket.gethostname(),
+                    "pid": os.getpid(),
+                    "role": system.role,
+                    "leader": system.leader,
+                    "since": self._since,
+                    "actors": len(system.tree()),
+                }
             case Tree():
                 return system.tree()
             case Whereis():
@@ -277,6 +289,17 @@ class ClientSession:
         except HoldfastError:  # It has gone, or does not come to it: no number is shown.
             return None
         return None if known is None else known.turns
+
+
+def _why_not_here(system: ActorSystem) -> str:
+    """Why a program does not run its system so far; an empty text if it does."""
+    match system.role:
+        case "standby":
+            return f"it stands by, and {system.leader} leads"
+        case "waiting":
+            return "it is being started, or waits for the servers of its store"
+        case "leader" | "alone":
+            return ""
 
 
 def as_told(change: Change) -> dict[str, Any]:

@@ -46,6 +46,14 @@ class NotDiagnosed(HoldfastError, text="{problem}"):
     problem: str
 
 
+class NotRunningHere(HoldfastError, text="process {pid} does not run {system}: {why}"):
+    """The program waits to lead its system, or is being started: it says which it is, and nothing else."""
+
+    pid: int
+    system: str
+    why: str
+
+
 class NotUpYet(
     HoldfastError,
     text="{path} has ended ({reason}), and its next life is not up within {seconds:g} s: it waits for {above}, "

@@ -61,7 +61,7 @@ from .last_lines.line_memory import LineMemory
 from .live_moves import Moves
 from .logs import LogSink
 from .mechanism_notes import MechanismNotes, check_no_part
-from .options import SystemOptions
+from .options import ProgramRole, SystemOptions
 from .portal import ThreadPortal
 from .recorded import Recorded
 from .recovery import RecoveryTree
@@ -173,6 +173,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             recovery_hooks=recovery_hooks,
             recovery=recovery,
         )
+        self._standing: StandingBy | None = None  # what was told last of another program that leads
         self._sink: LogSink | None = None
         self._history: HistoryRecorder | None = None
         self._running: Node | None = None
@@ -189,6 +190,24 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
     def name(self) -> str:
         """The first part of all addresses."""
         return self._options.name
+
+    @property
+    def role(self) -> ProgramRole:
+        """What this program is to the system: "waiting", "standby", "leader" or "alone".
+
+        It waits while it is being started, and for the servers of its store. It stands by while another program leads.
+        The tree runs only in one that leads, or that is alone because its store is not on several machines.
+        """
+        if self._root is None:
+            return "waiting" if self._standing is None else "standby"
+        store = self._options.store
+        is_shared = isinstance(store, Servers) or (isinstance(store, str) and is_replicated(store))
+        return "leader" if is_shared else "alone"
+
+    @property
+    def leader(self) -> str:
+        """The machine and process of the program that leads while this one stands by; an empty text otherwise."""
+        return "" if self._standing is None or self._root is not None else self._standing.leader
 
     # -- life -------------------------------------------------------------------------------------------------------
 
@@ -297,13 +316,17 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             self.name,
             options.standby,
             options.nats.told(),
-            waits=lambda leader: node.emit(StandingBy(where, leader)),
+            waits=lambda leader: self._stands_by(node, StandingBy(where, leader)),
             silent=lambda reason: node.emit(ServersSilent(where, reason)),
             deposed=self._deposed,
             key=options.store_key,
         )
         node.emit(LeadershipTaken(where, journal.epoch))
         return Called(journal)
+
+    def _stands_by(self, node: Node, told: StandingBy) -> None:
+        self._standing = told
+        node.emit(told)
 
     def _deposed(self, by: Deposed) -> None:
         """Another program leads: the tree ends, and the body hears of it."""

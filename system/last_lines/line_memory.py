@@ -24,8 +24,8 @@ PRINTED: Final[dict[str, LineLevel]] = {"stdout": "info", "stderr": "warning"}
 """What a line counts as that a process prints: it says no level itself."""
 LINE_BYTES: Final = 220
 """Bytes that a line takes in memory besides its text, about."""
-ADDRESS_BYTES: Final = 1_500
-"""Bytes that an address takes in memory besides its lines, about."""
+ADDRESS_BYTES: Final = 3_500
+"""Bytes that an address takes in memory besides its lines, at most, with the runs of lines that are gone."""
 FILLED: Final = 0.875
 """The part of the memory that is left in use when room has to be made: it is made seldom, for many lines at once."""
 LEAST_SHARE: Final = 1_024
@@ -47,7 +47,7 @@ class LineLimits:
     characters: int = 4_000
     lines: int = 1_000
     address_bytes: int = 256 * 1024
-    addresses: int = 1_000
+    addresses: int = 500
     all_bytes: int = 4 * 1024 * 1024
 
 

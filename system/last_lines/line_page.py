@@ -23,7 +23,7 @@ class LogPage(msgspec.Struct, frozen=True):
         lines: those that were asked for, oldest first.
         next: give this as `after` for the lines behind these, also for those that are still to come.
         dropped: lines between `after` (or the first of all) and `next` that had given way to newer ones before they
-            were asked for, of any level. Where a great many actors print at the same time rather too many are counted.
+            were asked for, of any level. If the lines of many actors came in turn rather too many are counted.
     """
 
     lines: list[LoggedLine]
