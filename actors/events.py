@@ -131,6 +131,17 @@ class StopOverdue(Event, frozen=True, eq=False):
     stacks: str
 
 
+class OrderHeld(Event, frozen=True, eq=False):
+    """A supervisor is suspended, and so an order to it waits: to "start" or to "stop" a child. Told once of each.
+
+    `child` is the address of that child, and `seconds` how long the order has waited. `resume` lets it go on.
+    """
+
+    order: str
+    child: str
+    seconds: float
+
+
 class AutoShutdown(Event, frozen=True, eq=False):
     """A supervisor ends because its significant children have."""
 

@@ -48,7 +48,7 @@ from ..cluster.log_writer import Deposed
 from ..cluster.servers import Servers
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.children import tell_stopped
-from ..supervision.patience import end_within
+from ..supervision.patience import end_within, told_if_held
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor, kill_starting
@@ -512,7 +512,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
     async def start(self, spec: ChildSpec[A], *, fresh: bool = False) -> ActorRef[A]:
         """Start a child of the root, and wait until it is up; None instead of a ref if it raised `Ignore`.
 
-        With `fresh` nothing comes back that was recorded at its address, or below it, before.
+        With `fresh` nothing comes back that was recorded at its address, or below it, before. While the root is
+        suspended the start waits: the event `OrderHeld` says so after 5 seconds, and `resume` lets it go on.
 
         Raises:
             StartFailed: naming the actor and why. AlreadyStarted, AlreadyPresent: the id is in use.
@@ -525,7 +526,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             known.brought.discard(address)
             await root.ask(RemoveChild(spec.id), LONG)
         wanted: ChildSpec = known.in_force(address, spec, fresh=fresh)
-        with seldom_collected():
+        with seldom_collected(), told_if_held(root._cell.living, "start", address):
             ref = cast("ActorRef[A]", await root.ask(StartChild(wanted, fresh=fresh), LONG))
         known.started(address, spec, wanted, fresh=fresh)
         await known.start_added(lambda one: root.ask(StartChild(one), LONG))
@@ -583,7 +584,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         if parent is not None and is_supervised(cell, parent):
             supervisor = ActorRef[Supervisor](parent)
             try:
-                await supervisor.ask(RemoveChild(cell.name, pack_exit(reason)), LONG)
+                with told_if_held(parent, "stop", cell.path):
+                    await supervisor.ask(RemoveChild(cell.name, pack_exit(reason)), LONG)
             except (NoSuchChild, ActorStopped):  # It has stopped already, or was temporary: its spec went with it.
                 pass
         elif not cell.is_dead:

@@ -81,9 +81,9 @@ def program_at(found: FoundSocket) -> RunningProgram:
     """Ask a program what it is."""
     known = {"name": found.system, "pid": found.pid, "socket": found.path}
     try:
-        with RemoteSystem(found.path) as remote:
-            remote.greet(GREETING_SECONDS)
-            return msgspec.convert({**known, **remote.about(), "socket": found.path}, RunningProgram)
+        with RemoteSystem(found.path) as program:
+            program.greet(GREETING_SECONDS)
+            return msgspec.convert({**known, **program.about(), "socket": found.path}, RunningProgram)
     except HoldfastError:  # It is there, and stopped or hung.
         return RunningProgram(found.system, found.pid, found.path)
 
