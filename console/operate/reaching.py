@@ -67,14 +67,14 @@ class RunningProgram(msgspec.Struct, frozen=True):
     @property
     def role_text(self) -> str:
         """Its role in words; of one that stands by with who leads."""
-        if self.role is None:
-            return "does not answer"
+        if self.role is None:  # A program of an earlier version answers, and knows no roles.
+            return "does not answer" if self.since is None else "?"
         return f"standby of {self.leader.partition(' (')[0]}" if self.role == "standby" and self.leader else self.role
 
     @property
     def runs(self) -> bool:
         """Whether the tree of the system runs in it, as far as it says."""
-        return self.role in ("leader", "alone")
+        return self.role in ("leader", "alone") or (self.role is None and self.since is not None)
 
 
 def program_at(found: FoundSocket) -> RunningProgram:
