@@ -74,6 +74,8 @@ def answer_lines(memory: LineMemory, asked: LogQuestion) -> LogPage:
     """The page that answers a question."""
     is_meant, least = _meant(asked.path), LEVELS.index(asked.level)
     number = asked.after or 0
+    if number > memory.last:  # It is a number of the program before this one.
+        number = 0
     found = (
         line for line in memory.after(number, is_meant) if line.at >= asked.since and LEVELS.index(line.level) >= least
     )

@@ -115,6 +115,7 @@ def test_lines_are_chosen_by_level_time_and_number() -> None:
     assert texts(asked(lines, since=2.0)) == ["err", "actor crashed"]
     assert texts(asked(lines, limit=1)) == ["actor crashed"]
     assert texts(asked(lines, after=1, limit=1)) == ["err"]
+    assert len(asked(lines, after=1_000).lines) == 3, "it is a number of the program before this one"
 
 
 def test_the_lines_of_replicas_are_those_of_the_actor() -> None:
