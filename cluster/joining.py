@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import math
 import os
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Final, TypeVar
 from urllib.parse import urlsplit
 
@@ -17,7 +17,7 @@ from ..checkpoint.store_key import StoreKey, read_store_key
 from ..checkpoint.store_opening import open_journal
 from .leadership import LeaderElsewhere, Patience, Standby, give_up, lead, leader_name
 from .log_records import DamagedLog
-from .log_writer import FIRST_PAUSE, LONGEST_PAUSE, Deposed
+from .log_writer import Deposed
 from .ports import Engine, Unanswered
 from .replicated_journal import ReplicatedJournal
 from .sealed_engine import sealed
@@ -90,8 +90,14 @@ async def join(
 
     opened: list[Engine] = []  # filled in there: whoever is cancelled here would not get to know of it
     unanswered = NowAndThen(lambda problem: _tell(loop, silent, problem))
+    patient = Patience(waits=standby is not None)
+
+    async def connect() -> Engine:
+        opened.append(await patient.answered(connected, unanswered))
+        return opened[0]
+
     try:
-        joined = await thread.run(_connected(connected, unanswered, opened, Patience(waits=standby is not None)))
+        joined = await thread.run(connect())
         leading = await thread.run(
             lead(
                 joined,
@@ -164,24 +170,6 @@ class NowAndThen:
         if now >= self._next:
             self._next = now + SILENT_SECONDS
             self._tell(what)
-
-
-async def _connected(
-    connect: Callable[[], Awaitable[Engine]], unanswered: NowAndThen, opened: list[Engine], patience: Patience
-) -> Engine:
-    """Connect, again and again; whoever waits for it is told why it takes so long. Take it down in `opened`."""
-    pause, loop = FIRST_PAUSE, asyncio.get_running_loop()
-    while True:
-        asked = loop.time()
-        try:
-            opened.append(await connect())
-            return opened[0]
-        except Unanswered as error:
-            if patience.is_over(asked):
-                raise
-            unanswered(error.problem)
-        await asyncio.sleep(pause)
-        pause = min(2 * pause, LONGEST_PAUSE)
 
 
 def open_store(

@@ -18,9 +18,9 @@ import random
 import socket
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal, TypeAlias, TypeVar
 
 from ..actors.errors import HoldfastError
 from .engine_thread import end_tasks
@@ -39,6 +39,7 @@ from .log_writer import FIRST_PAUSE, LONGEST_PAUSE, append_behind
 from .ports import Engine, LogReader, LogRecord, Unanswered
 from .store_contents import MemoryContents
 
+T = TypeVar("T")
 Standby: TypeAlias = Literal["warm", "cold"]
 """How a program waits until it leads: with what is stored in memory, or not."""
 LOOK_SECONDS: Final = 0.2
@@ -241,6 +242,24 @@ class Patience:
         now = asyncio.get_running_loop().time()
         self._until = min(self._until, (now if since is None else since) + MOMENT_SECONDS)
         return now >= self._until
+
+    async def answered(self, ask: Callable[[], Awaitable[T]], silent: Callable[[str], None]) -> T:
+        """Ask again and again, and tell each time why there is no answer.
+
+        Raises:
+            Unanswered: it is over. Else as `ask`.
+        """
+        pause, loop = FIRST_PAUSE, asyncio.get_running_loop()
+        while True:
+            asked = loop.time()
+            try:
+                return await ask()
+            except Unanswered as error:
+                if self.is_over(asked):
+                    raise
+                silent(error.problem)
+            await asyncio.sleep(pause)
+            pause = min(2 * pause, LONGEST_PAUSE)
 
 
 async def lead(

@@ -270,7 +270,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             root.ended().add_done_callback(self._root_ended)
             await self._specifications.start_added(lambda spec: root.ref.ask(StartChild(spec), LONG))
             if (at := options.reached_at) is not None:
-                self._transport = await serve(self._lines, at, options.nats)
+                waits = options.standby is not None
+                self._transport = await serve(self._lines, at, options.nats, waits=waits, silent=self._silent)
         except BaseException as error:  # Nobody is in the body yet who would hear of a failure, or end what has begun.
             await self.__aexit__(type(error), error, error.__traceback__)
             raise
@@ -316,17 +317,22 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             self.name,
             options.standby,
             options.nats.told(),
-            waits=lambda leader: self._stands_by(node, StandingBy(where, leader)),
-            silent=lambda reason: node.emit(ServersSilent(where, reason)),
+            waits=self._stands_by,
+            silent=self._silent,
             deposed=self._deposed,
             key=options.store_key,
         )
         node.emit(LeadershipTaken(where, journal.epoch))
         return Called(journal)
 
-    def _stands_by(self, node: Node, told: StandingBy) -> None:
-        self._standing = told
-        node.emit(told)
+    def _stands_by(self, leader: str) -> None:
+        """Another program leads, and the start waits until this one does."""
+        self._standing = StandingBy(f"/{self.name}", leader)
+        self._node.emit(self._standing)
+
+    def _silent(self, reason: str) -> None:
+        """The servers do not answer, and the start waits for them."""
+        self._node.emit(ServersSilent(f"/{self.name}", reason))
 
     def _deposed(self, by: Deposed) -> None:
         """Another program leads: the tree ends, and the body hears of it."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
@@ -17,6 +18,8 @@ from ..actors.seconds import check_seconds
 from ..actors.values.path_parts import check_path_part
 from ..checkpoint.home.ask_recovery import PASSING
 from ..cluster.configuration import NatsSettings
+from ..cluster.joining import NowAndThen
+from ..cluster.leadership import Patience
 from ..cluster.lines.calls import LineCaller, LineGate
 from ..cluster.lines.far_line import FindName
 from ..cluster.lines.lines import Lines, Transport, new_boot
@@ -219,13 +222,23 @@ def connect(
     return SystemConnection(servers, system, within, timeout)
 
 
-async def serve(lines: Lines, at: str | Servers, settings: NatsSettings) -> Transport:
+async def serve(
+    lines: Lines, at: str | Servers, settings: NatsSettings, *, waits: bool, silent: Callable[[str], None]
+) -> Transport:
     """Have this system reached at its servers.
 
+    Args:
+        lines: to other programs.
+        at: the servers.
+        settings: how they are reached.
+        waits: until they answer, however long that takes.
+        silent: told why they do not, each time.
+
     Raises:
-        SpecError: the address cannot be read. Unanswered: no server can be reached.
+        SpecError: the address cannot be read. Unanswered: no server can be reached for a moment, and nobody is to wait.
     """
-    transport, inbox = await servers_of(at, settings.told()).open_lines()
+    servers = servers_of(at, settings.told())
+    transport, inbox = await Patience(waits=waits).answered(servers.open_lines, NowAndThen(silent))
     try:
         await transport.hear(inbox, LineGate(lines, transport).hear)
     except BaseException:

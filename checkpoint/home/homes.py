@@ -60,7 +60,7 @@ class Homes:
         self.addresses = Addresses(node, journal, self.find)
         self.quarantine = Quarantine(node, self.journal)
         self._switches: dict[str, Switch] = {}
-        self.recoveries = Recoveries(node, hooks)
+        self.recoveries = Recoveries(node, self.journal, hooks)
         self.on_first: Callable[[], None] | None = None  # there is something to watch over from now on
         self.on_home: Callable[[Switch], None] = nobody  # a home has a life again, or for the first time
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet

@@ -17,6 +17,7 @@ from .safe_states import Safety
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node
+    from ..group_commit import Commits
     from ..method import Method
 
 Point = tuple[str, str]
@@ -68,11 +69,11 @@ class Recovery:
 class Recoveries:
     """All recoveries of a root."""
 
-    def __init__(self, node: Node, hooks: RecoveryHooks | None = None) -> None:
+    def __init__(self, node: Node, journal: Commits, hooks: RecoveryHooks | None = None) -> None:
         self._node = node
-        self.safety = Safety(node)
-        self.hooks = hooks  # those of the system
         self._by_path: dict[str, Recovery] = {}
+        self.safety = Safety(node, journal, self._by_path.__contains__)
+        self.hooks = hooks  # those of the system
         self._count = 0
         self._untold: deque[RecoveryPhase] = deque(maxlen=MOST)
         self._timers: set[asyncio.TimerHandle] = set()

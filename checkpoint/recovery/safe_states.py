@@ -3,12 +3,17 @@
 One owner with a count (T27). Each step is taken at once or not at all, so whoever takes it, a receiver is told once.
 A receiver is an address. Each life that begins there meanwhile is told before it handles a message (T26), and only who
 was told of the beginning is told of the end.
+
+A note in the store has those receivers whose journal outlives this program: the next one tells them of the end.
 """
 
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
 
 from ...actors.errors import HoldfastError, MailboxFull, UnknownMessage, type_name
 from ...actors.events import SafeStateEntered, SafeStateLeft, SafeStateMissed, SafeStateOverdue
@@ -25,7 +30,12 @@ from ..recovery_settings import SafeState
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node
+    from ..group_commit import Commits
 
+KEPT: Final = "safe state"
+"""The note of the receivers that the next program has to tell of the end."""
+_BEFORE: Final = -1
+"""The life in a program that has ended, of somebody who was told there."""
 Key = tuple[str, tuple[str, bytes] | None, tuple[str, bytes] | None]
 """A receiver, and the messages it is told with."""
 
@@ -35,10 +45,36 @@ def _next_life(cell: Cell) -> tuple[Cell, int]:
     return cell, cell.life + (cell.state is DOWN)
 
 
+class KeptReceiver(msgspec.Struct, array_like=True, frozen=True):
+    """A receiver, as the note has it; the fields are those of Receiver."""
+
+    path: str
+    enter: tuple[str, bytes] | None
+    leave: tuple[str, bytes] | None
+    timeout: float
+    holders: tuple[str, ...]
+
+
+_ENCODE: Final = msgspec.msgpack.Encoder().encode
+_DECODE: Final = msgspec.msgpack.Decoder(tuple[KeptReceiver, ...]).decode
+
+
 class Receiver:
     """One that is safe, or is being told that it is not any more."""
 
-    __slots__ = ("because", "holders", "is_missed", "life", "outbox", "path", "timeout", "timer", "told", "words")
+    __slots__ = (
+        "because",
+        "holders",
+        "is_left_behind",
+        "is_missed",
+        "life",
+        "outbox",
+        "path",
+        "timeout",
+        "timer",
+        "told",
+        "words",
+    )
 
     def __init__(self, key: Key, timeout: float) -> None:
         self.path, self.words = key[0], key[1:]
@@ -50,14 +86,29 @@ class Receiver:
         self.told: tuple[Any, object] = None, None  # what was said to it, and the journal where that stands
         self.timer: asyncio.TimerHandle | None = None
         self.outbox: list[bool] = []  # what could not be put in its mailbox yet
+        self.is_left_behind = False  # by a program that has ended; it has not begun in this one yet
 
 
 class Safety:
-    """All receivers of a root."""
+    """All receivers of a root.
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    Args:
+        node: the root.
+        journal: where those are noted that outlive this program.
+        is_recovering: whether the recovery of an address is under way.
+    """
+
+    def __init__(self, node: Node, journal: Commits, is_recovering: Callable[[str], bool]) -> None:
+        self._node, self._journal, self._is_recovering = node, journal, is_recovering
         self._receivers: dict[Key, Receiver] = {}
+        self._noted = journal.noted(KEPT)
+        for one in _DECODE(self._noted) if self._noted is not None else ():
+            key = one.path, one.enter, one.leave
+            receiver = self._receivers[key] = Receiver(key, one.timeout)
+            receiver.holders.update(dict.fromkeys(one.holders))
+            receiver.because, receiver.is_left_behind = one.holders[0], True
+            receiver.timer = node.loop.call_later(one.timeout, self._overdue, receiver)
+            node.on_life = self._begins
 
     def enter(self, path: str, state: SafeState, timeout: float) -> None:
         """The recovery of `path` wants its receivers to be safe; a second time changes nothing."""
@@ -72,8 +123,9 @@ class Safety:
                 receiver = self._receivers[key] = Receiver(key, timeout)
                 self._node.on_life = self._begins
             receiver.holders[path] = None
-            if receiver.life is None:
+            if receiver.life is None and not receiver.is_left_behind:
                 self._enter(receiver, path)
+        self._note()
 
     def _enter(self, receiver: Receiver, path: str) -> None:
         receiver.because = path
@@ -89,6 +141,7 @@ class Safety:
     def _begins(self, cell: Cell) -> None:
         """A life begins: if it has to be safe, nobody has told it so, unless a journal has it or it waits already."""
         path = cell.path
+        self._take_up(cell)
         for receiver in self._receivers.values():
             if receiver.path != path or receiver.life == _next_life(cell) or self._is_kept(receiver, cell):
                 continue
@@ -100,6 +153,26 @@ class Safety:
                     self._node.emit(SafeStateEntered(path, receiver.because))
             elif not was_missed:
                 self._node.emit(SafeStateMissed(path, receiver.because, problem))
+        self._note()
+
+    def _is_durable(self, receiver: Receiver) -> bool:
+        """Whether what it was told outlives this program."""
+        switch = switch_of(self._node.cell_at(receiver.path))
+        return switch is not None and switch is receiver.told[1] and switch.journal.durable
+
+    def _take_up(self, cell: Cell) -> None:
+        """A life begins: the first one of whom a program that has ended left safe, or because of whom it did."""
+        path = cell.path
+        for receiver in self._receivers.values():
+            if receiver.is_left_behind and receiver.path == path:
+                receiver.is_left_behind = False
+                receiver.told = None, switch_of(cell)
+                if self._is_kept(receiver, cell) or not receiver.holders:
+                    receiver.life = cell, _BEFORE
+        if not self._is_recovering(path):  # It has nothing to come back with.
+            self.leave(path)
+        else:
+            self._let_go("")
 
     @staticmethod
     def _is_kept(receiver: Receiver, cell: Cell) -> bool:
@@ -129,17 +202,36 @@ class Safety:
 
     def leave(self, path: str) -> None:
         """The recovery of `path` is over; a second time changes nothing."""
+        for receiver in self._receivers.values():
+            receiver.holders.pop(path, None)
+        self._let_go(path)
+
+    def _let_go(self, path: str) -> None:
+        """Tell those of the end whom nobody wants to be safe any more."""
         for key, receiver in list(self._receivers.items()):
-            if receiver.holders.pop(path, 0) is None and not receiver.holders:
+            if not receiver.holders and not receiver.is_left_behind:  # Else it is told when it begins.
                 del self._receivers[key]
                 if receiver.timer is not None:
                     receiver.timer.cancel()
-                receiver.because = path
+                receiver.because = path or receiver.because
                 if not receiver.is_missed:
                     self._leave(receiver)
-                    self._node.emit(SafeStateLeft(receiver.path, path))
+                    self._node.emit(SafeStateLeft(receiver.path, receiver.because))
         if not self._receivers:
             self._node.on_life = None
+        self._note()
+
+    def _note(self) -> None:
+        """Have the next program know whom to tell of the end."""
+        kept = tuple(
+            KeptReceiver(receiver.path, *receiver.words, receiver.timeout, tuple(receiver.holders))
+            for receiver in self._receivers.values()
+            if receiver.is_left_behind or self._is_durable(receiver)
+        )
+        noted = _ENCODE(kept) if kept else None
+        if noted != self._noted:
+            self._noted = noted
+            self._journal.note(KEPT, noted)
 
     def _leave(self, receiver: Receiver) -> None:
         """Tell the receiver of the end, unless the life that begins there next has not heard of the beginning."""
@@ -147,7 +239,7 @@ class Safety:
         if receiver.outbox:
             receiver.outbox.clear()
             return
-        is_between = cell.state in (DOWN, GONE) and receiver.life != _next_life(cell)
+        is_between = cell.state in (DOWN, GONE) and receiver.life not in (_next_life(cell), (cell, _BEFORE))
         if is_between and not self._is_kept(receiver, cell) and not mailbox.is_queued(cell, receiver.told[0]):
             return
         self._say(receiver, cell, entered=False)

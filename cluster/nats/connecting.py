@@ -202,10 +202,17 @@ class SystemClient(Client):
             raise AccessRefused(self.access.name, *next(iter(self.refusals.values())))
 
     async def close(self) -> None:
-        """Close the connection, if there ever was one to be made; a server that takes nothing is not waited for."""
+        """Close the connection, if there ever was one to be made; a server that takes nothing is not waited for.
+
+        What could not be sent goes with it. That is no error: whoever has asked for it gets no answer.
+        """
+        if not self.is_connected:  # It may be half-way to a connection, where nothing may be sent.
+            self._pending, self._pending_data_size = [], 0
         try:
             if self._flush_queue is not None:  # Else the library asserts that there is.
                 await super().close()
+        except (NotEncrypted, OSError):
+            pass
         finally:
             self._let_go()
 

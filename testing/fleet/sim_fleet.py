@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 from ...actors.errors import HoldfastError
 from ...cluster.leadership import LeadershipLost, Standby
 from ...cluster.lines.lines import Transport
-from ...cluster.ports import Engine
+from ...cluster.ports import Engine, Unanswered
 from ...cluster.servers import JoinLoop
 from ...system.system import ActorSystem
 from .broker import NO_FAULTS, BrokerFaults, SimBroker
@@ -61,9 +61,14 @@ class SimServers:
         return SimEngine(self._broker, link=self.link)
 
     async def open_lines(self) -> tuple[Transport, str]:
-        """Connect to the post; the system listens at an inbox of its own."""
+        """Connect to the post; the system listens at an inbox of its own.
+
+        Raises:
+            Unanswered: nothing gets through now.
+        """
+        if self._is_cut:
+            raise Unanswered("the post", "nothing gets through")
         made = self._post.transport()
-        made.is_cut = self._is_cut
         self.transports.append(made)
         return made, f"inbox of {self.system}"
 

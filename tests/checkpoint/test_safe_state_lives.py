@@ -6,7 +6,12 @@ It does not matter how that life comes about, nor where it is lived.
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
+import subprocess
+import sys
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,6 +21,7 @@ from tests.checkpoint.guards import Faint, Halt, Planner, Resume, Wheels, over, 
 from tests.checkpoint.players import until
 from tests.checkpoint.strikes import NEVER, strike
 
+PLAYER = Path(__file__).with_name("safe_state_player.py")
 WHEELS, PLANNER = "/app/top/wheels", "/app/top/planner"
 
 PLACES: dict[str, dict[str, Any]] = {
@@ -206,3 +212,34 @@ async def test_who_was_not_told_of_the_beginning_is_not_told_of_the_end() -> Non
         async with system.transaction() as change:
             change.add("/app/top", receiver("task"))
         assert await words(system.ref(WHEELS, Wheels)) == []
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(PLAYER), *map(str, arguments)]
+    paths = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    return subprocess.run(command, capture_output=True, text=True, timeout=100, env=paths)
+
+
+@pytest.mark.parametrize("order", ["wheels,planner", "planner,wheels"])
+@pytest.mark.parametrize("place", ["task", "recorded", "recorded process", "checkpoint only"])
+def test_the_next_program_tells_of_the_end(tmp_path: Path, place: str, order: str) -> None:
+    """The whole program is killed in the middle of a recovery: what a journal has of its beginning needs an end."""
+    store = tmp_path / "app.db"
+    first = run(store, place, order, "killed")
+    assert first.returncode == -signal.SIGKILL, first.stderr
+    last = run(store, place, order, "last")
+    assert last.returncode == 0, last.stderr
+    told = last.stdout.split()
+    if place == "checkpoint only":  # What it is told of the beginning may be lost with it, or told anew.
+        told = ["safe", *told[-1:]]
+    assert told == ([] if place == "task" else ["safe", "free"]), last.stderr
+
+
+@pytest.mark.parametrize("order", ["wheels,planner", "planner,wheels"])
+def test_a_program_that_is_killed_in_that_recovery_too_leaves_it_to_the_next_one(tmp_path: Path, order: str) -> None:
+    store = tmp_path / "app.db"
+    for _ in range(2):
+        killed = run(store, "recorded", order, "killed")
+        assert killed.returncode == -signal.SIGKILL, killed.stderr
+    last = run(store, "recorded", order, "last")
+    assert (last.returncode, last.stdout.split()) == (0, ["safe", "free"]), last.stderr

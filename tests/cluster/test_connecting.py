@@ -106,6 +106,7 @@ async def test_a_server_that_comes_back_without_encryption_is_told_nothing(tmp_p
         await servers.restart(0)
         await until(lambda: any("offers no TLS" in one.problem for one in client.refusals.values()))
         assert not client.is_connected
+        await client.publish("told", b"secret")  # It waits for a connection.
     finally:
         await client.close()
         servers.close()

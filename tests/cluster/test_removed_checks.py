@@ -34,6 +34,13 @@ CHECKS = {
         LEADERSHIP,
         "bears_servers_that_are_away_for_a_moment",
     ),
+    "a program that begins to lead waits for servers that are silent while it opens its lines": Check(
+        "system/system_connection.py",
+        "await Patience(waits=waits).answered(servers.open_lines, NowAndThen(silent))",
+        "await servers.open_lines()",
+        "tests/cluster/test_simulated_fleet.py",
+        "begins_to_lead_waits_for_servers",
+    ),
     "a server that takes up its file is not taken for one without JetStream": Check(
         "cluster/nats/server_check.py",
         "    while not has_jetstream and monotonic() < until:",

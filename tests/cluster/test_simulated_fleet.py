@@ -10,6 +10,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.errors import ConnectionLost, NoSuchActor
+from holdfast.cluster.leadership import MOMENT_SECONDS, Standby
 from holdfast.cluster.ports import Unanswered
 from holdfast.testing import History, Model, linearizable
 from holdfast.testing.fleet.broker import BrokerFaults
@@ -47,9 +48,9 @@ class Ledger(hf.Actor):
         return self.values.get(message.key, 0)
 
 
-async def bank(program: SimProgram) -> None:
+async def bank(program: SimProgram, standby: Standby | None = "warm") -> None:
     """A program of the bank: it leads, or stands by until it does."""
-    async with program.open() as system:
+    async with program.open(standby=standby) as system:
         spec = hf.child("ledger", hf.start(Ledger), recovery=hf.hybrid(interval=3.0), register="ledger", scope="fleet")
         await system.start(spec)
         await asyncio.Event().wait()
@@ -172,6 +173,23 @@ def test_another_program_goes_on_where_the_leader_was(how: str) -> None:
                     first.servers.heal()
                     await asyncio.sleep(10.0)
                 assert await ledger.ask(Get("a"), timeout=60.0) == 2
+
+    simulate(run, 0)
+
+
+@pytest.mark.parametrize("standby", ["warm", None])
+def test_who_begins_to_lead_waits_for_servers_that_are_silent_just_then(standby: Standby | None) -> None:
+    """They have answered for the log, and not yet for lines: who is not to wait bears that for a moment."""
+
+    async def run() -> None:
+        async with SimFleet() as fleet:
+            program = fleet.start(lambda program: bank(program, standby), "bank")
+            program.servers.cut(log=False)
+            await asyncio.sleep(60.0 if standby else MOMENT_SECONDS / 2)
+            fleet.check()
+            program.servers.heal()
+            async with hf.connect(fleet.servers("bank"), timeout=60.0) as connection:
+                assert await connection.ref("/bank/ledger", Ledger).ask(Put("a", 1), timeout=60.0) == 0
 
     simulate(run, 0)
 
