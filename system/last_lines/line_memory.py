@@ -26,7 +26,7 @@ LINE_BYTES: Final = 220
 """Bytes that a line takes in memory besides its text, about."""
 ADDRESS_BYTES: Final = 3_500
 """Bytes that an address takes in memory besides its lines, at most, with the runs of lines that are gone."""
-FILLED: Final = 0.875
+FILLED: Final = 0.95
 """The part of the memory that is left in use when room has to be made: it is made seldom, for many lines at once."""
 LEAST_SHARE: Final = 1_024
 """Bytes of each address that are spared as long as there are addresses with more."""
@@ -126,14 +126,18 @@ class LineMemory:
     def _make_room(self) -> None:
         """Have those with the most lines give some; if that does not do, forget who has been silent the longest."""
         rings, limits = self._rings, self._limits
-        most, share = FILLED * limits.all_bytes, limits.address_bytes
-        while self._bytes > most and share > LEAST_SHARE:
-            share //= 2
-            for ring in rings.values():
-                before = ring.bytes
+        most = FILLED * limits.all_bytes
+        sizes = [ring.bytes for ring in rings.values()]
+        share, room = max(sizes), most - ADDRESS_BYTES * len(rings)
+        while share > LEAST_SHARE and sum(min(size, share) for size in sizes) > room:
+            share = share * 7 // 8
+        for ring in rings.values():
+            before = ring.bytes
+            if before > share:
                 ring.shrink(share)
                 self._bytes += ring.bytes - before
-        while (self._bytes > most or len(rings) > limits.addresses) and len(rings) > 1:
+        fewest = limits.addresses if len(rings) <= limits.addresses else FILLED * limits.addresses
+        while (self._bytes > most or len(rings) > fewest) and len(rings) > 1:
             _, ring = rings.popitem(last=False)
             self._bytes -= ring.bytes + ADDRESS_BYTES
             self._forgotten.add(ring.oldest, ring.newest, ring.gone.count + len(ring))

@@ -21,8 +21,8 @@ CHECKS = {
     ),
     "those with the most lines give way first": Check(
         "system/last_lines/line_memory.py",
-        "        while self._bytes > most and share > LEAST_SHARE:\n",
-        "        while False:\n",
+        "            if before > share:\n",
+        "            if False:\n",
         MEMORY,
         "test_who_prints_much_does_not_drive_out_who_prints_little",
     ),
