@@ -13,14 +13,14 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.process.program import stdout
-from holdfast.console.remote import RemoteSystem
+from holdfast.console.endpoint import served
+from holdfast.console.remote import NotReached, RemoteSystem
 from holdfast.console.wire import AskLogs
 from holdfast.system.last_lines.line_memory import LineLimits
 from holdfast.system.last_lines.line_page import LogQuestion
 from tests.actors.process.players import Run, Worker
 from tests.actors.process.waiting import next_event, until
 from tests.console.commands import holdfast
-from tests.history.players import until as until_in_time
 
 
 async def worker_of(system: hf.ActorSystem, name: str = "worker") -> hf.ActorRef[Worker]:
@@ -64,11 +64,12 @@ async def test_a_program_says_which_life_it_is(system: hf.ActorSystem) -> None:
 
 
 async def test_in_a_storm_of_events_lines_are_kept_all_the_same(system: hf.ActorSystem) -> None:
-    worker = await worker_of(system)
+    await worker_of(system)
+    [process] = system._workers.by_cell.values()
     system._node.events.rest("others")
     assert not system._node.events.has_listeners
-    await worker.ask(Run("print", ["in the storm"]))
-    await until_in_time(lambda: said(system) == [(1, "in the storm")], 20.0)
+    process._on_line("stdout", "in the storm")
+    assert said(system) == [(1, "in the storm")]
 
 
 async def test_a_flood_takes_no_more_memory_than_it_may_and_others_keep_their_lines(system: hf.ActorSystem) -> None:
@@ -142,6 +143,21 @@ async def test_a_question_from_outside_is_checked_there(path: Path, asked: dict[
 async def test_what_cannot_be_asked_is_refused(system: hf.ActorSystem, ask: Callable[[Any], Any]) -> None:
     with pytest.raises(hf.SpecError, match="logs"):
         ask(system)
+
+
+async def test_whoever_follows_a_program_that_ends_is_not_left_waiting(tmp_path: Path) -> None:
+    system = hf.ActorSystem("app", log=False)
+
+    def follow() -> None:
+        with RemoteSystem(tmp_path / "app.sock") as remote:
+            asyncio.run(remote.follow_logs(after=0, timeout=600.0))
+
+    async with served(system, tmp_path / "app.sock"):
+        following = asyncio.create_task(asyncio.to_thread(follow))
+        await until(lambda: len(system._line_memory.followers) == 1)
+    with pytest.raises(NotReached):
+        await following
+    assert not (tmp_path / "app.sock").exists()
 
 
 async def test_the_command_shows_them_and_what_a_terminal_would_obey_as_text(
