@@ -193,7 +193,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
 
     @property
     def role(self) -> ProgramRole:
-        """What this program is to the system: "waiting", "standby", "leader" or "alone".
+        """Say what this program is to the system: "waiting", "standby", "leader" or "alone".
 
         It waits while it is being started, and for the servers of its store. It stands by while another program leads.
         The tree runs only in one that leads, or that is alone because its store is not on several machines.
