@@ -573,7 +573,8 @@ class EventHub:
         self.has_listeners = False  # else events are not even made
         self.hears_letters = False  # the same of dead letters,
         self.hears_starts = False  # and of the first lives at addresses,
-        self.hears_lines = False  # and of lines that processes print
+        self.hears_lines = False  # and of lines that processes print,
+        self.hears_unkept = False  # and of what a recorder does not keep
         self._streams: list[EventStream] = []
         self._sinks: list[Callable[[Event], None]] = []
         self._recorder: Callable[[Event], None] | None = None
@@ -637,6 +638,7 @@ class EventHub:
         self.hears_letters = anybody or (records and "letters" not in self._resting)
         self.hears_starts = anybody or (records and not self._resting & {"starts", "others"})
         self.hears_lines = anybody or records
+        self.hears_unkept = anybody
         self._changed(self.has_listeners)
 
     def close(self) -> None:

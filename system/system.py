@@ -30,7 +30,7 @@ from ..actors.process.worker_pool import Workers
 from ..checkpoint.engine_calls import Called
 from ..checkpoint.home.homes import Homes
 from ..checkpoint.home.journal_home import JournalHome
-from ..checkpoint.journal import Journal, StoreEngine
+from ..checkpoint.journal import Journal, StaleEpoch, StoreEngine
 from ..checkpoint.method import Durability
 from ..checkpoint.places.far_parent import FarParent
 from ..checkpoint.places.life_here import recorded_here
@@ -230,15 +230,20 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         try:
             check_system(engine, self.name)
             self._homes = Homes(node, engine, durability=options.durability, file=file, hooks=options.recovery_hooks)
-        except HoldfastError:
+            self._specifications = Specifications(self._homes, is_kept=options.store is not None)
+            self._mechanism_notes = MechanismNotes(self._homes)
+            epoch = engine.epoch if engine.safe_at == "sync" else None
+            self._lines = Lines(node, self.name, new_boot(epoch), self._homes, options.connection_limits)
+            if options.history:
+                store = self._homes if self._homes.journal.durable else None
+                self._history = HistoryRecorder(node, store, log_payloads=options.log_payloads, lines=lines)
+        except HoldfastError as error:
             with contextlib.suppress(HoldfastError):  # What it says now is only what follows from that.
                 engine.close()
             if self._sink is not None:
                 self._sink.close()
+            self._refuse_deposed(error, engine)
             raise
-        if options.history:
-            store = self._homes if self._homes.journal.durable else None
-            self._history = HistoryRecorder(node, store, log_payloads=options.log_payloads, lines=lines)
         RecoveryTree(node, self._homes).begin_with_first_home()
         self._workers = self._make_pool(node)
         if file is not None:
@@ -246,10 +251,6 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         self._moves = Moves(node)
         self._watch = LoopWatch(node, options.watch_lag, options.watch_turns)
         self._watch.open()
-        self._specifications = Specifications(self._homes, is_kept=options.store is not None)
-        self._mechanism_notes = MechanismNotes(self._homes)
-        epoch = engine.epoch if engine.safe_at == "sync" else None
-        self._lines = Lines(node, self.name, new_boot(epoch), self._homes, options.connection_limits)
         node.connect(
             Ports(
                 host_for=self._host_for,
@@ -330,6 +331,11 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         self._standing = StandingBy(f"/{self.name}", leader)
         self._node.emit(self._standing)
 
+    def _refuse_deposed(self, error: BaseException | None, engine: StoreEngine) -> None:
+        """Raise LeadershipLost, if the store has refused something because another program leads."""
+        if isinstance(error, StaleEpoch) and engine.safe_at == "sync":
+            raise LeadershipLost(self.name, "another program", error.current) from error
+
     def _silent(self, reason: str) -> None:
         """The servers do not answer, and the start waits for them."""
         self._node.emit(ServersSilent(f"/{self.name}", reason))
@@ -350,14 +356,16 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         body = self._body
         try:
             await self.shutdown()
-        except StoreError:  # JournalStopped has told of it: whoever has cancelled the body sees it cancelled.
+        except StoreError as store_error:  # JournalStopped has told of it: who cancelled the body sees it cancelled.
             if self._failure is None and not isinstance(error, asyncio.CancelledError):
+                self._refuse_deposed(store_error, self._homes.journal.engine)
                 raise
         if self._failure is not None:
             failure, self._failure = self._failure, None
             if body is not None:  # The cancel was ours: whoever catches TreeFailed must not look cancelled.
                 body.uncancel()
             raise failure from (None if isinstance(error, asyncio.CancelledError) else error)
+        self._refuse_deposed(error, self._homes.journal.engine)
 
     async def shutdown(self) -> None:
         """Stop every actor, newest first, and what belongs to the system. A second call changes nothing."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import dataclasses
 from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, cast
@@ -125,6 +126,14 @@ class Host(Protocol):
 
 Scope: TypeAlias = Literal["system", "fleet"]
 """Who finds an actor by a name: the system that it is of, or other systems and clients that are connected, too."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class GivenName:
+    """The name that the spec of a child gives to each of its lives, beside the address, and who finds it by that."""
+
+    text: str
+    scope: Scope = "system"
 
 
 class Belongings:
@@ -265,6 +274,11 @@ class Cell(_Hot):
     def is_dead(self) -> bool:
         """Nobody lives here and nobody will be restarted here."""
         return self.state is GONE or (self.state is DOWN and self.spec is None)
+
+    @property
+    def coming_life(self) -> int:
+        """The number of the life that is lived here, or between two lives that of the next one."""
+        return self.life + (self.state is DOWN)
 
     @property
     def living(self) -> Cell:

@@ -40,11 +40,6 @@ Key = tuple[str, tuple[str, bytes] | None, tuple[str, bytes] | None]
 """A receiver, and the messages it is told with."""
 
 
-def _next_life(cell: Cell) -> tuple[Cell, int]:
-    """The life at a cell, or the one that begins there next."""
-    return cell, cell.life + (cell.state is DOWN)
-
-
 class KeptReceiver(msgspec.Struct, array_like=True, frozen=True):
     """A receiver, as the note has it; the fields are those of Receiver."""
 
@@ -143,7 +138,7 @@ class Safety:
         path = cell.path
         self._take_up(cell)
         for receiver in self._receivers.values():
-            if receiver.path != path or receiver.life == _next_life(cell) or self._is_kept(receiver, cell):
+            if receiver.path != path or receiver.life == (cell, cell.coming_life) or self._is_kept(receiver, cell):
                 continue
             problem, was_missed = self._problem(receiver, cell), receiver.is_missed
             receiver.is_missed = bool(problem)
@@ -239,7 +234,7 @@ class Safety:
         if receiver.outbox:
             receiver.outbox.clear()
             return
-        is_between = cell.state in (DOWN, GONE) and receiver.life not in (_next_life(cell), (cell, _BEFORE))
+        is_between = cell.state in (DOWN, GONE) and receiver.life not in ((cell, cell.coming_life), (cell, _BEFORE))
         if is_between and not self._is_kept(receiver, cell) and not mailbox.is_queued(cell, receiver.told[0]):
             return
         self._say(receiver, cell, entered=False)
@@ -272,7 +267,7 @@ class Safety:
             if is_first:
                 mailbox.take_out(cell, receiver.told[0])  # The life that was to hear it has ended before.
             receiver.outbox.clear()
-            receiver.life = _next_life(cell)
+            receiver.life = (cell, cell.coming_life)
         message = self._message(receiver, cell, entered)
         if message is None:
             return

@@ -133,10 +133,12 @@ class Handing:
             work = functools.partial(system._moves.move, cell, "process", None, MOVED_WITHIN, known=place.spec)
             self._is_lodged |= await self._lodging.done(system, work)
         above = self._above.living(system._node)
-        if not is_elsewhere(above) or (self._asked is above and self._life == above.life and not self._has_failed()):
+        if not is_elsewhere(above) or (
+            self._asked is above and self._life == above.coming_life and not self._has_failed()
+        ):
             return
         await self._withdraw()
-        self._asked, self._life = above, above.life
+        self._asked, self._life = above, above.coming_life
         self._parent = far_parent(above, place.path)
         self._parent.expect()
         supervisor: ActorRef[Supervisor] = ActorRef(above)

@@ -20,7 +20,7 @@ from .operation import Operation, wrong
 if TYPE_CHECKING:
     from ..system import ActorSystem
 
-OPTIONS = ("restart", "shutdown", "backoff", "significant", "start_timeout", "rules")
+OPTIONS = ("restart", "shutdown", "backoff", "significant", "start_timeout", "rules", "register")
 """What a supervisor looks up at each restart or stop, so that it can be another at any time."""
 
 
@@ -121,9 +121,9 @@ class StartAgain(OnChild):
 
     async def prepare(self, system: ActorSystem) -> None:
         supervisor = self._supervisor(system)
-        if self._is_over or (self._asked is supervisor and self._life == supervisor.life):
+        if self._is_over or (self._asked is supervisor and self._life == supervisor.coming_life):
             return  # It is being restarted.
-        self._asked, self._life = supervisor, supervisor.life
+        self._asked, self._life = supervisor, supervisor.coming_life
         above: ActorRef[Supervisor] = ActorRef(supervisor)
         is_asked_again, self._is_asked = self._is_asked, True
         try:
@@ -139,10 +139,10 @@ class StartAgain(OnChild):
 
     def ready(self, system: ActorSystem) -> str:
         supervisor = self._supervisor(system)
+        if supervisor is not self._asked or supervisor.coming_life != self._life:
+            return f"{supervisor.path} has been restarted"
         if child_of(supervisor, self._name) is None:
             raise NoSuchActor(self.target)
-        if supervisor is not self._asked or supervisor.life != self._life:
-            return f"{supervisor.path} has been restarted"
         cell = (supervisor.children or {}).get(self._name)
         is_up = self._is_over or (cell is not None and cell.host.is_up(cell))
         return "" if is_up else f"{self.target} is being started"
@@ -151,7 +151,7 @@ class StartAgain(OnChild):
         supervisor = self._asked
         if supervisor is None or supervisor.is_dead:
             return
-        if supervisor.life != self._life and self._is_automatic:
+        if supervisor.coming_life != self._life and self._is_automatic:
             return  # It was stopped by a message alone: it has come back with its supervisor.
         cell = (supervisor.children or {}).get(self._name)
         if cell is not None and not cell.host.is_up(cell):

@@ -64,9 +64,9 @@ class Newcomer:
         if above is None:
             return
         cell = above.living(system._node)
-        if self._asked is cell and self._life == cell.life and place.name in (cell.children or {}):
+        if self._asked is cell and self._life == cell.coming_life and place.name in (cell.children or {}):
             return  # It is being restarted.
-        self._asked, self._life = cell, cell.life
+        self._asked, self._life = cell, cell.coming_life
         ref = await self._start(cell, in_force=False)
         if ref is None:
             self._is_over = True  # It did not want to be started.
@@ -89,7 +89,7 @@ class Newcomer:
         if above is None:
             return ""
         supervisor = above.living(system._node)
-        if supervisor is not self._asked or supervisor.life != self._life:
+        if supervisor is not self._asked or supervisor.coming_life != self._life:
             return f"{above.path} has been restarted"
         cell = (supervisor.children or {}).get(place.name)
         if cell is None and place.cell is not None:
@@ -194,7 +194,7 @@ def _planned(draft: Draft, above: DraftPlace, spec: ChildSpec) -> DraftPlace:
     Raises:
         NameTaken: its name is somebody's now (it is started before the others change), or another one's to be.
     """
-    name = spec.register
+    name = None if spec.register is None else spec.register.text
     if name is not None and (name in draft.node.names or any(name in other.names for other in draft.root.walk())):
         raise NameTaken(name)
     place = above.children[spec.id] = DraftPlace(spec.id, above, None, spec)

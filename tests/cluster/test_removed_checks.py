@@ -36,10 +36,17 @@ CHECKS = {
     ),
     "a program that begins to lead waits for servers that are silent while it opens its lines": Check(
         "system/system_connection.py",
-        "await Patience(waits=waits).answered(servers.open_lines, NowAndThen(silent))",
-        "await servers.open_lines()",
+        "await Patience(waits=waits).answered(listening, NowAndThen(silent))",
+        "await listening()",
         "tests/cluster/test_simulated_fleet.py",
         "begins_to_lead_waits_for_servers",
+    ),
+    "who is deposed while it starts has lost the leadership": Check(
+        "system/system.py",
+        'if isinstance(error, StaleEpoch) and engine.safe_at == "sync":',
+        "if False:",
+        "tests/cluster/test_simulated_fleet.py",
+        "deposed_while_it_starts",
     ),
     "a server that takes up its file is not taken for one without JetStream": Check(
         "cluster/nats/server_check.py",

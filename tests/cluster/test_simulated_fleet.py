@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import os
 import random
+from typing import Any
 
 import pytest
 
 import holdfast as hf
 from holdfast.actors.errors import ConnectionLost, NoSuchActor
-from holdfast.cluster.leadership import MOMENT_SECONDS, Standby
+from holdfast.checkpoint.journal import StaleEpoch
+from holdfast.cluster.leadership import MOMENT_SECONDS, LeadershipLost, Standby
 from holdfast.cluster.ports import Unanswered
 from holdfast.testing import History, Model, linearizable
 from holdfast.testing.fleet.broker import BrokerFaults
@@ -245,6 +247,29 @@ def test_what_a_program_raises_is_told() -> None:
             fleet.check()
         with pytest.raises(ValueError, match="broken"):
             await fleet.close()
+
+    simulate(run, 0)
+
+
+@pytest.mark.parametrize("moment", ["check_system", "Specifications", "serve", "its body"])
+def test_who_is_deposed_while_it_starts_has_lost_the_leadership(moment: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that it may be started again, and stands by: at whatever moment of its start, or later, it hears of that."""
+
+    def refused(*_: object, **__: object) -> Any:
+        raise StaleEpoch("sim:broker", epoch=1, current=2)
+
+    async def lead(fleet: SimFleet) -> None:
+        async with hf.ActorSystem("app", store=fleet.servers(), log=False):
+            if moment == "its body":
+                refused()
+            raise AssertionError("it runs")
+
+    async def run() -> None:
+        async with SimFleet() as fleet:
+            if moment != "its body":
+                monkeypatch.setattr(f"holdfast.system.system.{moment}", refused)
+            with pytest.raises(LeadershipLost, match="in epoch 2"):
+                await lead(fleet)
 
     simulate(run, 0)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import os
 import signal
 import sys
@@ -14,6 +15,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.kernel.cell import DOWN
 from holdfast.system.transaction.draft import difference
 from tests.system.trees import Add, Boom, Client, Counter, Double, Life, Stumble, Where, counter, picture, ref
 
@@ -304,6 +306,28 @@ async def test_a_supervisor_that_is_restarted_in_the_middle_has_what_was_in_forc
     assert failed.value.kept == ()
     assert shape(system) == before
     assert await in_force(system) == before
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_supervisor_that_is_down_at_the_moment_is_waited_for(system: hf.ActorSystem, isolation: Any) -> None:
+    """What is prepared below it has ended with its life, and no next one has begun yet."""
+    pause = hf.Backoff(0.3, 0.3, jitter=0.0)
+    low = hf.supervisor("low", isolation=isolation, children=[hf.child("b", hf.start(Counter), autostart=False)])
+    await system.start(hf.supervisor("top", intensity=99, children=[dataclasses.replace(low, backoff=pause)]))
+
+    async def meanwhile(running: hf.ActorSystem) -> None:
+        cell = ref(running, "/app/top/low")._cell
+        cell.kill()
+        while cell.state is not DOWN:
+            await asyncio.sleep(0)
+
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.add("/app/top/low", counter("g"))
+        if isolation == "task":  # What has not run in another process is not known here.
+            change.start("/app/top/low", "b")
+        change.step(Slot(meanwhile, fails=False))
+    assert await ref(system, "/app/top/low/g").ask(Add()) == 1
+    assert isolation == "process" or await ref(system, "/app/top/low/b").ask(Add()) == 1
 
 
 @shapes
