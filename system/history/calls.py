@@ -13,9 +13,10 @@ from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
 from ...actors.seconds import check_seconds
 from ...supervision.supervisor import Supervisor
 from .counted_work import count_work
-from .evidence import Evidence, PutAside, Told, collect, literal, put_aside
+from .evidence import Evidence, PutAside, Told, collect, put_aside
 from .lives import PastLife, done
 from .pages import MOST_ON_PAGE, HistoryPage, HistoryQuestion, answer, question
+from .paths import pattern_of
 from .recorder import HistoryRecorder
 from .why import Cause, causes, why
 
@@ -74,7 +75,7 @@ class HistoryCalls:
         Raises:
             SpecError: it cannot be asked so, or the system was made with `history=False`.
         """
-        asked = question(_pattern(target), kinds=kinds, since=since, until=until, after=after, limit=limit)
+        asked = question(pattern_of(target), kinds=kinds, since=since, until=until, after=after, limit=limit)
         return answer(self._recorder, asked)
 
     async def follow_history(
@@ -86,14 +87,14 @@ class HistoryCalls:
             SpecError: as `history`.
         """
         check_seconds("follow_history", "timeout", timeout)
-        return await self._follow(question(_pattern(target), kinds=kinds, after=after), timeout)
+        return await self._follow(question(pattern_of(target), kinds=kinds, after=after), timeout)
 
     async def _follow(self, asked: HistoryQuestion, timeout: float) -> HistoryPage:
         recorder = self._recorder
         try:
             async with asyncio.timeout(timeout):
                 while not (page := answer(recorder, asked)).events:
-                    await recorder.changed()
+                    await recorder.followers.changed()
         except TimeoutError:
             page = answer(recorder, asked)
         return page
@@ -177,7 +178,3 @@ def _path(target: ActorRef[Any] | str) -> str:
     if not isinstance(path, str):
         raise SpecError("history", f"takes an actor or an address, not {target!r}")
     return path
-
-
-def _pattern(target: ActorRef[Any] | str) -> str:
-    return literal(target.path) if isinstance(target, ActorRef) else target

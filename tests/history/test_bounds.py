@@ -132,7 +132,7 @@ def test_a_text_of_any_size_is_kept_in_a_bounded_one(size: int) -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_a_ring_keeps_the_newest_within_its_bounds(seed: int) -> None:
     chance = random.Random(seed)
-    ring = EventRing(50, 40_000)
+    ring = EventRing[PastEvent](50, 40_000)
     told = [event(number, why="x" * chance.choice([0, 100, 5_000])) for number in range(1, 300)]
     for one in told:
         ring.add(one)
@@ -144,7 +144,7 @@ def test_a_ring_keeps_the_newest_within_its_bounds(seed: int) -> None:
 
 
 def test_one_event_that_is_too_large_is_kept_alone() -> None:
-    ring = EventRing(50, 1_000)
+    ring = EventRing[PastEvent](50, 1_000)
     ring.add(event(1))
     ring.add(event(2, why="x" * 5_000))
     assert [one.number for one in ring.after(0)] == [2]

@@ -32,6 +32,13 @@ TURNS = "tests/supervision/test_turn_timeout.py"
 EFFECTS = "tests/effects/test_effect_processes.py"
 
 CHECKS = {
+    "an order that waits for a suspended supervisor is told": Check(
+        "supervision/patience.py",
+        "        if more is not None and more.suspended & mailbox.BY_USER:\n",
+        "        if False and more is not None:\n",
+        "tests/supervision/test_never_waits.py",
+        "test_a_start_and_a_stop_that_wait_for_a_suspended_supervisor_are_told",
+    ),
     "a move hears that the process has died which the actor was to leave": Check(
         "actors/migration/worker.py",
         "        self.worker.on_death(self._died_before_rest)\n",
