@@ -196,7 +196,7 @@ async def test_a_supervisor_tells_of_trouble_at_any_depth(system: hf.ActorSystem
     assert "nothing is wrong" in await said(system, "/app/outer")
     with system.events() as events:
         for number in range(5):
-            await failed(system.ref(f"/app/outer/middle/inner/w{number}", Worker), "raise")
+            await failed(system.ref(f"/app/outer/middle/inner/w{number}", Worker), "crash")
             await events.until(hf.events.ChildRestarted)
     for above in ("/app", "/app/outer", "/app/outer/middle"):
         told = await said(system, above)
