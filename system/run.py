@@ -62,7 +62,9 @@ class StandstillWatch:
                 missed = 0
             elif monotonic() - begin < 2 * look:  # Else we were late ourselves: the whole process stood still.
                 missed += 1
-        stood = f"holdfast: {signal.Signals(number).name} came, and the event loop has stood still for {self._seconds:g} s"
+        stood = (
+            f"holdfast: {signal.Signals(number).name} came, and the event loop has stood still for {self._seconds:g} s"
+        )
         os.write(2, f"{stood}: the process ends without an orderly stop; its threads are here:\n".encode())
         faulthandler.dump_traceback(2)
         os._exit(128 + number)
@@ -130,7 +132,9 @@ def run(
         try:
             for number in (signal.SIGTERM, signal.SIGINT):
                 loop.add_signal_handler(number, stop, number)
-                signal.signal(number, watch.begin)  # In place of a handler that does nothing: the loop is told all the same.
+                signal.signal(
+                    number, watch.begin
+                )  # In place of a handler that does nothing: the loop is told all the same.
                 signal.siginterrupt(number, False)  # As the loop has set it.
                 handled.append(number)
         except NotImplementedError:

@@ -675,6 +675,14 @@ def parent_ended(cell: Cell) -> bool:
     return True
 
 
+def nobody_at(cell: Cell) -> ActorStopped:
+    """What whoever wants something of an actor that is not there gets."""
+    restarting = parent_ended(cell)
+    return ActorStopped(
+        cell.path, "its supervisor is being restarted, and may start it again" if restarting else "nobody lives there"
+    )
+
+
 class ChildExit(Item):
     """A child's life has ended: its supervisor decides what follows."""
 

@@ -185,7 +185,9 @@ class FarHome(RemoteHome):
 
 
 def _not_granted(cell: Cell, order: str) -> NotGranted:
-    remedy = "only messages go over a connection; send one to an actor there that gives the order, or use the command line"
+    remedy = (
+        "only messages go over a connection; send one to an actor there that gives the order, or use the command line"
+    )
     return NotGranted(cell.path, order, "another program", remedy)
 
 

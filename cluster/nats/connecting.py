@@ -310,7 +310,8 @@ class SystemClient(Client):
             if key is None:
                 return ServerRefusal(
                     f"{where} lets nobody in without a key ({said})",
-                    f"give nkey=FILE, such as {access.system}-{self._role}.nk from `holdfast nats config`, or creds=FILE",
+                    f"give nkey=FILE, such as {access.system}-{self._role}.nk from `holdfast nats config`, "
+                    "or creds=FILE",
                 )
             return ServerRefusal(
                 f"{where} does not know the key {key} ({said})",

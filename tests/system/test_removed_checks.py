@@ -39,6 +39,27 @@ CHECKS = {
         "tests/migration/test_dying_processes.py",
         "dies_before_its_actor_is_at_rest",
     ),
+    "a loop that stands still after a signal ends the process": Check(
+        "system/run.py",
+        "                missed += 1\n",
+        "                pass\n",
+        "tests/system/test_standstill.py",
+        "never_yields and turn and 143",
+    ),
+    "a loop that goes on is left alone": Check(
+        "system/run.py",
+        "                missed = 0\n",
+        "                missed += 1\n",
+        "tests/system/test_standstill.py",
+        "takes_its_time",
+    ),
+    "whoever is between two lives has not stopped": Check(
+        "system/controls.py",
+        "        except (ActorStopped, AskFailed):  # Its",
+        "        except ZeroDivisionError:  # Its",
+        "tests/control/test_looking.py",
+        "between_two_lives_is_being_restarted",
+    ),
     "nobody is linked with who waits for the next life": Check(
         "actors/kernel/links.py",
         "    if other.has_nobody:\n",

@@ -38,7 +38,12 @@ def told_to_end(how: str, number: signal.Signals) -> tuple[int, str]:
 
 @pytest.mark.parametrize(
     ("how", "number", "code"),
-    [("turn", signal.SIGTERM, 143), ("turn", signal.SIGINT, 130), ("call", signal.SIGTERM, 143), ("stop", signal.SIGTERM, 143)],
+    [
+        ("turn", signal.SIGTERM, 143),
+        ("turn", signal.SIGINT, 130),
+        ("call", signal.SIGTERM, 143),
+        ("stop", signal.SIGTERM, 143),
+    ],
 )
 def test_a_turn_that_never_yields_does_not_outlive_the_signal(how: str, number: signal.Signals, code: int) -> None:
     ended_with, said = told_to_end(how, number)
@@ -47,8 +52,9 @@ def test_a_turn_that_never_yields_does_not_outlive_the_signal(how: str, number: 
     assert "standstill_player.py" in said, "it does not say where"
 
 
-def test_a_program_whose_loop_goes_on_ends_in_good_order() -> None:
-    assert told_to_end("well", signal.SIGTERM) == (143, "")
+@pytest.mark.parametrize("how", ["well", "slow"])
+def test_a_program_whose_loop_goes_on_takes_its_time(how: str) -> None:
+    assert told_to_end(how, signal.SIGTERM) == (143, "")
 
 
 @pytest.mark.parametrize("seconds", [0.0, float("inf"), "long"])
