@@ -560,7 +560,8 @@ class EventHub:
         self._changed = changed  # told whether there is anybody at all
         self.has_listeners = False  # else events are not even made
         self.hears_letters = False  # the same of dead letters,
-        self.hears_starts = False  # and of the first lives at addresses
+        self.hears_starts = False  # and of the first lives at addresses,
+        self.hears_unkept = False  # and of what a recorder does not keep
         self._streams: list[EventStream] = []
         self._sinks: list[Callable[[Event], None]] = []
         self._recorder: Callable[[Event], None] | None = None
@@ -623,6 +624,7 @@ class EventHub:
         self.has_listeners = anybody or (records and "others" not in self._resting)
         self.hears_letters = anybody or (records and "letters" not in self._resting)
         self.hears_starts = anybody or (records and not self._resting & {"starts", "others"})
+        self.hears_unkept = anybody
         self._changed(self.has_listeners)
 
     def close(self) -> None:

@@ -24,10 +24,6 @@ EXPIRED = 1e-9
 """A deadline that has passed. (Asks forget theirs when they expire.)"""
 
 
-NO_POSITIONS: list[int] = []
-"""Of an input that is nowhere in a journal. Never added to: those that are get a list of their own."""
-
-
 class RowPlace(msgspec.Struct, gc=False, eq=False):
     """A row of the journal in which inputs stand: it stays until a snapshot contains all of them.
 
@@ -38,8 +34,8 @@ class RowPlace(msgspec.Struct, gc=False, eq=False):
     """
 
     positions: list[int]
-    left: int
-    over: list[int]
+    left: int = 0
+    over: tuple[int, ...] = ()
 
 
 class Input(msgspec.Struct, gc=False, eq=False):
@@ -56,11 +52,17 @@ class Input(msgspec.Struct, gc=False, eq=False):
     turn: int = 0  # the turn that ended it
     deliveries: int = 0  # deaths of the process in this very turn
     origin: str = ""  # the timer or pipe it comes from
-    positions: list[int] = NO_POSITIONS  # of rows of its own
+    positions: list[int] | None = None  # of rows of its own, if it has any
     row: RowPlace | None = None  # that it shares, perhaps
     held: bool = False  # not as safe yet as it has to be: it must not be fed
     was_cut: bool = False  # a life has ended in its turn
     was_stashed: bool = False
+
+    def stands_at(self, position: int) -> None:
+        """Note a row of its own, which it has besides the one that it may share: most have none."""
+        if self.positions is None:
+            self.positions = []
+        self.positions.append(position)
 
     @property
     def size(self) -> int:

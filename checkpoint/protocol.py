@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import msgspec
 
 from ..actors.exit_reasons import ExitReason, unpack_exit
+from ..actors.kernel.cell import GivenName
 from ..actors.kernel.mailbox import Bounded
 from .method import Method
 
@@ -412,7 +413,7 @@ class AtRoot(msgspec.Struct, array_like=True):
 class Wanted(msgspec.Struct, array_like=True, tag=17):
     """A supervisor in another process wants to start a child whose home is at the root, or that is lived there.
 
-    `bindings` says where those of the child lead, port to address.
+    `bindings` says where those of the child lead, port to address; `register` is the name that its spec gives it.
     """
 
     number: int
@@ -422,6 +423,7 @@ class Wanted(msgspec.Struct, array_like=True, tag=17):
     bound: Bounded | None
     at_root: AtRoot | None = None
     bindings: dict[str, str] = {}
+    register: GivenName | None = None
 
 
 class Closed(msgspec.Struct, array_like=True, tag=18):

@@ -252,12 +252,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
                 waits = options.standby is not None
                 self._transport = await serve(self._lines, at, options.nats, waits=waits, silent=self._silent)
         except BaseException as error:  # Nobody is in the body yet who would hear of a failure, or end what has begun.
-            try:
-                await self.__aexit__(type(error), error, error.__traceback__)
-            except StoreError as store_error:
-                self._refuse_deposed(store_error, engine)
-                raise
-            self._refuse_deposed(error, engine)
+            await self.__aexit__(type(error), error, error.__traceback__)
             raise
         return self
 
@@ -309,8 +304,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         node.emit(LeadershipTaken(where, journal.epoch))
         return Called(journal)
 
-    def _refuse_deposed(self, error: BaseException, engine: StoreEngine) -> None:
-        """A start has failed. Raises LeadershipLost if that is because another program has come to lead meanwhile."""
+    def _refuse_deposed(self, error: BaseException | None, engine: StoreEngine) -> None:
+        """Raise LeadershipLost, if the store has refused something because another program leads."""
         if isinstance(error, StaleEpoch) and engine.safe_at == "sync":
             raise LeadershipLost(self.name, "another program", error.current) from error
 
@@ -334,14 +329,16 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         body = self._body
         try:
             await self.shutdown()
-        except StoreError:  # JournalStopped has told of it: whoever has cancelled the body sees it cancelled.
+        except StoreError as store_error:  # JournalStopped has told of it: who cancelled the body sees it cancelled.
             if self._failure is None and not isinstance(error, asyncio.CancelledError):
+                self._refuse_deposed(store_error, self._homes.journal.engine)
                 raise
         if self._failure is not None:
             failure, self._failure = self._failure, None
             if body is not None:  # The cancel was ours: whoever catches TreeFailed must not look cancelled.
                 body.uncancel()
             raise failure from (None if isinstance(error, asyncio.CancelledError) else error)
+        self._refuse_deposed(error, self._homes.journal.engine)
 
     async def shutdown(self) -> None:
         """Stop every actor, newest first, and what belongs to the system. A second call changes nothing."""

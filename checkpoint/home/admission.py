@@ -45,7 +45,7 @@ class InputRow:
     __slots__ = ("_accepted", "_batches", "_ends", "_home", "_place", "_size", "sources")
 
     def __init__(self, home: Switch, source: Input) -> None:
-        self._home, self._place = home, RowPlace([], 0, [])
+        self._home, self._place = home, RowPlace([])
         self.sources: list[Input] = []
         self._size = 0
         self._ends: dict[int, tuple[Primitive, ...]] = {}
@@ -234,7 +234,7 @@ class TurnRows:
             return False
         commits.check()
         source = home.ledger.admit(MESSAGE, name, body, home.node.clock.wall(), sender)
-        source.positions, source.ask, source.chain = [], ask, ask.chain
+        source.ask, source.chain = ask, ask.chain
         home.forward(source)  # In front of the submission: the loop comes to its turn before it comes to the store.
         row = self._row
         if row is not None and row.takes(source):

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ...actors.errors import DIVERGES, RAISED_AGAIN, ReplayDiverged
-from ..inputs import NO_POSITIONS, OVERHEAD, Input, RowPlace, Turn, spread
+from ..inputs import OVERHEAD, Input, RowPlace, Turn, spread
 from ..life.replay_guard import StateDiverged
 from ..long_waits import due_entry
 from ..protocol import (
@@ -364,9 +364,9 @@ class InputLedger:
         """Where in the journal a turn's own entries stand."""
         return self.positions.setdefault(turn, [])
 
-    def drop(self, *sinks: list[int]) -> None:
+    def drop(self, *sinks: list[int] | None) -> None:
         """Have the next snapshot cut what stands there, or will stand there when it is written."""
-        self.dropped += (sink for sink in sinks if sink is not NO_POSITIONS)
+        self.dropped += (sink for sink in sinks if sink is not None)
 
     def drop_input(self, source: Input) -> None:
         """The same of an input that has ended without a turn."""
@@ -382,7 +382,7 @@ class InputLedger:
             if number <= turn:
                 drop += known
         for source in self._contained_inputs(turn):
-            drop += source.positions
+            drop += source.positions or ()
         for row, keys in self._contained_places(turn).items():
             if row.left == len(keys):
                 drop += row.positions
@@ -446,7 +446,7 @@ class InputLedger:
         contained = self._contained_places(meta.turn)
         for row, keys in contained.items():
             row.left -= len(keys)
-            row.over += keys
+            row.over += tuple(keys)
         self.shared.parted = [row for row in dict.fromkeys((*self.shared.parted, *contained)) if row.left]
         self.dropped.clear()
         self.shared.gone.clear()
@@ -465,7 +465,7 @@ class InputLedger:
         turn = self.turns.pop(number)
         source = turn.input
         if not (source.was_stashed and any(past.input is source for past in self.turns.values())):
-            self.drop(self.positions.pop(number, NO_POSITIONS))  # Perhaps they stand nowhere yet.
+            self.drop(self.positions.pop(number, None))  # Perhaps they stand nowhere yet.
             if source.id not in self.open:  # Else it was put aside, and waits again.
                 self.drop_input(source)
         if turn.status != STASHED:
@@ -502,7 +502,7 @@ class InputLedger:
         """Take a journal entry up again, in order; False if it is of another kind."""
         match entry:
             case ("in", _, _, _, _, _, _, _, *_) | ("ins", _, _, _, *_):
-                place = RowPlace([position], 0, [])
+                place = RowPlace([position])
                 for one in spread(entry):
                     self._read_input(place, *one[1:])
                 if place.over:
@@ -539,7 +539,7 @@ class InputLedger:
             case ("tried", key, count):
                 if key in self.open:
                     self.open[key].deliveries = count
-                    self.open[key].positions.append(position)
+                    self.open[key].stands_at(position)
             case _:
                 return False
         return True
@@ -549,10 +549,10 @@ class InputLedger:
         *end: Any,
     ) -> None:  # fmt: skip
         if key in self.shared.over:
-            row.over.append(key)
+            row.over += (key,)
             return
         source = self.open[key] = Input(key, kind, name, body, when, sender)
-        source.origin, source.positions, source.row = origin, [], row
+        source.origin, source.row = origin, row
         row.left += 1
         self.next_id = max(self.next_id, key + 1)
         self.journal_bytes += source.size

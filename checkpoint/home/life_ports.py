@@ -41,6 +41,8 @@ def records_of(worker: Worker, take: Callable[[ToHome], None]) -> frames.TakeRec
                     gate.output(out.to, out.name)
         elif isinstance(record, Wanted):
             gate.claims(record.bindings)
+            if record.register is not None:
+                gate.require_name(record.register.text, record.register.scope)
         elif isinstance(record, Snapshot) and record.image is not None:
             pid = record.image.pid
             if not worker.forked.owns(pid):

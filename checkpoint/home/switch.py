@@ -90,10 +90,11 @@ class Switch:
     def __init__(
         self, homes: Homes, cell: Cell, method: Method, journal: HomeJournal, saved: Saved | None = None
     ) -> None:
-        self.homes, self.node, self.path = homes, homes.node, cell.path
+        self.homes, self.node = homes, homes.node
+        self.path = path = cell.path
         self.cell: Cell | None = cell
         self.method, self.journal = method, journal
-        self.ledger = InputLedger(cell.path)
+        self.ledger = InputLedger(path)
         self.life = PresentLife()
         self.intake = Intake()
         self.calls = PendingCalls(self)
@@ -207,13 +208,14 @@ class Switch:
         if self.intake.bound is not None:
             self.intake.bound.added(source)
         if self.journal.durable:
-            source.positions, source.held = [], True
+            source.held = True
             self.intake.last = source
             if name and name not in self.shapes.noted:
                 self.note_shape(name, batch)
                 self.note_reply(name, batch)
             if batch is not None:
                 self.outputs.rows.close()
+                source.positions = []
                 batch.add(self.path, source.entry(), source.positions)
             else:
                 self.outputs.rows.admit(source)

@@ -55,7 +55,7 @@ class Fed(Item):
         if type(result) is Coroutine_:
             if life.guard is not None:
                 result = life.guard.drive(result)
-            return item.finish(result if life.page is None else life.drive(result))
+            return item.finish(result)
         item.end_with(result)
         return None
 

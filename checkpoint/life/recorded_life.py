@@ -9,9 +9,8 @@ from __future__ import annotations
 import functools
 import hashlib
 import time
-import types
-from collections.abc import Callable, Coroutine, Generator
-from typing import Any, Final, NoReturn, Protocol, TypeVar
+from collections.abc import Callable
+from typing import Any, Final, NoReturn, Protocol
 
 from ...actors.control.trace_tail import follow
 from ...actors.effects import EffectCall
@@ -69,7 +68,6 @@ from ..protocol import (
 )
 from ..snapshot.image_writer import Imaging
 from ..snapshot.key_variables import check_keys, restore_state, save_state, variables
-from ..turn_word import WAITS
 from .determinism_guard import DeterminismGuard
 from .glances import answer_beside
 from .life_state import Asked, Awaited, HookTimers, LifeStage, RestoredState, SnapshotState, TurnWaits
@@ -77,8 +75,6 @@ from .readonly_guard import check_readonly
 from .recorded_context import Pending, RecordedContext
 from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
 from .replay_guard import digest_of
-
-T = TypeVar("T")
 
 NOT_SAVED: Final = -2
 """In place of the turn after which the last snapshot was made: none has the state as it is."""
@@ -280,7 +276,8 @@ class Life:
             return self.cell.node.codec.decode_reply(awaited.message, answer.body)
         if isinstance(awaited, EffectCall):
             return decode_value(answer.body)
-        return self.cell.node.codec.decode(awaited[answer.name], answer.body)
+        kind = next(kind for kind in awaited if message_name(kind) == answer.name)
+        return self.cell.node.codec.decode(kind, answer.body)
 
     def _perform(self, order: Perform) -> None:
         """An effect of the turn in hand has no outcome yet."""
@@ -307,32 +304,10 @@ class Life:
         if self.page is not None:
             self.page[0] = feed.id + 1
 
-    @types.coroutine
-    def drive(self, turn: Coroutine[Any, Any, T]) -> Generator[Any, Any, T]:
-        """Run a turn to its end; the page says when it waits."""
+    def mark(self, how: int = 0) -> None:
+        """Say on the page that the turn in hand is at work, or (WAITS) that it waits."""
         feed = self.feed
-        value: Any = None
-        thrown: BaseException | None = None
-        while True:
-            try:
-                yielded = turn.send(value) if thrown is None else turn.throw(thrown)
-            except StopIteration as done:
-                return done.value  # type: ignore[no-any-return]  # what the turn returns
-            except BaseException:
-                self._mark(feed, WAITS)  # If it was killed, nobody closes it.
-                raise
-            self._mark(feed, WAITS)
-            try:
-                value, thrown = (yield yielded), None
-            except GeneratorExit:
-                turn.close()
-                raise
-            except BaseException as error:
-                thrown = error
-            self._mark(feed)
-
-    def _mark(self, feed: Feed | None, how: int = 0) -> None:
-        if self.page is not None and feed is not None and feed is self.feed:  # Else its life was abandoned.
+        if self.page is not None and feed is not None:  # Else it is over, or its life was abandoned.
             self.page[0] = (
                 0 if how and self.waits.resting else feed.id + 1 | how
             )  # What rests for days ends no process.

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import dataclasses
 import inspect
+import os
 import signal
 import sys
 from collections.abc import AsyncGenerator, Awaitable, Callable
@@ -21,7 +22,7 @@ from ...system.run import run as run_loop
 from ...system.system import ActorSystem
 from ...system.transaction.change import Change
 from ...system.transaction.living import ReplaceActorCode
-from ...system.upgrade.new_program import load_named, specs_in
+from ...system.upgrade.new_program import find_in, load_named, specs_in
 from ..declare.tree_plan import actor_places, change_to, declare, other_code
 from ..declare.wanted_tree import WantedSpecs
 from ..endpoint import control_endpoint
@@ -79,6 +80,7 @@ def load_program(target: str) -> ServedProgram:
     """Find what is to be run. Raises SpecError: there is no such thing."""
     if target.endswith(".toml"):
         _text(target)
+        find_in(os.getcwd())
         return ServedProgram(target)
     if target.partition(":")[0].endswith(".py"):
         raise SpecError(target, "name a module, such as shop.tree:tree: actors in processes are imported by its name")

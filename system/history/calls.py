@@ -120,23 +120,18 @@ class HistoryCalls:
         Raises:
             SpecError: the system was made with `history=False`.
         """
-        check_seconds("why", "timeout", timeout)
-        return why(await self._evidence(_path(target), timeout))
+        return why(await self._evidence("why", target, timeout))
 
     async def causes(self, target: ActorRef[Any] | str, *, timeout: float = DEFAULT_TIMEOUT) -> list[Cause]:
-        """Say what `why` says, each sentence with the name of its cause, for programs; nothing if nothing is wrong.
+        """Say what `why` says of a target, within a timeout in seconds, each sentence with the name of its cause.
 
-        Args:
-            target: an actor, or an address, whether or not anybody lives there.
-            timeout: seconds that the actor's process may take to say how it is; the rest is known without it.
-
-        Raises:
-            SpecError: the system was made with `history=False`.
+        For programs; nothing if nothing is wrong. Raises SpecError: the system was made with `history=False`.
         """
-        check_seconds("causes", "timeout", timeout)
-        return causes(await self._evidence(_path(target), timeout))
+        return causes(await self._evidence("causes", target, timeout))
 
-    async def _evidence(self, path: str, timeout: float) -> Evidence:
+    async def _evidence(self, call: str, target: ActorRef[Any] | str, timeout: float) -> Evidence:
+        check_seconds(call, "timeout", timeout)
+        path = _path(target)
         node, recorder = self._node, self._recorder
         return collect(node, recorder, path, await self._ask_itself(path, timeout), self.quarantined(path))
 

@@ -84,7 +84,7 @@ class Ledgers(RuleBasedStateMachine):
     @rule(count=st.integers(2, 4), ended=st.integers(0, 3), gone=st.integers(0, 2))
     def admit_together(self, count: int, ended: int, gone: int) -> None:
         """Messages stand in one row; the turns of the first ones may be over, if nothing was in front of them."""
-        ledger, place, ends = self.ledger, RowPlace([], 0, []), list[tuple[Any, ...]]()
+        ledger, place, ends = self.ledger, RowPlace([]), list[tuple[Any, ...]]()
         is_ahead = self.next_input() is None
         sources = [ledger.admit(MESSAGE, "m:Do", b"%d" % number, 0.5, "/app/other") for number in range(count)]
         for source in sources:
@@ -216,6 +216,7 @@ class Ledgers(RuleBasedStateMachine):
         self.deaths[running] = self.deaths.get(running, 0) + 1
         assert (poison is source) == (self.deaths[running] >= MOST)
         if poison is None:
+            assert source.positions is not None
             self.write(("tried", running, source.deliveries), source.positions)
         else:  # Its turn ends with what it has sent.
             number = self.ledger.turn + 1
@@ -371,7 +372,7 @@ def test_background_work_has_one_result() -> None:
 
 def row_of(ledger: InputLedger, position: int, count: int) -> tuple[list[Input], tuple[Any, ...]]:
     """Messages that stand in one row, and the row."""
-    place = RowPlace([position], count, [])
+    place = RowPlace([position], count)
     sources = [ledger.admit(MESSAGE, "m:Do", b"", 0.5, None) for _ in range(count)]
     for source in sources:
         source.positions, source.row = [], place

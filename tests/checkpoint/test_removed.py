@@ -192,7 +192,7 @@ CHECKS = {
     ),
     "what a snapshot contains is not handled again though its row stays": Check(
         "checkpoint/home/input_ledger.py",
-        "        if key in self.shared.over:\n            row.over.append(key)\n            return\n",
+        "        if key in self.shared.over:\n            row.over += (key,)\n            return\n",
         "",
         "tests/checkpoint/test_turn_rows.py",
         "test_a_snapshot_may_contain_a_part_of_a_row",
@@ -336,6 +336,20 @@ CHECKS = {
         "",
         "tests/effects/test_long_waits.py",
         "test_a_turn_waits_on_whatever_ends and process",
+    ),
+    "a turn that has what it waited for rests no longer": Check(
+        "checkpoint/life/recorded_context.py",
+        "        self._over_soon()\n        super().set_result(result)\n",
+        "        super().set_result(result)\n",
+        "tests/effects/test_waiting_turns.py",
+        "test_a_turn_that_goes_on_rests_no_longer and went",
+    ),
+    "a turn that waits for a message no more rests no longer": Check(
+        "checkpoint/life/recorded_context.py",
+        "            self._over_soon()\n        return super().cancel(msg)\n",
+        "            pass\n        return super().cancel(msg)\n",
+        "tests/effects/test_waiting_turns.py",
+        "test_a_turn_that_goes_on_rests_no_longer and gave",
     ),
     "the journal goes on with the outputs of a turn where it had come to": Check(
         "checkpoint/home/input_ledger.py",

@@ -22,8 +22,8 @@ CHECKS = {
     ),
     "a program that begins to lead waits for servers that are silent while it opens its lines": Check(
         "system/system_connection.py",
-        "await Patience(waits=waits).answered(servers.open_lines, NowAndThen(silent))",
-        "await servers.open_lines()",
+        "await Patience(waits=waits).answered(listening, NowAndThen(silent))",
+        "await listening()",
         "tests/cluster/test_simulated_fleet.py",
         "begins_to_lead_waits_for_servers",
     ),

@@ -230,6 +230,21 @@ async def test_a_storm_is_recorded_in_part_and_no_more_events_are_made(monkeypat
         assert system.lives(worker)[-1].number == 202
 
 
+async def test_what_a_history_does_not_keep_is_made_for_those_who_listen() -> None:
+    """The phases of a recovery: five events for each actor of a tree that comes back."""
+    async with hf.ActorSystem("app", log=False) as system:
+        worker = await system.start(hf.child("worker", hf.start(Worker), recovery=hf.hybrid()))
+        hub = system._node.events
+        assert hub.has_listeners
+        assert not hub.hears_unkept
+        with system.events() as events:
+            assert hub.hears_unkept
+            worker.kill()
+            while (await events.until(hf.events.RecoveryPhase)).phase != "release":
+                pass
+        assert not hub.hears_unkept
+
+
 async def test_who_listens_gets_all_events_of_a_storm(monkeypatch: pytest.MonkeyPatch) -> None:
     others_are(monkeypatch, burst=10, per_second=20.0)
     async with hf.ActorSystem("app", log=False, intensity=100_000, period=0.001) as system:
