@@ -187,7 +187,7 @@ async def test_a_link_ends_with_the_lives_it_links(spawn: Spawn, system: hf.Acto
 # -- links and the lives that follow each other at an address ----------------------------------------------------------
 
 
-async def start_late(system: hf.ActorSystem, name: str, isolation: str = "task") -> Ref:
+async def start_late(system: hf.ActorSystem, name: str, isolation: Any = "task") -> hf.ActorRef[Any]:
     """Start an actor whose next life begins a while after the last one."""
     seconds = 0.5 if isolation == "task" else 2.0  # Time enough for a message to another process to be there meanwhile.
     backoff = hf.Backoff(initial=seconds, factor=1.0, jitter=0.0)

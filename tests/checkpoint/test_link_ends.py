@@ -62,7 +62,7 @@ class Counts(hf.Actor):
 
 @pytest.mark.parametrize("isolation", ["task", "process"])
 async def test_the_next_life_hears_of_no_exit_that_was_sent_to_one_that_ended_in_good_order(
-    system: hf.ActorSystem, isolation: str
+    system: hf.ActorSystem, isolation: Any
 ) -> None:
     recorded = hf.child("recorded", hf.start(Counts), isolation=isolation, recovery=hf.hybrid(interval=1000.0))
     one, other = await system.start(recorded), await system.start(hf.child("other", hf.start(Counts)))
