@@ -415,8 +415,8 @@ class NotGranted(
     HoldfastError,
     text="{by} may not order {actor} ({order}): {remedy}",
 ):
-    """Who may not gave an order (stop, kill, start a child): an actor in a process that has not started that one, or
-    another program, which may only send messages over a connection.
+    """An order (stop, kill, start a child) was given by somebody who may not: by an actor in a process that has not
+    started the other one, or by another program, which may only send messages over a connection.
 
     Attributes:
         remedy: what to do instead.

@@ -35,6 +35,8 @@ MOST_LOOKED_AT = 50_000
 """Actors and messages in mailboxes that are looked at for asks of one actor."""
 MOST = 200
 """Events of the address that are looked at, the newest."""
+PARTS = "ftm"
+"""The name of what has the parts of a protected actor."""
 MOST_DEEPER = 10_000
 """Actors further below that are looked at."""
 MOST_TEXT = 300
@@ -233,7 +235,7 @@ def collect(
         answer(recorder, question(f"{literal(address)}/*", kinds=CHILD_KINDS, limit=MOST)).events,
         children,
         _ended_below(recorder, address, children),
-        answer(recorder, question(f"{literal(address)}/*/*/**", kinds=DEEPER_KINDS, limit=MOST)).events,
+        _deeper(recorder, address),
         [] if cell is None else _deeper_now(cell),
         _deeper_ended(node, recorder, address),
         _own_allowance(told.overview),
@@ -269,6 +271,17 @@ def _ended_below(recorder: HistoryRecorder, address: str, children: list[ChildNo
     }
 
 
+def _deeper(recorder: HistoryRecorder, address: str) -> list[PastEvent]:
+    """What happened further below."""
+    events = answer(recorder, question(f"{literal(address)}/*/*/**", kinds=DEEPER_KINDS, limit=MOST)).events
+    return [event for event in events if not _is_part(event.address, address)]
+
+
+def _is_part(path: str, address: str) -> bool:
+    """Whether it is a part of a protected actor, which tells of its parts itself."""
+    return PARTS in path[len(address) :].split("/")
+
+
 def _deeper_now(cell: Cell) -> list[ChildNow]:
     """Who does not get on further below."""
     found: list[ChildNow] = []
@@ -285,8 +298,8 @@ def _deeper_now(cell: Cell) -> list[ChildNow]:
 
 
 def _below(cell: Cell) -> list[Cell]:
-    """Who is directly below somebody; the parts of a protected actor belong to it, and it tells of them itself."""
-    return [one for name, one in list((cell.children or {}).items()) if name != "ftm"]
+    """Who is directly below somebody, without the parts of a protected actor."""
+    return [one for name, one in list((cell.children or {}).items()) if name != PARTS]
 
 
 def _deeper_ended(node: Node, recorder: HistoryRecorder, address: str) -> dict[str, PastLife]:
@@ -294,7 +307,10 @@ def _deeper_ended(node: Node, recorder: HistoryRecorder, address: str) -> dict[s
     return {
         path: life
         for path, life in recorder.lives.last_deeper(address)
-        if life.is_over and is_fault(life) and ((cell := node.find(path)) is None or cell.is_dead)
+        if life.is_over
+        and is_fault(life)
+        and not _is_part(path, address)
+        and ((cell := node.find(path)) is None or cell.is_dead)
     }
 
 

@@ -18,8 +18,8 @@ OUTSIDE = "tests/history/test_from_outside.py"
 CHECKS = {
     "a supervisor tells of the restarts that are not its own children's": Check(
         "system/history/evidence.py",
-        """question(f"{literal(address)}/*/*/**", kinds=DEEPER_KINDS""",
-        """question(f"{literal(address)}/*", kinds=DEEPER_KINDS""",
+        'question(f"{literal(address)}/*/*/**", kinds=DEEPER_KINDS',
+        'question(f"{literal(address)}/*", kinds=DEEPER_KINDS',
         LIVE,
         "trouble_at_any_depth and task",
     ),
