@@ -31,7 +31,6 @@ class DurableTies:
         self._home = home
         self._kept: Counter[Tie] = Counter()
         self._untied: Counter[Tie] = Counter()  # as read back from the store
-        self._ended: set[Tie] = set()  # links of a life that has ended in good order: no snapshot brings them back
 
     def turn(self, verb: str, path: str) -> None:
         """A turn has tied or untied something."""
@@ -39,14 +38,6 @@ class DurableTies:
             self.over(UNDONE_BY[verb], path)
         elif verb != "link" or not self.has(verb, path):
             self._kept[verb, path] += 1
-            self._ended.discard((verb, path))
-
-    def end_links(self) -> None:
-        """The life has ended in good order, and its links with it."""
-        ended = {tie for tie in self._kept if tie[0] == "link"}
-        self._ended |= ended
-        for tie in ended:
-            del self._kept[tie], self._untied[tie]
 
     def over(self, verb: str, path: str) -> None:
         """One such tie is over: the actor is told of the other one's end, or has untied it."""
@@ -60,15 +51,12 @@ class DurableTies:
         """Some of the others have moved: `now` gives their addresses."""
         if self._kept or self._untied:
             self._kept, self._untied = _renamed(self._kept, now), _renamed(self._untied, now)
-        self._ended = {(verb, now(path)) for verb, path in self._ended}
 
     def go_back(self, ties: list[Tie]) -> None:
         """These again, as a snapshot has them: what was tied since is undone, and what was untied comes back."""
         cell, node = self._home.cell, self._home.node
         undo = {verb: name for name, verb in UNDONE_BY.items()}
         before, self._kept = self._kept, _renamed(Counter(ties), self._home.homes.addresses.now)
-        for tie in self._ended:
-            del self._kept[tie]
         stand = before - self._untied
         for verb, path in (stand - self._kept).elements():
             if cell is not None:

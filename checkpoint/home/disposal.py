@@ -11,7 +11,7 @@ from ...actors.events import MessageQuarantined
 from ...actors.kernel.codec import Parcel
 from ..group_commit import Unkept
 from ..inputs import Batch, Input
-from ..protocol import DROPPED, EXIT, MESSAGE, START, TICK, Answer
+from ..protocol import DROPPED, MESSAGE, START, TICK, Answer
 
 if TYPE_CHECKING:
     from .switch import Switch
@@ -28,15 +28,6 @@ def end_begun(home: Switch, source: Input, error: HoldfastError, batch: Batch) -
         return
     home.end_turn(source, home.ledger.turn + 1, DROPPED, batch)
     home.give(source, _failure(home, error), batch)
-
-
-def end_links(home: Switch) -> None:
-    """A life has ended for good reasons, and its links with it: the next one hears of no EXIT that was sent to this."""
-    home.ties.end_links()
-    batch, nobody = Batch(), AskFailed(home.path, "it had ended before it heard of that")
-    for source in [one for one in home.ledger.open.values() if one.kind == EXIT and one.id != home.ledger.begun]:
-        home.end_without_turn(source, _failure(home, nobody), batch)
-    batch.commit(home.journal)
 
 
 def put_into_quarantine(home: Switch, source: Input) -> None:

@@ -68,7 +68,7 @@ from ..snapshot.snapshot_schedule import SnapshotSchedule
 from ..snapshot.state_image import IMAGE_BYTES
 from ..upgrade.present_classes import REPLY_TO
 from .admission import taken_up
-from .disposal import end_links, lose, put_into_quarantine, undo_begun
+from .disposal import lose, put_into_quarantine, undo_begun
 from .held_messages import Intake, let_go
 from .input_ledger import InputLedger, stop_entry
 from .journal_limit import Limit
@@ -387,8 +387,6 @@ class Switch:
         poison = self.ledger.count_death(running, is_ordered=ordered, most=self.method.max_deliveries)
         if poison is not None:
             put_into_quarantine(self, poison)
-        if reason.is_clean:
-            end_links(self)
 
     def rests_in(self, running: int) -> bool:
         """Whether the turn of this input waits until a moment or for a message: for days, if that is wanted."""

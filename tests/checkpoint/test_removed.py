@@ -57,20 +57,6 @@ CHECKS = {
         "tests/checkpoint/test_restart_ends.py",
         "test_a_child_of_a_list",
     ),
-    "an exit that was sent to a life in good order is dropped with it": Check(
-        "checkpoint/home/switch.py",
-        "            end_links(self)\n",
-        "            pass\n",
-        "tests/checkpoint/test_link_ends.py",
-        "hears_of_no_exit and task",
-    ),
-    "no snapshot brings back a link that has ended": Check(
-        "checkpoint/durable_links.py",
-        "            del self._kept[tie]\n",
-        "            pass\n",
-        "tests/checkpoint/test_link_ends.py",
-        "hears_of_no_exit and task",
-    ),
     "a kill from outside is no order": Check(
         "checkpoint/home/journal_home.py",
         "ordered=ordered and not self.is_faulted",
