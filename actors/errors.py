@@ -413,14 +413,22 @@ class CannotMove(HoldfastError, text="{actor} cannot be moved: {why}"):
 
 class NotGranted(
     HoldfastError,
-    text="{by} lives in a process and may not order {actor} ({order}): orders go to what it has started and "
-    "to what the root has bound it to, child(..., bindings={{'port': {actor!r}}})",
+    text="{by} may not order {actor} ({order}): {remedy}",
 ):
-    """An actor in a process gave an order (stop, start a child) to one it has not started: bind it to that one."""
+    """An order (stop, kill, start a child) was given by somebody who may not: by an actor in a process that has not
+    started the other one, or by another program, which may only send messages over a connection.
+
+    Attributes:
+        remedy: what to do instead.
+    """
 
     actor: str
     order: str
     by: str
+    remedy: str = (
+        "an actor in a process gives orders to what it has started, and to what the root has bound it to by "
+        "child(..., bindings={'port': ADDRESS})"
+    )
 
 
 class NameTaken(HoldfastError, text="{actor} exists already; choose another name or stop it first"):

@@ -97,7 +97,7 @@ class ChildStopped(Event, frozen=True, eq=False):
 
 
 class EndedByLink(Event, frozen=True, eq=False):
-    """An actor ends because one that it is linked to, `peer`, has ended abnormally."""
+    """An actor ends because one that it is linked to, `peer`, has ended, and not with `NORMAL`."""
 
     peer: str
     reason: ExitReason

@@ -1,6 +1,7 @@
 """Exit reasons: why a life at an address ended. Values, never exceptions.
 
 Clean reasons are `NORMAL`, `SHUTDOWN` and `Shutdown(detail)`; every other one is abnormal (Erlang/OTP).
+That decides about restarts. A link ends the other side for every reason but `NORMAL`, clean or not.
 """
 
 from __future__ import annotations

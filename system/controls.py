@@ -22,9 +22,10 @@ from ..actors.control.orders import (
 )
 from ..actors.control.orders_lane import ask_status, order
 from ..actors.control.tracing import Statistics, tap_of
-from ..actors.errors import ActorStopped, AskTimeout, CannotMove, ControlFailed, HoldfastError, SpecError
+from ..actors.errors import ActorStopped, AskFailed, AskTimeout, CannotMove, ControlFailed, HoldfastError, SpecError
 from ..actors.events import EventStream
 from ..actors.exit_reasons import KILLED, SHUTDOWN, ExitReason
+from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import cell_kind
@@ -160,8 +161,14 @@ class Controls:
             respec(cell, start)
 
     async def get_status(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Status:
-        """How an actor is, also while a turn of it waits for something."""
+        """How an actor is, also while a turn of it waits for something, and between two lives."""
         cell = self._living(ref)
+        try:
+            return await self._status(cell, timeout)
+        except (ActorStopped, AskFailed):  # Its process has ended, or is about to.
+            return dataclasses.replace(status_of(self._living(ref)), state="restarting", pid=0)
+
+    async def _status(self, cell: Cell, timeout: float) -> Status:
         host = cell.host
         if isinstance(host, OutsideHost):
             return cast("Status", await ask_status(host.peer, cell, timeout))
@@ -296,7 +303,7 @@ class Controls:
     def _living(self, ref: ActorRef[Any]) -> Cell:
         living = ref._cell.living
         if living.is_dead:
-            raise ActorStopped(ref.path, "nobody lives there")
+            raise lifecycle.nobody_at(living)
         return living
 
     async def checkpoint(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-from ..errors import ActorStopped, ControlFailed, HoldfastError, error_text, type_name
+from ..errors import ControlFailed, HoldfastError, error_text, type_name
+from ..kernel import lifecycle
 from ..kernel.cell import Cell
 from ..kernel.envelope import NO_DEADLINE, Ask, Item
 from ..kernel.message import Message
@@ -112,7 +113,7 @@ def order(cell: Cell, wanted: Order, timeout: float) -> asyncio.Future[Any]:
     future: asyncio.Future[Any] = node.loop.create_future()
     living = cell.living
     if living.is_dead:
-        future.set_exception(ActorStopped(cell.path, "nobody lives there"))
+        future.set_exception(lifecycle.nobody_at(living))
         return future
     ask = OrderAsk(ORDERED, None, (), timeout, NO_DEADLINE, future, living)
     node.deadlines.add(ask)
@@ -188,7 +189,7 @@ def obey_order(guest: Guest, cell: Cell, frame: frames.Command) -> None:
     deadline = guest.node.loop.time() + left
     ask = RelayedAsk(ORDERED, None, (), left, deadline, None, cell, False, guest, key)
     if cell.is_dead:
-        ask.fail(ActorStopped(cell.path, "nobody lives there"))
+        ask.fail(lifecycle.nobody_at(cell))
         return
     if verb == "status":
         ask.answer(encode_value(status_of(cell)))

@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, cast
 
 from ..errors import ActorStopped, UnknownMessage, type_name
-from ..exit_reasons import SHUTDOWN, ExitReason
+from ..exit_reasons import KILLED, SHUTDOWN, ExitReason
 from ..ordered import Ordered
 from . import mailbox
 from .envelope import AnyTable, Ask, Item, Table
@@ -275,6 +275,32 @@ class Cell(_Hot):
         """Nobody lives here and nobody will be restarted here."""
         return self.state is GONE or (self.state is DOWN and self.spec is None)
 
+    def goes_on(self, reason: ExitReason) -> bool:
+        """Whether the life that ends here for this reason is followed by one that goes on where it was, by a recovery.
+
+        Who is linked with the one is linked with the other then, and hears of no end.
+        """
+        return self.spec is not None and self.host.recovers(reason) and self.spec.restarts(reason)
+
+    @property
+    def has_nobody(self) -> bool:
+        """Nobody lives here now, and whoever will is not the one who did: there is nobody to be linked with.
+
+        Before the first life begins there is somebody: the one who is being started.
+        """
+        if self.state is not DOWN or self.actor is not None:  # With an actor: its `__init__` runs.
+            return self.is_dead
+        return self.spec is None or (self.life > 0 and not self.goes_on(self._last_reason))
+
+    @property
+    def awaits_first_life(self) -> bool:
+        """Nobody has ever lived here; one who is read back from a store has lived before."""
+        return self.state is DOWN and self.life == 0 and self.actor is None and not self.host.recovers(KILLED)
+
+    @property
+    def _last_reason(self) -> ExitReason:
+        return self.more.reason if self.more is not None else SHUTDOWN
+
     @property
     def coming_life(self) -> int:
         """The number of the life that is lived here, or between two lives that of the next one."""
@@ -398,7 +424,7 @@ class Cell(_Hot):
         """A future of the reason with which the present life ends; done already when there is none."""
         future: asyncio.Future[ExitReason] = self.node.loop.create_future()
         if self.state in (DOWN, GONE):
-            future.set_result(self.more.reason if self.more is not None else SHUTDOWN)
+            future.set_result(self._last_reason)
         else:
             more = self.extra()
             if more.enders is None:

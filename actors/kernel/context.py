@@ -550,7 +550,11 @@ class ActorContext:
         self._cell.extra().trap_exits = value
 
     def link(self, other: ActorRef[Any]) -> None:
-        """Link two lives: an abnormal end of one ends the other."""
+        """Link this life with the one that is lived there: if one ends, and not with `NORMAL`, so does the other.
+
+        Whoever traps exits is told by `on_exit` instead. If nobody lives there now, also because the other one waits
+        for its restart, EXIT with `NoProc` comes at once: link again when it is back, not in `on_exit`.
+        """
         self._alive()
         links.link(self._cell, other._cell.living)
 

@@ -198,6 +198,8 @@ def build(cell: Cell, start: Start[Any], context_type: Callable[[Cell], ActorCon
         reason = NORMAL if isinstance(error, Ignore) else exit_reasons.crash(error)
         if cell.more is not None:
             cell.more.reason = reason
+            if not cell.goes_on(reason):
+                links.tell_linked(cell, reason)  # Else the next life would have the links of one that never began.
         if isinstance(error, Ignore):
             raise StartIgnored(cell.path, error.why) from error
         raise StartFailed(cell.path, str(reason)) from error
@@ -546,7 +548,7 @@ def ended(cell: Cell, reason: ExitReason) -> None:
         _undo(cell)
     if cell.spec is not None and cell.parent is not None:
         if more is not None:
-            links.announce(cell, reason, recovering=cell.host.recovers(reason) and cell.spec.restarts(reason))
+            links.announce(cell, reason, recovering=cell.goes_on(reason))
             tell_enders(more, reason)
         cell.parent.push(ChildExit(cell, cell.life, reason))
     else:
@@ -673,6 +675,14 @@ def parent_ended(cell: Cell) -> bool:
             return False
         above = above.parent
     return True
+
+
+def nobody_at(cell: Cell) -> ActorStopped:
+    """What whoever wants something of an actor that is not there gets."""
+    restarting = parent_ended(cell)
+    return ActorStopped(
+        cell.path, "its supervisor is being restarted, and may start it again" if restarting else "nobody lives there"
+    )
 
 
 class ChildExit(Item):

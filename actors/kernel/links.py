@@ -1,7 +1,9 @@
 """Links and monitors by Erlang's rules: who is told of an end, and what it does to them.
 
-A link is two-sided: an abnormal end ends the other side with the same reason, unless that one traps exits. A monitor is
-one-sided and only informs: of one life (`monitor`), or of the address (`watch`: once, when it is gone for good).
+A link is two-sided, and of two lives: any end but `NORMAL` ends the other side with the same reason, unless that one
+traps exits. Between two lives nobody is there to be linked with, so that no life has a link of the one before it; only
+a life that goes on where the last one was, by a recovery, keeps its links. A monitor is one-sided and only informs: of
+one life (`monitor`; between two lives of the next), or of the address (`watch`: once, when it is gone for good).
 """
 
 from __future__ import annotations
@@ -134,10 +136,13 @@ def demonitor(watcher: Cell, target: Cell, *, for_good: bool) -> None:
 
 
 def link(one: Cell, other: Cell, name: str = "") -> None:
-    """Link two lives; at most one link per pair. `name`: the address of the other that was given."""
+    """Link two lives; at most one link per pair. `name`: the address of the other that was given.
+
+    If nobody lives there now, EXIT with NOPROC comes at once, also if another life will begin there.
+    """
     if one is other:
         return
-    if other.is_dead:
+    if other.has_nobody:
         one.push(Exit(other, NOPROC, name))
         return
     one.extra().ties.links[other] = name or other.path
@@ -170,12 +175,8 @@ def announce(cell: Cell, reason: ExitReason, *, recovering: bool) -> None:
     if more is None or not more.has_more:
         return
     ties = more.ties
-    if ties.links and not recovering:
-        peers, ties.links = ties.links, {}
-        for peer in peers:
-            name = peer.more.ties.links.pop(cell, "") if peer.more is not None else ""
-            if name:
-                peer.push(Exit(cell, reason, name))
+    if not recovering:
+        tell_linked(cell, reason)
     if ties.monitors:
         stay: list[Monitor] = []
         for watch in ties.monitors:
@@ -188,6 +189,18 @@ def announce(cell: Cell, reason: ExitReason, *, recovering: bool) -> None:
                 else:
                     watch.forget()
         ties.monitors = stay
+
+
+def tell_linked(cell: Cell, reason: ExitReason) -> None:
+    """The links of a life end with it: EXIT to whoever lives at the other ends."""
+    more = cell.more
+    if more is None or not more.has_more or not more.ties.links:
+        return
+    peers, more.ties.links = more.ties.links, {}
+    for peer in peers:
+        name = peer.more.ties.links.pop(cell, "") if peer.more is not None else ""
+        if name and not peer.awaits_first_life:
+            peer.push(Exit(cell, reason, name))
 
 
 def gone(cell: Cell, reason: ExitReason) -> None:

@@ -184,19 +184,26 @@ class FarHome(RemoteHome):
         """Nobody kills an actor of another system."""
 
 
+def _not_granted(cell: Cell, order: str) -> NotGranted:
+    remedy = (
+        "only messages go over a connection; send one to an actor there that gives the order, or use the command line"
+    )
+    return NotGranted(cell.path, order, "another program", remedy)
+
+
 class FarPlace(OutsidePlace):
     """Wherever another system has an actor: it is not ours to end or to control."""
 
     kind = "another system"
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
-        raise NotGranted(cell.path, "stop", "another system")
+        raise _not_granted(cell, "stop")
 
     def kill(self, cell: Cell) -> None:
-        raise NotGranted(cell.path, "kill", "another system")
+        raise _not_granted(cell, "kill")
 
     def control(self, cell: Cell, call: QueuedOrder) -> None:
-        call.ask.fail(NotGranted(cell.path, "an order", "another system"))
+        call.ask.fail(_not_granted(cell, "an order"))
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         if verb in COMMANDS:

@@ -13,7 +13,7 @@ import socket
 import ssl
 from collections import Counter
 from collections.abc import Coroutine, Generator
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, Literal, NamedTuple, TypeVar
 from urllib.parse import ParseResult
 
 import nats.errors
@@ -97,11 +97,13 @@ class SystemClient(Client):
 
     Args:
         access: where the servers are, and by which files this program is known to them.
+        role: whose key it needs: "node" to run the system, "client" to send to it.
     """
 
-    def __init__(self, access: NatsAccess) -> None:
+    def __init__(self, access: NatsAccess, role: Literal["node", "client"] = "node") -> None:
         super().__init__()
         self.access = access
+        self._role = role
         self._tried = ""
         self._failures: dict[str, str] = {}
         self.refusals: dict[str, ServerRefusal] = {}
@@ -308,7 +310,8 @@ class SystemClient(Client):
             if key is None:
                 return ServerRefusal(
                     f"{where} lets nobody in without a key ({said})",
-                    f"give nkey=FILE, such as {access.system}-node.nk from `holdfast nats config`, or creds=FILE",
+                    f"give nkey=FILE, such as {access.system}-{self._role}.nk from `holdfast nats config`, "
+                    "or creds=FILE",
                 )
             return ServerRefusal(
                 f"{where} does not know the key {key} ({said})",

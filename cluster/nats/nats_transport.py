@@ -107,7 +107,7 @@ async def open_transport(access: NatsAccess) -> NatsTransport:
         AccessRefused: the servers do not let this program in.
         Unanswered: no server can be reached.
     """
-    client = SystemClient(access)
+    client = SystemClient(access, "client")
     try:
         await client.enter(CONNECT_SECONDS)
     except BaseException:  # It may be connected all the same, if this was cancelled just then.

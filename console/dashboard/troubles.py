@@ -82,6 +82,7 @@ ADVICE: Final[dict[str, TroubleAdvice]] = {
     "children in trouble": TroubleAdvice(NEWS_ONLY, "Ask the child why."),
     "children that had to be killed": TroubleAdvice(NEWS_ONLY, "Mend what hangs in its end."),
     "children that wait": TroubleAdvice(ODD, "Ask the child why."),
+    "trouble further below": TroubleAdvice(ODD, "Ask why of whom it names."),
     "events left out": TroubleAdvice(NEWS_ONLY, "Somebody tells very much: look at the events."),
 }
 """Of each cause that `why` knows, what to do."""
@@ -93,6 +94,7 @@ OF_CHILDREN: Final = frozenset(
         "children in trouble",
         "children that had to be killed",
         "children that wait",
+        "trouble further below",
     }
 )
 OF_ALL: Final = frozenset({"store", "events left out"})
@@ -230,6 +232,8 @@ def _is_own(one: tuple[str, str]) -> bool:
 def _is_told(seen: SeenSystem, path: str, one: tuple[str, str], told: set[str]) -> bool:
     """Whether a sentence stays: what concerns all is told of the root, and children that are asked speak themselves."""
     cause, sentence = one
+    if cause == "trouble further below":
+        return False  # Whoever it names is among those who are asked, or is silent: each stands in the list.
     if cause in OF_CHILDREN:
         names = {child.rpartition("/")[2] for child in told if child.rpartition("/")[0] == path}
         return not any(_names(sentence, name) for name in names)

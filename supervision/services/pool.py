@@ -227,7 +227,7 @@ def pool(
     restarting: Restarting | None = None,
     isolation: Isolation | None = None,
     mailbox: Bounded | None = None,
-    intensity: int = 1,
+    intensity: int | None = None,
     period: float = 5.0,
     restart: Restart = "permanent",
     shutdown: Shutdown = "infinity",
@@ -250,7 +250,8 @@ def pool(
             out "skip", and "wait" with "hash", where a key's messages stay with its worker.
         isolation: "process" gives each worker a process of its own.
         mailbox: `bounded(...)` for what waits at the router; unbounded if left out.
-        intensity, period: of the supervisor of workers and router.
+        intensity, period: how many restarts of workers and router within how many seconds are too many for the pool,
+            which then ends with all that waits in it. If `intensity` is left out, `size`: one death of each worker.
         restart, shutdown, rules: as a child of its own supervisor; see `supervisor`.
 
     Raises:
@@ -272,7 +273,7 @@ def pool(
     copies = [dataclasses.replace(one, id=str(number)) for number in range(size)]
     return supervisor(
         name,
-        intensity=intensity,
+        intensity=size if intensity is None else intensity,
         period=period,
         children=[*copies, child(ROUTER, router, mailbox=mailbox)],
         restart=restart,

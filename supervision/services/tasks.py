@@ -72,7 +72,8 @@ class Tasks:
     annotation says.
 
     Called by an actor, `run`, `start` and `stream` make jobs that end with that life of it; how they fail is told to
-    whoever awaits them and to nobody else, unless `linked=True`: then an abnormal end of the job ends the caller too.
+    whoever awaits them and to nobody else, unless `linked=True`: then any end of the job but a normal one ends the
+    caller too.
     A `spawn`ed job belongs to nobody but the task supervisor.
 
     All raise MaxChildren when there are as many as there may be, and ActorStopped if there is no task supervisor.

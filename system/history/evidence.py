@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, deque
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -17,7 +17,7 @@ from ...supervision.children import STOPPED
 from ...supervision.intensity import recent_restarts
 from ...supervision.spec import ChildSpec
 from ...supervision.supervisor import Supervisor
-from .lives import WITH_THE_ROOT, PastLife
+from .lives import WITH_THE_ROOT, PastLife, is_fault
 from .pages import answer, question
 from .past_event import PastEvent, content, message_type, shortened
 from .paths import literal
@@ -36,10 +36,16 @@ MOST_LOOKED_AT = 50_000
 """Actors and messages in mailboxes that are looked at for asks of one actor."""
 MOST = 200
 """Events of the address that are looked at, the newest."""
+PARTS = "ftm"
+"""The name of what has the parts of a protected actor."""
+MOST_DEEPER = 10_000
+"""Actors further below that are looked at."""
 MOST_TEXT = 300
 """Characters of an error that a sentence quotes."""
 LONG_TURN = 1.0
 """Seconds from which on a turn is worth a sentence."""
+DEEPER_KINDS = (*GAVE_UP_KINDS, "ChildRestarted", "JournalFull", "MessageQuarantined", "RecoveryFailed", "ReplicaLost")
+"""Events further below a supervisor of which it tells, too."""
 CHILD_KINDS = ("ChildRestarted", "JournalFull", "MessageQuarantined", "RecoveryFailed", "ReplicaLost", "StopOverdue")
 """Events of children that their supervisor is asked about, too."""
 
@@ -137,6 +143,9 @@ class Evidence(msgspec.Struct, frozen=True):
         below: the newest events about what weighs much at its children, oldest first.
         children: if it is a supervisor that answers, its children.
         ended_below: the last lives of its children that are not there now, by address.
+        deeper: the newest events about what weighs much further below, oldest first.
+        deeper_now: those further below who do not get on now, by their addresses, as far as this process knows.
+        deeper_ended: the last lives of those further below that ended by a fault and are not there now, by address.
         own_allowance: what it allows itself, if it is a supervisor that answers.
         protection: its mechanisms and replicas, if somebody lives there.
         memory: of its own process, if its limits bound that.
@@ -159,6 +168,9 @@ class Evidence(msgspec.Struct, frozen=True):
     below: list[PastEvent] = []
     children: list[ChildNow] = []
     ended_below: dict[str, PastLife] = {}
+    deeper: list[PastEvent] = []
+    deeper_now: list[ChildNow] = []
+    deeper_ended: dict[str, PastLife] = {}
     own_allowance: Allowance | None = None
     protection: ProtectionStatus | None = None
     memory: ProcessMemory | None = None
@@ -224,6 +236,9 @@ def collect(
         answer(recorder, question(f"{literal(address)}/*", kinds=CHILD_KINDS, limit=MOST)).events,
         children,
         _ended_below(recorder, address, children),
+        _deeper(recorder, address),
+        [] if cell is None else _deeper_now(cell),
+        _deeper_ended(node, recorder, address),
         _own_allowance(told.overview),
         None if cell is None else protection_of(cell),
         None if cell is None else _memory(cell),
@@ -254,6 +269,49 @@ def _ended_below(recorder: HistoryRecorder, address: str, children: list[ChildNo
         path: life
         for path, life in recorder.lives.last_below(address)
         if life.is_over and path not in there and life.reason_kind not in WITH_THE_ROOT
+    }
+
+
+def _deeper(recorder: HistoryRecorder, address: str) -> list[PastEvent]:
+    """What happened further below."""
+    events = answer(recorder, question(f"{literal(address)}/*/*/**", kinds=DEEPER_KINDS, limit=MOST)).events
+    return [event for event in events if not _is_part(event.address, address)]
+
+
+def _is_part(path: str, address: str) -> bool:
+    """Whether it is a part of a protected actor, which tells of its parts itself."""
+    return PARTS in path[len(address) :].split("/")
+
+
+def _deeper_now(cell: Cell) -> list[ChildNow]:
+    """Who does not get on further below."""
+    found: list[ChildNow] = []
+    level = deque(below for one in _below(cell) for below in _below(one))
+    for _ in range(MOST_DEEPER):
+        if not level:
+            break
+        one = level.popleft()
+        level += _below(one)
+        status = None if one.is_dead else status_of(one)
+        if status is not None and (status.state == "suspended" or (status.turn and status.turn_seconds >= LONG_TURN)):
+            found.append(ChildNow(one.path, status.state, status.turn or "", status.turn_seconds, status.turn_at))
+    return found
+
+
+def _below(cell: Cell) -> list[Cell]:
+    """Who is directly below somebody, without the parts of a protected actor."""
+    return [one for name, one in list((cell.children or {}).items()) if name != PARTS]
+
+
+def _deeper_ended(node: Node, recorder: HistoryRecorder, address: str) -> dict[str, PastLife]:
+    """Who ended further below by a fault, and is not there."""
+    return {
+        path: life
+        for path, life in recorder.lives.last_deeper(address)
+        if life.is_over
+        and is_fault(life)
+        and not _is_part(path, address)
+        and ((cell := node.find(path)) is None or cell.is_dead)
     }
 
 

@@ -67,6 +67,24 @@ class PastLife(msgspec.Struct):
         return self.ended is not None
 
 
+CLEAN = frozenset({"", "Normal", "Shutdown", "SystemStopped", "RootKilled", "FailedOver"})
+"""The kinds of ends that are no fault of whoever has ended."""
+
+
+def is_fault(life: PastLife) -> bool:
+    """Whether it has ended, or did not begin, because of something at its own address that went wrong."""
+    return life.reason_kind not in CLEAN and not life.by
+
+
+def is_deeper(path: str, address: str) -> bool:
+    """Whether a path is below an address, and not directly.
+
+    >>> is_deeper("/app/arm/motor", "/app"), is_deeper("/app/arm", "/app")
+    (True, False)
+    """
+    return path.startswith(f"{address}/") and "/" in path[len(address) + 1 :]
+
+
 Lives: TypeAlias = "deque[PastLife]"
 
 
@@ -90,6 +108,12 @@ class LivesByAddress:
         """The newest life of each address directly below this one, with that address."""
         for path, known in self._known.items():
             if path.rpartition("/")[0] == address:
+                yield path, known[-1]
+
+    def last_deeper(self, address: str) -> Iterator[tuple[str, PastLife]]:
+        """The newest life of each address below the ones directly below this one, with that address."""
+        for path, known in self._known.items():
+            if is_deeper(path, address):
                 yield path, known[-1]
 
     def __len__(self) -> int:

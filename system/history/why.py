@@ -8,10 +8,11 @@ from typing import NamedTuple
 
 from ...ftm.group.protected import ProtectionStatus
 from .evidence import LONG_TURN, MOST_TEXT, Evidence, PutAside, seconds_text
-from .lives import PastLife
+from .lives import CLEAN, PastLife, is_fault
 from .past_event import PastEvent
 from .raised import raised_at
 from .why_children import (
+    deeper_trouble,
     ended_children,
     moving_children,
     overdue_children,
@@ -67,14 +68,7 @@ def _well(evidence: Evidence) -> str:
 
 def _ends(evidence: Evidence) -> list[PastLife]:
     """The lives that ended by a fault, oldest first; only those behind the last good start of the root."""
-    return [life for life in evidence.lives if life.is_over and _is_fault(life)]
-
-
-def _is_fault(life: PastLife) -> bool:
-    return life.reason_kind not in CLEAN and not life.by
-
-
-CLEAN = frozenset({"", "Normal", "Shutdown", "SystemStopped", "RootKilled", "FailedOver"})
+    return [life for life in evidence.lives if life.is_over and is_fault(life)]
 
 
 def _crash_loop(evidence: Evidence) -> list[str]:
@@ -395,6 +389,7 @@ RULES: dict[str, Rule] = {
     "children in trouble": troubled_children,
     "children that had to be killed": overdue_children,
     "children that wait": waiting_children,
+    "trouble further below": deeper_trouble,
     "events left out": _gap,
 }
 """The causes, in the order in which they are told."""

@@ -99,6 +99,46 @@ def overdue_children(evidence: Evidence) -> list[str]:
     )
 
 
+def deeper_trouble(evidence: Evidence) -> list[str]:
+    """Who is in trouble further below, at any depth: the worst few, and how many more."""
+    worst = sorted(_deeper_trouble(evidence).items(), key=lambda one: (-one[1][0], one[0]))
+    said = [f"Below it, {path} {words}: ask why of {path}." for path, (_, words) in worst[:MOST_NAMED]]
+    more = len(worst) - MOST_NAMED
+    return [*said, f"{more} more are in trouble below it."] if more > 0 else said
+
+
+def _deeper_trouble(evidence: Evidence) -> dict[str, tuple[float, str]]:
+    """What is wrong with each further below, and how much that weighs; of each only what weighs most."""
+    found: dict[str, tuple[float, str]] = {}
+
+    def add(path: str, weight: float, words: str) -> None:
+        if weight > found.get(path, (0.0, ""))[0]:
+            found[path] = weight, words
+
+    for one in evidence.deeper_now:
+        held = one.state == "suspended"
+        add(one.name, 1.0 if held else 2.0, "is suspended" if held else f"does not get on{_hangs(one)}")
+    for event in evidence.deeper:
+        ago = evidence.ago(event.at)
+        if evidence.now - event.at > NEWS:
+            continue
+        if event.kind in TROUBLE:
+            add(event.address, 3.0, f"has something to tell: {TROUBLE[event.kind]} {ago}")
+        elif event.kind != "ChildRestarted":
+            add(event.address, 5.0, f"gave up {ago}" if event.kind == "SupervisorGaveUp" else f"ended {ago}")
+    for path, life in evidence.deeper_ended.items():
+        if life.ended is not None and evidence.now - life.ended <= NEWS:
+            ended = "could not be started" if life.reason_kind == "StartFailed" else "ended and is not there"
+            add(path, 4.0, f"{ended}, {evidence.ago(life.ended)} ({life.reason[:MOST_TEXT]})")
+    restarts = [one for one in evidence.deeper if one.kind == "ChildRestarted" and evidence.now - one.at <= LATELY]
+    for path, count in Counter(event.address for event in restarts).items():
+        first = next(event for event in restarts if event.address == path)
+        within = max(1, round(evidence.now - first.at))
+        words = f"was restarted {_times(count)} within the last {within} s ({_last_reason(restarts, path)})"
+        add(path, 6.0 + count, words)
+    return found
+
+
 def _stacks(event: PastEvent) -> str:
     lines = str(event.fields.get("stacks") or "").splitlines()
     return lines[0].rstrip(":") if lines else "what it waited for is not known"

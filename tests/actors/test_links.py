@@ -184,6 +184,131 @@ async def test_a_link_ends_with_the_lives_it_links(spawn: Spawn, system: hf.Acto
     assert len(await heard(one)) == 1
 
 
+# -- links and the lives that follow each other at an address ----------------------------------------------------------
+
+
+async def start_late(system: hf.ActorSystem, name: str, isolation: Any = "task") -> hf.ActorRef[Any]:
+    """Start an actor whose next life begins a while after the last one."""
+    seconds = 0.5 if isolation == "task" else 2.0  # Time enough for a message to another process to be there meanwhile.
+    backoff = hf.Backoff(initial=seconds, factor=1.0, jitter=0.0)
+    return await system.start(hf.child(name, hf.start(Answers), isolation=isolation, backoff=backoff))
+
+
+class Fail(hf.Message[None]):
+    pass
+
+
+class LinkWith(hf.Message[None]):
+    path: str
+
+
+class Heard(hf.Message[list[str]]):
+    pass
+
+
+class Answers(hf.Actor):
+    """As a peer, for a process of its own: what it is sent can be encoded."""
+
+    def __init__(self) -> None:
+        self.ctx.trap_exits = True
+        self.heard: list[str] = []
+
+    @hf.on(Fail)
+    def fail(self, message: Fail) -> None:
+        raise ValueError("boom")
+
+    @hf.on(LinkWith)
+    def link(self, message: LinkWith) -> None:
+        self.ctx.link(self.ctx.find(message.path, Answers))
+
+    @hf.on(Heard)
+    def tell(self, message: Heard) -> list[str]:
+        return self.heard
+
+    def on_exit(self, source: hf.ActorRef[Any], reason: hf.ExitReason) -> None:
+        self.heard.append(f"{source.path}: {reason}")
+
+
+@pytest.mark.parametrize("trap", [False, True])
+async def test_between_two_lives_nobody_is_there_to_be_linked_with(
+    spawn: Spawn, system: hf.ActorSystem, trap: bool
+) -> None:
+    one, other = spawn("one", trap=trap), await start_late(system, "other")
+    with system.events() as events:
+        with pytest.raises(hf.RemoteCrash):
+            await other.ask(Fail())
+        await link(one, other)
+        if trap:
+            assert await heard(one) == [("EXIT", "/t/other", hf.NOPROC)]
+            await system.stop(one)
+        else:
+            assert not await is_alive(one)
+        await events.until(hf.events.ChildRestarted, timeout=60.0)
+        assert await other.ask(Heard()) == []  # The next life knows nothing of whoever ended before it began.
+
+
+@pytest.mark.parametrize("whose", ["linker", "linked"])
+async def test_a_link_with_somebody_between_two_lives_is_none_over_the_border_of_a_process(
+    system: hf.ActorSystem, whose: str
+) -> None:
+    one = await start_late(system, "one", "process" if whose == "linker" else "task")
+    other = await start_late(system, "other", "process" if whose == "linked" else "task")
+    with system.events() as events:
+        with pytest.raises(hf.RemoteCrash):
+            await other.ask(Fail())
+        await events.until(hf.events.ChildTerminated)
+        await one.ask(LinkWith("/t/other"))
+        while not (told := await one.ask(Heard())):
+            await asyncio.sleep(0)
+        assert told == [f"/t/other: {hf.NOPROC}"]
+        await events.until(hf.events.ChildRestarted, timeout=60.0)
+        with pytest.raises(hf.RemoteCrash):
+            await one.ask(Fail())
+        assert await other.ask(Heard()) == []
+
+
+async def test_who_links_again_in_on_exit_does_not_take_the_link_into_its_next_life(system: hf.ActorSystem) -> None:
+    class Watcher(Answers):
+        def on_start(self, restored: bool) -> None:
+            self.ctx.link(self.ctx.find("/t/two/first", Answers))
+
+        def on_exit(self, source: hf.ActorRef[Any], reason: hf.ExitReason) -> None:
+            super().on_exit(source, reason)
+            if len(self.heard) < 5:
+                self.ctx.link(source)
+
+    children = [hf.child("first", hf.start(Answers)), hf.child("second", hf.start(Watcher))]
+    await system.start(hf.supervisor("two", strategy="rest_for_one", children=children))
+    with system.events() as events:
+        with pytest.raises(hf.RemoteCrash):
+            await system.ref("/t/two/first", Answers).ask(Fail())
+        while (await events.until(hf.events.ActorStarted)).address != "/t/two/second":
+            pass
+        assert await system.ref("/t/two/second", Watcher).ask(Heard()) == []
+        assert [event for event in events.take() if isinstance(event, hf.events.SupervisorGaveUp)] == []
+
+
+async def test_a_life_that_does_not_begin_leaves_no_link_to_the_next_one(spawn: Spawn, system: hf.ActorSystem) -> None:
+    one, tries = spawn("one", trap=True), list[int]()
+
+    class Late(Answers):
+        def __init__(self) -> None:
+            super().__init__()
+            tries.append(self.ctx.life)
+            if self.ctx.life == 2:
+                self.ctx.link(one)
+                raise ValueError("not yet")
+
+    late = await system.start(hf.child("late", hf.start(Late)))
+    with system.events() as events:
+        late.tell(Fail())
+        await events.until(hf.events.ChildRestarted)
+        assert (await late.ask(Heard()), tries) == ([], [1, 2, 3])
+        assert [(path, reason.text) for _, path, reason in await heard(one)] == [("/t/late", "not yet")]
+        await system.stop(one)
+        assert await late.ask(Heard()) == []
+
+
 # -- monitors --------------------------------------------------------------------------------------------------------
 
 

@@ -182,6 +182,14 @@ async def test_who_is_refused_does_not_stand_by(nats1: NatsServers, standby: Sta
             raise AssertionError("it leads")
 
 
+async def test_a_client_without_a_key_is_told_of_the_key_of_a_client(nats1: NatsServers) -> None:
+    name = nats1.new_system()
+    store = nats1.store(name).partition("?")[0]
+    with pytest.raises(hf.errors.AccessRefused, match=f"such as {name}-client.nk"):
+        async with asyncio.timeout(PATIENCE), hf.connect(store, system="app"):
+            raise AssertionError("it is connected")
+
+
 async def test_who_waits_for_servers_says_so(tmp_path: Path) -> None:
     servers = NatsServers(tmp_path)
     await servers.start()

@@ -183,3 +183,25 @@ async def test_the_state_of_a_dynamic_supervisor_has_its_children(system: hf.Act
     await pool.ask(hf.StartChild(hf.child("one", hf.start(Account))))
     state = await system.get_state(pool)
     assert (state["max_children"], list(state["children"])) == (3, ["one"])
+
+
+class End(hf.Message[None]):
+    """End in good order behind this turn."""
+
+
+class Ends(hf.Actor):
+    @hf.on(End)
+    def end(self, message: End) -> None:
+        self.ctx.stop()
+
+
+async def test_who_is_looked_at_between_two_lives_is_being_restarted(system: hf.ActorSystem) -> None:
+    """Also while its process has ended and the root has not heard of it yet."""
+    one = await system.start(hf.child("ends", hf.start(Ends), isolation="process"))
+    states: list[str] = []
+    for _ in range(3):
+        await one.ask(End(), timeout=60.0)
+        while not states or states[-1] != "restarting":
+            states.append((await system.get_status(one, timeout=60.0)).state)
+        states.append("asked again")
+    assert set(states) <= {"running", "restarting", "asked again"}

@@ -16,6 +16,20 @@ WHY = "tests/history/test_why.py"
 OUTSIDE = "tests/history/test_from_outside.py"
 
 CHECKS = {
+    "a supervisor tells of the restarts that are not its own children's": Check(
+        "system/history/evidence.py",
+        'question(f"{literal(address)}/*/*/**", kinds=DEEPER_KINDS',
+        'question(f"{literal(address)}/*", kinds=DEEPER_KINDS',
+        LIVE,
+        "trouble_at_any_depth and task",
+    ),
+    "a supervisor tells of few who are in trouble further below": Check(
+        "system/history/why_children.py",
+        "for path, (_, words) in worst[:MOST_NAMED]]",
+        "for path, (_, words) in worst]",
+        WHY,
+        "test_the_worst_trouble",
+    ),
     "in a storm a part is recorded": Check(
         "system/history/tracks.py",
         "        return self._quota.take(now, least=max(1.0, leaving * self._burst))\n",

@@ -281,6 +281,15 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         {"children": [ChildNow("a", "running", "shop.Pay", 3.0), ChildNow("b", "running", "shop.Pay", 0.5)]},
         "Its child a does not get on: it has been in the turn of shop.Pay for 3.0 s.",
     ),
+    "trouble further below": (
+        {
+            "deeper": [
+                told("ChildRestarted", f"{AT}/a/b", 960.0, reason="KeyError: 7"),
+                told("ChildRestarted", f"{AT}/a/b", 980.0, reason="KeyError: 8"),
+            ],
+        },
+        f"Below it, {AT}/a/b was restarted 2 times within the last 40 s (KeyError: 8): ask why of {AT}/a/b.",
+    ),
     "a child that is suspended": ({"children": [ChildNow("a", "suspended")]}, "Its child a is suspended."),
     "little memory is left": (
         {"memory": ProcessMemory(250_000_000, 300_000_000)},
@@ -349,6 +358,22 @@ def test_a_replica_that_was_lost_is_told_of_also_when_it_is_back() -> None:
     said = why(Evidence(AT, NOW, events=[*LOST, JOINED], protection=protection(a="follows", b="leads")))
     assert said[0] == "Replica a was lost 10 s ago: its process has ended (SIGKILL)."
     assert said[2] == "It is whole again, for a came back 5.0 s ago: a follows, b leads, epoch 2."
+
+
+def test_the_worst_trouble_further_below_is_told_first_and_the_rest_is_counted() -> None:
+    deeper = [
+        *(told("ChildRestarted", f"{AT}/a/b", 980.0, reason="KeyError: 8") for _ in range(2)),
+        told("RecoveryFailed", f"{AT}/a/c/d", reason="no file"),
+        told("RecoveryFailed", f"{AT}/a/old", 100.0, reason="no file"),
+    ]
+    now = [ChildNow(f"{AT}/a/e", "suspended"), ChildNow(f"{AT}/a/f", "running", "shop.Pay", 3.0)]
+    ended = {f"{AT}/a/g": life(1, 998.0, "no file", "StartFailed")}
+    assert why(Evidence(AT, NOW, deeper=deeper, deeper_now=now, deeper_ended=ended)) == [
+        f"Below it, {AT}/a/b was restarted 2 times within the last 20 s (KeyError: 8): ask why of {AT}/a/b.",
+        f"Below it, {AT}/a/g could not be started, 2.0 s ago (no file): ask why of {AT}/a/g.",
+        f"Below it, {AT}/a/c/d has something to tell: a recovery failed 10 s ago: ask why of {AT}/a/c/d.",
+        "2 more are in trouble below it.",
+    ]
 
 
 def test_of_many_children_some_are_named() -> None:

@@ -188,6 +188,23 @@ async def test_a_supervisor_tells_of_its_children(system: hf.ActorSystem, isolat
     assert "one ended" not in text
 
 
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_supervisor_tells_of_trouble_at_any_depth(system: hf.ActorSystem, isolation: Any) -> None:
+    inner = hf.supervisor("inner", intensity=9, children=[worker(f"w{number}") for number in range(5)])
+    middle = hf.supervisor("middle", children=[inner], isolation=isolation)
+    await system.start(hf.supervisor("outer", children=[middle]))
+    assert "nothing is wrong" in await said(system, "/app/outer")
+    with system.events() as events:
+        for number in range(5):
+            await failed(system.ref(f"/app/outer/middle/inner/w{number}", Worker), "crash")
+            await events.until(hf.events.ChildRestarted)
+    for above in ("/app", "/app/outer", "/app/outer/middle"):
+        told = await said(system, above)
+        assert "Below it, /app/outer/middle/inner/w0 was restarted once" in told
+        assert "2 more are in trouble below it." in told
+        assert [one.cause for one in await system.causes(above)] == ["trouble further below"] * 4
+
+
 async def test_a_supervisor_tells_who_made_it_give_up(system: hf.ActorSystem) -> None:
     await system.start(hf.supervisor("family", intensity=1, children=[worker("one"), worker("two")]))
     two = system.ref("/app/family/two", Worker)

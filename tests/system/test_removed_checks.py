@@ -28,6 +28,7 @@ SLOW = "tests/supervision/test_slow_restarts.py"
 UPGRADE = "tests/system/upgrade/test_check_upgrade.py"
 COLLECTIONS = "tests/system/test_full_collections.py"
 ORDERS = "tests/effects/test_orders_while_resting.py"
+LINKS = "tests/actors/test_links.py"
 TURNS = "tests/supervision/test_turn_timeout.py"
 EFFECTS = "tests/effects/test_effect_processes.py"
 
@@ -45,6 +46,41 @@ CHECKS = {
         "",
         "tests/migration/test_dying_processes.py",
         "dies_before_its_actor_is_at_rest",
+    ),
+    "a loop that stands still after a signal ends the process": Check(
+        "system/run.py",
+        "                missed += 1\n",
+        "                pass\n",
+        "tests/system/test_standstill.py",
+        "never_yields and turn and 143",
+    ),
+    "a loop that goes on is left alone": Check(
+        "system/run.py",
+        "                missed = 0\n",
+        "                missed += 1\n",
+        "tests/system/test_standstill.py",
+        "takes_its_time",
+    ),
+    "whoever is between two lives has not stopped": Check(
+        "system/controls.py",
+        "        except (ActorStopped, AskFailed):  # Its",
+        "        except ZeroDivisionError:  # Its",
+        "tests/control/test_looking.py",
+        "between_two_lives_is_being_restarted",
+    ),
+    "nobody is linked with who waits for the next life": Check(
+        "actors/kernel/links.py",
+        "    if other.has_nobody:\n",
+        "    if other.is_dead:\n",
+        LINKS,
+        "between_two_lives_nobody_is_there",
+    ),
+    "a life that does not begin leaves no link": Check(
+        "actors/kernel/lifecycle.py",
+        "                links.tell_linked(cell, reason)  # Else",
+        "                pass  # Else",
+        LINKS,
+        "a_life_that_does_not_begin",
     ),
     "a turn that takes longer than its class allows is cancelled": Check(
         "actors/kernel/lifecycle.py",

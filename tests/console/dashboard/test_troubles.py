@@ -104,6 +104,10 @@ def test_what_children_say_themselves_is_not_said_of_them() -> None:
             ("restarts of children", "Within the last 4 s it restarted till 3 times (SIGSEGV); it allows 3 in 5 s."),
             ("children that wait", "Its child other is suspended."),
             ("children that wait", "Its child till does not get on."),
+            (
+                "trouble further below",
+                "Below it, /app/shop/till was restarted once (SIGSEGV): ask why of /app/shop/till.",
+            ),
         ],
         "/app/till": [("its own faults", "/app/till restarted 3 times.")],
     }
