@@ -292,6 +292,11 @@ class Intake:
     inlets: dict[str, Inlet] = dataclasses.field(default_factory=dict)
     last: Input | None = None
 
+    @property
+    def mailbox(self) -> HomeBound | None:
+        """The bound of the mailbox itself, also while messages are held."""
+        return self.bound.inner if isinstance(self.bound, Holding) else self.bound
+
 
 def hold(home: Switch, running: int = -1) -> None:
     """The actor is recovered: what comes now is held by its method's rules."""

@@ -16,6 +16,7 @@ from ...actors.errors import HoldfastError, StartFailed, StartIgnored
 from ...actors.events import ActorStarted, Recovered, RecoveryFailed
 from ...actors.exit_reasons import KILLED, ExitReason
 from ...actors.kernel import links
+from ...actors.kernel.address_host import Work
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.lifecycle import MAILBOX
 from ...actors.persistence import UNFIT
@@ -32,7 +33,7 @@ from .recorded_home import RecordedHome
 from .switch import Switch
 
 if TYPE_CHECKING:
-    from ...actors.kernel.address_host import Parent
+    from ...actors.kernel.address_host import Capacity, Parent
     from ...actors.kernel.envelope import Item
     from ...actors.process.worker_pool import Worker
 
@@ -215,6 +216,18 @@ class JournalHome(RecordedHome):
 
     def backlog(self, cell: Cell, running: int) -> int:
         return 0 if self.switch is None else self.switch.ledger.backlog(running)
+
+    def work(self, cell: Cell, running: int) -> Work:
+        """The input in hand, or the number of the turn that has ended last: the same for every place."""
+        switch = self.switch
+        if switch is None:
+            return Work()
+        source, turn = switch.ledger.open.get(running), cell.more.turn if cell.more is not None else None
+        mark: object = switch.ledger.turn if source is None else source
+        return Work(mark, source is not None, None if turn is None else turn.since)
+
+    def mailbox(self, cell: Cell) -> Capacity | None:
+        return None if self.switch is None else self.switch.intake.mailbox
 
     def load(self, cell: Cell) -> int:
         """Messages that wait and those in hand; what the actor has put aside is among them."""

@@ -308,14 +308,14 @@ class Life:
             self.page[0] = feed.id + 1
 
     @types.coroutine
-    def drive(self, turn: Coroutine[Any, Any, T]) -> Generator[Any, Any, T]:
-        """Run a turn to its end; the page says when it waits."""
+    def drive(self, driven_turn: Coroutine[Any, Any, T]) -> Generator[Any, Any, T]:
+        """Run a turn to its end; the page says when it waits. (`turn_stacks.DRIVEN` is the name of the parameter.)"""
         feed = self.feed
         value: Any = None
         thrown: BaseException | None = None
         while True:
             try:
-                yielded = turn.send(value) if thrown is None else turn.throw(thrown)
+                yielded = driven_turn.send(value) if thrown is None else driven_turn.throw(thrown)
             except StopIteration as done:
                 return done.value  # type: ignore[no-any-return]  # what the turn returns
             except BaseException:
@@ -325,7 +325,7 @@ class Life:
             try:
                 value, thrown = (yield yielded), None
             except GeneratorExit:
-                turn.close()
+                driven_turn.close()
                 raise
             except BaseException as error:
                 thrown = error
