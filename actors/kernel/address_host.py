@@ -96,6 +96,9 @@ class Home:
         """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
         return True
 
+    def hangs(self, cell: Cell) -> None:
+        """The life is told to end because it works badly: a turn in hand that has to be cut off for that did not end."""
+
     def faulted(self, cell: Cell, by: str) -> None:
         """The life is killed, and no supervisor has ordered that: a turn in hand counts it as any death.
 

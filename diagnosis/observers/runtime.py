@@ -9,6 +9,7 @@ from collections import Counter, deque
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Final
 
+from ...actors.control.orders_lane import OrderAsk
 from ...actors.errors import AskTimeout
 from ...actors.events import ActorCrashed, EventStream
 from ...actors.exit_reasons import Crash
@@ -130,7 +131,7 @@ class RuntimeObserver(Observer):
         return self.ctx._cell.node
 
     def _note(self, ask: Ask, error: BaseException) -> None:
-        if len(self._failed) < MOST:
+        if len(self._failed) < MOST and not isinstance(ask, OrderAsk):  # Orders pass ahead of messages: no work of its.
             self._failed.append((ask, error))
 
     def spares(self, grace: Any, about: Literal) -> bool:

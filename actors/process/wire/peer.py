@@ -529,6 +529,8 @@ def obey(node: Node, cell: Cell, name: str, frame: frames.Command, *, by_root: b
             cell.request_stop(unpack_exit(data.get("reason")))
         case "kill":
             cell.kill()
+        case "hangs":
+            cell.host.home.hangs(cell)
         case "faulted":
             by = data.get("by")
             cell.host.home.faulted(cell, by if isinstance(by, str) else "")

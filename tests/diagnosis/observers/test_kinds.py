@@ -1,0 +1,143 @@
+"""Whatever an actor is, wherever it lives, diagnosis sees that it works, and that it hangs."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast import diagnosis
+from holdfast.diagnosis.engine import Diagnosis, State
+
+pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
+
+IN_TIME = 30.0
+"""Seconds on a machine that is as busy as it may be; what is waited for is seen within two on one that is not."""
+PATHS = {"task": "/t/all/node", "process": "/t/all/node", "subtree": "/t/all/own/node", "PBR": "/t/all/node"}
+KINDS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "hybrid": {"recovery": hf.hybrid()},
+    "checkpoint_only": {"recovery": hf.checkpoint_only(interval=60.0)},
+    **{
+        overflow: {"recovery": hf.hybrid(), "mailbox": hf.bounded(2, overflow=overflow)}
+        for overflow in ("block", "reject", "drop_newest", "drop_oldest", "latest")
+    },
+    "plain latest": {"mailbox": hf.bounded(2, overflow="latest")},
+}
+CASES = [
+    ("task", "plain"), ("task", "hybrid"), ("task", "latest"), ("task", "plain latest"),
+    ("process", "plain"), ("process", "plain latest"), ("process", "hybrid"), ("process", "checkpoint_only"),
+    ("process", "block"), ("process", "reject"), ("process", "drop_newest"), ("process", "drop_oldest"),
+    ("process", "latest"), ("subtree", "hybrid"), ("PBR", "hybrid"),
+]  # fmt: skip
+
+
+class Count(hf.Message[int]): ...
+
+
+class Frame(hf.Message): ...
+
+
+class Refuse(hf.Message[int]): ...
+
+
+class Sorry(hf.Refusal):
+    """It cannot be done now."""
+
+
+class Hang(hf.Message): ...
+
+
+class Spin(hf.Message): ...
+
+
+class Node(hf.Actor):
+    def __init__(self) -> None:
+        self.counted = 0
+
+    @hf.on(Count)
+    def count(self, message: Count) -> int:
+        self.counted += 1
+        return self.counted
+
+    @hf.on(Frame)
+    def frame(self, message: Frame) -> None:
+        self.counted += 1
+
+    @hf.on(Refuse)
+    def refuse(self, message: Refuse) -> int:
+        raise Sorry
+
+    @hf.on(Hang)
+    async def hang(self, message: Hang) -> None:
+        await asyncio.Event().wait()
+
+    @hf.on(Spin)
+    def spin(self, message: Spin) -> None:
+        while True:
+            pass
+
+
+def tree(place: str, kind: str) -> hf.ChildSpec[Any]:
+    more: dict[str, Any] = {"mechanism": hf.ftm.PBR()} if place == "PBR" else {}
+    isolation: Any = "process" if place == "process" else "task"
+    node = hf.child("node", hf.start(Node), isolation=isolation, shutdown="brutal_kill", **KINDS[kind], **more)
+    own = hf.supervisor("own", children=[node], isolation="process")
+    return hf.supervisor("all", children=[own if place == "subtree" else node])
+
+
+async def told(node: hf.ActorRef[Node], message: hf.Message[Any]) -> None:
+    """Tell it that again and again."""
+    while True:
+        with contextlib.suppress(hf.SendError):
+            node.tell(message)
+        await asyncio.sleep(0.02)
+
+
+async def asked(node: hf.ActorRef[Node], message: hf.Message[int]) -> None:
+    """Ask it that again and again."""
+    while True:
+        with contextlib.suppress(hf.SendError, hf.Refusal):
+            await node.ask(message, timeout=IN_TIME)
+        await asyncio.sleep(0.02)
+
+
+@contextlib.asynccontextmanager
+async def doing(work: Any) -> AsyncIterator[None]:
+    """Have this going on beside the block."""
+    task = asyncio.ensure_future(work)
+    try:
+        yield
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+async def until(watching: diagnosis.Watch, component: str, state: State) -> Diagnosis:
+    """Wait until the diagnosis is that; if it is healthy, until something is known of the component's work, too."""
+    async with asyncio.timeout(IN_TIME):
+        while True:
+            found = await watching.diagnosis()
+            if found.state is state and (state is State.FAULTY or component not in found.unknown):
+                return found
+            await asyncio.sleep(0.05)
+
+
+@pytest.mark.parametrize(("place", "kind"), CASES, ids=lambda case: case)
+async def test_it_is_seen_to_work_and_to_hang(place: str, kind: str) -> None:
+    component = PATHS[place].removeprefix("/t/")
+    async with hf.ActorSystem("t", log=False) as system:
+        await system.start(tree(place, kind))
+        node = system.ref(PATHS[place], Node)
+        watching = await diagnosis.watch(system, seconds=0.1, repair="off")
+        async with doing(asked(node, Count())):
+            await until(watching, component, State.HEALTHY)
+        async with doing(told(node, Frame())):
+            await asyncio.sleep(3.0)  # Longer than it may have a full mailbox, and for twenty looks.
+            assert (await until(watching, component, State.HEALTHY)).suspects == ()
+            node.tell(Hang())
+            found = await until(watching, component, State.FAULTY)
+        assert found.certain == (component,)
