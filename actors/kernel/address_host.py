@@ -97,7 +97,7 @@ class Home:
         return True
 
     def hangs(self, cell: Cell) -> None:
-        """The life is told to end because it works badly: a turn in hand that has to be cut off for that did not end."""
+        """The life is told to end because it works badly: a turn that has to be cut off for that did not end."""
 
     def faulted(self, cell: Cell, by: str) -> None:
         """The life is killed, and no supervisor has ordered that: a turn in hand counts it as any death.

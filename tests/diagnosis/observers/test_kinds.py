@@ -10,6 +10,7 @@ import pytest
 import holdfast as hf
 from holdfast import diagnosis
 from holdfast.diagnosis.engine import Diagnosis, State
+from holdfast.testing import advance
 
 pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
 
@@ -40,17 +41,10 @@ class Count(hf.Message[int]): ...
 class Frame(hf.Message): ...
 
 
-class Refuse(hf.Message[int]): ...
-
-
-class Sorry(hf.Refusal):
-    """It cannot be done now."""
+class Slow(hf.Message): ...
 
 
 class Hang(hf.Message): ...
-
-
-class Spin(hf.Message): ...
 
 
 class Node(hf.Actor):
@@ -66,18 +60,13 @@ class Node(hf.Actor):
     def frame(self, message: Frame) -> None:
         self.counted += 1
 
-    @hf.on(Refuse)
-    def refuse(self, message: Refuse) -> int:
-        raise Sorry
+    @hf.on(Slow)
+    async def slow(self, message: Slow) -> None:
+        await asyncio.sleep(0.2)
 
     @hf.on(Hang)
     async def hang(self, message: Hang) -> None:
         await asyncio.Event().wait()
-
-    @hf.on(Spin)
-    def spin(self, message: Spin) -> None:
-        while True:
-            pass
 
 
 def tree(place: str, kind: str) -> hf.ChildSpec[Any]:
@@ -88,19 +77,19 @@ def tree(place: str, kind: str) -> hf.ChildSpec[Any]:
     return hf.supervisor("all", children=[own if place == "subtree" else node])
 
 
-async def told(node: hf.ActorRef[Node], message: hf.Message[Any]) -> None:
+async def told(node: hf.ActorRef[Node], kind: type[hf.Message[Any]] = Frame) -> None:
     """Tell it that again and again."""
     while True:
         with contextlib.suppress(hf.SendError):
-            node.tell(message)
+            node.tell(kind())
         await asyncio.sleep(0.02)
 
 
-async def asked(node: hf.ActorRef[Node], message: hf.Message[int]) -> None:
+async def asked(node: hf.ActorRef[Node], kind: type[hf.Message[int]]) -> None:
     """Ask it that again and again."""
     while True:
-        with contextlib.suppress(hf.SendError, hf.Refusal):
-            await node.ask(message, timeout=IN_TIME)
+        with contextlib.suppress(hf.SendError, hf.AskTimeout):
+            await node.ask(kind(), timeout=IN_TIME)
         await asyncio.sleep(0.02)
 
 
@@ -133,11 +122,42 @@ async def test_it_is_seen_to_work_and_to_hang(place: str, kind: str) -> None:
         await system.start(tree(place, kind))
         node = system.ref(PATHS[place], Node)
         watching = await diagnosis.watch(system, seconds=0.1, repair="off")
-        async with doing(asked(node, Count())):
+        async with doing(asked(node, Count)):
             await until(watching, component, State.HEALTHY)
-        async with doing(told(node, Frame())):
+        async with doing(told(node)):
             await asyncio.sleep(3.0)  # Longer than it may have a full mailbox, and for twenty looks.
             assert (await until(watching, component, State.HEALTHY)).suspects == ()
             node.tell(Hang())
             found = await until(watching, component, State.FAULTY)
         assert found.certain == (component,)
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+@pytest.mark.parametrize("kind", ["latest", "plain latest"])
+async def test_a_mailbox_that_is_full_by_its_policy_is_no_fault(kind: str) -> None:
+    """It is slower than what comes, as a node behind a camera may be: the newest always finds room."""
+    async with hf.ActorSystem("t", log=False) as system:
+        await system.start(tree("task", kind))
+        node = system.ref("/t/all/node", Node)
+        watching = await diagnosis.watch(system, seconds=0.1, repair="off")
+        async with doing(told(node, Slow)):
+            await advance(30.0)
+            assert (await watching.diagnosis()).state is State.HEALTHY
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+@pytest.mark.parametrize("kind", ["plain", "hybrid"])
+async def test_who_was_idle_for_long_is_blamed_as_soon_as_who_was_not(kind: str) -> None:
+    """The time in which it had nothing to do is no turn that it needed."""
+    async with hf.ActorSystem("t", log=False) as system:
+        await system.start(tree("task", kind))
+        node = system.ref("/t/all/node", Node)
+        watching = await diagnosis.watch(system, seconds=0.1, repair="off")
+        async with doing(asked(node, Count)):
+            await advance(4.0)
+        await advance(100.0)
+        async with doing(asked(node, Count)):
+            await advance(4.0)
+            node.tell(Hang())
+            await advance(3.0)
+            assert (await watching.diagnosis()).certain == ("all/node",)
