@@ -53,7 +53,7 @@ class Listener(hf.Actor):
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
-@pytest.mark.parametrize(("isolation", "bad"), [("task", Hang()), ("process", Hang()), ("process", Spin())], ids=str)
+@pytest.mark.parametrize(("isolation", "bad"), [("task", Hang()), ("process", Spin())], ids=str)
 async def test_an_actor_whose_turn_hangs_again_is_healed_by_repair(isolation: Any, bad: hf.Message) -> None:
     spec = hf.child("node", hf.start(Node), isolation=isolation, recovery=hf.hybrid(), shutdown=0.2)
     async with hf.ActorSystem("t", log=False) as system:
