@@ -48,7 +48,9 @@ campaign: $(VENV)/.dev
 	HOLDFAST_MACHINES=1000 $(BIN)/python -m pytest -q -n 2 -o faulthandler_timeout=0 tests/cluster/machines
 	HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s tests/system/test_removed_checks.py \
 	    tests/actors/process/hostile/test_removed_claims.py tests/telemetry/test_removed_checks.py \
-	    tests/diagnosis/test_removed_checks.py tests/console/dashboard/test_removed_from_dashboard.py
+	    tests/diagnosis/test_removed_checks.py tests/console/dashboard/test_removed_from_dashboard.py \
+	    tests/last_lines/test_removed_lines.py tests/testing/test_removed_checks.py
+	$(MAKE) --no-print-directory alarms RUNS=8
 	HOLDFAST_REPAIRS=25 HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -s -p no:xdist -o faulthandler_timeout=0 \
 	    tests/diagnosis/repair/test_no_worse.py tests/diagnosis/repair/test_removed_repair.py \
 	    tests/diagnosis/live/test_replicas.py
@@ -67,7 +69,7 @@ RUNS ?= 10
 loaded: $(VENV)/.dev
 	$(BIN)/python -m tests.loaded $(RUNS) $(PYTEST_ARGS)
 
-# The tests that the guard watches, in random order, so many times: it tells of none.
+# Tests under the guard, in random order, so many times: it tells of none.
 alarms: $(VENV)/.dev
 	$(BIN)/python -m tests.alarms $(RUNS) $(SEED) $(PYTEST_ARGS)
 

@@ -131,6 +131,17 @@ class StopOverdue(Event, frozen=True, eq=False):
     stacks: str
 
 
+class OrderHeld(Event, frozen=True, eq=False):
+    """A supervisor is suspended, and so an order to it waits: to "start" or to "stop" a child. Told once of each.
+
+    `child` is the address of that child, and `seconds` how long the order has waited. `resume` lets it go on.
+    """
+
+    order: str
+    child: str
+    seconds: float
+
+
 class AutoShutdown(Event, frozen=True, eq=False):
     """A supervisor ends because its significant children have."""
 
@@ -427,10 +438,11 @@ class LoopLagged(Event, frozen=True, eq=False):
 
 
 class LogLine(Event, frozen=True, eq=False):
-    """A line an actor's process wrote to stdout or stderr, or a log record of it."""
+    """A line that an actor's process wrote to its `stream`, stdout or stderr; `life` is the one that wrote it."""
 
     stream: str
     text: str
+    life: int = 0
 
 
 class MessageIn(Event, frozen=True, eq=False):
@@ -560,7 +572,9 @@ class EventHub:
         self._changed = changed  # told whether there is anybody at all
         self.has_listeners = False  # else events are not even made
         self.hears_letters = False  # the same of dead letters,
-        self.hears_starts = False  # and of the first lives at addresses
+        self.hears_starts = False  # and of the first lives at addresses,
+        self.hears_lines = False  # and of lines that processes print,
+        self.hears_unkept = False  # and of what a recorder does not keep
         self._streams: list[EventStream] = []
         self._sinks: list[Callable[[Event], None]] = []
         self._recorder: Callable[[Event], None] | None = None
@@ -623,6 +637,8 @@ class EventHub:
         self.has_listeners = anybody or (records and "others" not in self._resting)
         self.hears_letters = anybody or (records and "letters" not in self._resting)
         self.hears_starts = anybody or (records and not self._resting & {"starts", "others"})
+        self.hears_lines = anybody or records
+        self.hears_unkept = anybody
         self._changed(self.has_listeners)
 
     def close(self) -> None:

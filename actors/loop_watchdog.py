@@ -25,7 +25,7 @@ LOOKS = 4
 """How often a turn is looked at within the time it may take."""
 TURN = run_loop.run_turns.__code__
 """In its frame: the cell. The frame above it is the handler's, or that of the item it is in; new for each turn."""
-RUNNER = run_loop.Runner._run.__code__
+RUNNER = run_loop.Runner._step.__code__
 """In its frame: the turn that the runner has."""
 
 

@@ -21,6 +21,7 @@ from collections.abc import AsyncGenerator
 import httpx
 from harness import Job, Run, main
 from playwright.async_api import Page, async_playwright
+from workload import Responder
 
 import holdfast as hf
 from holdfast.console.dashboard import dashboard, open_dashboard
@@ -40,22 +41,12 @@ async (frames) => {
 """
 
 
-class Ping(hf.Message[int]):
-    n: int
-
-
-class Echo(hf.Actor):
-    @hf.on(Ping)
-    def ping(self, message: Ping) -> int:
-        return message.n
-
-
 @contextlib.asynccontextmanager
 async def served(actors: int) -> AsyncGenerator[tuple[hf.ActorSystem, str]]:
     """A system of so many actors, with its dashboard."""
     async with hf.ActorSystem("bench", log=False) as system:
         for at in range(max(1, actors // (GROUP + 1))):
-            crowd = [hf.child(f"echo{number}", hf.start(Echo)) for number in range(GROUP)]
+            crowd = [hf.child(f"echo{number}", hf.start(Responder)) for number in range(GROUP)]
             await system.start(hf.supervisor(f"group{at}", children=crowd))
         async with open_dashboard(dashboard(system, operators=TOKEN)) as url:
             yield system, url
@@ -112,7 +103,7 @@ async def changing(run: Run) -> None:
         browsed(url) as page,
         httpx.AsyncClient(base_url=url) as client,
     ):
-        echo = system.ref("/bench/group0/echo0", Echo)
+        echo = system.ref("/bench/group0/echo0", Responder)
         await page.get_by_role("searchbox").fill("/bench/group0/echo0")
         state = page.locator(".row.at .st")
         await state.get_by_text("running").wait_for()

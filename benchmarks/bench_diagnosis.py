@@ -38,6 +38,9 @@ from holdfast.diagnosis.observers import GeneralObserver, Manner
 from holdfast.diagnosis.repair import Policy, Repaired
 from holdfast.supervision.admin import TerminateChild
 
+sys.path.append(str(Path(__file__).parent.parent))
+from tests.diagnosis.circuits import COMPARATOR  # pyright: ignore[reportMissingImports]  # found by the line above
+
 OBSERVED = 0.2
 FAULTS = 3
 CASES = 5
@@ -177,6 +180,19 @@ def observe_example(model: Model, faulty: set[str]) -> Observed:
     literals = [ok(topic) if is_fine else ~ok(topic) for topic, is_fine in fine.items() if topic != "/joy"]
     agree = model.vocabulary.parse("matched(odom.yaw,imu.yaw)")
     return Observed.of([*literals, agree if fine["/odom"] and fine["/imu_data"] else ~agree])
+
+
+async def engine_comparator(run: Run) -> None:
+    """The median over all stuck gates of the circuit 74L85, each at an input at which it shows."""
+    engine = Diagnoser(COMPARATOR.model(), limit=10_000, seconds=60.0)
+    random_ = random.Random(run.seed)
+    stuck = [{gate: is_high} for gate in COMPARATOR.gates for is_high in (False, True)]
+    seen = [COMPARATOR.observed(random_.choice(COMPARATOR.cases(one))) for one in stuck]
+    times: list[float] = []
+    for observed in seen * (1 if run.quick else 3):
+        engine._parts.clear()
+        times.append(milliseconds(lambda observed=observed: engine.diagnose_now(observed)))  # type: ignore[misc] # bound
+    run.bound("74L85 with a stuck gate, all minimal diagnoses", statistics.median(times), unit="ms", target=20.0)
 
 
 async def engine_1000(run: Run) -> None:
@@ -384,4 +400,5 @@ async def loop_of_the_robot(run: Run) -> None:
 
 
 if __name__ == "__main__":
-    main([engine_example, engine_1000, engine_5000, engine_again, engine_lag, loop_of_repair, loop_of_the_robot])
+    engines = [engine_example, engine_comparator, engine_1000, engine_5000, engine_again, engine_lag]
+    main([*engines, loop_of_repair, loop_of_the_robot])

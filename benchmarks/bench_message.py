@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 
 import limits
-from harness import Gate, Run, ask_all, main, tell_one, tell_round
+from harness import Gate, Run, compare_asks, main, tell_one, tell_round
 from workload import AsyncCounter, Counter, Ping, Responder, Tick
 
 import holdfast as hf
@@ -90,33 +90,19 @@ async def _fan_out(run: Run, job: str, kind: type[Counter | AsyncCounter], targe
 
 
 async def ask_one(run: Run) -> None:
-    count = run.size(50_000)
-    async with hf.ActorSystem("bench") as system:
-        ref = system.spawn(hf.start(Responder))
-        mailbox = limits.Mailbox(Gate())
-
-        async def ours() -> float:
-            return (await ask_all(ref.ask, PING, count)).p50 * 1e6
-
-        async def limit() -> float:
-            return (await ask_all(mailbox.ask, PING, count)).p50 * 1e6
-
-        await run.compare("ask, 1 outstanding, default deadline", ours, limit, unit="us", target=0.6)
+    await _ask(run, 1, 0.6)
 
 
 async def ask_hundred(run: Run) -> None:
-    count = run.size(50_000)
+    await _ask(run, 100, 0.5)
+
+
+async def _ask(run: Run, outstanding: int, target: float) -> None:
     async with hf.ActorSystem("bench") as system:
-        ref = system.spawn(hf.start(Responder))
-        mailbox = limits.Mailbox(Gate())
-
-        async def ours() -> float:
-            return (await ask_all(ref.ask, PING, count, outstanding=100)).rate
-
-        async def limit() -> float:
-            return (await ask_all(mailbox.ask, PING, count, outstanding=100)).rate
-
-        await run.compare("ask, 100 outstanding, default deadline", ours, limit, unit="1/s", target=0.5)
+        ours = system.spawn(hf.start(Responder)).ask, PING
+        limit = limits.Mailbox(Gate()).ask, PING
+        job, count = f"ask, {outstanding} outstanding, default deadline", run.size(50_000)
+        await compare_asks(run, job, ours, limit, count, outstanding=outstanding, target=target)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import statistics
 
 from harness import Job, Run, ask_all, main
 from prometheus_client import generate_latest
+from workload import Ping, Responder
 
 import holdfast as hf
 from holdfast.console.telemetry.metrics import Metrics
@@ -22,22 +23,12 @@ ACTORS = 10_000
 SCRAPES = 20
 
 
-class Ping(hf.Message[int]):
-    n: int
-
-
-class Echo(hf.Actor):
-    @hf.on(Ping)
-    def ping(self, message: Ping) -> int:
-        return message.n
-
-
 async def walk(run: Run) -> None:
     """The time on the loop, and the longest time for which it is held."""
     async with hf.ActorSystem("bench", log=False) as system:
         metrics = Metrics(system)
         for _ in range(ACTORS):
-            system.spawn(hf.start(Echo))
+            system.spawn(hf.start(Responder))
         await system._node.settled()
         times, slices = list[float](), list[float]()
         for _ in range(run.size(SCRAPES)):
@@ -54,7 +45,7 @@ async def asks(run: Run) -> None:
     """Asks while the system is scraped once a second, beside asks while it is not."""
     async with hf.ActorSystem("bench", log=False) as system:
         metrics = Metrics(system)
-        echo, *_ = [system.spawn(hf.start(Echo)) for _ in range(ACTORS)]
+        echo, *_ = [system.spawn(hf.start(Responder)) for _ in range(ACTORS)]
         count = run.size(100_000)
 
         async def scraping() -> None:
@@ -64,12 +55,12 @@ async def asks(run: Run) -> None:
 
         async def scraped() -> float:
             work = asyncio.ensure_future(scraping())
-            rate = (await ask_all(echo.ask, Ping(1), count)).rate
+            rate = (await ask_all(echo.ask, Ping(), count)).rate
             work.cancel()
             return rate
 
         async def alone() -> float:
-            return (await ask_all(echo.ask, Ping(1), count)).rate
+            return (await ask_all(echo.ask, Ping(), count)).rate
 
         await run.compare("asks", scraped, alone, unit="asks/s", target=0.9)
 

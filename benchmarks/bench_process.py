@@ -18,7 +18,7 @@ import time
 from collections.abc import AsyncGenerator
 
 import limits
-from harness import Run, ask_all, main, tell_one
+from harness import Run, ask_all, compare_asks, main, tell_one
 from workload import Data, Drive, Driver, Echo, EchoData, Told, start_process
 
 import holdfast as hf
@@ -47,29 +47,17 @@ async def _echoes() -> AsyncGenerator[tuple[hf.ActorSystem, hf.ActorRef[Echo], l
 
 
 async def ask_one(run: Run) -> None:
-    count = run.size(10_000)
-    async with _echoes() as (_, ref, client):
-
-        async def ours() -> float:
-            return (await ask_all(ref.ask, ECHO, count)).p50 * 1e6
-
-        async def limit() -> float:
-            return (await ask_all(client.ask, BYTES, count)).p50 * 1e6
-
-        await run.compare("ask 100 B, 1 outstanding", ours, limit, unit="us", target=0.7)
+    await _ask(run, 1, run.size(10_000), 0.7)
 
 
 async def ask_hundred(run: Run) -> None:
-    count = run.size(20_000)
+    await _ask(run, 100, run.size(20_000), 0.4)
+
+
+async def _ask(run: Run, outstanding: int, count: int, target: float) -> None:
     async with _echoes() as (_, ref, client):
-
-        async def ours() -> float:
-            return (await ask_all(ref.ask, ECHO, count, outstanding=100)).rate
-
-        async def limit() -> float:
-            return (await ask_all(client.ask, BYTES, count, outstanding=100)).rate
-
-        await run.compare("ask 100 B, 100 outstanding", ours, limit, unit="1/s", target=0.4)
+        job, ours, limit = f"ask 100 B, {outstanding} outstanding", (ref.ask, ECHO), (client.ask, BYTES)
+        await compare_asks(run, job, ours, limit, count, outstanding=outstanding, target=target)
 
 
 async def tell(run: Run) -> None:

@@ -16,18 +16,9 @@ from harness import Job, Run, ask_all, main
 from opentelemetry.sdk.trace import ReadableSpan, TracerProvider
 from opentelemetry.sdk.trace.export import BatchSpanProcessor, SpanExporter, SpanExportResult
 from opentelemetry.trace import Tracer
+from workload import Ping, Responder
 
 import holdfast as hf
-
-
-class Ping(hf.Message[int]):
-    n: int
-
-
-class Echo(hf.Actor):
-    @hf.on(Ping)
-    def ping(self, message: Ping) -> int:
-        return message.n
 
 
 class Dropped(SpanExporter):
@@ -43,16 +34,16 @@ async def measured(run: Run, job: str, one_in: float, target: float, *, inside: 
     provider.add_span_processor(BatchSpanProcessor(Dropped()))
     tracer: Tracer = provider.get_tracer("bench")
     async with hf.ActorSystem("bench", log=False) as system:
-        echo = await system.start(hf.child("echo", hf.start(Echo)))
+        echo = await system.start(hf.child("echo", hf.start(Responder)))
         count = run.size(100_000) // (10 if inside else 1)
 
         def with_tracer(used: Tracer | None) -> Callable[[], Awaitable[float]]:
             async def rate() -> float:
                 system.trace_with(used, one_in=one_in)
                 if not inside:
-                    return (await ask_all(echo.ask, Ping(1), count)).rate
+                    return (await ask_all(echo.ask, Ping(), count)).rate
                 with tracer.start_as_current_span("request"):
-                    return (await ask_all(echo.ask, Ping(1), count)).rate
+                    return (await ask_all(echo.ask, Ping(), count)).rate
 
             return rate
 

@@ -255,6 +255,26 @@ async def ask_all(
     return Latencies(len(seen) / elapsed * 1e9, statistics.median(seen) / 1e9)
 
 
+async def compare_asks(
+    run: Run,
+    job: str,
+    ours: tuple[Callable[[Any], Awaitable[object]], object],
+    limit: tuple[Callable[[Any], Awaitable[object]], object],
+    count: int,
+    *,
+    target: float,
+    outstanding: int = 1,
+) -> None:
+    """Compare asks with the limit's, each a call and its message: the median time of one, or the rate of several."""
+
+    async def measure(ask: Callable[[Any], Awaitable[object]], message: object) -> float:
+        seen = await ask_all(ask, message, count, outstanding=outstanding)
+        return seen.p50 * 1e6 if outstanding == 1 else seen.rate
+
+    unit = "us" if outstanding == 1 else "1/s"
+    await run.compare(job, lambda: measure(*ours), lambda: measure(*limit), unit=unit, target=target)
+
+
 def resident_bytes(field: str = "VmRSS") -> int:
     """Memory of this process now, or its peak (`VmHWM`)."""
     for line in Path("/proc/self/status").read_text().splitlines():

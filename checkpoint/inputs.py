@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import msgspec
 
@@ -24,8 +24,8 @@ EXPIRED = 1e-9
 """A deadline that has passed. (Asks forget theirs when they expire.)"""
 
 
-NO_POSITIONS: list[int] = []
-"""Of an input that is nowhere in a journal. Never added to: those that are get a list of their own."""
+NO_DIGESTS: list[int] = []
+"""Of a turn that has let nothing out. Never added to."""
 
 
 class RowPlace(msgspec.Struct, gc=False, eq=False):
@@ -38,28 +38,32 @@ class RowPlace(msgspec.Struct, gc=False, eq=False):
     """
 
     positions: list[int]
-    left: int
-    over: list[int]
+    left: int = 0
+    over: tuple[int, ...] = ()
 
 
-class Input(msgspec.Struct, gc=False, eq=False):
-    """One journaled input. (Not seen by the garbage collector: there can be many, and nothing here refers back.)"""
+class Input(Feed, gc=False, eq=False):
+    """One journaled input: what is fed, and what its home knows of it.
 
-    id: int
-    kind: str
-    name: str
-    body: bytes
-    time: float
-    sender: str | None
+    A life in the process of its home gets the input itself, if there is no more to say; another one what `feed` makes.
+    (Not seen by the garbage collector: there can be many, and nothing here refers back.)
+
+    Attributes:
+        ask: who waits for its answer.
+        deliveries: deaths of the process in this very turn.
+        positions: of rows of its own, if it has any.
+        row: that it shares, perhaps.
+        held: whether it is not as safe yet as it has to be: it must not be fed.
+        was_cut: whether a life has ended in its turn.
+        was_stashed: whether a turn has put it aside.
+    """
+
     ask: Ask | None = None
-    chain: tuple[tuple[str, int], ...] = ()
-    turn: int = 0  # the turn that ended it
-    deliveries: int = 0  # deaths of the process in this very turn
-    origin: str = ""  # the timer or pipe it comes from
-    positions: list[int] = NO_POSITIONS  # of rows of its own
-    row: RowPlace | None = None  # that it shares, perhaps
-    held: bool = False  # not as safe yet as it has to be: it must not be fed
-    was_cut: bool = False  # a life has ended in its turn
+    deliveries: int = 0
+    positions: list[int] | None = None
+    row: RowPlace | None = None
+    held: bool = False
+    was_cut: bool = False
     was_stashed: bool = False
 
     @property
@@ -78,11 +82,12 @@ class Input(msgspec.Struct, gc=False, eq=False):
 
         `was_asked`: it was an ask when it was handled first, and is replayed as one.
         """
-        ask = self.ask
+        ask, kind, origin = self.ask, self.kind, self.origin
         deadline = 0.0 if ask is None or has_begun else ask.deadline or EXPIRED
-        origin = self.origin if self.kind in (TICK, PIPE) else ""
+        if origin and kind not in (TICK, PIPE):
+            origin = ""
         return Feed(
-            self.id, turn, self.kind, self.name, self.body, self.time, self.sender,
+            self.id, turn, kind, self.name, self.body, self.time, self.sender,
             was_asked or ask is not None, self.chain, pipes, deadline, origin, has_begun,
         )  # fmt: skip
 
@@ -100,6 +105,20 @@ class Turn(msgspec.Struct, gc=False, eq=False):
         """Its entry in the journal: of the state and the reply only what there is to say."""
         more = (self.state, self.reply) if self.reply else (self.state,) if self.state else ()
         return "end", number, self.input.id, self.status, tuple(self.digests), *more
+
+
+class Contained(NamedTuple):
+    """What of a journal a snapshot contains.
+
+    Attributes:
+        turn: after which it was made.
+        inputs: those that have ended by then.
+        rows: that inputs share, each with those of them that it contains and that no earlier one has contained.
+    """
+
+    turn: int
+    inputs: Sequence[Input] = ()
+    rows: Mapping[RowPlace, list[int]] = {}
 
 
 def spread(entry: Entry) -> Iterable[tuple[Any, ...]]:

@@ -39,7 +39,7 @@ class LongWaits:
         self._home = home
         self._clocks: dict[Place, asyncio.TimerHandle] = {}
         self.taken: dict[Place, int] = {}  # the messages that the turn in hand has waited for
-        self.wanted: dict[Place, tuple[str, ...]] = {}  # types of messages, none: a moment; in the order of the waits
+        self.wanted: dict[Place, str] = {}  # "A|B": types of messages, "": a moment; in the order of the waits
 
     @property
     def is_busy(self) -> bool:
@@ -58,7 +58,7 @@ class LongWaits:
         place = turn, out.k
         if place in self.wanted:
             return
-        names = tuple(out.name.split("|")) if out.verb == "wait" else ()
+        names = out.name if out.verb == "wait" else ""
         if names:
             source = next((one for one in self._home.ledger.open.values() if self._suits(one, names, key)), None)
             if source is not None:
@@ -70,14 +70,14 @@ class LongWaits:
         if self.wanted:
             self.show(self._home.ledger.open.values())
 
-    def _suits(self, source: Input, names: tuple[str, ...], running: int) -> bool:
+    def _suits(self, source: Input, names: str, running: int) -> bool:
         """Whether an input is a message that a turn waits for, and nobody has begun it."""
         is_free = source.kind == MESSAGE and source.id != running and not source.held
-        return is_free and source.name in names and source.id not in self._home.ledger.stashed()
+        return is_free and source.name in names.split("|") and source.id not in self._home.ledger.stashed()
 
     def takes(self, source: Input) -> bool:
         """Whether a message that has come is what a turn waits for; it has it then."""
-        place = next((place for place, names in self.wanted.items() if source.name in names), None)
+        place = next((place for place, names in self.wanted.items() if source.name in names.split("|")), None)
         if place is None or source.kind != MESSAGE:
             return False
         self._take(place, source)
@@ -105,7 +105,7 @@ class LongWaits:
         if not names:
             answer = Answer(MOMENT)
         else:
-            answer = Answer(*home.node.codec.encode_error(WaitTimeout(home.path, " or ".join(names))))
+            answer = Answer(*home.node.codec.encode_error(WaitTimeout(home.path, names.replace("|", " or "))))
         home.calls.outcome(*place, timed(answer, now), None)
 
     def _forget(self, place: Place) -> None:

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 
 from ..actors.exit_reasons import ExitReason, unpack_exit
+from ..actors.kernel.cell import GivenName
 from ..actors.kernel.mailbox import Bounded
 from .method import Method
 
@@ -72,6 +73,10 @@ class Answer(msgspec.Struct, array_like=True, gc=False):
     kind: str = NOTHING
     name: str = ""
     body: bytes = b""
+
+
+NO_ANSWER = Answer()
+"""Of a turn that nobody has asked for."""
 
 
 def timed(answer: Answer, when: float) -> Answer:
@@ -412,7 +417,7 @@ class AtRoot(msgspec.Struct, array_like=True):
 class Wanted(msgspec.Struct, array_like=True, tag=17):
     """A supervisor in another process wants to start a child whose home is at the root, or that is lived there.
 
-    `bindings` says where those of the child lead, port to address.
+    `bindings` says where those of the child lead, port to address; `register` is the name that its spec gives it.
     """
 
     number: int
@@ -422,6 +427,7 @@ class Wanted(msgspec.Struct, array_like=True, tag=17):
     bound: Bounded | None
     at_root: AtRoot | None = None
     bindings: dict[str, str] = {}
+    register: GivenName | None = None
 
 
 class Closed(msgspec.Struct, array_like=True, tag=18):
@@ -453,24 +459,6 @@ ToHome = (
     | Closed
     | Marked
 )
-
-
-class LifePort(Protocol):
-    """The way to the present life."""
-
-    @property
-    def begins(self) -> bool:
-        """Whether what is handed to it may be begun at any time from then on. If not, it says itself when."""
-        ...
-
-    @property
-    def is_far(self) -> bool:
-        """Whether that life is in another process."""
-        ...
-
-    def to_life(self, record: ToLife) -> None:
-        """Hand a record to the life; it is handled in order."""
-        ...
 
 
 PIECE = 4 * 1024 * 1024

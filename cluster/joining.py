@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import math
 import os
 from collections.abc import Callable, Mapping
@@ -21,7 +22,7 @@ from .log_writer import Deposed
 from .ports import Engine, Unanswered
 from .replicated_journal import ReplicatedJournal
 from .sealed_engine import sealed
-from .servers import Servers, servers_of
+from .servers import JoinLoop, Servers, servers_of
 
 T = TypeVar("T")
 TOOL_SECONDS: Final = 30.0
@@ -76,65 +77,72 @@ async def join(
         DamagedStore: what the log holds cannot be used.
     """
     servers, secret = servers_of(store, settings), read_store_key(key)
-    loop = asyncio.get_running_loop()
-    me = leader_name()
+    loop, me = asyncio.get_running_loop(), leader_name()
     thread = servers.engine_loop(f"holdfast {system}")
-
-    async def connected() -> Engine:
-        engine = await servers.open_engine(is_new=is_new)
-        try:
-            return await sealed(engine, secret, servers.system)
-        except BaseException:
-            await engine.close()
-            raise
-
     opened: list[Engine] = []  # filled in there: whoever is cancelled here would not get to know of it
     unanswered = NowAndThen(lambda problem: _tell(loop, silent, problem))
     patient = Patience(waits=standby is not None)
 
     async def connect() -> Engine:
-        opened.append(await patient.answered(connected, unanswered))
+        attempt = functools.partial(_open_sealed, servers, secret, is_new=is_new)
+        opened.append(await patient.answered(attempt, unanswered))
         return opened[0]
 
+    def told(leader: str) -> None:
+        _tell(loop, waits, leader)
+
+    def lost(error: Exception) -> None:
+        if isinstance(error, Deposed):
+            _tell(loop, deposed, error)
+
     try:
-        joined = await thread.run(connect())
-        leading = await thread.run(
-            lead(
-                joined,
-                me,
-                standby=standby,
-                waits=lambda leader: _tell(loop, waits, leader),
-                unanswered=unanswered,
-            )
-        )
-
-        def lost(error: Exception) -> None:
-            if isinstance(error, Deposed):
-                _tell(loop, deposed, error)
-
-        journal = ReplicatedJournal(joined, thread, leading, lost=lost, patience=patience)
+        engine = await thread.run(connect())
+        leading = await thread.run(lead(engine, me, standby=standby, waits=told, unanswered=unanswered))
+        journal = ReplicatedJournal(engine, thread, leading, lost=lost, patience=patience)
         if patience == math.inf:  # A tool reads all, one after another.
-            try:
-                await thread.run(journal.fetch())
-            except BaseException:
-                with contextlib.suppress(asyncio.CancelledError, HoldfastError):
-                    await thread.run(journal.end())
-                raise
-        return journal
+            await _fetch_all(journal, thread)
     except BaseException as error:
         with contextlib.suppress(asyncio.CancelledError, TimeoutError):
             await asyncio.wait_for(thread.run(_let_go(opened, me)), 2.0)
         await asyncio.to_thread(thread.close)
-        named = opened[0].name if opened else str(store).partition("?")[0]
-        match error:
-            case LeaderElsewhere():
-                raise StoreInUse(named, 0, error.leader) from error
-            case Unanswered():
-                raise StoreFailed(named, error.problem) from error
-            case DamagedLog():
-                raise DamagedStore(named, None, None, str(error)) from error
-            case _:
-                raise
+        problem = _of_store(error, opened[0].name if opened else str(store).partition("?")[0])
+        if problem is None:
+            raise
+        raise problem from error
+    return journal
+
+
+async def _open_sealed(servers: Servers, secret: bytes | None, *, is_new: bool) -> Engine:
+    """The engine of the store, through which nothing passes that is not encrypted, if it has a key."""
+    engine = await servers.open_engine(is_new=is_new)
+    try:
+        return await sealed(engine, secret, servers.system)
+    except BaseException:
+        await engine.close()
+        raise
+
+
+async def _fetch_all(journal: ReplicatedJournal, thread: JoinLoop) -> None:
+    """Have the journal hold all that it has; it is ended if that cannot be."""
+    try:
+        await thread.run(journal.fetch())
+    except BaseException:
+        with contextlib.suppress(asyncio.CancelledError, HoldfastError):
+            await thread.run(journal.end())
+        raise
+
+
+def _of_store(error: BaseException, name: str) -> HoldfastError | None:
+    """What has kept a program from leading, as users of a store know it; None: they know it as it is."""
+    match error:
+        case LeaderElsewhere():
+            return StoreInUse(name, 0, error.leader)
+        case Unanswered():
+            return StoreFailed(name, error.problem)
+        case DamagedLog():
+            return DamagedStore(name, None, None, str(error))
+        case _:
+            return None
 
 
 async def _let_go(opened: list[Engine], me: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import socket
 import time
 from typing import TYPE_CHECKING, Any, assert_never
 
@@ -29,6 +30,7 @@ from .wire import (
     AskDiagnosis,
     AskHistory,
     AskLives,
+    AskLogs,
     AskQuarantined,
     AskWhy,
     BadRequest,
@@ -39,6 +41,7 @@ from .wire import (
     FollowActor,
     InspectActor,
     NextEvents,
+    NotRunningHere,
     OrderRepair,
     Overview,
     RestartActor,
@@ -51,6 +54,7 @@ from .wire import (
 
 if TYPE_CHECKING:
     from ..system.history.pages import HistoryPage
+    from ..system.last_lines.line_page import LogPage
     from ..system.system import ActorSystem
 
 LONGEST = 3600.0
@@ -93,9 +97,19 @@ class ClientSession:
     async def answer(self, request: AnyRequest) -> Any:
         """Carry out a request. Raises whatever goes wrong."""
         system = self._system
+        if not isinstance(request, About) and (why := _why_not_here(system)):
+            raise NotRunningHere(os.getpid(), system.name, why)
         match request:
             case About():
-                return {"name": system.name, "pid": os.getpid(), "since": self._since, "actors": len(system.tree())}
+                return {
+                    "name": system.name,
+                    "node": socket.gethostname(),
+                    "pid": os.getpid(),
+                    "role": system.role,
+                    "leader": system.leader,
+                    "since": self._since,
+                    "actors": len(system.tree()),
+                }
             case Tree():
                 return system.tree()
             case Whereis():
@@ -122,6 +136,8 @@ class ClientSession:
                 return {"steps": [], "difference": [], "lost": []} if change is None else as_told(change)
             case AskHistory():
                 return msgspec.to_builtins(await self._history(request))
+            case AskLogs():
+                return msgspec.to_builtins(await self._logs(request))
             case AskLives():
                 return msgspec.to_builtins(system.lives(request.path))
             case AskWhy():
@@ -164,6 +180,15 @@ class ClientSession:
             return page
         after, wait = page.next, min(request.wait, LONGEST)
         return await self._system.follow_history(asked.path, kinds=asked.kinds, after=after, timeout=wait)
+
+    async def _logs(self, request: AskLogs) -> LogPage:
+        """A page of last lines; the question is checked as everybody's is."""
+        system, asked = self._system, request.question
+        path, level, after, limit = asked.path, asked.level, asked.after, asked.limit
+        if after is None or not request.wait:
+            return system.logs(path, level=level, since=asked.since, after=after, limit=limit)
+        wait = min(request.wait, LONGEST)
+        return await system.follow_logs(path, level=level, after=after, limit=limit, timeout=wait)
 
     def _settle(self, request: SettleQuarantined) -> dict[str, Any]:
         """Retry or drop what is meant, each message by itself; which of them it was, and why others were not."""
@@ -264,6 +289,17 @@ class ClientSession:
         except HoldfastError:  # It has gone, or does not come to it: no number is shown.
             return None
         return None if known is None else known.turns
+
+
+def _why_not_here(system: ActorSystem) -> str:
+    """Why a program does not run its system so far; an empty text if it does."""
+    match system.role:
+        case "standby":
+            return f"it stands by, and {system.leader} leads"
+        case "waiting":
+            return "it is being started, or waits for the servers of its store"
+        case "leader" | "alone":
+            return ""
 
 
 def as_told(change: Change) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from .operate import (
     diagnosing,
     following,
     looking,
+    reaching,
     remembering,
     repairing,
     retrying,
@@ -59,8 +60,18 @@ def holdfast(
     show_version: Annotated[
         bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
     ] = False,
+    node: Annotated[
+        str,
+        typer.Option(
+            "--node",
+            envvar="HOLDFAST_NODE",
+            metavar="NODE",
+            help="Of several programs of a system: a pid, a machine, or a role (leader, standby).",
+        ),
+    ] = "",
 ) -> None:
     """Actors in supervision trees, with crash recovery that loses nothing."""
+    reaching.NODE.set(node)
 
 
 @commands.command()
@@ -90,6 +101,7 @@ for command in (
     looking.top,
     looking.inspect,
     following.trace,
+    following.logs,
     changing.suspend,
     changing.resume,
     changing.restart,

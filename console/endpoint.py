@@ -61,6 +61,41 @@ async def control_endpoint(
         EndpointInUse: a live process has it, there is something else, or the system cannot watch one more descriptor.
         UntrustedFile: others may write the folder.
     """
+    async with _listening(system, path) as (where, _):
+        yield where
+
+
+@contextlib.asynccontextmanager
+async def served(
+    system: ActorSystem,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    entered: contextlib.AbstractAsyncContextManager[object] | None = None,
+) -> AsyncGenerator[Path, None]:
+    """Run a system with its control endpoint, which is there already while the program waits to lead.
+
+    A program that stands by can be seen so: `holdfast ls` lists it, and commands are told who leads instead.
+
+    Args:
+        system: a system that was not entered yet.
+        path: of the socket, as `control_endpoint` takes it.
+        entered: what is entered to run the system, such as a `Service` with it; left out, the system itself.
+
+    Raises:
+        EndpointInUse, UntrustedFile: as `control_endpoint`, before anything is started.
+    """
+    async with _listening(system, path) as (where, endpoint), system if entered is None else entered:
+        try:
+            yield where
+        finally:  # Before the tree ends: what a client has asked for and is not done is undone.
+            await endpoint.close()
+
+
+@contextlib.asynccontextmanager
+async def _listening(
+    system: ActorSystem, path: str | os.PathLike[str] | None
+) -> AsyncGenerator[tuple[Path, Endpoint], None]:
+    """The endpoint of a system while it serves, and where."""
     where = socket_path(system.name) if path is None else absolute(path)
     with claimed(where):
         sock, inode = listen(where)
@@ -70,7 +105,7 @@ async def control_endpoint(
                 endpoint.listen(sock)
             except OSError as error:
                 raise EndpointInUse(str(where), error.strerror or str(error)) from error
-            yield where
+            yield where, endpoint
         finally:
             await endpoint.close()
             sock.close()

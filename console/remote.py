@@ -29,6 +29,7 @@ from ..supervision.spec import NAMELESS, ChildSpec, Isolation, Strategy, child
 from ..system.history.evidence import PutAside
 from ..system.history.lives import PastLife
 from ..system.history.pages import MOST_ON_PAGE, HistoryPage, question
+from ..system.last_lines.line_page import LogPage, log_question
 from ..system.transaction.operation import Step
 from .overview import LOOK, SystemLook
 from .wire import (
@@ -39,6 +40,7 @@ from .wire import (
     AskDiagnosis,
     AskHistory,
     AskLives,
+    AskLogs,
     AskQuarantined,
     AskWhy,
     ControlActor,
@@ -349,6 +351,33 @@ class RemoteSystem:
         check_seconds("follow_history", "timeout", timeout)
         asked = question(text_of(target), kinds=kinds, after=after)
         return msgspec.convert(await self.call(AskHistory(asked, timeout), timeout), HistoryPage)
+
+    def logs(
+        self,
+        target: RemoteTarget = "**",
+        *,
+        level: str = "debug",
+        since: float = 0.0,
+        after: int | None = None,
+        limit: int = MOST_ON_PAGE,
+    ) -> LogPage:
+        """The last lines, oldest first; see `ActorSystem.logs`."""
+        asked = log_question(text_of(target), level=level, since=since, after=after, limit=limit)
+        return msgspec.convert(self._client.call(AskLogs(asked), 10.0), LogPage)
+
+    async def follow_logs(
+        self,
+        target: RemoteTarget = "**",
+        *,
+        after: int,
+        level: str = "debug",
+        limit: int = MOST_ON_PAGE,
+        timeout: float = 30.0,
+    ) -> LogPage:
+        """The lines behind `after`, as soon as there are some; see `ActorSystem.follow_logs`."""
+        check_seconds("follow_logs", "timeout", timeout)
+        asked = log_question(text_of(target), level=level, after=after, limit=limit)
+        return msgspec.convert(await self.call(AskLogs(asked, timeout), timeout), LogPage)
 
     def lives(self, target: RemoteTarget) -> list[PastLife]:
         """The newest lives at an address, oldest first."""

@@ -23,6 +23,7 @@ from ..actors.process.wire.start_codec import pack_data, pack_recipe, unpack_dat
 from ..actors.values import decode_value, encode_value
 from ..supervision.spec import ChildSpec
 from ..system.history.pages import HistoryQuestion
+from ..system.last_lines.line_page import LogQuestion
 
 CREDENTIALS = struct.Struct("3i")
 
@@ -43,6 +44,14 @@ class NotDiagnosed(HoldfastError, text="{problem}"):
     """No diagnosis of the system runs, or it has no component at the address that was asked about."""
 
     problem: str
+
+
+class NotRunningHere(HoldfastError, text="process {pid} does not run {system}: {why}"):
+    """The program waits to lead its system, or is being started: it says which it is, and nothing else."""
+
+    pid: int
+    system: str
+    why: str
 
 
 class NotUpYet(
@@ -270,6 +279,13 @@ class AskHistory(ControlRequest, tag="history", frozen=True):
     wait: float = 0.0
 
 
+class AskLogs(ControlRequest, tag="logs", frozen=True):
+    """Last lines, as `ActorSystem.logs` takes the question; with `wait`, until there is one, or for so long."""
+
+    question: LogQuestion
+    wait: float = 0.0
+
+
 class AskLives(ControlRequest, tag="lives", frozen=True):
     """The newest lives at an address."""
 
@@ -352,6 +368,7 @@ AnyRequest = (
     | CountTurns
     | DeclareTree
     | AskHistory
+    | AskLogs
     | AskLives
     | AskWhy
     | AskCauses

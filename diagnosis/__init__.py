@@ -11,6 +11,7 @@
 from .assembly import observer, tree
 from .diagnoser import DiagnoserActor
 from .generate import Generated, Wired, generate, observers_for
+from .live_limits import expecting, property_observers
 from .messages import (
     DIAGNOSIS,
     EXPLANATION,
@@ -40,7 +41,7 @@ from .model_server import (
     RollBackModel,
     ValidateModel,
 )
-from .system_watch import Watch, expecting, property_observers, watch
+from .system_watch import Watch, watch
 
 __all__ = [
     "ChangeModel",

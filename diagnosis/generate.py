@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import Any, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar
 
 import msgspec
 
@@ -34,7 +34,7 @@ from .literals import (
     word_for,
 )
 from .messages import DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, ROS_DIAGNOSTICS, STARTS
-from .model import Component, Declaration, Expectation, Kind
+from .model import Component, Declaration, Expectation, Kind, ModelError
 from .observers.flow import MOST_ARRIVALS, Arrival, Baselines, FlowObserver, FlowSource
 from .observers.hearing import Heard, listen
 from .observers.node_observer import NodeObserver
@@ -88,9 +88,9 @@ class Generated(msgspec.Struct, frozen=True):
     """A declaration of a model to begin with, made from a running system, and how it came about.
 
     Attributes:
-        declaration: each actor is a component; its name is its address below the root as a word (`word_for`). A topic
-            depends on the publisher's subscriptions and, through replies (`replies(NAME)`), on those it is bound to or
-            was seen to ask.
+        declaration: each actor is a component; its name is its address below the root as a word (`component_for`). A
+            topic depends on the publisher's subscriptions and, through replies (`replies(NAME)`), on those it is bound
+            to or was seen to ask.
         addresses: component to address.
         wiring: component to how it is connected.
         left_out: dependencies that would close a circle; a fault goes round in it, so one has to be cut.
@@ -134,6 +134,7 @@ class LiveWiring:
     """Holds how a running system is connected, as observers see it and go by it; it outlives their lives.
 
     Attributes:
+        found: what observers go by at the moment.
         addresses: component to address.
         protected: component to address, of those whose lives replicas live.
         made: topic to how it comes about.
@@ -154,7 +155,7 @@ class LiveWiring:
 
     def use(self, found: Generated) -> None:
         """Have observers go by this from their next look on."""
-        self._wiring = found.wiring
+        self.found = found
         replace(self.addresses, found.addresses)
         replace(self.protected, {name: wired.path for name, wired in found.wiring.items() if wired.is_protected})
         replace(self.made, _made(found.wiring, set().union(*self.heard.values())))
@@ -162,10 +163,10 @@ class LiveWiring:
     def look_again(self, node: Node) -> Generated | None:
         """What the system is like now; None if it is as before."""
         wiring = _wiring(node, self.heard, self._out, self.asked)
-        for name, wired in self._wiring.items():
+        for name, wired in self.found.wiring.items():
             if name not in wiring and _is_missed(node, wired):
                 wiring[name] = wired  # It has failed for good: that is no change of what the system should be.
-        return None if wiring == self._wiring else declared(wiring)
+        return None if wiring == self.found.wiring else declared(wiring)
 
 
 def _is_missed(node: Node, wired: Wired) -> bool:
@@ -223,7 +224,7 @@ def _wiring(
     if root is None:
         return {}
     cells = [cell for cell in _below(root, out) if not _is_ours(cell)]
-    names = {cell.path: word_for(cell.path[len(root.path) + 1 :]) for cell in cells}
+    names = {cell.path: component_for(cell.path[len(root.path) + 1 :]) for cell in cells}
     return {names[cell.path]: _wired(cell, names, heard, asked) for cell in cells}
 
 
@@ -300,12 +301,25 @@ def has_replicas(cell: Cell | None) -> bool:
     return cell is not None and cell.host.place.replica_states() is not None
 
 
+def component_for(path: str) -> str:
+    """Name an actor as a component, by its address below the root: no two are alike, nor like replicas of another one.
+
+    >>> component_for("lab/left arm"), component_for("lab/arm.replicas")
+    ('lab/left%20arm', 'lab/arm%2Ereplicas')
+    """
+    word = word_for(path)
+    return f"{word.removesuffix(_REPLICAS)}%2E{_REPLICAS[1:]}" if word.endswith(_REPLICAS) else word
+
+
+_REPLICAS: Final = ".replicas"
+
+
 def replicas_of(component: str) -> str:
     """The component that stands for the replicas of another one.
 
     It is one of its own: that a replica is missing is no fault of the actor, whose others work on.
     """
-    return f"{component}.replicas"
+    return f"{component}{_REPLICAS}"
 
 
 def evident(
@@ -321,6 +335,9 @@ def evident(
         components: those with an address; others of the model are left as they are.
         waits: who may wait for whom.
         protected: those whose lives replicas live; their replicas are a component each.
+
+    Raises:
+        ModelError: the model has a component already that is called like the replicas of another one.
     """
     known = {component.name for component in declaration.components}
     actors = [name for name in components if name in known]
@@ -328,6 +345,9 @@ def evident(
     expected = [Expectation(str(atom(name)), (name,)) for name in actors for atom in (progress, room, keeps_up)]
     expected += [Expectation(str(replies(name)), (name,)) for name in actors if str(replies(name)) not in outs]
     groups = [name for name in protected if name in known]
+    if taken := tuple(replicas_of(name) for name in groups if replicas_of(name) in known):
+        why = "this name stands for the replicas of a protected actor; call the component of the model otherwise"
+        raise ModelError(tuple(f"{name}: {why}" for name in taken))
     expected += [Expectation(str(led(name)), (name,)) for name in groups]
     expected += [Expectation(str(atom(name)), (replicas_of(name),)) for name in groups for atom in (whole, caught_up)]
     seen = [str(crashes(name)) for name in actors]
@@ -404,8 +424,3 @@ def observers_for(
         observer("replicas", Start(ReplicaObserver, (wiring.protected,))),
         observer("topics", Start(FlowObserver, (wiring.made,), {**flow, "manner": manner})),
     )
-
-
-def child_name(what: str, name: str) -> str:
-    """A name for who looks at a topic or a component; an address has no `/` in its parts."""
-    return f"{what} {name.strip('/').replace('/', '.')}"

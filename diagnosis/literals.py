@@ -246,12 +246,13 @@ class Vocabulary:
         arity = names.get(literal.name, ARITIES.get(literal.name))
         if arity is None:
             hint = "; a negation is spelled `not `" if _OTHER_NEGATION.match(literal.name) else ""
-            return f"the model knows no predicate {literal.name!r}{_near(literal.name, names)}{hint}"
+            return f"the model knows no predicate {literal.name!r}{near(literal.name, names)}{hint}"
         if arity != len(literal.args):
             return f"{literal.name} takes {arity} argument{'s' * (arity != 1)}, not {len(literal.args)}"
-        return f"the model declares no such atom{_near(str(literal.atom), map(str, self))}"
+        return f"the model declares no such atom{near(str(literal.atom), map(str, self))}"
 
 
-def _near(word: str, words: Iterable[str]) -> str:
-    near = difflib.get_close_matches(word, list(words), n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
+def near(word: str, words: Iterable[str]) -> str:
+    """Return the end of a sentence on a word that is unknown: which of the words may be meant, if any is like it."""
+    like = difflib.get_close_matches(word, list(words), n=1)
+    return f"; did you mean {like[0]!r}?" if like else ""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Final
 
 from ..actors.kernel.actor import Actor, on
 from ..actors.kernel.message import Message
-from .generate import Generated, LiveWiring, replace, replicas_of
-from .model import Replace
+from .generate import LiveWiring, replace, replicas_of
+from .live_limits import LimitsOf, LiveLimits
+from .model import Declaration, Replace
 from .model_server import ChangeModel, ModelServer
 from .observers.node_observer import at_root
 
@@ -36,7 +37,8 @@ class Reach:
         replace(self.addresses, {**found, **self._given})
         above = {component: path.rpartition("/")[0] for component, path in self.addresses.items()}
         replace(self.above, {component: path for component, path in above.items() if path not in ("", self._root)})
-        replace(self.groups, {replicas_of(component): path for component, path in self.addresses.items()})
+        groups = {replicas_of(component): path for component, path in self.addresses.items()}
+        replace(self.groups, {name: path for name, path in groups.items() if name not in self.addresses})
 
 
 class _LookAgain(Message):
@@ -48,15 +50,23 @@ class ModelFollower(Actor):
 
     Args:
         wiring: what observers note, and what they go by.
+        limits: those of properties, by which their observer goes.
         server: the last part of the model server's address, beside this actor.
-        adapt: completes a generated declaration, such as by limits.
+        adapt: completes a generated declaration; it is given the components and their limits, too.
         reach: what repair goes by.
     """
 
     deterministic = False
 
-    def __init__(self, wiring: LiveWiring, server: str, adapt: Callable[[Generated], Generated], reach: Reach) -> None:
-        self._wiring, self._server, self._adapt, self._reach = wiring, server, adapt, reach
+    def __init__(
+        self,
+        wiring: LiveWiring,
+        limits: LiveLimits,
+        server: str,
+        adapt: Callable[[Declaration, Iterable[str], LimitsOf], Declaration],
+        reach: Reach,
+    ) -> None:
+        self._wiring, self._limits, self._server, self._adapt, self._reach = wiring, limits, server, adapt, reach
 
     def on_start(self, restored: bool) -> None:
         """Begin to look. Raises SpecError in a process of its own."""
@@ -65,12 +75,14 @@ class ModelFollower(Actor):
 
     @on(_LookAgain)
     async def _look(self, message: _LookAgain) -> None:
-        found = self._wiring.look_again(self.ctx._cell.node)
-        if found is None:
-            return
-        path = f"{self.ctx.path.rpartition('/')[0]}/{self._server}"
-        declaration = self._adapt(found).declaration
-        change = ChangeModel((Replace(declaration),), "the system has changed")
-        await self.ctx.find(path, ModelServer).ask(change)
-        self._wiring.use(found)
-        self._reach.use(found.addresses)
+        node, known = self.ctx._cell.node, self._wiring.found
+        found = self._wiring.look_again(node) or known
+        limits = self._limits.look_again(found.addresses)
+        if found is not known or limits != self._limits.applied:
+            path = f"{self.ctx.path.rpartition('/')[0]}/{self._server}"
+            declaration = self._adapt(found.declaration, found.addresses, limits)
+            change = ChangeModel((Replace(declaration),), "the system has changed")
+            await self.ctx.find(path, ModelServer).ask(change)
+            self._wiring.use(found)
+            self._reach.use(found.addresses)
+        self._limits.use(limits, node, found.addresses)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import functools
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,25 +21,20 @@ from .generate import (
     Generated,
     LiveWiring,
     WatchedSystem,
-    child_name,
     evident,
     generate,
     has_replicas,
     observers_for,
 )
-from .literals import ok
+from .live_limits import LimitsOf, LiveLimits, expecting, observe_bounds
 from .messages import DIAGNOSER, Explained, GetDiagnosis, GetExplanation, GetObserved
 from .model import Declaration, Expectation, History, System
 from .model_follower import ModelFollower, Reach
 from .observations import Observed
 from .observers import (
     Baselines,
-    Bound,
-    Limits,
     Manner,
     NodeObserver,
-    Property,
-    PropertyObserver,
     ReplicaObserver,
     RuntimeObserver,
 )
@@ -62,8 +58,6 @@ from .repair.policy import check_stance
 
 REPAIRER: Final = "repairer"
 """The last part of the repairer's address."""
-LimitsOf = Mapping[str, Mapping[Property, Limits]]
-"""What is good, for each property of some components."""
 
 
 class Watch:
@@ -147,7 +141,9 @@ async def watch(
         addresses: of components that are actors: whether they run is observed, and repair can restart them. Of a
             generated model they are known.
         limits: what is good of their properties, such as `{"ledger": {Property.GROWTH: Limits(high=1e6)}}`; the atom
-            `ok(ledger.growth)` is added to the model.
+            `ok(ledger.growth)` is added to the model. A pattern such as `"desk/*"` stands for all components that it
+            fits and that have no limits by name; of a generated model those that come later, too. Limits go with an
+            actor that is moved.
         repair: "advise" says what it would do, and keeps the score of whether that would have been right. "ask" has a
             person approve each plan: by `approve`, or by `holdfast repair approve CASE`. "on" repairs: by `actions`
             and, for actors that are supervised, by a restart of the actor; what is dangerous, such as a restart of the
@@ -171,12 +167,14 @@ async def watch(
 
     Raises:
         ModelError: something is wrong with the model. StartFailed, AlreadyStarted: see `ActorSystem.start`.
-        ValueError: there is no such stance of repair, or the file of repair is another one.
+        ValueError: there is no such stance of repair, the file of repair is another one, or `limits` name a component
+            that there is not.
     """
     check_stance(repair)
     generated = await generate(system, seconds=seconds) if model is None else None
     watchers = [*observers]
     live = None if generated is None else LiveWiring(generated)
+    live_limits = LiveLimits(limits or {})
     reach = Reach("" if system._node.root is None else system._node.root.path, addresses or {})
     reach.use({} if generated is None else generated.addresses)
     where = reach.addresses
@@ -185,8 +183,8 @@ async def watch(
         watchers += observers_for(
             generated, window=window, hung_after=hung_after, manner=manner, wiring=live, baselines=baselines
         )
-        completed = _completed(limits, alerts=alerts)
-        follower = child("follower", Start(ModelFollower, (live, SERVER, completed, reach)))
+        completed = functools.partial(_completed, alerts=alerts)
+        follower = child("follower", Start(ModelFollower, (live, live_limits, SERVER, completed, reach)))
         options["others"] = (*options.get("others", ()), follower)
     else:
         assert model is not None
@@ -197,12 +195,13 @@ async def watch(
         watchers.append(observer("runtime", Start(RuntimeObserver, (where,))))
         watchers.append(observer("replicas", Start(ReplicaObserver, (groups,))))
         declaration = evident(declaration, where, protected=groups)
+    heard = where if live is None else live.addresses
+    live_limits.check(heard)
+    live_limits.use(live_limits.look_again(heard), system._node, heard)
+    declaration = _completed(declaration, heard, live_limits.applied, alerts=alerts)
     if limits:
-        declaration = expecting(declaration, limits)
-        watchers += property_observers(limits, where, manner)
+        watchers.append(observe_bounds(live_limits.bounds, heard, manner))
     if alerts:
-        declaration = _with_alerts(declaration, where)
-        heard = where if live is None else live.addresses
         watchers.append(observer("alerts", Start(AlertObserver, (heard,))))
     mend = None
     if repair != "off":
@@ -214,44 +213,16 @@ async def watch(
     return Watch(started, system._node, where, generated)
 
 
-def _completed(limits: LimitsOf | None, *, alerts: bool) -> Callable[[Generated], Generated]:
-    """What is added to each model that is generated anew; limits of components that have gone are left out."""
-
-    def adapt(found: Generated) -> Generated:
-        kept = {name: some for name, some in (limits or {}).items() if name in found.addresses}
-        declaration = expecting(found.declaration, kept)
-        if alerts:
-            declaration = _with_alerts(declaration, found.addresses)
-        return msgspec.structs.replace(found, declaration=declaration)
-
-    return adapt
+def _completed(declaration: Declaration, components: Iterable[str], limits: LimitsOf, *, alerts: bool) -> Declaration:
+    """What is added to each model: limits of properties, and that nobody outside complains."""
+    declaration = expecting(declaration, limits)
+    return _with_alerts(declaration, components) if alerts else declaration
 
 
 def _with_alerts(declaration: Declaration, components: Iterable[str]) -> Declaration:
     """Return the declaration again, in which nobody outside complains about a component that works."""
     more = tuple(Expectation(str(no_alert(name)), (name,)) for name in components)
     return msgspec.structs.replace(declaration, expectations=(*declaration.expectations, *more))
-
-
-def expecting(declaration: Declaration, limits: LimitsOf) -> Declaration:
-    """Return the declaration again, with limits that properties of components are expected to keep."""
-    atoms = [(component, str(ok(_property(component, one)))) for component, some in limits.items() for one in some]
-    more = tuple(Expectation(atom, (component,)) for component, atom in atoms)
-    return msgspec.structs.replace(declaration, expectations=(*declaration.expectations, *more))
-
-
-def property_observers(
-    limits: LimitsOf, addresses: Mapping[str, str], manner: Manner | None = None
-) -> Iterable[ChildSpec]:
-    """Describe an observer for each component with limits. Raises KeyError: a component without an address."""
-    for component, some in limits.items():
-        bounds = tuple(Bound(ok(_property(component, one)), one, good) for one, good in some.items())
-        start = Start(PropertyObserver, (addresses[component], bounds), {"manner": manner})
-        yield observer(child_name("properties of", component), start)
-
-
-def _property(component: str, one: Property) -> str:
-    return f"{component}.{one.value}"
 
 
 def _actions(reach: Reach, more: Iterable[RepairAction]) -> list[RepairAction]:

@@ -49,6 +49,9 @@ def tree_from(mapping: Mapping[str, Any], where: str = "tree") -> ChildSpec:
     table = _table(mapping, where)
     if "start" in table:
         raise SpecError(where, "the top must be a supervisor, with name and children")
+    if any(key.startswith("/") for key in table):
+        problem = "its tables are named for addresses: that is a whole tree for `holdfast run`, `plan` and `apply`"
+        raise SpecError(where, f"{problem}; here is one supervisor, with name and children")
     return _spec(table, where)
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
+import contextlib
+from collections.abc import Generator, Iterator
 from typing import TYPE_CHECKING, Any
 
 from ..actors import turn_stacks
-from ..actors.events import StopOverdue
-from ..actors.kernel import lifecycle
+from ..actors.events import OrderHeld, StopOverdue
+from ..actors.kernel import lifecycle, mailbox
 from ..actors.kernel.cell import DOWN, GONE, Cell
 from ..actors.kernel.lifecycle import GRACE
 
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 SLACK = 5.0
 """Seconds that a supervisor may take beyond what its children may."""
 FOREVER = float("inf")
+HELD_SECONDS = 5.0
+"""Seconds after which it is told that an order waits for a supervisor that is suspended."""
 
 
 def end_within(cell: Cell, gone: asyncio.Future[Any]) -> None:
@@ -37,6 +40,34 @@ def _overdue(cell: Cell, seconds: float) -> None:
     if cell.state not in (DOWN, GONE):
         cell.node.emit(StopOverdue(cell.path, seconds, turn_stacks.blocked_below(cell)))
         cell.kill()
+
+
+@contextlib.contextmanager
+def told_if_held(supervisor: Cell, order: str, child: str) -> Generator[None, None, None]:
+    """While the block waits for a supervisor of this process, tell (OrderHeld) once if that is suspended.
+
+    Args:
+        supervisor: who has the order.
+        order: "start" or "stop".
+        child: the address of whom it is about.
+    """
+    node = supervisor.node
+    begun = node.loop.time()
+    timer: asyncio.TimerHandle
+
+    def look() -> None:
+        nonlocal timer
+        more = supervisor.more
+        if more is not None and more.suspended & mailbox.BY_USER:
+            node.emit(OrderHeld(supervisor.path, order, child, node.loop.time() - begun))
+        else:
+            timer = node.loop.call_later(HELD_SECONDS, look, context=node.base_context.copy())
+
+    timer = node.loop.call_later(HELD_SECONDS, look, context=node.base_context.copy())
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def most(cell: Cell | None, spec: ChildSpec | None) -> float:

@@ -14,7 +14,7 @@ from ..actors.errors import SpecError, type_name
 from ..actors.events import ShutdownError
 from ..actors.exit_reasons import KILLED, SHUTDOWN, ExitReason
 from ..actors.kernel.actor import Actor, Start, signature_of
-from ..actors.kernel.cell import Cell, Scope
+from ..actors.kernel.cell import Cell, GivenName, Scope
 from ..actors.kernel.lifecycle import GRACE
 from ..actors.kernel.mailbox import Bounded
 from ..actors.process.resource_limits import Limits
@@ -112,10 +112,10 @@ class ChildSpec(Generic[A_co]):
     start_timeout: StartTimeout | None = None  # None becomes what the kind of child has by default
     autostart: bool = True  # whether its supervisor starts it with the others, or only by order
     late: frozenset[str] = frozenset()  # ports that transactions have bound: whom they lead to may be started later
-    register: str | None = None  # the name that each life has beside its address
-    scope: Scope = "system"  # who finds it by that name
+    register: GivenName | None = None  # what each life has beside its address
+    scope: dataclasses.InitVar[Scope | None] = None  # of a spec that was stored before, beside a text as `register`
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, scope: Scope | None) -> None:
         where = f"child {self.id!r}"
         check_path_part(where, "the id", self.id)
         if not isinstance(self.start, Start) or not issubclass(self.start.kind, Actor):
@@ -135,13 +135,7 @@ class ChildSpec(Generic[A_co]):
             raise SpecError(where, f"start_timeout must be seconds > 0 or 'infinity', not {self.start_timeout!r}")
         if not isinstance(self.autostart, bool):
             raise SpecError(where, f"autostart must be True or False, not {self.autostart!r}")
-        name = self.register
-        if name is not None and (not isinstance(name, str) or not name or name.startswith("/") or has_control(name)):
-            problem = "must be text without control characters that does not begin with '/', or left out"
-            raise SpecError(where, f"register {problem}, not {name!r}")
-        _choose(where, "scope", self.scope, Scope)
-        if self.scope != "system" and name is None:
-            raise SpecError(where, f"scope={self.scope!r} says who finds it by a name, and register='NAME' is missing")
+        object.__setattr__(self, "register", given_name(where, self.register, scope))
         if not isinstance(self.significant, bool):
             raise SpecError(where, f"significant must be True or False, not {self.significant!r}")
         if self.significant and self.restart == "permanent":
@@ -221,6 +215,27 @@ class ChildSpec(Generic[A_co]):
             cell.node.emit(ShutdownError(cell.path, ended))
 
 
+def given_name(where: str, register: object, scope: Any) -> GivenName | None:
+    """The name that a spec gives, of a text and who finds it by that; None scopes are "system".
+
+    Raises:
+        SpecError: it is no name, nobody is in that scope, or there is a scope and no name.
+    """
+    if isinstance(register, GivenName):
+        scope = register.scope
+        register = register.text
+    if register is not None and (
+        not isinstance(register, str) or not register or register.startswith("/") or has_control(register)
+    ):
+        problem = "must be text without control characters that does not begin with '/', or left out"
+        raise SpecError(where, f"register {problem}, not {register!r}")
+    scope = "system" if scope is None else scope
+    _choose(where, "scope", scope, Scope)
+    if register is None and scope != "system":
+        raise SpecError(where, f"scope={scope!r} says who finds it by a name, and register='NAME' is missing")
+    return None if register is None else GivenName(register, scope)
+
+
 def _specs_in(values: Iterable[Any]) -> Iterator[ChildSpec]:
     for value in values:
         if isinstance(value, ChildSpec):
@@ -274,8 +289,8 @@ def child(
         autostart: whether its supervisor starts it with the others. If not, it is known and stopped, at each start of
             its supervisor, until it is started by order (`RestartChild`, or `start` in a transaction).
         register: a name that each of its lives has, as `system.register` gives it to one; nobody has it between two.
+            If it is taken, the start fails.
         scope: who finds it by that name: "system", or "fleet": other systems and clients that are connected, too.
-            If it is taken, the start fails. Not below a supervisor with a process of its own.
 
     Raises:
         MechanismRefused: the class does not have what the mechanism needs.
@@ -301,8 +316,7 @@ def child(
         mechanism,
         start_timeout=start_timeout,
         autostart=autostart,
-        register=register,
-        scope=scope,
+        register=given_name(f"child {NAMELESS if id is None else id!r}", register, scope),
     )
 
 

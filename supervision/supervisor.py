@@ -10,12 +10,12 @@ import asyncio
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, ClassVar
 
-from ..actors.errors import HoldfastError, NameTaken, SpecError, StartFailed, StartIgnored
+from ..actors.errors import HoldfastError, SpecError, StartFailed, StartIgnored
 from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
 from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, crash, unpack_exit
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Start, on
-from ..actors.kernel.cell import DOWN, GONE, Cell
+from ..actors.kernel.cell import DOWN, GONE, Cell, GivenName
 from ..actors.kernel.envelope import Item, ReplyHandle
 from ..actors.persistence import UNFIT, is_in_vain
 from .admin import (
@@ -205,6 +205,8 @@ class Supervisor(Inquiries):
         row.current = one
         try:
             await self._await_bound(row, one)
+            if one.row is row and one.spec.register is not None:
+                await self._take_name(one, one.spec.register)
             if one.row is not row:
                 return None
             await self._come_up(one)
@@ -281,11 +283,7 @@ class Supervisor(Inquiries):
         Raises:
             StartFailed, StartIgnored: at once. NameTaken: somebody else lives at its address.
         """
-        cell = one.cell
-        if cell is None or cell.state is GONE:
-            cell = one.cell = new_cell(self.ctx._cell, one)
-            one.ignored_life = 0  # A new address counts its lives anew.
-        self._name(one, cell)
+        cell = self._address_of(one)
         seconds = one.spec.start_timeout or "infinity"
         if isinstance(seconds, str):
             return cell.host.start(cell)
@@ -295,16 +293,26 @@ class Supervisor(Inquiries):
         finally:
             void()
 
-    def _name(self, one: Child, cell: Cell) -> None:
-        """Give a child that is about to start the name that its spec says. Raises StartFailed: another one has it."""
-        name = one.spec.register
-        if name is not None:
-            try:
-                cell.node.register(name, cell, is_starting=True, scope=one.spec.scope)
-            except NameTaken as taken:
-                holder = cell.node.names[name].path
-                why = f"{holder} is registered as {name!r} already; free the name, or say another one"
-                raise StartFailed(cell.path, why) from taken
+    def _address_of(self, one: Child) -> Cell:
+        """The cell of a child, made now if it has none. Raises StartFailed, NameTaken: see `new_cell`."""
+        cell = one.cell
+        if cell is None or cell.state is GONE:
+            cell = one.cell = new_cell(self.ctx._cell, one)
+            one.ignored_life = 0  # A new address counts its lives anew.
+        return cell
+
+    async def _take_name(self, one: Child, name: GivenName) -> None:
+        """Have a child that is about to start found by the name that its spec says.
+
+        If it is stopped meanwhile, the name is free again when its address is, or when its next life ends.
+
+        Raises:
+            StartFailed: another one has the name. Else what `_address_of` raises.
+        """
+        cell = self._address_of(one)
+        claimed = cell.host.place.name(cell, name)
+        if claimed is not None:
+            await claimed
 
     def _is_up(self, one: Child) -> None:
         one.state = UP

@@ -120,8 +120,7 @@ def check_place(where: str, specs: Iterable[ChildSpec], node: Node) -> None:
 def check_subtree(where: str, specs: Iterable[ChildSpec]) -> None:
     """Whether specs, and what is below them, can be below a supervisor with a process of its own.
 
-    An actor there may have one too; the root has it, and the supervisor decides on it. A supervisor may not. Nobody has
-    a name by its spec, for names are the root's.
+    An actor there may have one too; the root has it, and the supervisor decides on it. A supervisor may not.
 
     Raises:
         SpecError: one of them cannot.
@@ -130,9 +129,6 @@ def check_subtree(where: str, specs: Iterable[ChildSpec]) -> None:
         if spec.isolation == "process" and spec.is_supervisor:
             why = "cannot hold another supervisor with a process of its own: give the actors below it theirs"
             raise SpecError(where, f"a subtree in a process {why}")
-        if spec.register is not None:
-            why = f"child {spec.id!r} cannot be registered as {spec.register!r}: it is"
-            raise SpecError(where, f"{why} below a supervisor with a process of its own, and names are the root's")
 
 
 def everything(specs: Iterable[ChildSpec]) -> Iterator[ChildSpec]:

@@ -9,6 +9,8 @@ from .history.evidence import PutAside
 from .history.lives import PastLife
 from .history.pages import HistoryPage
 from .history.past_event import PastEvent
+from .last_lines.line_memory import LoggedLine
+from .last_lines.line_page import LogPage
 from .portal import ThreadPortal
 from .system_connection import SystemConnection
 from .transaction.change import Change
@@ -18,6 +20,8 @@ __all__ = [
     "Change",
     "ConnectionLimits",
     "HistoryPage",
+    "LogPage",
+    "LoggedLine",
     "Opaque",
     "Operation",
     "PastEvent",

@@ -17,7 +17,7 @@ from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import cell_kind
 from ..actors.kernel.ref import current
 from ..actors.migration.here import ToHere
-from ..actors.migration.move import UNWANTED, Entering, Gate, Move, Pause
+from ..actors.migration.move import UNWANTED, CommitGate, Entering, Move, Pause
 from ..actors.migration.worker import ToWorker
 from ..actors.ordered import Ordered
 from ..actors.process.process_host import WorkerPlace
@@ -67,7 +67,7 @@ class Moves:
         isolation: Isolation,
         limits: Limits | None,
         timeout: float,
-        gate: Gate | None = None,
+        gate: CommitGate | None = None,
         known: ChildSpec | None = None,
     ) -> bool:
         """Move an actor; if whoever wants it does not wait any more, the move comes to its end all the same.
@@ -106,7 +106,7 @@ class Moves:
         isolation: Isolation,
         limits: Limits | None,
         timeout: float,
-        gate: Gate | None,
+        gate: CommitGate | None,
         known: ChildSpec | None,
     ) -> bool:
         origin, place = place_of(cell), cell.host.place
@@ -132,7 +132,7 @@ class Moves:
         homes: Homes,
         mechanism: Any,
         timeout: float,
-        gate: Gate | None = None,
+        gate: CommitGate | None = None,
         begun: Begun = lambda probation: None,
     ) -> None:
         """Have a group of replicas live an actor's life. With a gate it waits there when all is ready.
@@ -146,7 +146,7 @@ class Moves:
         await self._alone(cell, protected, f"attach to {cell.path}", timeout, gate)
 
     async def _protected(
-        self, cell: Cell, homes: Homes, mechanism: Any, timeout: float, gate: Gate | None, begun: Begun
+        self, cell: Cell, homes: Homes, mechanism: Any, timeout: float, gate: CommitGate | None, begun: Begun
     ) -> None:
         from ..ftm.events import MechanismAttached
         from ..ftm.group.group_place import GroupPlace
@@ -184,7 +184,7 @@ class Moves:
             names = tuple(layer.name for layer in move.entering.host.place.layers)
             self._node.emit(MechanismAttached(cell.path, names, move.gone_on_at - move.rest_at))
 
-    async def unprotect(self, cell: Cell, timeout: float, gate: Gate | None = None) -> None:
+    async def unprotect(self, cell: Cell, timeout: float, gate: CommitGate | None = None) -> None:
         """Have a protected actor live as its spec says without the mechanism. With a gate it waits there when ready.
 
         Raises:
@@ -193,7 +193,7 @@ class Moves:
         unprotected = self._unprotected(cell, timeout, gate)
         await self._alone(cell, unprotected, f"detach from {cell.path}", timeout, gate)
 
-    async def _unprotected(self, cell: Cell, timeout: float, gate: Gate | None) -> None:
+    async def _unprotected(self, cell: Cell, timeout: float, gate: CommitGate | None) -> None:
         from ..ftm.events import MechanismDetached
         from ..ftm.group.group_place import GroupPlace
         from ..ftm.migration.protection import is_plain, out_of_group
@@ -233,7 +233,7 @@ class Moves:
         cell: Cell,
         mechanism: Any,
         timeout: float,
-        gate: Gate | None = None,
+        gate: CommitGate | None = None,
         begun: Begun = lambda probation: None,
     ) -> None:
         """Have a protected actor go on with another stack of mechanisms, all of it given. With a gate it waits there.
@@ -246,7 +246,7 @@ class Moves:
         adapted = self._adapted(cell, mechanism, timeout, gate, begun)
         await self._alone(cell, adapted, f"adaptation of {cell.path}", timeout, gate)
 
-    async def _adapted(self, cell: Cell, mechanism: Any, timeout: float, gate: Gate | None, begun: Begun) -> None:
+    async def _adapted(self, cell: Cell, mechanism: Any, timeout: float, gate: CommitGate | None, begun: Begun) -> None:
         from ..ftm.events import MechanismChanged
         from ..ftm.group.group_place import GroupPlace
         from ..ftm.group.reconfiguration import CannotAdapt
@@ -306,7 +306,7 @@ class Moves:
         spec = _spec_of(cell)
         await self._moved(cell, timeout, lambda: self._made(cell, spec, timeout), lambda: None)
 
-    async def pause(self, cell: Cell, timeout: float, gate: Gate) -> None:
+    async def pause(self, cell: Cell, timeout: float, gate: CommitGate) -> None:
         """Bring a recorded or protected actor to rest where it lives; it goes on when the gate opens.
 
         Who replays turns takes a snapshot.
@@ -327,7 +327,7 @@ class Moves:
         await self._alone(cell, pausing, f"pause of {cell.path}", timeout, gate)
 
     async def _alone(
-        self, cell: Cell, change: Coroutine[Any, Any, T], name: str, timeout: float, gate: Gate | None
+        self, cell: Cell, change: Coroutine[Any, Any, T], name: str, timeout: float, gate: CommitGate | None
     ) -> T:
         """Carry out a change of where an actor lives while no other is; it comes to its end in any case.
 
@@ -365,7 +365,7 @@ class Moves:
         return await to_its_end(cell.path, task)
 
     async def _settle_in(
-        self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float, gate: Gate | None = None
+        self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float, gate: CommitGate | None = None
     ) -> None:
         spec = _spec_there(cell, _spec_of(cell), isolation, limits)
         await self._moved(
@@ -383,7 +383,7 @@ class Moves:
         timeout: float,
         made: Callable[[], Move],
         moved: Callable[[], None],
-        gate: Gate | None = None,
+        gate: CommitGate | None = None,
     ) -> Any:
         """Carry out a move; if the life ends before it is at rest, its next life is moved."""
         attempts = _Attempts(cell, timeout, gate)
@@ -423,9 +423,9 @@ class Moves:
 class _Attempts:
     """The lives of one actor that a change is begun with: if one ends before it is at rest, the next one."""
 
-    def __init__(self, cell: Cell, timeout: float, gate: Gate | None) -> None:
+    def __init__(self, cell: Cell, timeout: float, gate: CommitGate | None) -> None:
         self._cell, self._timeout = cell, timeout
-        self._gate = Gate(cell.node.loop) if gate is None else gate
+        self._gate = CommitGate(cell.node.loop) if gate is None else gate
         self._end = cell.node.loop.time() + timeout
 
     async def until_up(self) -> None:

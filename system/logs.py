@@ -31,6 +31,7 @@ from ..actors.events import (
     LoopLagged,
     MessageQuarantined,
     Moved,
+    OrderHeld,
     ProcessDied,
     RecordsMapped,
     Recovered,
@@ -79,6 +80,7 @@ from ..ftm.events import (
     TurnHung,
 )
 from .history.writer import HistoryNotKept
+from .last_lines.line_memory import LineLevel, LineMemory
 from .mechanism_notes import AdaptationUndone
 from .specification import SpecificationNotKept
 from .transaction.events import ScriptLoaded, TransactionCommitted, TransactionRolledBack
@@ -96,6 +98,15 @@ SHOWN = {code: f"\\x{code:02x}" for code in (*range(9), *range(11, 32), *range(1
 """Control characters as they are shown: the text of an error is written to terminals, and may not steer them."""
 LOGGER = "holdfast"
 """The name of the logger."""
+LEVEL_NAMES: dict[int, LineLevel] = {
+    logging.DEBUG: "debug",
+    logging.INFO: "info",
+    logging.WARNING: "warning",
+    logging.ERROR: "error",
+    logging.CRITICAL: "critical",
+}
+TOLD_APART = frozenset({"address", "life", "system"})
+"""Fields of a record that a line which is kept has beside its text."""
 
 Fields = dict[str, Any]
 
@@ -109,10 +120,19 @@ class LogSink:
     Args:
         system: the system's name.
         log_payloads: write what was in the message that an actor has crashed in, too.
+        lines: keeps what is written, but for the output of processes; None: nothing does.
     """
 
-    def __init__(self, system: str, loop: asyncio.AbstractEventLoop, *, log_payloads: bool = False) -> None:
+    def __init__(
+        self,
+        system: str,
+        loop: asyncio.AbstractEventLoop,
+        *,
+        log_payloads: bool = False,
+        lines: LineMemory | None = None,
+    ) -> None:
         self._system, self._loop, self._log_payloads = system, loop, log_payloads
+        self._lines = lines
         self._second: dict[type, tuple[int, int]] = {}
         self._crashes: dict[str, tuple[Event, asyncio.TimerHandle]] = {}  # by address: what waits for its supervisor
         self._letters: dict[tuple[str, type, str], tuple[float, int]] = {}  # when one was told, and how many not since
@@ -196,6 +216,10 @@ class LogSink:
             fields = {key: one.translate(SHOWN) if isinstance(one, str) else one for key, one in fields.items()}
         if left_out:
             fields["left_out"] = left_out
+        if self._lines is not None and kind is not LogLine:
+            own = {key: one for key, one in fields.items() if key not in TOLD_APART}
+            life = fields.get("life", 0)
+            self._lines.add(event.address, "holdfast", LEVEL_NAMES[level], record_text(name, own), int(life))
         structlog = _structlog()
         if structlog is None:
             _write_standard(level, name, fields)
@@ -228,6 +252,7 @@ WRITTEN: dict[type, tuple[int, str]] = {
     ChildStartFailed: (logging.ERROR, "child not started"),
     ShutdownError: (logging.WARNING, "shutdown error"),
     StopOverdue: (logging.ERROR, "stop overdue"),
+    OrderHeld: (logging.WARNING, "order held"),
     TrustBreached: (logging.ERROR, "trust breached"),
     AutoShutdown: (logging.INFO, "auto shutdown"),
     SupervisorGaveUp: (logging.ERROR, "supervisor gave up"),
@@ -317,6 +342,16 @@ def describe(event: Event, *, payloads: bool = False) -> Fields:
     return fields
 
 
+def record_text(name: str, fields: Fields) -> str:
+    """A record in one line, without its traceback.
+
+    >>> record_text("process died", {"pid": 7, "reason": "killed by SIGKILL"})
+    "process died pid=7 reason='killed by SIGKILL'"
+    """
+    shown = " ".join(f"{key}={value!r}" for key, value in fields.items() if key != "exception")
+    return f"{name} {shown}"
+
+
 def _structlog() -> Any:
     """structlog, if the program has set it up, or has set up no logging at all: then it writes to stderr."""
     if "structlog" not in sys.modules and logging.getLogger(LOGGER).hasHandlers():
@@ -331,10 +366,8 @@ def _write_standard(level: int, name: str, fields: Fields) -> None:
     logger = logging.getLogger(LOGGER)
     if not logger.isEnabledFor(level):
         return
-    shown = " ".join(f"{key}={value!r}" for key, value in fields.items() if key != "exception")
-    text = f"{name} {shown}"
     record = logger.makeRecord(
-        LOGGER, level, __file__, 0, text, (), None, extra={"holdfast": {"event": name, **fields}}
+        LOGGER, level, __file__, 0, record_text(name, fields), (), None, extra={"holdfast": {"event": name, **fields}}
     )
     record.exc_text = str(fields.get("exception", "")).rstrip() or None
     logger.handle(record)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from typing import Final, get_args
+from typing import Final, Literal, TypeAlias, get_args
 
 from ..actors.errors import SpecError
 from ..actors.loop_watchdog import check_limits
@@ -21,6 +21,13 @@ from ..cluster.leadership import Standby
 from ..cluster.lines.inflow import ConnectionLimits
 from ..cluster.servers import Servers
 from ..supervision.spec import Flags
+
+ProgramRole: TypeAlias = Literal["waiting", "standby", "leader", "alone"]
+"""What a program is to its system.
+
+It is being started, or waits for the servers of its store; another program leads, and it waits; it leads, of several;
+or it is the only one there can be.
+"""
 
 CONFIGURED: Final = "configured"
 """The store that `holdfast.toml` and the environment name."""

@@ -48,7 +48,7 @@ from ..cluster.log_writer import Deposed
 from ..cluster.servers import Servers
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.children import tell_stopped
-from ..supervision.patience import end_within
+from ..supervision.patience import end_within, told_if_held
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor, kill_starting
@@ -56,10 +56,12 @@ from .controls import Controls
 from .full_collections import seldom_collected
 from .history.calls import HistoryCalls
 from .history.recorder import HistoryRecorder, expect_end
+from .last_lines.line_calls import LineCalls
+from .last_lines.line_memory import LineMemory
 from .live_moves import Moves
 from .logs import LogSink
 from .mechanism_notes import MechanismNotes, check_no_part
-from .options import SystemOptions
+from .options import ProgramRole, SystemOptions
 from .portal import ThreadPortal
 from .recorded import Recorded
 from .recovery import RecoveryTree
@@ -88,7 +90,7 @@ LONG = 365 * 86_400.0
 """Seconds `start` and `stop` wait: no limit of their own, the child specs say how long a start or an end may take."""
 
 
-class ActorSystem(Recorded, Controls, HistoryCalls):
+class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
     """A tree of actors: an async context manager that lives in whatever loop it is entered in.
 
     Args:
@@ -171,6 +173,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             recovery_hooks=recovery_hooks,
             recovery=recovery,
         )
+        self._standing: StandingBy | None = None  # what was told last of another program that leads
         self._sink: LogSink | None = None
         self._history: HistoryRecorder | None = None
         self._running: Node | None = None
@@ -188,6 +191,24 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         """The first part of all addresses."""
         return self._options.name
 
+    @property
+    def role(self) -> ProgramRole:
+        """Say what this program is to the system: "waiting", "standby", "leader" or "alone".
+
+        It waits while it is being started, and for the servers of its store. It stands by while another program leads.
+        The tree runs only in one that leads, or that is alone because its store is not on several machines.
+        """
+        if self._root is None:
+            return "waiting" if self._standing is None else "standby"
+        store = self._options.store
+        is_shared = isinstance(store, Servers) or (isinstance(store, str) and is_replicated(store))
+        return "leader" if is_shared else "alone"
+
+    @property
+    def leader(self) -> str:
+        """The machine and process of the program that leads while this one stands by; an empty text otherwise."""
+        return "" if self._standing is None or self._root is not None else self._standing.leader
+
     # -- life -------------------------------------------------------------------------------------------------------
 
     async def __aenter__(self) -> ActorSystem:
@@ -196,8 +217,9 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         options = self._options
         file = options.read_recovery_file()
         node = self._running = Node(self.name, asyncio.get_running_loop(), seed=options.seed)
+        lines = LineMemory(node.clock.wall) if options.history else None
         if options.log:
-            self._sink = LogSink(self.name, node.loop, log_payloads=options.log_payloads)
+            self._sink = LogSink(self.name, node.loop, log_payloads=options.log_payloads, lines=lines)
             node.events.add_sink(self._sink)
         try:
             engine = await self._open_store(node)
@@ -214,7 +236,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             self._lines = Lines(node, self.name, new_boot(epoch), self._homes, options.connection_limits)
             if options.history:
                 store = self._homes if self._homes.journal.durable else None
-                self._history = HistoryRecorder(node, store, log_payloads=options.log_payloads)
+                self._history = HistoryRecorder(node, store, log_payloads=options.log_payloads, lines=lines)
         except HoldfastError as error:
             with contextlib.suppress(HoldfastError):  # What it says now is only what follows from that.
                 engine.close()
@@ -252,12 +274,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
                 waits = options.standby is not None
                 self._transport = await serve(self._lines, at, options.nats, waits=waits, silent=self._silent)
         except BaseException as error:  # Nobody is in the body yet who would hear of a failure, or end what has begun.
-            try:
-                await self.__aexit__(type(error), error, error.__traceback__)
-            except StoreError as store_error:
-                self._refuse_deposed(store_error, engine)
-                raise
-            self._refuse_deposed(error, engine)
+            await self.__aexit__(type(error), error, error.__traceback__)
             raise
         return self
 
@@ -301,7 +318,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             self.name,
             options.standby,
             options.nats.told(),
-            waits=lambda leader: node.emit(StandingBy(where, leader)),
+            waits=self._stands_by,
             silent=self._silent,
             deposed=self._deposed,
             key=options.store_key,
@@ -309,8 +326,13 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         node.emit(LeadershipTaken(where, journal.epoch))
         return Called(journal)
 
-    def _refuse_deposed(self, error: BaseException, engine: StoreEngine) -> None:
-        """A start has failed. Raises LeadershipLost if that is because another program has come to lead meanwhile."""
+    def _stands_by(self, leader: str) -> None:
+        """Another program leads, and the start waits until this one does."""
+        self._standing = StandingBy(f"/{self.name}", leader)
+        self._node.emit(self._standing)
+
+    def _refuse_deposed(self, error: BaseException | None, engine: StoreEngine) -> None:
+        """Raise LeadershipLost, if the store has refused something because another program leads."""
         if isinstance(error, StaleEpoch) and engine.safe_at == "sync":
             raise LeadershipLost(self.name, "another program", error.current) from error
 
@@ -334,14 +356,16 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         body = self._body
         try:
             await self.shutdown()
-        except StoreError:  # JournalStopped has told of it: whoever has cancelled the body sees it cancelled.
+        except StoreError as store_error:  # JournalStopped has told of it: who cancelled the body sees it cancelled.
             if self._failure is None and not isinstance(error, asyncio.CancelledError):
+                self._refuse_deposed(store_error, self._homes.journal.engine)
                 raise
         if self._failure is not None:
             failure, self._failure = self._failure, None
             if body is not None:  # The cancel was ours: whoever catches TreeFailed must not look cancelled.
                 body.uncancel()
             raise failure from (None if isinstance(error, asyncio.CancelledError) else error)
+        self._refuse_deposed(error, self._homes.journal.engine)
 
     async def shutdown(self) -> None:
         """Stop every actor, newest first, and what belongs to the system. A second call changes nothing."""
@@ -502,7 +526,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
     async def start(self, spec: ChildSpec[A], *, fresh: bool = False) -> ActorRef[A]:
         """Start a child of the root, and wait until it is up; None instead of a ref if it raised `Ignore`.
 
-        With `fresh` nothing comes back that was recorded at its address, or below it, before.
+        With `fresh` nothing comes back that was recorded at its address, or below it, before. While the root is
+        suspended the start waits: the event `OrderHeld` says so after 5 seconds, and `resume` lets it go on.
 
         Raises:
             StartFailed: naming the actor and why. AlreadyStarted, AlreadyPresent: the id is in use.
@@ -515,7 +540,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
             known.brought.discard(address)
             await root.ask(RemoveChild(spec.id), LONG)
         wanted: ChildSpec = known.in_force(address, spec, fresh=fresh)
-        with seldom_collected():
+        with seldom_collected(), told_if_held(root._cell.living, "start", address):
             ref = cast("ActorRef[A]", await root.ask(StartChild(wanted, fresh=fresh), LONG))
         known.started(address, spec, wanted, fresh=fresh)
         await known.start_added(lambda one: root.ask(StartChild(one), LONG))
@@ -573,7 +598,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls):
         if parent is not None and is_supervised(cell, parent):
             supervisor = ActorRef[Supervisor](parent)
             try:
-                await supervisor.ask(RemoveChild(cell.name, pack_exit(reason)), LONG)
+                with told_if_held(parent, "stop", cell.path):
+                    await supervisor.ask(RemoveChild(cell.name, pack_exit(reason)), LONG)
             except (NoSuchChild, ActorStopped):  # It has stopped already, or was temporary: its spec went with it.
                 pass
         elif not cell.is_dead:

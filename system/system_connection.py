@@ -238,11 +238,15 @@ async def serve(
         SpecError: the address cannot be read. Unanswered: no server can be reached for a moment, and nobody is to wait.
     """
     servers = servers_of(at, settings.told())
-    transport, inbox = await Patience(waits=waits).answered(servers.open_lines, NowAndThen(silent))
-    try:
-        await transport.hear(inbox, LineGate(lines, transport).hear)
-    except BaseException:
-        with contextlib.suppress(TimeoutError):
-            await transport.close()
-        raise
-    return transport
+
+    async def listening() -> Transport:
+        transport, inbox = await servers.open_lines()
+        try:
+            await transport.hear(inbox, LineGate(lines, transport).hear)
+        except BaseException:
+            with contextlib.suppress(TimeoutError):
+                await transport.close()
+            raise
+        return transport
+
+    return await Patience(waits=waits).answered(listening, NowAndThen(silent))

@@ -237,8 +237,9 @@ class Guard:
         """The system that was started first, if there is one."""
         return self._systems[0] if self._systems else None
 
-    async def start(self, system: GuardedSystem) -> GuardedSystem:
-        """Start a system; `close` ends it."""
+    async def start(self, name: str = "app", **options: Any) -> GuardedSystem:
+        """Start a system, with the options of ActorSystem; `close` ends it."""
+        system = GuardedSystem(name, **options)
         await system.__aenter__()
         self._systems.append(system)
         return system

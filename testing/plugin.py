@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 import importlib
 import types
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Generator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -155,11 +154,12 @@ WANTED = pytest.StashKey["SystemsWanted"]()
 
 def _wanted(item: pytest.Item) -> SystemsWanted:
     """What the test expects, which is read once."""
-    from .wanted import SystemsWanted
+    found = item.stash.get(WANTED, None)
+    if found is None:
+        from .wanted import SystemsWanted
 
-    if WANTED not in item.stash:
-        item.stash[WANTED] = SystemsWanted(item, EXPECTABLE)
-    return item.stash[WANTED]
+        found = item.stash[WANTED] = SystemsWanted(item, EXPECTABLE)
+    return found
 
 
 @pytest.hookimpl(wrapper=True)
@@ -175,52 +175,61 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, Any, Any]
 
 
 GUARD = pytest.StashKey["Guard"]()
-READY = pytest.StashKey[bool]()
+GUARDS = pytest.StashKey["type[Guard]"]()
 
 
-@contextlib.asynccontextmanager
-async def _guarded(item: pytest.Item) -> AsyncGenerator[Guard]:
+class GuardOf:
     """The guard of a test, which looks at what is left when the fixture ends that was the first to ask for it."""
-    from .guard.sends import stay_ready
-    from .guarded import Guard
 
-    if GUARD in item.stash:
-        yield item.stash[GUARD]
-        return
-    if READY not in item.config.stash:
-        item.config.stash[READY] = True
-        item.config.add_cleanup(stay_ready())
-    wanted = _wanted(item)
-    guard = item.stash[GUARD] = Guard(allowed=wanted.leaks, exceptions=not wanted.exceptions)
-    try:
-        yield guard
-    finally:
-        del item.stash[GUARD]
-        await guard.close()
+    def __init__(self, item: pytest.Item) -> None:
+        self._item = item
+        self._own: Guard | None = None
+
+    async def __aenter__(self) -> Guard:
+        found = self._item.stash.get(GUARD, None)
+        if found is not None:
+            return found
+        wanted = _wanted(self._item)
+        guard = _guards(self._item.config)(allowed=wanted.leaks, exceptions=not wanted.exceptions)
+        self._own = self._item.stash[GUARD] = guard
+        return guard
+
+    async def __aexit__(self, *error: object) -> None:
+        if self._own is not None:
+            del self._item.stash[GUARD]
+            await self._own.close()
+
+
+def _guards(config: pytest.Config) -> type[Guard]:
+    """The class of guards, imported once: an `import` within a function takes longer than most calls."""
+    found = config.stash.get(GUARDS, None)
+    if found is None:
+        from .guard.sends import stay_ready
+        from .guarded import Guard
+
+        found = config.stash[GUARDS] = Guard
+        config.add_cleanup(stay_ready())
+    return found
 
 
 async def system_of_the_test(item: pytest.Item | None = None) -> AsyncIterator[GuardedSystem]:
     """A running system of the test's own, on the test's loop; it ends with the test."""
-    from .guarded import GuardedSystem
-
     assert item is not None, "the test is given by `pytest_fixture_setup`"
     wanted = _wanted(item)
-    async with _guarded(item) as guard:
-        system = await guard.start(GuardedSystem(**wanted.options))
+    async with GuardOf(item) as guard:
+        system = await guard.start(**wanted.options)
         wanted.tell(system)
         yield system
 
 
 async def systems_of_the_test(item: pytest.Item | None = None) -> AsyncIterator[ActorSystems]:
     """Start a system: `system = await actor_systems("name", store=...)`, as often as the test likes."""
-    from .guarded import GuardedSystem
-
     assert item is not None, "the test is given by `pytest_fixture_setup`"
     wanted = _wanted(item)
-    async with _guarded(item) as guard:
+    async with GuardOf(item) as guard:
 
         async def start(name: str = "app", **options: Any) -> GuardedSystem:
-            system = await guard.start(GuardedSystem(name, **{**wanted.options, **options}))
+            system = await guard.start(name, **{**wanted.options, **options})
             wanted.tell(system)
             return system
 

@@ -38,7 +38,7 @@ class SystemsWanted:
                 for name, value in marker.kwargs.items():
                     (self._expected if name in expectable else self.options)[name] = value
         self.leaks = _kinds(self._expected.get("leaks"))
-        self.exceptions = bool(self._expected.get("exceptions"))
+        self.exceptions = self.expects("exceptions")
 
     def option(self, name: str) -> Any:
         """What the command line of pytest says, as `--holdfast-{name}`; None: nothing."""
@@ -49,6 +49,10 @@ class SystemsWanted:
         from .schedules.failures import Failures
 
         return None if self._config is None else Failures(self._config, self.nodeid)
+
+    def expects(self, what: str) -> bool:
+        """Whether the test expects this, one of `EXPECTABLE`, at all."""
+        return bool(self._expected.get(what))
 
     def tell(self, system: GuardedSystem) -> None:
         """Let a system know what it may see."""
@@ -66,7 +70,7 @@ class SystemsWanted:
             ("types", system.expect_types),
             ("exceptions", system.expect_exceptions),
         ):
-            if self._expected.get(name):
+            if self.expects(name):
                 allow()
 
 

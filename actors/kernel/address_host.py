@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ..exit_reasons import ExitReason
     from ..overflow import Overflow
     from .actor import Start
-    from .cell import Cell
+    from .cell import Cell, GivenName
     from .envelope import Ask, Item
 
 
@@ -126,6 +126,18 @@ class Place:
     limits_turns: bool = True
     """Whether a turn that takes longer than its class allows is ended where it runs, and not by others."""
 
+    def name(self, cell: Cell, name: GivenName) -> asyncio.Future[None] | None:
+        """Have the life that is about to begin found by a name. None: it is.
+
+        Names are the root's: an actor process asks it. Raises, or fails the future, with StartFailed: another has it.
+        """
+        uplink = cell.node.ports.uplink
+        if uplink is not None:
+            claimed: asyncio.Future[None] = uplink.claim_name(cell, name)
+            return claimed
+        cell.node.name_life(cell, name)
+        return None
+
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         """Begin a life. None: it is up already. Raises, or fails the future, with StartFailed."""
         raise NotImplementedError
@@ -226,6 +238,9 @@ class Parent:
     def is_restarting(self, cell: Cell) -> bool:
         """Whether a retired address may have its supervisor, and so itself, started again."""
         raise NotImplementedError
+
+    def undone(self, cell: Cell) -> None:
+        """A life here is over, or could not be built: what it had taken in this process is given back."""
 
     def retired(self, cell: Cell) -> None:
         """The address is gone for good."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import dataclasses
 from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, cast
@@ -133,6 +134,14 @@ class Host(Protocol):
 
 Scope: TypeAlias = Literal["system", "fleet"]
 """Who finds an actor by a name: the system that it is of, or other systems and clients that are connected, too."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class GivenName:
+    """The name that the spec of a child gives to each of its lives, beside the address, and who finds it by that."""
+
+    text: str
+    scope: Scope = "system"
 
 
 class Belongings:

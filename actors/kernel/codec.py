@@ -134,12 +134,13 @@ class Codec:
         Raises:
             msgspec.DecodeError: the bytes are no such value; the text names the field.
         """
+        decode = self._decoders.get(kind) or self.decoder(kind)
         try:
-            return self.decoder(kind)(body)
+            return decode(body)
         except msgspec.MsgspecError:
             raise
-        except Exception as error:  # Text that is no UTF-8, nesting without end, an array of no known type.
-            raise msgspec.DecodeError(f"{type_name(type(error))}: {error}") from error
+        except Exception as error:
+            raise decode_error(error) from error
 
     def decoder(self, kind: Any) -> Callable[[Any], Any]:
         """What decodes one kind, made once; it may raise more than `decode` does."""
@@ -160,16 +161,25 @@ class Codec:
         """
         if cell.state is GONE or (cell.host.takes_parcels and cell.actor is None):
             return Parcel(name, bytes(body))
+        return self.message_for(cell, name, body)
+
+    def message_for(self, cell: Cell, name: str, body: Any) -> Any:
+        """A message that came encoded, for an actor of this process: decoded as what that handles by this name.
+
+        Raises:
+            UnknownMessage: its class has no handler for this name. BadMessage: the payload does not fit the type.
+        """
         kind = cell.table.named.get(name)
         if kind is None:
             try:
                 kind = cell.table.kind_named(name)
             except UnknownMessage as error:
                 raise UnknownMessage(cell.path, error.message) from None
+        decode = self._decoders.get(kind) or self.decoder(kind)
         try:
-            return self.decode(kind, body)
-        except msgspec.DecodeError as error:
-            raise BadMessage(cell.path, name.replace(":", "."), misfit(kind, error)) from error
+            return decode(body)
+        except Exception as error:
+            raise BadMessage(cell.path, name.replace(":", "."), misfit(kind, decode_error(error))) from error
 
     def opened(self, cell: Cell, message: object) -> object:
         """A message for a cell, decoded if it is still packed; as it is if the cell's class does not know its type."""
@@ -233,6 +243,16 @@ class Codec:
         if kind == "crash":
             return RemoteCrash(*args)
         return rebuild_error(name, args) or AskFailed(name, ", ".join(map(str, args)))
+
+
+def decode_error(error: Exception) -> msgspec.MsgspecError:
+    """What a decoder has raised, as an error of the codec.
+
+    It may be another one: for text that is no UTF-8, nesting without end, or an array of no known type.
+    """
+    if isinstance(error, msgspec.MsgspecError):
+        return error
+    return msgspec.DecodeError(f"{type_name(type(error))}: {error}")
 
 
 def encode_special(value: Any) -> Any:
@@ -353,7 +373,7 @@ def unencodable(value: object, error: BaseException) -> str:
     return str(error)
 
 
-def misfit(kind: type[msgspec.Struct], error: msgspec.DecodeError) -> str:
+def misfit(kind: type[msgspec.Struct], error: msgspec.MsgspecError) -> str:
     """Why a payload is no such message; its fields, which are sent by place, are named.
 
     >>> class Deposit(Message):

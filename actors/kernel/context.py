@@ -58,6 +58,8 @@ class ActorContext:
 
     _may_rest: ClassVar[bool] = False
     """Whether a turn may wait for days, and be run again elsewhere."""
+    _marks_waits: ClassVar[bool] = False
+    """Whether it is to be told when a turn begins to wait, and when that goes on."""
 
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
@@ -90,7 +92,10 @@ class ActorContext:
 
     @property
     def life(self) -> int:
-        """The number of this life at the address, from 1."""
+        """The number of this life at the address, from 1.
+
+        A replay runs in another life, so a journaled turn must not reply, send or keep it: its replay would diverge.
+        """
         return self._cell.life
 
     @property
@@ -604,6 +609,12 @@ class ActorContext:
     def _rests(self) -> bool:
         """Whether the turn in hand is at no work: it waits for a moment or a message, or is being handled again."""
         return False
+
+    def _turn_waits(self) -> None:
+        """Take down that the turn in hand waits, or has ended behind a wait."""
+
+    def _turn_goes_on(self) -> None:
+        """Take down that the turn in hand is at work again."""
 
     def _leaves_turn(self) -> bool:
         """Leave the turn in hand, if it rests (for days, perhaps) and the next life runs it again from its start."""

@@ -579,8 +579,9 @@ def _undo(cell: Cell) -> None:
         own.tasks.clear()
         for topic in list(own.topics):
             cell.node.topics.unsubscribe(topic, cell)
-        _free_names(cell)
+        free_names(cell)
         more.ties.watching.clear()
+    cell.host.parent.undone(cell)
     more.suspended, more.trap_exits = 0, False
     queue = cell.queue
     if queue:
@@ -598,9 +599,11 @@ def _undo(cell: Cell) -> None:
         more.stash.clear()
 
 
-def _free_names(cell: Cell) -> None:
-    """Nobody has the names any more that the life at the cell had."""
-    names = cell.extra().belongings.names
+def free_names(cell: Cell) -> None:
+    """Nobody has the names any more that the life at the cell had, or one that was about to begin."""
+    if cell.more is None or not cell.more.has_more:
+        return
+    names = cell.more.belongings.names
     for name in names:
         if cell.node.names.get(name) is cell:  # Else the life has moved, and its names with it.
             del cell.node.names[name]
@@ -623,8 +626,7 @@ def retire(cell: Cell, why: object) -> None:
     queue, cell.queue = cell.queue, None
     more = cell.more
     if more is not None:
-        if more.has_more:
-            _free_names(cell)  # Of a life that was about to begin: another one's end has freed them already.
+        free_names(cell)  # Of a life that was about to begin: another one's end has freed them already.
         if more.bound is not None:
             waiting, more.bound.waiting = more.bound.waiting, deque()
             for ask in waiting:

@@ -14,8 +14,8 @@ import time
 import types
 from asyncio.tasks import _enter_task, _leave_task  # the documented hooks for stepping coroutines in a task's name
 from collections import deque
-from collections.abc import Callable, Generator
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Coroutine, Generator
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from ..errors import WrongThread
 from ..ordered import Ordered
@@ -251,6 +251,8 @@ class RunLoop:
         _leave_task(self.loop, runner.task)
         self.turns_held += 1
         suspended = Suspended(cell, item, turn, waiting, runner)
+        if suspended.marked is not None:
+            suspended.marked._turn_waits()
         cell.extra().turn = suspended
         runner.take(suspended)
 
@@ -391,6 +393,7 @@ class Suspended:
         "is_left",
         "item",
         "killed",
+        "marked",
         "overran",
         "rebinds",
         "runner",
@@ -402,6 +405,8 @@ class Suspended:
     def __init__(self, cell: Cell, item: Any, coroutine: Any, waiting: Any, runner: Runner) -> None:
         self.cell, self.item, self.coroutine, self.waiting, self.runner = cell, item, coroutine, waiting, runner
         self.killed = self.is_left = False  # (left: cancelled, and it does not matter how it ends)
+        ctx = cell.ctx  # Of this life: the cell may have another one before its coroutine ends.
+        self.marked = ctx if ctx is not None and ctx._marks_waits else None  # who is told when it waits, and goes on
         self.overran: BaseException | None = None  # what it has raised, however its coroutine ends
         self.since: float = cell.node.now  # on the loop's clock, of the slice it began in
         self.rebinds: dict[str, Cell] | None = None  # bindings that change when this turn is over
@@ -421,31 +426,32 @@ class Suspended:
 class RunnerTask(asyncio.Task[None]):
     """A runner's task. It tells the run loop of a cancel, which may come from the very step that runs in its name."""
 
-    __slots__ = ("_run_loop", "_runner")
+    __slots__ = ("_runner",)
 
     def __init__(self, runner: Runner, loop: RunLoop) -> None:
-        self._runner, self._run_loop = runner, loop
-        work = runner._run()
-        work.send(None)  # A task that is cancelled before its coroutine has begun would never run it.
-        super().__init__(work, loop=loop.loop, name="holdfast runner", context=loop.base_context)
+        self._runner = runner
+        super().__init__(runner, loop=loop.loop, name="holdfast runner", context=loop.base_context)
 
     def cancel(self, msg: Any = None) -> bool:
-        self._run_loop.strike(self._runner)
+        self._runner.strike()
         return super().cancel(msg)
 
 
-class Runner:
-    """A task in whose name turns are stepped; when a turn suspends, it becomes that turn's task."""
+class Runner(Coroutine[Any, Any, None]):
+    """A task in whose name turns are stepped; when a turn suspends, it becomes that turn's task.
 
-    __slots__ = ("_call", "_loop", "_turn", "task")
+    The runner is what its task runs: a coroutine without a frame, for a turn may wait for days, and many may.
+    """
+
+    __slots__ = ("_call", "_context", "_loop", "_turn", "task")
 
     def __init__(self, loop: RunLoop) -> None:
         self._loop = loop
         self._turn: Suspended | None = None
         self._call: asyncio.Future[None] | None = None  # while it waits for a turn
+        self._context: Context | None = None  # of the turn, when it has taken that over: its actor may lose it before
         self.task = RunnerTask(self, loop)
         loop.joined(self)
-        self.task.add_done_callback(self._done)
 
     def take(self, turn: Suspended) -> None:
         """Wait with this turn from the next tick on."""
@@ -457,71 +463,80 @@ class Runner:
         """End the task of this runner."""
         self.task.cancel()
 
-    def _done(self, _: object) -> None:
-        self._loop.left(self)
+    def strike(self) -> None:
+        """The task is cancelled, perhaps by the turn in this step."""
+        self._loop.strike(self)
 
-    async def _run(self) -> None:
-        begun = False
-        while True:
-            cancelled: asyncio.CancelledError | None = None
-            try:
-                if not begun:
-                    begun = True
-                    await _task_begins()
-                if self._turn is None:
-                    self._call = self._loop.loop.create_future()
-                    await self._call
-            except asyncio.CancelledError as error:
-                # A cancel can come between the turn's first wait and our taking it over: it belongs to the turn.
-                if self._turn is None:
-                    raise
-                cancelled = error
-            turn, self._turn, self._call = self._turn, None, None
-            if turn is None:
-                return
-            error_left: BaseException | None = None
-            try:
-                context = turn.cell.context
-                assert context is not None
-                await _drive(context, turn.coroutine, turn.waiting, cancelled)
-            except BaseException as error:  # The turn's own outcome, whatever it is: its actor gets it.
-                error_left = error
-            self._loop.turn_over(turn, error_left)
-            if not self._loop.idle_again(self):
-                return
+    # -- what its task calls ----------------------------------------------------------------------------------------
 
+    def send(self, value: Any) -> Any:
+        """Go on: with the turn, or to the next one. Returns what the task is to wait for."""
+        turn = self._turn
+        if self._context is not None and turn is not None:
+            return self._step(turn, self._context, turn.coroutine.send, value)
+        if turn is not None:
+            return self._take_over(turn)
+        if self._call is not None:  # Nothing has been given to it: the system is closing.
+            return self._leave()
+        return self._wait()
 
-@types.coroutine
-def _task_begins() -> Generator[None, None, None]:
-    """Wait for the first step of the task to be."""
-    yield
+    def throw(self, error: Any, *_: Any) -> Any:
+        """The same, with what is raised where it waits: a cancel, mostly."""
+        turn = self._turn
+        if self._context is not None and turn is not None:
+            return self._step(turn, self._context, turn.coroutine.throw, error)
+        if turn is None or not isinstance(error, asyncio.CancelledError):
+            self._loop.left(self)
+            raise error
+        # A cancel can come between the turn's first wait and our taking it over: it belongs to the turn.
+        waiting = self._take_over(turn)
+        if waiting is not None:
+            if waiting.cancel(*error.args):  # As `Task.cancel` does: what is waited for is cancelled first.
+                return waiting
+            waiting._asyncio_future_blocking = False  # It is done, and we do not wait for it after all.
+        assert self._context is not None
+        return self._step(turn, self._context, turn.coroutine.throw, error)
 
+    def close(self) -> None:
+        """Give the turn up."""
+        if self._turn is not None:
+            self._turn.coroutine.close()
 
-@types.coroutine
-def _drive(
-    context: Context, turn: Any, waiting: Any, cancelled: asyncio.CancelledError | None
-) -> Generator[Any, Any, None]:
-    """Step a started coroutine to its end inside `context`, handing what it waits for up to the running task."""
-    while True:
+    def __await__(self) -> Generator[Any, Any, None]:
+        raise TypeError("only the task of a runner runs it")
+
+    def _take_over(self, turn: Suspended) -> Any:
+        self._call, self._context = None, turn.cell.context
+        waiting, turn.waiting = turn.waiting, None
+        return waiting
+
+    def _step(self, turn: Suspended, context: Context, step: Callable[[Any], Any], value: Any) -> Any:
+        """Step a started coroutine inside its actor's context; what it waits for is handed to the running task."""
+        error: BaseException | None = None
+        waiting, is_over, marked = None, True, turn.marked
+        if marked is not None:
+            marked._turn_goes_on()
         try:
-            if cancelled is not None:
-                error, cancelled = cancelled, None
-                if waiting is None:
-                    raise error
-                if not waiting.cancel(*error.args):  # As `Task.cancel` does: what is waited for is cancelled first.
-                    waiting._asyncio_future_blocking = False  # It is done, and we do not wait for it after all.
-                    raise error
-            value = yield waiting
-        except GeneratorExit:
-            turn.close()
-            raise
-        except BaseException as error:
-            try:
-                waiting = context.run(turn.throw, error)
-            except StopIteration:
-                return
-        else:
-            try:
-                waiting = context.run(turn.send, value)
-            except StopIteration:
-                return
+            waiting = context.run(step, value)
+            is_over = False
+        except StopIteration:
+            pass
+        except BaseException as raised:  # The turn's own outcome, whatever it is: its actor gets it.
+            error = raised
+        if marked is not None:
+            marked._turn_waits()  # If it was killed, nobody closes it.
+        if not is_over:
+            return waiting
+        self._turn = self._context = None
+        self._loop.turn_over(turn, error)
+        return self._wait() if self._loop.idle_again(self) else self._leave()
+
+    def _wait(self) -> Any:
+        """Have the task wait for the next turn."""
+        call = self._call = self._loop.loop.create_future()
+        call._asyncio_future_blocking = True  # As a future says itself where it is awaited.
+        return call
+
+    def _leave(self) -> NoReturn:
+        self._loop.left(self)
+        raise StopIteration

@@ -19,6 +19,7 @@ from ..errors import (
     NameTaken,
     NoSuchActor,
     SpecError,
+    StartFailed,
     UnknownMessage,
     WrongActor,
     type_name,
@@ -29,7 +30,7 @@ from ..persistence import Keeper, NothingKept
 from ..values.path_parts import check_beside, check_path_part
 from . import lifecycle
 from .blocking_handlers import HandlerThreads
-from .cell import DOWN, GONE, RUNNING, Cell, CellKinds, Host, Scope
+from .cell import DOWN, GONE, RUNNING, Cell, CellKinds, GivenName, Host, Scope
 from .codec import Codec
 from .deadlines import Deadlines
 from .envelope import Item
@@ -366,6 +367,19 @@ class Node(RunLoop):
             raise ActorStopped(cell.path)
         self.names[name] = cell
         cell.extra().belongings.names[name] = scope or "system"
+
+    def name_life(self, cell: Cell, name: GivenName) -> None:
+        """Give a life that is about to begin the name that its spec says.
+
+        Raises:
+            StartFailed: another living actor has it. SpecError: it is empty, or has control characters.
+        """
+        try:
+            self.register(name.text, cell, is_starting=True, scope=name.scope)
+        except NameTaken as taken:
+            holder = self.names[name.text].path
+            why = f"{holder} is registered as {name.text!r} already; free the name, or say another one"
+            raise StartFailed(cell.path, why) from taken
 
     def unregister(self, name: str) -> None:
         """Free a name; unknown ones are fine."""

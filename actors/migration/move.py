@@ -34,7 +34,7 @@ T = TypeVar("T")
 UNWANTED = "it is not wanted any more"
 
 
-class Gate:
+class CommitGate:
     """Where a change that is ready waits for leave to be made, so that several are made at the same instant.
 
     Whoever has the gate can give up the change for which it was made, and no other one of the same actor.
@@ -68,9 +68,9 @@ class Gate:
         """Have a change that is on its way here told when it is not to be."""
         self.closed.add_done_callback(lambda closed: give_up(UNWANTED))
 
-    def passage(self) -> Gate:
+    def passage(self) -> CommitGate:
         """A gate on the way to this one: all may pass, until this one is closed."""
-        before = Gate(self.opened.get_loop())
+        before = CommitGate(self.opened.get_loop())
         before.open()
         self.closed.add_done_callback(lambda closed: before.close())
         return before
@@ -222,7 +222,7 @@ class Move:
         self.is_bound = False  # the old place has let the life go: there is no way back
         self.is_done = False
         self.is_late = False  # its life has ended before it was at rest
-        self.gate: Gate | None = None  # it waits there when all is ready
+        self.gate: CommitGate | None = None  # it waits there when all is ready
         self.moved: Callable[[], None] = lambda: None  # called at once when the new life is the one
         self.ending: asyncio.Future[None] | None = None  # of what is not needed any more
         self._hearing = contextlib.ExitStack()

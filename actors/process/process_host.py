@@ -17,7 +17,7 @@ from ..events import ActorStarted, StoreRefused
 from ..exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
 from ..kernel import lifecycle, links, mailbox
 from ..kernel.address_host import AddressHost, Home, Parent, Place, Work
-from ..kernel.cell import DOWN, GONE, RUNNING, Cell
+from ..kernel.cell import DOWN, GONE, RUNNING, Cell, GivenName
 from ..kernel.codec import Parcel
 from ..kernel.envelope import Ask, Envelope, Item
 from ..kernel.lifecycle import NEAR
@@ -593,6 +593,12 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
         case "gone":
             reason, with_parent = unpack_exit(frame.data.get("reason")), bool(frame.data.get("with_parent"))
             worker.inner.gone(frame.data["path"], reason, with_parent=with_parent)
+        case "undone":
+            worker.inner.undone(frame.data["path"])
+        case "name":
+            said, name = frame.data, GivenName(frame.data["name"], frame.data["scope"])
+            problem = _problem(lambda: worker.inner.named(cell, said["path"], said["kind"], name))
+            worker.accepted(said["answer"], problem)
         case "keep":
             keep(worker, frame)
         case "readdressed":
@@ -609,28 +615,42 @@ def keep(worker: Worker, frame: frames.Command) -> None:
     Raises:
         BadFrame: there is nothing like it to be done.
     """
-    node, path, answer = worker.node, frame.data["path"], frame.data.get("answer")
-    keeper, problem = node.ports.keeper, None
-    try:
-        match frame.data["what"]:
+    node, data = worker.node, frame.data
+    path, keeper = data["path"], node.ports.keeper
+
+    def tell() -> None:
+        match data["what"]:
             case "erase":
-                keeper.erase(path, below=bool(frame.data.get("below")))
+                keeper.erase(path, below=bool(data.get("below")))
             case "roll_back":
-                keeper.roll_back(path, str(frame.data.get("why", "")))
+                keeper.roll_back(path, str(data.get("why", "")))
             case "blame":
                 keeper.blame(path)
             case "returned":
                 keeper.returned(path)
             case "note":
                 above, _, name = path.rpartition("/")
-                keeper.note(child_key(above, name), frame.data.get("value"))
+                keeper.note(child_key(above, name), data.get("value"))
             case what:
                 raise BadFrame(f"an actor process cannot have {what!r} done")
-    except BadFrame:
-        raise
-    except HoldfastError as error:  # The process goes on: it was not its fault.
-        problem = error
+
+    problem, answer = _problem(tell), data.get("answer")
     if answer is not None:
         worker.accepted(answer, problem)
     elif problem is not None:
         node.emit(StoreRefused(path, str(problem)))
+
+
+def _problem(work: Callable[[], None]) -> HoldfastError | None:
+    """Do what an actor process wants done; why it cannot be. The process goes on: it was not its fault.
+
+    Raises:
+        BadFrame: it was.
+    """
+    try:
+        work()
+    except BadFrame:
+        raise
+    except HoldfastError as error:
+        return error
+    return None

@@ -9,7 +9,7 @@ from ..exit_reasons import ExitReason
 from ..kernel import lifecycle, links
 from ..kernel.actor import Actor, Start
 from ..kernel.bindings import claim
-from ..kernel.cell import RUNNING, Cell, Host
+from ..kernel.cell import RUNNING, Cell, GivenName, Host
 from ..kernel.codec import Parcel
 from ..kernel.node import cell_kind
 from .wire.frames import BadFrame
@@ -40,23 +40,44 @@ class Inner:
         Raises:
             BadFrame: that address is not for this process to give.
         """
-        cell = self._cells.get(path)
-        is_new = cell is None or cell.life != life
-        if cell is None:
-            parent, name = self._place(home, path)
-            self._free(home, path)
-            cell = self._node.cell_below(parent, name, self._host)
-            self._cells[path] = cell
-            cell.state, cell.admit = RUNNING, self._admit
-        elif cell.life != life:
+        cell = self._known(home, path, kind)
+        is_new = cell.life != life
+        if is_new and cell.life:
             lifecycle.tell_enders(cell.extra(), last)
         cell.life = life
-        know(cell, kind)
         above = cell_kind(home)
         if above is None or not above._is_part:  # Who is protected is bound at its own address, not in its replicas.
             claim(cell, bound)
         if is_new and self._node.on_life is not None:
             self._node.on_life(cell)
+
+    def named(self, home: Cell, path: str, kind: str, name: GivenName) -> None:
+        """A life is about to begin at `path` below `home`, and is found by this name from its very start.
+
+        Raises:
+            BadFrame: that address is not for this process to give. StartFailed: another living actor has the name.
+            SpecError: it is none.
+        """
+        cell = self._known(home, path, kind)
+        lifecycle.free_names(cell)  # A life has one name by its spec, however often a start is tried.
+        self._node.name_life(cell, name)
+
+    def undone(self, path: str) -> None:
+        """The life at an address is over, or could not be built, and others may follow."""
+        cell = self._cells.get(path)
+        if cell is not None:
+            lifecycle.free_names(cell)
+
+    def _known(self, home: Cell, path: str, kind: str) -> Cell:
+        """The stand-in at an address below `home`, made now if there is none, with the class that lives there."""
+        cell = self._cells.get(path)
+        if cell is None:
+            parent, name = self._place(home, path)
+            self._free(home, path)
+            cell = self._cells[path] = self._node.cell_below(parent, name, self._host)
+            cell.state, cell.admit = RUNNING, self._admit
+        know(cell, kind)
+        return cell
 
     def homed(self, home: Cell, path: str, cell: Cell | None, host: Host) -> Cell:
         """An address below `home` whose own home is here: its cell outlives the process.

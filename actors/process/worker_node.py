@@ -23,7 +23,7 @@ from ..fast_loop import new_event_loop
 from ..kernel import lifecycle, links
 from ..kernel.actor import Start
 from ..kernel.address_host import AddressHost
-from ..kernel.cell import RUNNING, Cell
+from ..kernel.cell import RUNNING, Cell, GivenName
 from ..kernel.envelope import AnyTable, Envelope
 from ..kernel.lifecycle import HERE, MAILBOX
 from ..kernel.message import Message, RuntimeOrder, message_name
@@ -107,6 +107,9 @@ class GuestParent(lifecycle.NearParent):
 
     def __init__(self, guest: Guest) -> None:
         self._guest = guest
+
+    def undone(self, cell: Cell) -> None:
+        self._guest.tell_undone(cell)
 
     def retired(self, cell: Cell) -> None:
         self._guest.address_retired(cell)
@@ -258,6 +261,27 @@ class Guest(Peer):
     def command(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         """Tell the root something about an address."""
         self.connection.send(frames.Command(self.connection.names.to_wire(cell.path), verb, data))
+
+    def claim_name(self, cell: Cell, name: GivenName) -> asyncio.Future[None]:
+        """Have the root give a name to the life of a child that is about to begin here.
+
+        The future fails with StartFailed if another actor has it.
+        """
+        root, start = self.node.root, cell.extra().start
+        assert root is not None
+        assert start is not None
+        cell.table = start.kind._table  # Who finds it by its name may send at once, before there is a life.
+        key, claimed = self.acceptance()
+        claimed.add_done_callback(lambda done: done.exception())  # Whoever has asked may have ended meanwhile.
+        child = {"path": cell.path, "kind": message_name(start.kind)}
+        self.command(root, "name", {**child, "name": name.text, "scope": name.scope, "answer": key})
+        return claimed
+
+    def tell_undone(self, cell: Cell) -> None:
+        """The life of a child is over, and its address may have another one: the root frees what names it had."""
+        root = self.node.root
+        if root is not None and cell is not root and cell.spec is not None:
+            self.command(root, "undone", {"path": cell.path})
 
     def address_retired(self, cell: Cell) -> None:
         """An address of this process is free. The process's own is kept at the root, and the process ends with it."""

@@ -58,6 +58,9 @@ class Worker(Peer):
         self.gate = WorkerGate(self)
         self.inner = Inner(self.node, self)
         self.cell: Cell | None = None
+        self.life = (
+            0  # the number of the life that it has; the next life at its address may begin before it is read out
+        )
         self.home = ""  # the address that it was given; an actor that has left may have another one by now
         self._workers = workers
         self._died: Callable[[Cell, ExitReason], None] | None = None
@@ -129,6 +132,7 @@ class Worker(Peer):
 
     async def _ask_launch(self, cell: Cell, recipe: bytes, options: dict[str, Any]) -> None:
         self._check_program(cell, recipe)
+        self.life = cell.life
         key = self.next_id()
         if self.end.is_buried:
             raise StartFailed(cell.path, "its process has ended")
@@ -317,9 +321,9 @@ class Worker(Peer):
         self._workers.on_note(self, frame)
 
     def _on_line(self, stream: str, text: str) -> None:
-        if self.node.events.has_listeners:
+        if self.node.events.hears_lines:
             path = self.cell.path if self.cell is not None else f"process {self.pid}"
-            self.node.emit(LogLine(path, stream, text))
+            self.node.emit(LogLine(path, stream, text, self.life))
 
     # -- its end ----------------------------------------------------------------------------------------------------
 
@@ -577,8 +581,10 @@ class Workers:
             cell = self.node.find(event.address)
             if cell is not None and cell.more is not None and cell.more.tap is not None:
                 cell.more.tap.hub.emit(event)
-        elif event is not None and self.node.events.has_listeners:
-            self.node.emit(event)
+        elif event is not None:
+            events = self.node.events
+            if events.hears_lines if isinstance(event, LogLine) else events.has_listeners:
+                self.node.emit(event)
 
     def processes(self) -> dict[str, int]:
         """The pid of each actor's process, by address."""

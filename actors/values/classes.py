@@ -7,7 +7,7 @@ import enum
 import sys
 import types
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from importlib import import_module
 from itertools import chain
 from typing import Any, cast
@@ -70,10 +70,13 @@ def class_mark(kind: Any) -> ExtType | None:
     return None
 
 
-def slots_of(kind: type) -> dict[str, Any]:
-    """Descriptors of all slots, by name, inherited ones first."""
+def _slots_of(kind: type) -> dict[str, Any]:
     found = chain.from_iterable(vars(base).items() for base in reversed(kind.__mro__))
     return {name: slot for name, slot in found if type(slot) is types.MemberDescriptorType}
+
+
+slots_of: Callable[[type], dict[str, Any]] = lru_cache(1024)(_slots_of)
+"""Descriptors of all slots of a class, by name, inherited ones first. (Always the same dict: nobody changes it.)"""
 
 
 def defaults_of(kind: Any) -> Defaults:

@@ -42,37 +42,36 @@ class InputRow:
     them or none.
     """
 
-    __slots__ = ("_accepted", "_batches", "_ends", "_home", "_place", "_size", "sources")
+    __slots__ = ("_accepted", "_batches", "_ends", "_home", "_place", "_room", "sources")
 
     def __init__(self, home: Switch, source: Input) -> None:
-        self._home, self._place = home, RowPlace([], 0, [])
-        self.sources: list[Input] = []
-        self._size = 0
+        self._home, self._place = home, RowPlace([])
+        self.sources = [source]
+        self._room = MOST_BYTES - len(source.body)
         self._ends: dict[int, tuple[Primitive, ...]] = {}
         self._batches: dict[int, Batch] = {}  # what follows from these ends
         self._accepted: dict[int, asyncio.Future[None]] = {}
-        self.add(source)
+        source.row = self._place
 
     def takes(self, source: Input) -> bool:
-        """Whether this input may stand here, too."""
-        first = self.sources[0]
-        return (
-            first.name == source.name
-            and first.sender == source.sender
-            and first.held == source.held
-            and first.kind == source.kind == MESSAGE
-            and not first.origin
-            and not source.origin
-            and len(self.sources) < MOST_INPUTS
-            and self._size < MOST_BYTES
-        )
-
-    def add(self, source: Input) -> None:
-        """One more input stands here."""
-        self.sources.append(source)
-        self._size += len(source.body)
-        source.row = place = self._place
-        place.left += 1
+        """Have this input stand here, too; False if it may not."""
+        sources, room = self.sources, self._room
+        first = sources[0]
+        if (
+            room <= 0
+            or len(sources) >= MOST_INPUTS
+            or first.name != source.name
+            or first.sender != source.sender
+            or first.held != source.held
+            or not first.kind == source.kind == MESSAGE
+            or first.origin
+            or source.origin
+        ):
+            return False
+        sources.append(source)
+        source.row = self._place
+        self._room = room - len(source.body)
+        return True
 
     def end(self, number: int, turn: Turn, batch: Batch) -> None:
         """The turn of an input is over before it is written; `batch` has what follows when both are safe."""
@@ -106,6 +105,7 @@ class InputRow:
     def written(self, positions: Sequence[int]) -> None:
         """It stands there in the journal."""
         self._place.positions.append(positions[0])
+        self._place.left = len(self.sources)
         self._home.outputs.rows.written(self)
 
     def safe(self) -> None:
@@ -149,22 +149,22 @@ class QuietEnds:
     weight = 1
     __slots__ = ("_first", "_home", "_inputs")
 
-    def __init__(self, home: Switch, first: int) -> None:
+    def __init__(self, home: Switch, first: int, key: int) -> None:
         self._home, self._first = home, first
-        self._inputs: list[int] = []
+        self._inputs = [key]
 
     @property
     def entries(self) -> Sequence[tuple[str, Entry]]:
         """The row, with all turns that it has got until it is written."""
         return ((self._home.path, ("ends", self._first, tuple(self._inputs))),)
 
-    def takes(self, number: int) -> bool:
-        """Whether this turn follows on the others, and there is room."""
-        return number == self._first + len(self._inputs) and len(self._inputs) < MOST_ENDS
-
-    def add(self, key: int) -> None:
-        """One more turn has ended; `key` is its input."""
+    def takes(self, number: int, key: int) -> bool:
+        """Have the end of one more turn stand here, of this input; False if it does not follow, or there is no room."""
+        count = len(self._inputs)
+        if number != self._first + count or count >= MOST_ENDS:
+            return False
         self._inputs.append(key)
+        return True
 
     def written(self, positions: Sequence[int]) -> None:
         """It stands there in the journal."""
@@ -199,7 +199,6 @@ class TurnRows:
         """
         row = self._row
         if row is not None and row.takes(source):
-            row.add(source)
             return
         row = InputRow(self._home, source)
         if source.kind != MESSAGE:
@@ -234,12 +233,10 @@ class TurnRows:
             return False
         commits.check()
         source = home.ledger.admit(MESSAGE, name, body, home.node.clock.wall(), sender)
-        source.positions, source.ask, source.chain = [], ask, ask.chain
+        source.ask, source.chain = ask, ask.chain
         home.forward(source)  # In front of the submission: the loop comes to its turn before it comes to the store.
         row = self._row
-        if row is not None and row.takes(source):
-            row.add(source)
-        else:
+        if row is None or not row.takes(source):
             self._row = row = InputRow(home, source)
             commits.submit(row)
         self._ahead[source.id] = row
@@ -247,12 +244,10 @@ class TurnRows:
 
     def end_quietly(self, number: int, key: int) -> None:
         """A turn has ended that has let nothing out."""
-        quiet = self._quiet
-        if quiet is None or not quiet.takes(number):
+        if self._quiet is None or not self._quiet.takes(number, key):
             self.close()
-            quiet = self._quiet = QuietEnds(self._home, number)
-            self._home.journal.submit(quiet)
-        quiet.add(key)
+            self._quiet = QuietEnds(self._home, number, key)
+            self._home.journal.submit(self._quiet)
 
     def end_with_input(self, number: int, turn: Turn, batch: Batch) -> bool:
         """Have the end of a turn stand in the row of its input, if that is not written and in its place."""

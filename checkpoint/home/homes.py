@@ -81,23 +81,24 @@ class Homes:
         Raises:
             StartFailed: the class that is to live there would misread what is recorded.
         """
-        switch = self._switches.get(cell.path)
+        path = cell.path
+        switch = self._switches.get(path)
         if switch is None:
-            self._settle_key(cell.path)
-            switch = Switch(self, cell, method, self._journal_of(method), self.planted.get(cell.path))
+            self._settle_key(path)
+            switch = Switch(self, cell, method, self._journal_of(method), self.planted.get(path))
             self._check(switch, cell)
-            self.planted.pop(cell.path, None)
-            self._switches[cell.path] = switch
+            self.planted.pop(path, None)
+            self._switches[path] = switch
             self.rejoin.loaded(switch)
             switch.ties.rename(self.addresses.now)
             self._count_death(switch)
             if self.on_first is not None:
                 begin, self.on_first = self.on_first, None
                 begin()
-        self.absolve(cell.path)
+        self.absolve(path)
         switch.begin_at(cell, method)
         if switch.journal.durable:
-            self.journal.want(cell.path, method.durability)
+            self.journal.want(path, method.durability)
         self.on_home(switch)
         more = cell.extra()
         if more.bound is not None:
@@ -142,9 +143,10 @@ class Homes:
             return
         source.deliveries += 1
         try:
-            source.positions += self.journal.append([(switch.path, ("tried", source.id, source.deliveries))])
+            tried = self.journal.append([(switch.path, ("tried", source.id, source.deliveries))])
         except HoldfastError as error:
             raise StartFailed(switch.path, str(error)) from error
+        source.positions = [*(source.positions or ()), *tried]
         hands.word(self.addresses.key(switch.path))[0] = 0
         if source.deliveries >= switch.method.max_deliveries:
             put_into_quarantine(switch, source)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ...actors.errors import DIVERGES, RAISED_AGAIN, ReplayDiverged
-from ..inputs import NO_POSITIONS, OVERHEAD, Input, RowPlace, Turn, spread
+from ..inputs import NO_DIGESTS, OVERHEAD, Contained, Input, RowPlace, Turn, spread
 from ..life.replay_guard import StateDiverged
 from ..long_waits import due_entry
 from ..protocol import (
@@ -188,7 +188,7 @@ class InputLedger:
         """Number an input, which is open from now on."""
         key = self.next_id
         self.next_id = key + 1
-        source = self.open[key] = Input(key, kind, name, body, time, sender)
+        source = self.open[key] = Input(key, -1, kind, name, body, time, sender)
         if origin:
             source.origin = origin
         self.journal_bytes += len(body) + OVERHEAD
@@ -248,12 +248,16 @@ class InputLedger:
 
     def end_turn(self, source: Input, number: int, status: str, state: int = 0, reply: int = 0) -> Turn:
         """End a turn, with the outputs that it has released."""
-        turn = self.turns[number] = Turn(source, status, self.released, state, reply)
-        self.released, self.begun = [], -1
-        self.lasts = False
-        self.dues.clear()
-        self.turn = source.turn = number
-        source.deliveries = 0
+        digests = NO_DIGESTS
+        if self.released:
+            digests, self.released = self.released, []
+        turn = self.turns[number] = Turn(source, status, digests, state, reply)
+        self.begun, self.lasts = -1, False
+        if self.dues:
+            self.dues.clear()
+        self.turn = number
+        if source.deliveries:
+            source.deliveries = 0
         if status == STASHED:
             source.was_stashed = True
         else:
@@ -364,9 +368,9 @@ class InputLedger:
         """Where in the journal a turn's own entries stand."""
         return self.positions.setdefault(turn, [])
 
-    def drop(self, *sinks: list[int]) -> None:
+    def drop(self, *sinks: list[int] | None) -> None:
         """Have the next snapshot cut what stands there, or will stand there when it is written."""
-        self.dropped += (sink for sink in sinks if sink is not NO_POSITIONS)
+        self.dropped += (sink for sink in sinks if sink is not None)
 
     def drop_input(self, source: Input) -> None:
         """The same of an input that has ended without a turn."""
@@ -374,43 +378,46 @@ class InputLedger:
         if source.row is not None:
             self.shared.gone.append((source.row, source.id))
 
-    def contained_in(self, turn: int) -> list[int]:
-        """The positions that need not follow a snapshot of the state after `turn`."""
+    def contained_in(self, turn: int) -> Contained:
+        """What a snapshot of the state after `turn` contains: found once, for the cut and for all that follows it."""
+        inputs: dict[int, Input] = {}
+        for number, past in self.turns.items():
+            if number <= turn:
+                inputs[past.input.id] = past.input
+            else:  # An image may be behind: what was stashed when it was begun may have been handled since.
+                inputs.pop(past.input.id, None)
+        for key in inputs.keys() & self.open.keys():  # It is only stashed.
+            del inputs[key]
+        rows: dict[RowPlace, list[int]] = {}
+        gone = ((key, row) for row, key in dict.fromkeys(self.shared.gone) if key not in inputs)
+        last: RowPlace | None = None
+        keys: list[int] = []
+        for key, row in itertools.chain(((key, source.row) for key, source in inputs.items()), gone):
+            if row is not last:  # Inputs of one row come one after the other, as a rule.
+                last = row
+                keys = [] if row is None or not row.positions else rows.setdefault(row, [])  # The store has refused it.
+            keys.append(key)
+        return Contained(turn, list(inputs.values()), rows)
+
+    def needless(self, contained: Contained) -> list[int]:
+        """The positions that need not follow such a snapshot."""
         drop = [position for known in self.dropped for position in known]
         own = itertools.chain(self.positions.items(), self.shared.ends.items())
         for number, known in own:  # Those of hooks are there.
-            if number <= turn:
+            if number <= contained.turn:
                 drop += known
-        for source in self._contained_inputs(turn):
-            drop += source.positions
-        for row, keys in self._contained_places(turn).items():
+        for source in contained.inputs:
+            drop += source.positions or ()
+        for row, keys in contained.rows.items():
             if row.left == len(keys):
                 drop += row.positions
         return drop
 
-    def over_after(self, turn: int) -> list[int]:
-        """The inputs that a snapshot of the state after `turn` contains, though their rows have to follow it."""
-        contained = self._contained_places(turn)
-        parted = [row for row in contained if row.left > len(contained[row])]
-        over = [key for row in parted for key in (*row.over, *contained[row])]
-        return over + [key for row in self.shared.parted if row not in contained for key in row.over]
-
-    def _contained_inputs(self, turn: int) -> Iterator[Input]:
-        # An image may be behind: what was stashed when it was begun may have been handled since.
-        later = {past.input.id for number, past in self.turns.items() if number > turn}
-        for number, past in self.turns.items():
-            source = past.input
-            if number <= turn and source.id not in self.open and source.id not in later:  # Else it is only stashed.
-                yield source
-
-    def _contained_places(self, turn: int) -> dict[RowPlace, set[int]]:
-        """The rows of which a snapshot of the state after `turn` contains inputs that no other does, and those."""
-        contained: dict[RowPlace, set[int]] = {}
-        inputs = ((source.row, source.id) for source in self._contained_inputs(turn))
-        for row, key in itertools.chain(inputs, self.shared.gone):
-            if row is not None and row.positions:  # What the store has refused stands nowhere.
-                contained.setdefault(row, set()).add(key)
-        return contained
+    def over_after(self, contained: Contained) -> list[int]:
+        """The inputs that such a snapshot contains, though their rows have to follow it."""
+        rows = contained.rows
+        over = [key for row, keys in rows.items() if row.left > len(keys) for key in (*row.over, *keys)]
+        return over + [key for row in self.shared.parted if row not in rows for key in row.over]
 
     def begin_after(self, meta: Meta) -> None:
         """Begin with a snapshot as the store has it; its entries follow."""
@@ -441,31 +448,30 @@ class InputLedger:
         ledger.next_id, ledger.read = self.next_id, self.read
         return ledger
 
-    def begin_with(self, meta: Meta) -> None:
+    def begin_with(self, meta: Meta, contained: Contained) -> None:
         """Have the next life begin with this snapshot, and forget the turns that it contains."""
-        contained = self._contained_places(meta.turn)
-        for row, keys in contained.items():
+        shared, turn = self.shared, meta.turn
+        for row, keys in contained.rows.items():
             row.left -= len(keys)
-            row.over += keys
-        self.shared.parted = [row for row in dict.fromkeys((*self.shared.parted, *contained)) if row.left]
+            row.over += tuple(keys)
+        shared.parted = [row for row in dict.fromkeys((*shared.parted, *contained.rows)) if row.left]
         self.dropped.clear()
-        self.shared.gone.clear()
+        shared.gone.clear()
         self.newest, self.stash = meta, meta.stash
-        for number in [number for number in self.turns if number <= meta.turn]:
-            turn = self.turns.pop(number)
-            if turn.status != STASHED:
-                self.journal_bytes -= turn.input.size
-        for known in (self.positions, self.shared.ends, self.pipes_done):
-            for number in [number for number in known if number <= meta.turn]:
+        ended = [past for number, past in self.turns.items() if number <= turn and past.status != STASHED]
+        self.journal_bytes -= sum([len(past.input.body) for past in ended]) + OVERHEAD * len(ended)
+        self.turns = {number: past for number, past in self.turns.items() if number > turn}
+        for known in (self.positions, shared.ends, self.pipes_done):
+            for number in [number for number in known if number <= turn]:
                 del known[number]
-        self._forget_outcomes(key for key in self.outcomes if key[0] <= meta.turn)
+        self._forget_outcomes(key for key in self.outcomes if key[0] <= turn)
 
     def give_up(self, number: int) -> Turn:
         """Forget an ended turn that nothing will replay. (In a store it stays until the next snapshot.)"""
         turn = self.turns.pop(number)
         source = turn.input
         if not (source.was_stashed and any(past.input is source for past in self.turns.values())):
-            self.drop(self.positions.pop(number, NO_POSITIONS))  # Perhaps they stand nowhere yet.
+            self.drop(self.positions.pop(number, None))  # Perhaps they stand nowhere yet.
             if source.id not in self.open:  # Else it was put aside, and waits again.
                 self.drop_input(source)
         if turn.status != STASHED:
@@ -502,7 +508,7 @@ class InputLedger:
         """Take a journal entry up again, in order; False if it is of another kind."""
         match entry:
             case ("in", _, _, _, _, _, _, _, *_) | ("ins", _, _, _, *_):
-                place = RowPlace([position], 0, [])
+                place = RowPlace([position])
                 for one in spread(entry):
                     self._read_input(place, *one[1:])
                 if place.over:
@@ -539,7 +545,8 @@ class InputLedger:
             case ("tried", key, count):
                 if key in self.open:
                     self.open[key].deliveries = count
-                    self.open[key].positions.append(position)
+                    source = self.open[key]
+                    source.positions = [*(source.positions or ()), position]
             case _:
                 return False
         return True
@@ -549,10 +556,10 @@ class InputLedger:
         *end: Any,
     ) -> None:  # fmt: skip
         if key in self.shared.over:
-            row.over.append(key)
+            row.over += (key,)
             return
-        source = self.open[key] = Input(key, kind, name, body, when, sender)
-        source.origin, source.positions, source.row = origin, [], row
+        source = self.open[key] = Input(key, -1, kind, name, body, when, sender)
+        source.origin, source.row = origin, row
         row.left += 1
         self.next_id = max(self.next_id, key + 1)
         self.journal_bytes += source.size

@@ -21,7 +21,6 @@ from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.lifecycle import MAILBOX
 from ...actors.persistence import UNFIT
 from ..method import Method
-from ..protocol import LifePort
 from ..recovery.recoveries import Recovery
 from ..snapshot.unreplayed import forget_turns
 from ..turn_word import input_of
@@ -29,6 +28,7 @@ from .disposal import drop_all
 from .held_messages import hold, inlet, let_go
 from .homes import ENDED, Homes
 from .life_ports import RemoteLife, own_records
+from .present_life import LifePort
 from .recorded_home import RecordedHome
 from .switch import Switch
 

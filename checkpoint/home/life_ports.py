@@ -13,6 +13,7 @@ from ..protocol import Released, Snapshot, ToHome, ToLife, TurnEnd, Wanted
 
 if TYPE_CHECKING:
     from ...actors.process.worker_pool import Worker
+    from ..inputs import Input
     from .switch import Switch
 
 FROM_LIFE: msgspec.msgpack.Decoder[ToHome] = msgspec.msgpack.Decoder(ToHome)
@@ -41,6 +42,8 @@ def records_of(worker: Worker, take: Callable[[ToHome], None]) -> frames.TakeRec
                     gate.output(out.to, out.name)
         elif isinstance(record, Wanted):
             gate.claims(record.bindings)
+            if record.register is not None:
+                gate.require_name(record.register.text, record.register.scope)
         elif isinstance(record, Snapshot) and record.image is not None:
             pid = record.image.pid
             if not worker.forked.owns(pid):
@@ -59,6 +62,9 @@ class RemoteLife:
     def __init__(self, path: str, worker: Worker) -> None:
         self._worker, self._connection = worker, worker.connection
         self._below = path[len(worker.home) :]  # of a child of the process's own actor
+
+    def take(self, source: Input) -> None:
+        self.to_life(source.feed())
 
     def to_life(self, record: ToLife) -> None:
         path = self._worker.home + self._below

@@ -16,11 +16,12 @@ from ...actors.kernel.envelope import Chain, waiters
 from ..durable_links import UNDONE_BY, connect
 from ..inputs import Batch
 from ..life.recorded_inbox import STARTED
-from ..protocol import MESSAGE, PIPE, Answer, Hooked, LifePort, Out, PipeDone
+from ..protocol import MESSAGE, PIPE, Answer, Hooked, Out, PipeDone
 from .admission import TurnRows
 from .ask_recovery import origin_asked, origin_kept
 from .held_messages import Inlet, inlet
 from .pending_asks import SwitchAsk, answer_ask, origin_of
+from .present_life import LifePort
 from .recorded_home import switch_of
 
 if TYPE_CHECKING:

@@ -151,13 +151,13 @@ class PendingCalls:
 
     # -- what is owed -----------------------------------------------------------------------------------------------
 
-    def owe(self, source: Input, batch: Batch) -> None:
-        """The turn of an input will answer its ask later."""
+    def owe(self, source: Input, turn: int, batch: Batch) -> None:
+        """The turn of an input has ended, and its ask will be answered later."""
         if source.ask is None:
             return
         self.later[source.id] = source.ask
         if isinstance(source.ask, SwitchAsk):
-            self._home.note(source.turn, ("later", source.turn, source.id), batch)
+            self._home.note(turn, ("later", turn, source.id), batch)
 
     def debts(self) -> dict[int, tuple[str, str]]:
         """The asks from recorded turns that are to be answered later: asker and origin."""

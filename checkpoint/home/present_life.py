@@ -5,14 +5,37 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from ...actors.exit_reasons import Crash
 
 if TYPE_CHECKING:
     from ...actors.errors import ReplayDiverged
     from ...actors.exit_reasons import ExitReason
-    from ..protocol import LifePort
+    from ..inputs import Input
+    from ..protocol import ToLife
+
+
+class LifePort(Protocol):
+    """The way to the present life."""
+
+    @property
+    def begins(self) -> bool:
+        """Whether what is handed to it may be begun at any time from then on. If not, it says itself when."""
+        ...
+
+    @property
+    def is_far(self) -> bool:
+        """Whether that life is in another process."""
+        ...
+
+    def take(self, source: Input) -> None:
+        """Hand a new input to the life, as what it has to know of it; it is handled in order."""
+        ...
+
+    def to_life(self, record: ToLife) -> None:
+        """Hand a record to the life; it is handled in order."""
+        ...
 
 
 @dataclasses.dataclass(slots=True)

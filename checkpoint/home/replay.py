@@ -24,7 +24,7 @@ from ..upgrade.mapping import NotMapped, in_whole_numbers
 from ..upgrade.present_classes import REFUSAL, REPLY_TO
 
 if TYPE_CHECKING:
-    from ..protocol import LifePort
+    from .present_life import LifePort
     from .switch import Switch
 
 Due = tuple[float, int, Turn]

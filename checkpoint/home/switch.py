@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import asyncio
 import functools
+from threading import get_ident
 from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import AskDeadlock, HoldfastError, ReplayDiverged, StartIgnored
 from ...actors.events import RecoveryFailed
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
-from ...actors.kernel.envelope import Ask, Chain, Envelope, Item, waiters
+from ...actors.kernel.envelope import Ask, Chain, Item, waiters
 from ...actors.kernel.message import message_name
 from ...actors.kernel.node import cell_kind
 from ..durable_links import DurableTies
@@ -43,7 +44,6 @@ from ..protocol import (
     Go,
     Hooked,
     Ignored,
-    LifePort,
     Live,
     Marked,
     Out,
@@ -75,7 +75,7 @@ from .journal_limit import Limit
 from .life_ports import SENT
 from .outputs import Outputs
 from .pending_asks import PendingCalls, SwitchAsk, answer_ask, origin_of
-from .present_life import PresentLife, is_end_of
+from .present_life import LifePort, PresentLife, is_end_of
 from .replay import PacedReplay, is_as_before, is_same_reply
 from .replay_filter import declared, turns_to_replay
 
@@ -90,10 +90,11 @@ class Switch:
     def __init__(
         self, homes: Homes, cell: Cell, method: Method, journal: HomeJournal, saved: Saved | None = None
     ) -> None:
-        self.homes, self.node, self.path = homes, homes.node, cell.path
+        self.homes, self.node = homes, homes.node
+        self.path = path = cell.path
         self.cell: Cell | None = cell
         self.method, self.journal = method, journal
-        self.ledger = InputLedger(cell.path)
+        self.ledger = InputLedger(path)
         self.life = PresentLife()
         self.intake = Intake()
         self.calls = PendingCalls(self)
@@ -139,35 +140,41 @@ class Switch:
 
     def admit(self, cell: Cell, item: Any) -> None:
         """Stands in `cell.admit`: number, journal, and feed unless the actor is being recovered."""
-        self.node.check_thread(self.path)
-        message, sender, ask = item, None, None
+        node = self.node
+        if get_ident() != node.thread:
+            node.check_thread(self.path)
+        message, sender = item, None
+        ask: Any = None
         chain: Chain = ()
-        if isinstance(item, Ask):
-            message, sender, ask = item.message, item.sender, item
-            if item.chain and self.waits(item):
-                item.fail(AskDeadlock(self.path, waiters(item.chain)))
-                return
-        elif isinstance(item, Envelope):
+        if isinstance(item, Item):  # Else it is the message itself. (To ask for a struct's class takes longer.)
             message, sender, chain = item.message, item.sender, item.chain
-        if type(message) is Parcel:
+            if item.is_ask:
+                ask = item
+                if chain and self.waits(ask):
+                    ask.fail(AskDeadlock(self.path, waiters(chain)))
+                    return
+        kind = type(message)
+        if kind is Parcel:
             name, body = message.name, message.body
         else:
-            if type(message) not in cell.table:
+            if kind not in cell.table:
                 cell.require(message)
-            name, body = message_name(type(message)), self.node.codec.encode(message, self.path)
+            name, body = message_name(kind), node.codec.encode(message, self.path)
         if self.ledger.journal_bytes >= self.limit.at and not self.limit.has_room(ask):
             return
         origin, bound = None if sender is None else sender.path, self.intake.bound
-        if bound is None or bound.makes_room(ask, name, body, origin):
-            self.take(ask, name, body, origin, chain)
-
-    def take(self, ask: Ask | None, name: str, body: bytes, sender: str | None, chain: Chain = ()) -> None:
-        """Admit a message for which there is room."""
-        if ask is None:
-            told = self.record(MESSAGE, name, body, sender)
-            told.chain = chain
-            self.forward(told)
+        if bound is not None and not bound.makes_room(ask, name, body, origin):
             return
+        if ask is None:
+            told = self.record(MESSAGE, name, body, origin)
+            if chain:
+                told.chain = chain
+            self.forward(told)
+        else:
+            self.take(ask, name, body, origin)
+
+    def take(self, ask: Ask, name: str, body: bytes, sender: str | None) -> None:
+        """Admit an ask for which there is room."""
         origin = origin_of(ask) if isinstance(ask, SwitchAsk) else ""
         try:
             if not origin and self.journal.durable and self.outputs.rows.let_ahead(ask, name, body, sender):
@@ -207,13 +214,14 @@ class Switch:
         if self.intake.bound is not None:
             self.intake.bound.added(source)
         if self.journal.durable:
-            source.positions, source.held = [], True
+            source.held = True
             self.intake.last = source
             if name and name not in self.shapes.noted:
                 self.note_shape(name, batch)
                 self.note_reply(name, batch)
             if batch is not None:
                 self.outputs.rows.close()
+                source.positions = []
                 batch.add(self.path, source.entry(), source.positions)
             else:
                 self.outputs.rows.admit(source)
@@ -256,10 +264,11 @@ class Switch:
         life, bound, rests = self.life, self.intake.bound, self.calls.rests
         if rests.wanted and rests.takes(source):
             return
-        if life.is_released and life.port is not None and (bound is None or bound.may_feed(source)):
-            if source.ask is not None and life.port.begins:
+        port = life.port
+        if life.is_released and port is not None and (bound is None or bound.may_feed(source)):
+            if source.ask is not None and port.begins:
                 source.ask.started = True
-            life.port.to_life(source.feed())
+            port.take(source)
         if rests.wanted:
             rests.show((source,))
 
@@ -402,11 +411,12 @@ class Switch:
         if life.diverged is not None or life.is_void:
             return  # What it became is not what it was: above all, its snapshots must not be kept.
         try:
+            if type(record) is TurnEnd:  # Before a `match`, which takes longer: there is one for each message.
+                self._turn_end(record)
+                if self.method.every:
+                    self.due.count(self.ledger.turn)
+                return
             match record:
-                case TurnEnd():
-                    self._turn_end(record)
-                    if self.method.every:
-                        self.due.count(self.ledger.turn)
                 case Released():
                     self._released(record)
                 case Snapshot():
@@ -431,8 +441,8 @@ class Switch:
                     self.images.mark(record)
                 case Ignored():
                     life.fail(StartIgnored(self.path, record.why))
-                case Wanted() | Closed():
-                    pass  # for whoever begins lives, or hands them over
+                case Wanted() | Closed() | TurnEnd():
+                    pass  # for whoever begins lives, or hands them over; the end of a turn was taken above
         except ReplayDiverged as error:
             life.diverged = error
             if life.fail(error):
@@ -496,7 +506,7 @@ class Switch:
             self.note_shape(shape_name(end.answer), batch)
         self.end_turn(source, end.turn, end.status, batch, end.state, answer_digest(end.answer) if was_asked else 0)
         if end.answer.kind == LATER:
-            self.calls.owe(source, batch)
+            self.calls.owe(source, end.turn, batch)
         elif end.status != STASHED:
             self._lose(source, end)
             self.give(source, end.answer, batch)

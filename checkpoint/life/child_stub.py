@@ -15,7 +15,7 @@ from ...actors.errors import StartFailed
 from ...actors.exit_reasons import ExitReason, pack_exit
 from ...actors.kernel import links
 from ...actors.kernel.address_host import AddressHost, Home, Place
-from ...actors.kernel.cell import DOWN, RUNNING, Cell
+from ...actors.kernel.cell import DOWN, RUNNING, Cell, GivenName
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.lifecycle import MAILBOX, NEAR
 from ...actors.kernel.mailbox import Bounded, Senders
@@ -148,6 +148,9 @@ class ChildPlace(Place):
         self.join(cell)
         cell.host, cell.admit = AddressHost(self.home, self, NEAR), self.home.way_home
 
+    def name(self, cell: Cell, name: GivenName) -> None:
+        """The root gives the name when it is asked for the life, for it has the address."""
+
     def begin_here(self, record: Begin) -> None:
         """Begin the life that is wanted, if it is to be lived here."""
 
@@ -179,7 +182,8 @@ class ChildPlace(Place):
         port = self.join(cell)
         kind, topics = message_name(start.kind), list(start.kind._topics)
         bindings = {name: target.path for name, target in cell.extra().bindings.items()}
-        port.to_home(Wanted(self._number, kind, topics, method, self.home.bound, made, bindings))
+        register = cell.spec.register
+        port.to_home(Wanted(self._number, kind, topics, method, self.home.bound, made, bindings, register))
         return self._up
 
     def is_starting(self, number: int) -> bool:

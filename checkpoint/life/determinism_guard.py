@@ -26,11 +26,12 @@ from types import CodeType, FrameType
 from typing import Any, TypeVar
 
 from ...actors.errors import HoldfastError
+from ...actors.kernel.context import ActorContext
 
 T = TypeVar("T")
 
 CLOCK, DICE, NAME, TASK = "ctx.now()", "ctx.random", "ctx.uuid()", "ctx.pipe_to_self()"
-SELF, WORLD = "ctx.path", "a message, or ctx.pipe_to_self(),"
+SELF, LIVES, WORLD = "ctx.path", "a count in the state", "a message, or ctx.pipe_to_self(),"
 PACKAGE = __name__.partition(".")[0]
 TRUSTED = sys.stdlib_module_names | {PACKAGE, "anyio", "msgpack", "msgspec", "numpy", "structlog", "uvloop"}
 """Top packages whose own calls are their own affair."""
@@ -92,6 +93,8 @@ def _functions() -> dict[CodeType, tuple[str, str]]:
     for owner, prefix, names, instead in listed:
         for name in names:
             found[getattr(owner, name).__code__] = f"{prefix}.{name}", instead
+    life: Any = vars(ActorContext)["life"]  # A property: a replay runs in another life.
+    found[life.fget.__code__] = "ctx.life", LIVES
     return found
 
 

@@ -94,7 +94,7 @@ def answer_beside(life: Life, feed: Feed) -> None:
 
 def _answered(life: Life, feed: Feed) -> Answer:
     message: Message[Any] = life.cell.node.codec.message_in(life.cell, feed.name, feed.body)
-    fed = Fed(life, feed, message, None)
+    fed = Fed(life, feed, message, None, feed.chain)
     try:
         result = fed.call(life.cell.actor)
         if isinstance(result, types.CoroutineType):

@@ -23,7 +23,7 @@ class Asked(NamedTuple):
     message: type[Message[Any]]
 
 
-Awaited: TypeAlias = "Asked | EffectCall | dict[str, type[Message[Any]]] | None"
+Awaited: TypeAlias = "Asked | EffectCall | tuple[type[Message[Any]], ...] | None"
 """What a turn waits for: the reply to a message of that class, an effect, a message of one of these types (none: a
 moment), or that a `send` is accepted."""
 
@@ -136,11 +136,7 @@ class TurnWaits:
     moment: float = 0.0
     resting: int = 0
 
-    def begin(self) -> None:
-        """Have waited for nothing, since another turn begins."""
-        self.moment, self.resting = 0.0, 0
-
-    def rested(self, _: asyncio.Future[Any]) -> None:
+    def rested(self) -> None:
         """Something has come that a turn has waited for, perhaps an earlier one."""
         self.resting = max(0, self.resting - 1)
 

@@ -7,7 +7,7 @@ import dataclasses
 import hashlib
 import random
 from collections.abc import Awaitable, Callable, Generator
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import msgspec
 
@@ -34,6 +34,7 @@ from ...actors.kernel.ref import ActorRef, current
 from ...actors.seconds import check_seconds
 from ...actors.values import encode_value
 from ..protocol import REPLY, SINCE_THEN, Answer, EndWanted, Feed, Perform, Performed, PipeDone
+from ..turn_word import WAITS
 from .life_state import Asked
 from .recorded_inbox import INIT, STARTED, Fed
 
@@ -97,12 +98,53 @@ class Pending(asyncio.Future[Any]):
         super().__init__(loop=life.cell.node.loop)
         self._life, self.when, self.is_out = life, 0.0, False
 
+    # It is its own iterator, so that nothing else is kept while it is awaited, perhaps for days.
+
     def __await__(self) -> Generator[Any, None, Any]:
-        try:
-            return (yield from super().__await__())
-        finally:
-            waits = self._life.waits
-            waits.moment = max(waits.moment, self.when)
+        return self  # type: ignore[return-value]  # what `await` needs of one
+
+    __iter__ = __await__
+
+    def __next__(self) -> Any:
+        if not self.done():
+            self._asyncio_future_blocking = True
+            return self  # To the task, which goes on when it is done.
+        self._move_clock()
+        raise StopIteration(self.result())
+
+    def throw(self, error: BaseException) -> NoReturn:
+        """Its handler does not wait any more."""
+        self._move_clock()
+        raise error
+
+    def _move_clock(self) -> None:
+        waits = self._life.waits
+        waits.moment = max(waits.moment, self.when)
+
+
+class Resting(Pending):
+    """A moment or a message that a turn waits for. When it has come, or is not waited for any more, the turn rests no
+    longer for it, as its handler is about to see. (A callback would be kept as long as the turn waits.)
+    """
+
+    __slots__ = ()
+
+    def set_result(self, result: Any) -> None:
+        self._over_soon()
+        super().set_result(result)
+
+    def set_exception(self, exception: Any) -> None:
+        self._over_soon()
+        super().set_exception(exception)
+
+    def cancel(self, msg: Any = None) -> bool:
+        if not self.done():
+            self._over_soon()
+        return super().cancel(msg)
+
+    def _over_soon(self) -> None:
+        life = self._life
+        life.cell.node.loop.call_soon(life.waits.rested)  # In front of whoever waits for it.
 
 
 class RecordedContext(ActorContext):
@@ -112,6 +154,7 @@ class RecordedContext(ActorContext):
 
     _may_fail_fast = False
     _may_rest = True
+    _marks_waits = True
 
     recorded: Life
     _drawn: int  # the turn that `_random` belongs to
@@ -297,37 +340,37 @@ class RecordedContext(ActorContext):
         if not self._in_turn():
             self._outside()
             return super()._performed(effect)
-        return self._awaited("effect", effect.key, "at most once" if effect.at_most_once else "", 0.0, effect)
+        name = "at most once" if effect.at_most_once else ""
+        return self._awaited(Pending(self.recorded), "effect", effect.key, name, 0.0, effect)
 
-    def _awaited(self, verb: str, to: str, name: str, until: float, kind: Awaited) -> asyncio.Future[Any]:
+    def _awaited(
+        self, outcome: Pending, verb: str, to: str, name: str, until: float, kind: Awaited
+    ) -> asyncio.Future[Any]:
         """An output of the turn in hand, and a future of what comes of it; the turn need not wait for that."""
         life = self.recorded
         k = life.put(verb, to, name, seconds=until)
-        outcome = Pending(life)
         life.waits.outcomes[life.turn, k] = outcome, kind
         life.release()
         return outcome
 
     def _rest(
-        self, verb: str, name: str, seconds: float, kinds: dict[str, type[Message[Any]]], since: str = SINCE_THEN
+        self, verb: str, name: str, seconds: float, kinds: tuple[type[Message[Any]], ...], since: str = SINCE_THEN
     ) -> asyncio.Future[Any]:
         """Wait for what the home waits for: nothing of it is out."""
-        life, outcome = self.recorded, self._awaited(verb, since, name, seconds, kinds)
-        life.waits.resting += 1
-        outcome.add_done_callback(life.waits.rested, context=life.cell.context)  # Else it is given a copy of its own.
+        outcome = self._awaited(Resting(self.recorded), verb, since, name, seconds, kinds)
+        self.recorded.waits.resting += 1
         return outcome
 
     def _slept(self, seconds: float, *, is_moment: bool) -> asyncio.Future[None]:
         if self._in_turn():
-            return self._rest("sleep", "", seconds, {}, "" if is_moment else SINCE_THEN)
+            return self._rest("sleep", "", seconds, (), "" if is_moment else SINCE_THEN)
         self._outside()
         return super()._slept(seconds, is_moment=is_moment)
 
     def _signal(self, kinds: tuple[type[Message[Any]], ...], timeout: float | None) -> asyncio.Future[Message[Any]]:
         if not self._in_turn():
             raise HoldfastError(f"{self.path}: only a turn can wait for a message")
-        names = {message_name(kind): kind for kind in kinds}
-        return self._rest("wait", "|".join(names), timeout or 0.0, names)
+        return self._rest("wait", "|".join(map(message_name, dict.fromkeys(kinds))), timeout or 0.0, kinds)
 
     def perform(self, order: Perform, effect: EffectCall, outcome: Pending) -> None:
         """Perform an effect of the turn in hand, in a task of its own, and have the home journal what it comes to."""
@@ -378,7 +421,7 @@ class RecordedContext(ActorContext):
         if life.hook == STARTED:  # In a process, what was put aside may not be here yet.
             life.restored.unstashes = True
         stash, life.stash = life.stash, []
-        again = [Fed(life, once_more(fed.feed), fed.message, fed.sender) for fed in stash]
+        again = [Fed(life, once_more(fed.feed), fed.message, fed.sender, fed.feed.chain) for fed in stash]
         life.returned = {fed.feed.id: fed for fed in again} | life.returned  # in front of those put back before
         if life.is_live:
             life.handle_returned()
@@ -413,6 +456,12 @@ class RecordedContext(ActorContext):
 
     def _rests(self) -> bool:
         return self.recorded.waits.resting > 0 or not self.recorded.is_live
+
+    def _turn_waits(self) -> None:
+        self.recorded.mark(WAITS)
+
+    def _turn_goes_on(self) -> None:
+        self.recorded.mark()
 
     def _leaves_turn(self) -> bool:
         more = self._cell.more

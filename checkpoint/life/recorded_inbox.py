@@ -5,14 +5,16 @@ from __future__ import annotations
 import types
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from ...actors.errors import HoldfastError, RemoteCrash, StartFailed, type_name
 from ...actors.exit_reasons import NORMAL, ExitReason, unpack_exit
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import Cell
-from ...actors.kernel.envelope import LEAVE, Item, ReplyHandle
+from ...actors.kernel.envelope import LEAVE, Chain, Item, ReplyHandle
 from ...actors.kernel.message import Message, Refusal, reply_type
-from ..protocol import CRASH, DROPPED, LATER, OK, START, STASHED, Answer, Feed, Go
+from ..protocol import CRASH, DROPPED, LATER, NO_ANSWER, OK, START, STASHED, Answer, Feed, Go
 from ..snapshot.key_variables import check_saved
 
 if TYPE_CHECKING:
@@ -24,14 +26,15 @@ INIT, STARTED, RECOVERED, STOP = "init", "start", "recovered", "stop"
 """The hooks that are no turns: `__init__`, `on_start(True)`, `on_recovered`, `on_stop`."""
 
 
-class Fed(Item):
-    """An input in the mailbox of its life."""
+class Fed(Item, msgspec.Struct, eq=False):
+    """An input in the mailbox of its life. (A struct, as an envelope is: there is one for each message.)"""
 
-    __slots__ = ("chain", "feed", "is_stashed", "life", "message", "sender")
-
-    def __init__(self, life: Life, feed: Feed, message: Any, sender: Cell | None) -> None:
-        self.life, self.feed, self.message, self.sender = life, feed, message, sender
-        self.chain, self.is_stashed = feed.chain, False
+    life: Any  # the `Life` that is to handle it
+    feed: Feed
+    message: Any  # None: it is still encoded, or brings none
+    sender: Any  # the sending actor's Cell; None from outside
+    chain: Chain
+    is_stashed: bool = False
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -39,11 +42,12 @@ class Fed(Item):
         feed: Feed = item.feed
         life.open_turn(feed)
         if feed.deadline and feed.turn < 0 and life.cell.node.clock.is_past(feed.deadline):
-            life.close_turn(DROPPED, Answer())  # Nobody waits any more.
+            life.close_turn(DROPPED, NO_ANSWER)  # Nobody waits any more.
             return None
         if item.message is None and feed.name:
+            cell = life.cell
             try:
-                item.message = life.cell.node.codec.message_in(life.cell, feed.name, feed.body)
+                item.message = cell.node.codec.message_for(cell, feed.name, feed.body)
             except HoldfastError as error:  # It came encoded, and is none of ours.
                 life.close_turn(DROPPED, life.answer_error(error))
                 return None
@@ -55,8 +59,8 @@ class Fed(Item):
         if type(result) is Coroutine_:
             if life.guard is not None:
                 result = life.guard.drive(result)
-            return item.finish(result if life.page is None else life.drive(result))
-        item.end_with(result)
+            return item.finish(result)
+        item.end(item.answer(result) if feed.is_ask else NO_ANSWER)
         return None
 
     @property
@@ -72,6 +76,11 @@ class Fed(Item):
 
     def call(self, actor: Any) -> Any:
         """Call the handler or hook that this input is for."""
+        message = self.message
+        return self._call_hook(actor) if message is None else actor._table[type(message)](actor, message)
+
+    def _call_hook(self, actor: Any) -> Any:
+        """What brings no message is for a hook, or is what background work has raised."""
         feed = self.feed
         node: Node = self.life.cell.node
         match feed.kind:
@@ -91,12 +100,10 @@ class Fed(Item):
                 return actor.on_down(
                     node.cell_at(data["source"]).ref, unpack_exit(data["reason"]), bool(data["recovering"])
                 )
-            case "pipe" if not feed.name:
+            case _:
                 error = node.codec.decode_error(CRASH, "", feed.body)
                 assert isinstance(error, RemoteCrash)
                 raise error
-            case _:
-                return actor._table[type(self.message)](actor, self.message)
 
     async def finish(self, handler: Any) -> None:
         """The turn of an async handler."""
@@ -105,23 +112,21 @@ class Fed(Item):
         except Refusal as no:
             self.refuse(no)
         else:
-            self.end_with(result)
+            self.end(self.answer(result) if self.feed.is_ask else NO_ANSWER)
 
     def refuse(self, no: Refusal) -> None:
         """The handler said no, which is an answer; nobody has asked an actor to start."""
         if self.feed.kind == START:
             raise StartFailed(self.life.cell.path, str(no)) from no
-        self.end(self.life.answer_error(no) if self.feed.is_ask else Answer())
+        self.end(self.life.answer_error(no) if self.feed.is_ask else NO_ANSWER)
 
-    def end_with(self, result: object) -> None:
-        """End the turn with what the handler has returned."""
-        if not self.feed.is_ask:
-            self.end(Answer())
-        elif isinstance(result, ReplyHandle):
-            self.end(Answer(LATER))
-        else:
-            kind: type[Message[Any]] = type(self.message)
-            self.end(self.life.answer_value(result, reply_type(kind), type_name(kind)))
+    def answer(self, result: object) -> Answer:
+        """What the handler has returned, as whoever has asked gets it."""
+        if isinstance(result, ReplyHandle):
+            return Answer(LATER)
+        kind: type[Message[Any]] = type(self.message)
+        answer: Answer = self.life.answer_value(result, reply_type(kind), type_name(kind))
+        return answer
 
     def end(self, answer: Answer) -> None:
         """The turn is over; a stashed message stays open."""
@@ -129,9 +134,9 @@ class Fed(Item):
         if self.feed.kind == START and self.feed.turn < 0 and life.cell.actor is not None and life.saving.is_needed:
             check_saved(life.cell.actor, life.method)  # What cannot be saved is refused now, not when it is needed.
         if self.is_stashed:
-            life.close_turn(STASHED, Answer())
+            life.close_turn(STASHED, NO_ANSWER)
         else:
-            life.close_turn(OK, answer if self.feed.is_ask else Answer())
+            life.close_turn(OK, answer)
 
     def is_start(self) -> bool:
         return self.feed.kind == START

@@ -9,9 +9,8 @@ from __future__ import annotations
 import functools
 import hashlib
 import time
-import types
-from collections.abc import Callable, Coroutine, Generator
-from typing import Any, Final, NoReturn, Protocol, TypeVar
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final, NoReturn, Protocol
 
 from ...actors.control.trace_tail import follow
 from ...actors.effects import EffectCall
@@ -40,6 +39,7 @@ from ..protocol import (
     FAILED,
     MESSAGE,
     MOMENT,
+    NO_ANSWER,
     OK,
     REPLY,
     START,
@@ -69,7 +69,6 @@ from ..protocol import (
 )
 from ..snapshot.image_writer import Imaging
 from ..snapshot.key_variables import check_keys, restore_state, save_state, variables
-from ..turn_word import WAITS
 from .determinism_guard import DeterminismGuard
 from .glances import answer_beside
 from .life_state import Asked, Awaited, HookTimers, LifeStage, RestoredState, SnapshotState, TurnWaits
@@ -78,7 +77,8 @@ from .recorded_context import Pending, RecordedContext
 from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
 from .replay_guard import digest_of
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from ..inputs import Input
 
 NOT_SAVED: Final = -2
 """In place of the turn after which the last snapshot was made: none has the state as it is."""
@@ -194,6 +194,10 @@ class Life:
 
     # -- records from home ------------------------------------------------------------------------------------------
 
+    def take(self, source: Input) -> None:
+        """Take a new input from a home in this process: as it is, if a feed would not say more or less."""
+        self._take(source if source.ask is None and not source.origin else source.feed())
+
     def to_life(self, record: ToLife) -> None:
         """Take what the home says, in order."""
         match record:
@@ -225,15 +229,15 @@ class Life:
         cell = self.cell
         returned = self.returned.get(feed.id)  # until its turn begins: it may be taken from the queue again
         if returned is not None:
-            fed = Fed(self, feed, returned.message, returned.sender)
+            fed = Fed(self, feed, returned.message, returned.sender, feed.chain)
         else:
             sender = None if feed.sender is None else cell.node.cell_at(feed.sender)
-            fed = Fed(self, feed, None, sender)
+            fed = Fed(self, feed, None, sender, feed.chain)
         if feed.chain and feed.turn < 0:  # What is handled again is no new work.
             follow(fed)
         if feed.kind == TICK and feed.origin in self.timers.cancelled and feed.turn < 0:
             return  # Its timer was cancelled while it was on its way; the home drops it too.
-        if feed.id in self.restored.stash_ids and feed.turn < 0 and not self.is_live:
+        if not self.is_live and feed.turn < 0 and feed.id in self.restored.stash_ids:
             if self.restored.unstashes:
                 self.returned[feed.id] = fed
             else:
@@ -242,8 +246,13 @@ class Life:
         self._queue(fed)
 
     def _queue(self, item: Item) -> None:
-        mailbox.queue_of(self.cell).append(item)
-        self.cell.schedule()
+        cell = self.cell
+        queue = cell.queue
+        if queue is None:
+            queue = mailbox.queue_of(cell)
+        queue.append(item)
+        if not cell.scheduled:
+            cell.schedule()
 
     def _outcome(self, record: Outcome) -> None:
         if record.taken >= 0:
@@ -280,7 +289,8 @@ class Life:
             return self.cell.node.codec.decode_reply(awaited.message, answer.body)
         if isinstance(awaited, EffectCall):
             return decode_value(answer.body)
-        return self.cell.node.codec.decode(awaited[answer.name], answer.body)
+        kind = next(kind for kind in awaited if message_name(kind) == answer.name)
+        return self.cell.node.codec.decode(kind, answer.body)
 
     def _perform(self, order: Perform) -> None:
         """An effect of the turn in hand has no outcome yet."""
@@ -302,37 +312,17 @@ class Life:
             self.turn += 1
         if self.returned:
             self.returned.pop(feed.id, None)  # It has come again: its feed may have been here before it was put back.
-        self.feed, self.outs, self.last_k, self.stage.ending = feed, [], 0, None
-        self.waits.begin()
+        self.feed, self.last_k, self.stage.ending = feed, 0, None
+        self.waits.moment, self.waits.resting = 0.0, 0
+        if self.outs:  # What a turn that was left in the middle has said does not count.
+            self.outs = []
         if self.page is not None:
             self.page[0] = feed.id + 1
 
-    @types.coroutine
-    def drive(self, driven_turn: Coroutine[Any, Any, T]) -> Generator[Any, Any, T]:
-        """Run a turn to its end; the page says when it waits. (`turn_stacks.DRIVEN` is the name of the parameter.)"""
+    def mark(self, how: int = 0) -> None:
+        """Say on the page that the turn in hand is at work, or (WAITS) that it waits."""
         feed = self.feed
-        value: Any = None
-        thrown: BaseException | None = None
-        while True:
-            try:
-                yielded = driven_turn.send(value) if thrown is None else driven_turn.throw(thrown)
-            except StopIteration as done:
-                return done.value  # type: ignore[no-any-return]  # what the turn returns
-            except BaseException:
-                self._mark(feed, WAITS)  # If it was killed, nobody closes it.
-                raise
-            self._mark(feed, WAITS)
-            try:
-                value, thrown = (yield yielded), None
-            except GeneratorExit:
-                driven_turn.close()
-                raise
-            except BaseException as error:
-                thrown = error
-            self._mark(feed)
-
-    def _mark(self, feed: Feed | None, how: int = 0) -> None:
-        if self.page is not None and feed is not None and feed is self.feed:  # Else its life was abandoned.
+        if self.page is not None and feed is not None:  # Else it is over, or its life was abandoned.
             self.page[0] = (
                 0 if how and self.waits.resting else feed.id + 1 | how
             )  # What rests for days ends no process.
@@ -347,10 +337,9 @@ class Life:
             if self.method.check_replay and self.cell.actor and status in (OK, STASHED)
             else 0
         )
-        self.feed = None
+        outs, self.feed, self.outs = self.outs, None, []
         ends = None if status == FAILED else self.stage.ending
-        self.port.to_home(TurnEnd(self.turn, feed.id, status, self.outs, answer, state, ends))
-        self.outs = []
+        self.port.to_home(TurnEnd(self.turn, feed.id, status, outs, answer, state, ends))
         if self.page is not None:
             self.page[0] = 0
         if self.is_live and self.stage.begun >= 0:
@@ -402,7 +391,7 @@ class Life:
         self.enter(STOP)  # That is what is left.
         # The start of a protected actor tells it, and under replay it must not happen at all.
         is_heard = feed.is_ask or feed.kind == START or feed.turn >= 0
-        self.close_turn(FAILED, self.answer_error(remote_crash(error)) if is_heard else Answer())
+        self.close_turn(FAILED, self.answer_error(remote_crash(error)) if is_heard else NO_ANSWER)
 
     def answer_error(self, error: BaseException) -> Answer:
         """An error as the asker will get it."""

@@ -126,6 +126,8 @@ class FarParent(Parent):
         if wanted.bound is not None and not isinstance(cell.extra().bound, RemoteBound):
             cell.extra().bound = Bound(wanted.bound.capacity, wanted.bound.overflow)
         try:
+            if wanted.register is not None:
+                cell.node.name_life(cell, wanted.register)
             host = self._host_for(cell, wanted)
             cell.host = host
             context = cell.node.base_context.copy()  # Not in that of the socket, which is whoever's had the process.
@@ -486,5 +488,6 @@ def _tell_end(cell: Cell, reason: ExitReason, *, recovers: bool) -> None:
     """Tell of the end of a life whose supervisor is in another process: that one decides what follows."""
     more = cell.extra()
     cell.state, more.reason = DOWN, reason
+    lifecycle.free_names(cell)
     links.announce(cell, reason, recovering=recovers)
     lifecycle.tell_enders(more, reason)

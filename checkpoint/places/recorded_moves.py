@@ -21,10 +21,11 @@ from ...actors.migration.worker import FromOwnWorker, FromWorker, ToWorker
 from ...actors.process.process_host import WorkerPlace
 from ..home.journal_home import JournalHome
 from ..home.life_ports import RemoteLife, records_of
+from ..home.present_life import LifePort
 from ..home.switch import Switch
 from ..life.recorded_inbox import StopRecorded
 from ..life.recorded_life import Life
-from ..protocol import LifePort, Live, ToHome
+from ..protocol import Live, ToHome
 from .life_here import LifeHere, LocalHome
 
 if TYPE_CHECKING:

@@ -136,7 +136,7 @@ class Recoveries:
     def phase(self, recovery: Recovery, phase: str, when: float) -> None:
         """A phase is over, the next one begins: the controller tells of it."""
         since, recovery.since = recovery.since, max(recovery.since, when)
-        if self._node.events.has_listeners:
+        if self._node.events.hears_unkept:
             spent, total = recovery.since - since, max(0.0, recovery.since - recovery.noticed)
             self._untold.append(RecoveryPhase(recovery.path, recovery.number, recovery.attempt, phase, total, spent))
             if len(self._untold) == 1 and self._controller is not None:
@@ -154,7 +154,10 @@ class Recoveries:
         if recovery is None or "over" in recovery.stages:
             return
         self.phase(recovery, "release", time.monotonic())
-        self._ask(recovery, "over")
+        if self.needs(recovery, "over") or self.safety.holds(path):
+            self._ask(recovery, "over")
+        else:  # As it mostly is, and for the whole of a tree at once when a program begins again.
+            self._finish(recovery)
 
     def given_up(self, path: str, why: str) -> None:
         """Nobody lives there any more: who was safe because of it stays so (T17), until it is back."""

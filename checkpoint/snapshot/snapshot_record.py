@@ -13,7 +13,7 @@ from ...actors.persistence import UNFIT
 from ..durable_links import Tie
 from ..durable_timers import Saved
 from ..encoding.compression import PLAIN, compressor, decompress
-from ..inputs import spread
+from ..inputs import Contained, spread
 from ..journal import DamagedStore, Entry
 from ..journal import Saved as Journaled
 from ..protocol import DOWN, EXIT, OK, STASHED, TICK, TIMED, Answer, Snapshot, timed, untimed
@@ -206,15 +206,17 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
     Raises:
         HoldfastError: it could not be kept, and nothing has changed.
     """
+    contained = Contained(meta.turn)
     if home.journal.durable:
         made = msgspec.structs.replace(meta.made, shapes=home.shapes.saved(meta.turn))
         meta = msgspec.structs.replace(meta, made=made)
         home.journal.barrier()  # From here on it is known where everything stands.
-        drop = home.ledger.contained_in(meta.turn)
-        meta = msgspec.structs.replace(meta, over=home.ledger.over_after(meta.turn))
+        contained = home.ledger.contained_in(meta.turn)
+        drop = home.ledger.needless(contained)
+        meta = msgspec.structs.replace(meta, over=home.ledger.over_after(contained))
         home.journal.cut(home.path, encode_meta(meta, home.method.compress), drop, turn=meta.turn, keep=keep)
     home.images.cancel()
-    home.ledger.begin_with(meta)
+    home.ledger.begin_with(meta, contained)
 
 
 def go_back(home: Switch, meta: Meta) -> None:

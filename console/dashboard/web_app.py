@@ -25,6 +25,7 @@ from ..wire import (
     AskDiagnosis,
     AskHistory,
     AskLives,
+    AskLogs,
     AskQuarantined,
     AskWhy,
     ControlActor,
@@ -60,7 +61,7 @@ HEADERS: Final = {
 }
 """What is said with each answer: nothing is loaded from elsewhere, framed by others, or made a script of."""
 
-Question = About | InspectActor | AskHistory | AskLives | AskWhy | AskQuarantined | AskDiagnosis
+Question = About | InspectActor | AskHistory | AskLives | AskLogs | AskWhy | AskQuarantined | AskDiagnosis
 """What whoever may look may ask."""
 Body = TypeVar("Body")
 Handler = Callable[[Request, Login], Awaitable[Response]]
@@ -249,8 +250,9 @@ class Dashboard:
 
     async def _ask(self, request: Request, login: Login) -> Response:
         asked = await _body(request, Question | ShowState | ShowRepair)  # type: ignore[arg-type]  # a union is no class
-        if isinstance(asked, ShowState):
+        if isinstance(asked, ShowState | AskLogs):  # What is printed may be the content of messages.
             check_role(login, self._state_role)
+        if isinstance(asked, ShowState):
             question: Any = ControlActor("outline", asked.path, [], ANSWER)
         else:
             question = OrderRepair("status", (), ANSWER) if isinstance(asked, ShowRepair) else _bounded(asked)
@@ -266,8 +268,8 @@ class Dashboard:
 
 def _bounded(asked: Any) -> Any:
     """A question that is answered in good time, and waits for nothing."""
-    if isinstance(asked, AskHistory):
-        return AskHistory(asked.question)
+    if isinstance(asked, AskHistory | AskLogs):
+        return msgspec.structs.replace(asked, wait=0.0)
     if isinstance(asked, InspectActor | AskWhy | AskDiagnosis):
         return msgspec.structs.replace(asked, timeout=min(max(asked.timeout, 0.1), ANSWER / 2))
     return asked

@@ -40,6 +40,8 @@ ACTOR: Final = (
     "running",
     "names",
 )
+OF_ONE_SPEC: Final = ("name", "kind", "children", "strategy", "id", "start")
+"""Keys at the top of a file for `hf.load_tree`."""
 STRATEGIES: Final = ("one_for_one", "one_for_all", "rest_for_one")
 
 
@@ -59,6 +61,9 @@ class TreeFile:
         below = tables.pop("below", None)
         self.actors: dict[str, WantedActor] = {}
         for path, table in tables.items():
+            if path in OF_ONE_SPEC:
+                problem = "this is one supervisor as hf.load_tree reads it, for system.start: here is"
+                raise self.error(path, f'{problem} a table for each address, ["/app/bank"], of the whole tree')
             if not isinstance(table, dict) or not path.startswith("/"):
                 raise self.error(path, 'there are `below = "/app"`, and tables named for an address: ["/app/bank"]')
             self.actors[path] = self._read(path.rstrip("/"), cast("dict[str, Any]", table))
@@ -116,7 +121,7 @@ class TreeFile:
         try:
             spec = self._supervisor(path, given) if is_supervisor else self._actor(path, given)
         except (HoldfastError, TypeError, ValueError, DamagedValue) as error:
-            problem = error.problem if isinstance(error, SpecError) else str(error)
+            problem = error.problem if isinstance(error, (SpecError, DamagedValue)) else str(error)
             if isinstance(error, SpecError) and error.where.startswith(self._name):
                 raise
             raise self.error(path, problem, next((key for key in given if key in problem), None)) from error
@@ -163,7 +168,9 @@ class TreeFile:
         if not isinstance(args, list):
             raise self.error(path, "args must be a list", "args")
         start: Start[Any] = Start(kind, tuple(args), dict(kwargs))
-        return child(path.rpartition("/")[2], start, autostart=given.get("running", True), **options)
+        register = next(iter(self._texts(path, "names", given.get("names", []))), None)  # Others are of its life.
+        running = given.get("running", True)
+        return child(path.rpartition("/")[2], start, autostart=running, register=register, **options)
 
     def _recovery(self, path: str, given: object) -> Any:
         settings = cast("dict[str, Any]", dict(given) if isinstance(given, dict) else {"method": given})

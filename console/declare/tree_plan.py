@@ -15,7 +15,7 @@ from ...supervision.spec import ChildSpec
 from ...system.recovery import RecoverySupervisor
 from ...system.transaction.arrangement import Arrangement
 from ...system.transaction.change import Change
-from ...system.transaction.draft import Draft, DraftPlace
+from ...system.transaction.draft import Draft, DraftPlace, is_elsewhere
 from ...system.transaction.living import ReplaceActorCode
 from ...system.transaction.mechanisms import Isolate, Protect
 from ...system.transaction.operation import Operation
@@ -235,9 +235,7 @@ class TreePlan:
     def _spec_of(self, one: WantedActor, fresh: dict[str, WantedActor]) -> ChildSpec:
         """The spec of one that is new, with all that is new below it."""
         assert one.spec is not None
-        register = one.spec.register if one.names is None else next(iter(one.names), None)
-        scope = "system" if register is None else one.spec.scope
-        spec = dataclasses.replace(one.spec, bindings=self._bound_early(one, fresh), register=register, scope=scope)
+        spec = dataclasses.replace(one.spec, bindings=self._bound_early(one, fresh))
         below = [inner for inner in fresh.values() if inner.above == one.path]
         if not spec.is_supervisor or not below or len(spec.start.args) != 2:
             return spec
@@ -260,6 +258,8 @@ class TreePlan:
         ):
             yield other_code(place, spec.start, path)
         options = {name: getattr(spec, name) for name in CHANGEABLE if getattr(spec, name) != getattr(now, name)}
+        if self._renamed(wanted, place):
+            options["register"] = spec.register
         if options:
             yield Respecify(path, options)
         file = self._system._homes.file
@@ -271,6 +271,22 @@ class TreePlan:
             yield Isolate(path, spec.isolation)
         if not _same_stack(spec.mechanism, now.mechanism):
             yield Protect(path, spec.mechanism)
+
+    @staticmethod
+    def _renamed(wanted: WantedActor, place: DraftPlace) -> bool:
+        """Whether its next lives are to have another name, which its supervisor gives them.
+
+        A file does not say who finds an actor by its name: that stays. Nor is the spec of a child another by it whose
+        supervisor is in another process: only the present life has other names then.
+        """
+        assert wanted.spec is not None
+        assert place.spec is not None
+        new, now = wanted.spec.register, place.spec.register
+        if place.parent is not None and place.parent.cell is not None and is_elsewhere(place.parent.cell):
+            return False
+        if wanted.names is not None and new is not None and now is not None:
+            return new.text != now.text
+        return new != now
 
     def _changed_flags(self, wanted: WantedActor, place: DraftPlace) -> Iterator[Operation]:
         now, flags, path = place.flags, wanted.flags, wanted.path

@@ -1,17 +1,52 @@
-"""The command that follows the messages of one actor: trace."""
+"""The commands that follow what actors do and say: trace, logs."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import datetime
+import re
 import time
-from typing import Annotated, Any
+from collections.abc import Iterable
+from enum import StrEnum
+from typing import Annotated, Any, Final
 
+import msgspec
 import typer
 
-from .reaching import FAILED, Json, OnePath, Socket, System, ended, meant_rows, reached, show_json
+from ...system import LoggedLine
+from ..remote import RemoteSystem
+from .reaching import (
+    FAILED,
+    UNUSABLE,
+    Json,
+    OnePath,
+    Socket,
+    System,
+    complete_path,
+    ended,
+    meant_rows,
+    reached,
+    show_json,
+)
+from .told_lines import log_line
 
 SLICE = 1.0
 """Seconds that one request for more waits."""
+ONE_WAIT: Final = 30.0
+"""Seconds that one request of `logs --follow` waits for the next line."""
+AGO: Final = re.compile(r"(?P<number>\d+(?:\.\d+)?)(?P<unit>[smhd]?)")
+SECONDS: Final = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
+
+
+class LogLevel(StrEnum):
+    """How grave a line is."""
+
+    DEBUG = "debug"
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+    CRITICAL = "critical"
 
 
 def trace(
@@ -47,6 +82,86 @@ def trace(
                 missed = told["missed"]
             if told["is_over"]:
                 return
+
+
+def logs(
+    path: Annotated[
+        str,
+        typer.Argument(help="An address, a name, or a pattern such as '/app/bank/**'.", autocompletion=complete_path),
+    ] = "**",
+    system: System = None,
+    socket: Socket = None,
+    follow: Annotated[
+        bool, typer.Option("--follow", "-f", help="Go on with lines as they come, until Ctrl+C.")
+    ] = False,
+    last: Annotated[int, typer.Option("--last", min=1, max=1000, help="How many, the newest.")] = 50,
+    since: Annotated[
+        str | None,
+        typer.Option(metavar="WHEN", help="Only lines since then: 90s, 10m, 2h, 1d ago, or 2026-01-31T12:00."),
+    ] = None,
+    level: Annotated[LogLevel, typer.Option(help="Only lines as grave as this: stdout is info, stderr warning.")] = (
+        LogLevel.DEBUG
+    ),
+    as_json: Json = False,
+) -> None:
+    """Print the last lines that actors' processes have printed, and what holdfast has logged, oldest first.
+
+    Each says which life of the actor it is from. With --json each line is one JSON object.
+
+    Exit status 0: done. 1: nobody is there, and nothing is kept of it. 2: no system answers.
+    """
+    try:
+        begin = 0.0 if since is None else moment_meant(since, time.time())
+    except ValueError as error:
+        raise ended("logs", f"--since: {error}", UNUSABLE) from error
+    with reached("logs", system, socket) as remote, contextlib.suppress(KeyboardInterrupt):
+        path = _address_of(remote, path)
+        page = remote.logs(path, level=level.value, since=begin, limit=last)
+        print_log(page.lines, as_json=as_json)
+        if not page.lines and not follow:
+            why_empty(remote, path)
+        while follow:
+            page = asyncio.run(remote.follow_logs(path, level=level.value, after=page.next, timeout=ONE_WAIT))
+            if page.dropped:
+                typer.echo(f"{page.dropped} lines came too fast and are not shown", err=True)
+            print_log(page.lines, as_json=as_json)
+
+
+def _address_of(remote: RemoteSystem, path: str) -> str:
+    """The address of the actor with this name; an address or a pattern as it is."""
+    return path if path.startswith("/") or {*"*?["} & {*path} else remote.whereis(path).path
+
+
+def why_empty(remote: RemoteSystem, path: str) -> None:
+    """Say why no line is there: nobody is, or nobody who prints. Raises typer.Exit: nobody is there."""
+    if not {*"*?["} & {*path} and path not in remote.tree() and not remote.logs(path, limit=1).lines:
+        raise ended("logs", f"nobody is at {path}, and no line is kept of it", FAILED)
+    typer.echo("no such line is kept; what actors print that have no process of their own is not kept here", err=True)
+
+
+def print_log(lines: Iterable[LoggedLine], *, as_json: bool) -> None:
+    """Print lines as text, or each as a JSON object."""
+    for line in lines:
+        typer.echo(msgspec.json.encode(line).decode() if as_json else log_line(line))
+
+
+def moment_meant(text: str, now: float) -> float:
+    """The Unix time that is meant by so long ago, or by a date and time, which is local if it does not say otherwise.
+
+    Raises:
+        ValueError: it is neither of these.
+
+    >>> moment_meant("90", 1000.0), moment_meant("2m", 1000.0), moment_meant("1970-01-01T00:00:07+00:00", 1000.0)
+    (910.0, 880.0, 7.0)
+    """
+    ago = AGO.fullmatch(text)
+    if ago is not None:
+        return now - float(ago["number"]) * SECONDS[ago["unit"]]
+    try:
+        return datetime.datetime.fromisoformat(text).timestamp()
+    except (ValueError, OverflowError, OSError) as error:
+        known = "90s, 10m, 2h or 1d ago, nor a date and time such as 2026-01-31T12:00"
+        raise ValueError(f"{text!r} is neither {known}") from error
 
 
 def event_line(event: dict[str, Any]) -> str:

@@ -6,20 +6,16 @@ import asyncio
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
 import typer
 
-from ...actors.errors import HoldfastError
 from ..overview import ActorRow, ProcessUse, SystemLook
-from ..remote import RemoteSystem
 from ..runtime_folder import found_sockets, sweep
 from .patterns import select
 from .reaching import (
     FAILED,
-    GREETING_SECONDS,
     UNUSABLE,
     Json,
     Paths,
@@ -28,6 +24,7 @@ from .reaching import (
     complete_path,
     ended,
     printable,
+    program_at,
     reached,
     show_json,
     told,
@@ -45,29 +42,20 @@ def ls(as_json: Json = False) -> None:
     """
     with told("ls"):
         sweep()
-        systems = [_about(one.path, one.system, one.pid) for one in found_sockets()]
+        systems = [program_at(one) for one in found_sockets()]
     if as_json:
-        show_json(systems)
+        show_json([{**msgspec.structs.asdict(one), "socket": str(one.socket)} for one in systems])
         return
     if not systems:
         typer.echo("no system of yours runs with a control endpoint", err=True)
-    lines = [("NAME", "PID", "SINCE", "ACTORS")]
-    lines += [(one["name"], str(one["pid"]), _when(one["since"]), _count(one["actors"])) for one in systems]
-    widths = [max(len(line[column]) for line in lines) for column in range(4)]
+    lines = [("NAME", "NODE", "PID", "ROLE", "SINCE", "ACTORS")]
+    lines += [
+        (one.name, one.node or "?", str(one.pid), one.role_text, _when(one.since), _count(one.actors))
+        for one in systems
+    ]
+    widths = [max(len(line[column]) for line in lines) for column in range(6)]
     for line in lines if systems else []:
         typer.echo("  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip())
-
-
-def _about(path: Path, name: str, pid: int) -> dict[str, Any]:
-    """What a system says of itself; nulls if it does not answer."""
-    found: dict[str, Any] = {"name": name, "pid": pid, "since": None, "actors": None}
-    try:
-        with RemoteSystem(path) as remote:
-            remote.greet(GREETING_SECONDS)
-            found |= remote.about()
-    except HoldfastError:
-        pass  # It is there, and stopped or hung: its line says so.
-    return {**found, "socket": str(path)}
 
 
 def _when(seconds: float | None) -> str:

@@ -6,18 +6,21 @@ import contextlib
 import json
 import sys
 from collections.abc import Callable, Generator, Iterable
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Annotated, Any, Final
 
+import msgspec
 import typer
 
 from ...actors.errors import HoldfastError
 from ...actors.values.path_parts import CONTROL
+from ...system.options import ProgramRole
 from ...system.script import UntrustedFile
 from ..overview import ActorRow
 from ..remote import NotAnswering, NotReached, RemoteSystem
-from ..runtime_folder import found_sockets, sweep
-from ..wire import WrongUser
+from ..runtime_folder import FoundSocket, found_sockets, sweep
+from ..wire import NotRunningHere, WrongUser
 from .patterns import select
 
 FAILED: Final = 1
@@ -45,6 +48,46 @@ class NoSystem(HoldfastError, text="{problem}"):
     problem: str
 
 
+NODE: ContextVar[str] = ContextVar("the program that is meant of several of a system", default="")
+"""What was given as `holdfast --node NODE`: a pid, a machine, or a role; empty if nothing was."""
+
+
+class RunningProgram(msgspec.Struct, frozen=True):
+    """A program with a control endpoint, and what it says of itself: nulls if it does not answer."""
+
+    name: str
+    pid: int
+    socket: Path
+    node: str | None = None
+    role: ProgramRole | None = None
+    leader: str | None = None
+    since: float | None = None
+    actors: int | None = None
+
+    @property
+    def role_text(self) -> str:
+        """Its role in words; of one that stands by with who leads."""
+        if self.role is None:  # A program of an earlier version answers, and knows no roles.
+            return "does not answer" if self.since is None else "?"
+        return f"standby of {self.leader.partition(' (')[0]}" if self.role == "standby" and self.leader else self.role
+
+    @property
+    def runs(self) -> bool:
+        """Whether the tree of the system runs in it, as far as it says."""
+        return self.role in ("leader", "alone") or (self.role is None and self.since is not None)
+
+
+def program_at(found: FoundSocket) -> RunningProgram:
+    """Ask a program what it is."""
+    known = {"name": found.system, "pid": found.pid, "socket": found.path}
+    try:
+        with RemoteSystem(found.path) as program:
+            program.greet(GREETING_SECONDS)
+            return msgspec.convert({**known, **program.about(), "socket": found.path}, RunningProgram)
+    except HoldfastError:  # It is there, and stopped or hung.
+        return RunningProgram(found.system, found.pid, found.path)
+
+
 def complete_system(incomplete: str) -> list[str]:
     """The names of running systems, for the shell."""
     try:
@@ -61,6 +104,7 @@ def complete_path(ctx: typer.Context, incomplete: str) -> list[str]:
 def complete(ctx: typer.Context, incomplete: str, words: Callable[[RemoteSystem], Iterable[str]]) -> list[str]:
     """Words that the system that is meant knows, those that begin as what was typed; none if it does not answer."""
     try:
+        NODE.set(ctx.find_root().params.get("node") or "")
         with RemoteSystem(chosen(ctx.params.get("system"), ctx.params.get("socket"))) as remote:
             return [word for word in words(remote) if word.startswith(incomplete)]
     except HoldfastError:  # A shell that waits for words has no use for a sentence.
@@ -97,7 +141,7 @@ OnePath = Annotated[str, typer.Argument(metavar="PATH", help="An address or a na
 
 
 def chosen(system: str | None, socket: Path | None) -> Path:
-    """The socket of the system that is meant.
+    """The socket of the system that is meant; of several programs of it that of the one that runs its tree.
 
     Raises:
         NoSystem: there is none, or there are several. UntrustedFile: others may enter the folder of sockets.
@@ -105,17 +149,35 @@ def chosen(system: str | None, socket: Path | None) -> Path:
     if socket is not None:
         return socket
     sweep()
-    live = found_sockets()
+    live, node = found_sockets(), NODE.get()
     meant = [one for one in live if system in (None, "", one.system, str(one.pid))]
-    if len(meant) == 1:
+    if len(meant) == 1 and not node:
         return meant[0].path
-    there = ", ".join(f"{one.system} (pid {one.pid})" for one in meant or live)
-    if meant:
-        hint = "--system PID" if len({one.system for one in meant}) == 1 else "--system NAME"
-        raise NoSystem(f"several systems run: {there}; say which one is meant, with {hint}")
-    wanted = f"no system {system!r} runs" if system else "no system of yours runs with a control endpoint"
-    hint = f"there are {there}" if there else "a program opens one by control_endpoint(system)"
-    raise NoSystem(f"{wanted}; {hint}")
+    if not meant:
+        there = ", ".join(f"{one.system} (pid {one.pid})" for one in live)
+        wanted = f"no system {system!r} runs" if system else "no system of yours runs with a control endpoint"
+        raise NoSystem(
+            f"{wanted}; {f'there are {there}' if there else 'a program opens one by control_endpoint(system)'}"
+        )
+    return _one_of([program_at(one) for one in meant], node).socket
+
+
+def _one_of(programs: list[RunningProgram], node: str) -> RunningProgram:
+    """The program that is meant. Raises NoSystem: none of them is, or several are."""
+    there = ", ".join(f"{one.name} (pid {one.pid}, {one.role_text})" for one in programs)
+    meant = [one for one in programs if node in ("", str(one.pid), one.node, one.role)]
+    is_one_system = len({one.name for one in meant}) == 1
+    running = [one for one in meant if one.runs]
+    if is_one_system and len(running) == 1:
+        return running[0]
+    if len(meant) == 1:
+        return meant[0]
+    if not meant:
+        raise NoSystem(f"no program is {node!r}, by its pid, machine or role; there are {there}")
+    hint = "holdfast --node PID COMMAND" if is_one_system else "--system NAME"
+    raise NoSystem(
+        f"several {'programs' if is_one_system else 'systems'} run: {there}; say which is meant, with {hint}"
+    )
 
 
 @contextlib.contextmanager
@@ -123,7 +185,7 @@ def told(command: str) -> Generator[None, None, None]:
     """Say what went wrong in a sentence, and end with 2 if the system or a file cannot be had, else with 1."""
     try:
         yield
-    except (NotReached, NotAnswering, NoSystem, WrongUser, UntrustedFile) as error:
+    except (NotReached, NotAnswering, NotRunningHere, NoSystem, WrongUser, UntrustedFile) as error:
         raise ended(command, error, UNUSABLE) from error
     except HoldfastError as error:
         raise ended(command, error, FAILED) from error

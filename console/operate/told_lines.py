@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import time
 
-from ...system import PastEvent, PastLife
+from ...actors.values.path_parts import CONTROL
+from ...system import LoggedLine, PastEvent, PastLife
 from ...system.history.evidence import PutAside
 
 HIDDEN = frozenset({"traceback", "reason_kind", "turns", "longest_turn", "longest_message"})
 """Fields of events that stand in `--json` only: their line would become too long."""
+
+ESCAPED = {code: f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}" for code in CONTROL if code != ord("\t")}
+"""What stands for characters in what a process has printed that a terminal would obey instead of showing them."""
 
 
 def event_line(event: PastEvent) -> str:
@@ -42,6 +46,17 @@ def life_line(life: PastLife) -> str:
     parts += [f"the longest {life.longest_turn:.1f} s with {life.longest_message}"] if life.longest_message else []
     parts += [f"recovered in {sum(life.phases.values()):.3f} s, {life.replayed} replayed"] if life.phases else []
     return ", ".join(parts)
+
+
+def log_line(line: LoggedLine) -> str:
+    """A line that a process has printed, or holdfast has logged, as a line of text.
+
+    >>> log_line(LoggedLine(1, 0.0, "/app/till", "stderr", "warning", "no\\x1b[31m paper", 2)).split(" ", 2)[2]
+    '/app/till life 2 stderr: no\\\\x1b[31m paper'
+    """
+    life = f" life {line.life}" if line.life else ""
+    tag = line.level if line.source == "holdfast" else line.source
+    return f"{moment(line.at)} {line.address}{life} {tag}: {line.text.translate(ESCAPED)}"
 
 
 def moment(at: float) -> str:

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import dataclasses
 import inspect
+import os
 import signal
 import sys
 from collections.abc import AsyncGenerator, Awaitable, Callable
@@ -21,10 +22,10 @@ from ...system.run import run as run_loop
 from ...system.system import ActorSystem
 from ...system.transaction.change import Change
 from ...system.transaction.living import ReplaceActorCode
-from ...system.upgrade.new_program import load_named, specs_in
+from ...system.upgrade.new_program import find_in, load_named, specs_in
 from ..declare.tree_plan import actor_places, change_to, declare, other_code
 from ..declare.wanted_tree import WantedSpecs
-from ..endpoint import control_endpoint
+from ..endpoint import served
 from ..operate.reaching import FAILED, UNUSABLE, ended
 from .health import Service
 from .notify import Notifier
@@ -79,6 +80,7 @@ def load_program(target: str) -> ServedProgram:
     """Find what is to be run. Raises SpecError: there is no such thing."""
     if target.endswith(".toml"):
         _text(target)
+        find_in(os.getcwd())
         return ServedProgram(target)
     if target.partition(":")[0].endswith(".py"):
         raise SpecError(target, "name a module, such as shop.tree:tree: actors in processes are imported by its name")
@@ -122,10 +124,10 @@ async def _replace_codes(system: ActorSystem, names: set[str]) -> list[str]:
     return _words(change)
 
 
-async def serve(program: ServedProgram, service: Service) -> None:
-    """Run the program until it is told to stop, or its main has returned."""
-    async with service, control_endpoint(service.system) as socket:
-        system = service.system
+async def serve(program: ServedProgram, system: ActorSystem, probes: str | None) -> None:
+    """Run the program until it is told to stop, or its main has returned; probes are answered at `probes`, if given."""
+    service = Service(system, probes=probes)
+    async with served(system, entered=service) as socket:
         await program.begin(system)
         modules = None if program.is_file else ProjectModules(program.target.partition(":")[0])
         async with _reloads() as asked:
@@ -227,7 +229,7 @@ def run(
     try:
         chosen: Durability | None = durability  # type: ignore[assignment]  # it is looked at where it is used
         system = ActorSystem(name, store=store, store_key=key_file, durability=chosen, recovery=recovery)
-        run_loop(serve(program, Service(system, probes=probes)))
+        run_loop(serve(program, system, probes))
     except HoldfastError as error:
         raise ended("run", error, FAILED) from error
     except KeyboardInterrupt:

@@ -109,14 +109,19 @@ class FlowSource(msgspec.Struct, frozen=True):
 class _Flow:
     """What is seen of one topic."""
 
-    __slots__ = ("began", "came_in", "in_block", "last", "marks", "out_of_block", "poor")
+    __slots__ = ("began", "came_in", "guess", "in_block", "last", "marks", "out_of_block", "poor", "seen")
 
     began: float
     last: float | None
 
     def __init__(self, now: float) -> None:
         self.marks: tuple[object, ...] = ()
+        self.guess = self.seen = 0
         self.begin(now)
+
+    def most_in(self, learned: Usual) -> int:
+        """Most that comes in between two messages: until that was seen often enough, no less than was guessed."""
+        return learned.most_in if self.seen >= ENOUGH else max(learned.most_in, self.guess)
 
     def begin(self, now: float) -> None:
         """Nothing that came before counts."""
@@ -180,6 +185,7 @@ class FlowObserver(Observer):
         if flow is not None:
             if flow.last is not None:
                 self._learned(topic).take(now - flow.last, flow.came_in)
+                flow.seen += flow.came_in > 0
             flow.last, flow.came_in = now, 0
             flow.out_of_block += 1
         for user in self._users.get(topic, ()):
@@ -224,8 +230,9 @@ class FlowObserver(Observer):
             for topic, when in self._arrivals:
                 flow = self._flows.get(topic)
                 if flow is not None and flow.last is not None and not self._made[topic].inputs:
-                    # As if its publishers had had turns at each look: too much is no false alarm.
-                    flow.came_in = math.ceil((when - flow.last) / self.manner.every)
+                    # As if its publishers had had turns at each look: too much is no false alarm. It is not learned,
+                    # as whoever publishes in bursts would be allowed many more bursts without a message for ever.
+                    flow.guess = max(flow.guess, math.ceil((when - flow.last) / self.manner.every))
                 self._arrived(topic, when)
             self._arrivals.clear()
             for flow in self._flows.values():
@@ -250,7 +257,7 @@ class FlowObserver(Observer):
         if learned.count < ENOUGH:
             return True if silent < self._patience else None
         is_long = silent > max(self._patience, LONGER * learned.longest_gap)
-        is_due = flow.came_in > ENOUGH // 2 + LONGER * learned.most_in
+        is_due = flow.came_in > ENOUGH // 2 + LONGER * flow.most_in(learned)
         is_by_clock = not made.inputs and learned.longest_gap <= REGULAR * learned.mean_gap
         if (is_due and silent > self._patience) or (is_by_clock and is_long):
             return False

@@ -7,7 +7,7 @@ import contextlib
 import enum
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Mapping
 from typing import Final
 
 import msgspec
@@ -82,30 +82,27 @@ class Bound(msgspec.Struct, frozen=True):
 
 
 class PropertyObserver(Observer):
-    """Measures an actor and its process from outside. What cannot be measured, because it is not there, is unknown.
+    """Measures actors and their processes from outside. What cannot be measured, because it is not there, is unknown.
 
     Args:
-        path: the actor's address.
-        bounds: what is good.
+        bounds: component to what is good of its properties; it may change.
+        actors: component to address; it may change, and has all components with bounds that are there.
         growth_window: seconds over which `Property.GROWTH` is seen.
         manner: see `Observer`.
     """
 
     def __init__(
-        self, path: str, bounds: Iterable[Bound], *, growth_window: float = 60.0, manner: Manner | None = None
+        self,
+        bounds: Mapping[str, tuple[Bound, ...]],
+        actors: Mapping[str, str],
+        *,
+        growth_window: float = 60.0,
+        manner: Manner | None = None,
     ) -> None:
         super().__init__(manner=manner)
-        self._path = path
-        self._bounds = [
-            (atom_of(one.atom), one.property, one.limits, one.filter() if one.filter is not None else None)
-            for one in bounds
-        ]
-        self._wanted = {wanted for _, wanted, _, _ in self._bounds}
-        self._restarts_of = {atom for atom, wanted, _, _ in self._bounds if wanted is Property.RESTARTS}
-        self._process: psutil.Process | None = None
-        self._counts: Statistics | None = None
-        self._lives: deque[tuple[float, int]] = deque()
-        self._growth = Regression(growth_window)
+        self._bounds, self._actors, self._growth_window = bounds, actors, growth_window
+        self._meters: dict[str, _Meter] = {}
+        self._restarts_of = set[Literal]()
 
     def on_start(self, restored: bool) -> None:
         """Begin. Raises SpecError in a process of its own."""
@@ -117,64 +114,87 @@ class PropertyObserver(Observer):
         return super().spares(grace, about) and not (grace.is_counted and about in self._restarts_of)
 
     def afresh(self, names: Collection[str]) -> None:
-        """How it grew, and how often repair has restarted it, says nothing of after."""
+        """How one grew, and how often repair has restarted it, says nothing of after."""
+        for meter in self._meters.values():
+            if not meter.names.isdisjoint(names):
+                meter.forget()
+
+    async def look(self) -> None:
+        """Measure all properties, and say which are within their bounds; all actors are looked at at the same time."""
+        late = self.age % self.manner.every
+        late = late if self.manner.every - late > EARLY else 0.0
+        self._follow()
+        meters, now = dict(self._meters), self.now  # They may change while actors are asked.
+        asked = (meter.measure(self._cell(component), now, late) for component, meter in meters.items())
+        for meter, values in zip(meters.values(), await asyncio.gather(*asked), strict=True):
+            for atom, wanted, limits, smooth in meter.bounds:
+                value = values.get(wanted)
+                if value is not None and smooth is not None:
+                    value = smooth(value)
+                self.verdict(atom, None if value is None else limits.holds(value, self.said(atom)))
+
+    def _follow(self) -> None:
+        """Have a meter for each component with bounds."""
+        for component in [name for name, meter in self._meters.items() if self._bounds.get(name) != meter.given]:
+            for atom, _, _, _ in self._meters.pop(component).bounds:
+                self.verdict(atom, None)
+        for component in self._bounds.keys() - self._meters.keys():
+            self._meters[component] = _Meter(self._bounds[component], self._growth_window)
+        bounds = [bound for meter in self._meters.values() for bound in meter.bounds]
+        self._restarts_of = {atom for atom, wanted, _, _ in bounds if wanted is Property.RESTARTS}
+
+    def _cell(self, component: str) -> Cell | None:
+        path = self._actors.get(component)
+        return None if path is None else self.ctx._cell.node.find(path)
+
+
+class _Meter:
+    """Measures one actor, and remembers what it needs of earlier looks."""
+
+    def __init__(self, given: tuple[Bound, ...], growth_window: float) -> None:
+        self.given = given
+        self.bounds = [
+            (atom_of(one.atom), one.property, one.limits, one.filter() if one.filter is not None else None)
+            for one in given
+        ]
+        self.names = {name for atom, _, _, _ in self.bounds for name in atom.args}
+        self._wanted = {wanted for _, wanted, _, _ in self.bounds}
+        self._process: psutil.Process | None = None
+        self._counts: Statistics | None = None
+        self._lives: deque[tuple[float, int]] = deque()
+        self._lived: Cell | None = None
+        self._growth = Regression(growth_window)
+
+    def forget(self) -> None:
+        """Somebody has acted upon it: count and look at its growth from now on."""
         self._growth.clear()
         self._lives.clear()
 
-    async def look(self) -> None:
-        """Measure all properties, and say which are within their bounds."""
-        late = self.age % self.manner.every
-        self._late = late if self.manner.every - late > EARLY else 0.0
-        values = await self._measure()
-        for atom, wanted, limits, smooth in self._bounds:
-            value = values.get(wanted)
-            if value is not None and smooth is not None:
-                value = smooth(value)
-            self.verdict(atom, None if value is None else limits.holds(value, self.said(atom)))
-
-    async def _measure(self) -> dict[Property, float]:
-        cell = self.ctx._cell.node.find(self._path)
+    async def measure(self, cell: Cell | None, now: float, late: float) -> dict[Property, float]:
+        """All that is wanted, as far as it can be known; `late`: seconds by which this look comes late."""
         if cell is None:
             return {}
-        values: dict[Property, float] = {Property.RESTARTS: self._restarts(cell)}
-        status = await self._status(cell, values)
+        values: dict[Property, float] = {Property.RESTARTS: self._restarts(cell, now)}
+        status = await _status(cell, values, late)
         if status is not None and status.state in ("running", "suspended"):
             values |= {Property.MAILBOX: cell.host.backlog(cell), Property.WAITING: status.turn_seconds}
             if not OF_PROCESS.isdisjoint(self._wanted):
-                values |= self._of_process(status.pid)
+                values |= self._of_process(status.pid, now)
             if Property.TURN in self._wanted:
                 values |= await self._turns(cell)
         return values
 
-    async def _status(self, cell: Cell, values: dict[Property, float]) -> Status | None:
-        """Its status; how long the answer takes is how late its loop comes."""
-        host = cell.host
-        peer = host.peer if isinstance(host, OutsideHost) else None
-        if isinstance(host.place, WorkerPlace):
-            peer = host.place.process(cell)
-            if peer is None:
-                return None
-        began = time.monotonic()
-        if peer is None:
-            await asyncio.sleep(0)
-            values[Property.LOOP_LAG] = max(time.monotonic() - began, self._late)
-            return status_of(cell)
-        try:
-            found: Status = await ask_status(peer, cell, PATIENCE)
-        except HoldfastError:  # Its process has ended, or its loop does not come to it.
-            values[Property.LOOP_LAG] = time.monotonic() - began
-            return None
-        values[Property.LOOP_LAG] = time.monotonic() - began
-        return found
-
-    def _restarts(self, cell: Cell) -> float:
+    def _restarts(self, cell: Cell, now: float) -> float:
         """Per minute; the first look only tells where to count from."""
-        self._lives.append((self.now, cell.life))
-        while len(self._lives) > 2 and self._lives[1][0] <= self.now - MINUTE:
+        if cell is not self._lived:  # Another actor lives at the address: its lives are no restarts of the one before.
+            self._lived = cell
+            self._lives.clear()
+        self._lives.append((now, cell.life))
+        while len(self._lives) > 2 and self._lives[1][0] <= now - MINUTE:
             self._lives.popleft()
         return self._lives[-1][1] - self._lives[0][1]
 
-    def _of_process(self, pid: int) -> dict[Property, float]:
+    def _of_process(self, pid: int, now: float) -> dict[Property, float]:
         """What psutil says of it; nothing if it has ended meanwhile."""
         try:
             if self._process is None or self._process.pid != pid:
@@ -194,7 +214,7 @@ class PropertyObserver(Observer):
         except psutil.Error:
             self._process = None
             return {}
-        self._growth.add(self.now, memory)
+        self._growth.add(now, memory)
         line = self._growth.fit() if self._growth.is_full else None
         return values if line is None else {**values, Property.GROWTH: line.slope}
 
@@ -206,3 +226,25 @@ class PropertyObserver(Observer):
             if before is not None and now is not None and now.since == before.since and now.turns > before.turns:
                 return {Property.TURN: (now.turn_seconds - before.turn_seconds) / (now.turns - before.turns)}
         return {}
+
+
+async def _status(cell: Cell, values: dict[Property, float], late: float) -> Status | None:
+    """Its status; how long the answer takes is how late its loop comes."""
+    host = cell.host
+    peer = host.peer if isinstance(host, OutsideHost) else None
+    if isinstance(host.place, WorkerPlace):
+        peer = host.place.process(cell)
+        if peer is None:
+            return None
+    began = time.monotonic()
+    if peer is None:
+        await asyncio.sleep(0)
+        values[Property.LOOP_LAG] = max(time.monotonic() - began, late)
+        return status_of(cell)
+    try:
+        found: Status = await ask_status(peer, cell, PATIENCE)
+    except HoldfastError:  # Its process has ended, or its loop does not come to it.
+        values[Property.LOOP_LAG] = time.monotonic() - began
+        return None
+    values[Property.LOOP_LAG] = time.monotonic() - began
+    return found

@@ -60,9 +60,7 @@ def restart_child(
     **options: Any,
 ) -> RepairAction:
     """`restart_child(n)`: have its supervisor stop it and start it, in one call that nothing can cut in two."""
-    run = functools.partial(_restart, addresses=addresses, timeout=timeout)
-    more = {"grace": 1.0, "timeout": 2 * timeout, "is_restart": True} | options
-    return _action(name, run, addresses, more, pddl=_restart_text(name, cost))
+    return _restarting(name, addresses, cost, timeout, options)
 
 
 def restart_replica(
@@ -130,9 +128,7 @@ def roll_back(
     If there is no older snapshot the action has failed, and the actor goes on as it was. A person has to approve it,
     unless the policy allows it.
     """
-    run = functools.partial(_restart, addresses=addresses, timeout=timeout, older=True)
-    more = {"grace": 1.0, "timeout": 2 * timeout, "is_dangerous": True, "is_restart": True} | options
-    return _action(name, run, addresses, more, pddl=_restart_text(name, cost))
+    return _restarting(name, addresses, cost, timeout, {"is_dangerous": True} | options, older=True)
 
 
 def bind_port(
@@ -151,6 +147,21 @@ def bind_port(
     owners = {component: owner for component, (owner, _, _) in bindings.items()}
     run = functools.partial(_bind, bindings=bindings)
     return _action(name, run, owners, options, pddl=_mend_text(name, cost))
+
+
+def _restarting(
+    name: str,
+    addresses: Mapping[str, str],
+    cost: int,
+    timeout: float,
+    options: Mapping[str, Any],
+    *,
+    older: bool = False,
+) -> RepairAction:
+    """An action that restarts actors; `older`: with the snapshot before the newest."""
+    run = functools.partial(_restart, addresses=addresses, timeout=timeout, older=older)
+    more = {"grace": 1.0, "timeout": 2 * timeout, "is_restart": True, **options}
+    return _action(name, run, addresses, more, pddl=_restart_text(name, cost))
 
 
 def _action(

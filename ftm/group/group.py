@@ -30,6 +30,7 @@ from .transient_homes import StateCopies, forget_ended
 
 if TYPE_CHECKING:
     from ...checkpoint.home.switch import Switch
+    from ...checkpoint.inputs import Input
     from ...checkpoint.protocol import ToLife, TurnEnd
     from .group_place import GroupPlace
 
@@ -131,6 +132,10 @@ class Group:
         replicas.wake()
 
     # -- from the home ----------------------------------------------------------------------------------------------
+
+    def take(self, source: Input) -> None:
+        """Hand a new input to whoever lives the life."""
+        self.to_life(source.feed())
 
     def to_life(self, record: ToLife) -> None:
         """Stands as the home's way to its life."""

@@ -23,7 +23,7 @@ from ...actors.kernel.actor import Start
 from ...actors.kernel.address_host import AddressHost, Parent, Place
 from ...actors.kernel.cell import DOWN, GONE, RUNNING, Cell
 from ...actors.kernel.lifecycle import NEAR
-from ...actors.migration.move import Gate
+from ...actors.migration.move import CommitGate
 from ...actors.process.resource_limits import limits_data
 from ...checkpoint.home.homes import Homes
 from ...checkpoint.home.journal_home import Entered, JournalHome
@@ -234,7 +234,7 @@ class GroupPlace(Place):
     # -- other mechanisms -------------------------------------------------------------------------------------------
 
     async def adapt(
-        self, cell: Cell, mechanism: Any, switched: Callable[[], None], gate: Gate | None = None
+        self, cell: Cell, mechanism: Any, switched: Callable[[], None], gate: CommitGate | None = None
     ) -> Reconfiguration:
         """Go on with another stack of mechanisms.
 

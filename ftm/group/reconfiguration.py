@@ -16,7 +16,7 @@ from ...actors.errors import AskTimeout, HoldfastError
 if TYPE_CHECKING:
     import asyncio
 
-    from ...actors.migration.move import Gate
+    from ...actors.migration.move import CommitGate
     from ..bricks.replica_orders import Stand
     from ..bricks.sealed_frames import SecuredLink
     from ..model.mechanism import Description, Mechanism
@@ -100,7 +100,7 @@ class Reconfiguration:
     loop: dataclasses.InitVar[asyncio.AbstractEventLoop]
     on_given_up: Callable[[], None]
     is_back: bool = False
-    gate: Gate | None = None
+    gate: CommitGate | None = None
     stage: Stage = "preparing"
     why: str = ""
     link: SecuredLink | None = None

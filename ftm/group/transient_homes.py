@@ -70,9 +70,8 @@ def begin_afresh(switch: Switch) -> None:
     forget_ended(switch)
     newest = switch.ledger.newest
     assert newest is not None
-    switch.ledger.begin_with(
-        type(newest)(newest.format, switch.turn, newest.next_id, [], {}, [], newest.epoch, b"", switch.turn)
-    )
+    meta = type(newest)(newest.format, switch.turn, newest.next_id, [], {}, [], newest.epoch, b"", switch.turn)
+    switch.ledger.begin_with(meta, switch.ledger.contained_in(meta.turn))
     switch.timers.replace({})
     switch.topics.clear()
 

@@ -78,7 +78,9 @@ def _apply_deltas(actor: Any, deltas: list[bytes], *, has_deltas: bool) -> None:
 
 def _fed(life: ServerLife, feeds: Iterable[Feed]) -> list[Fed]:
     node = life.cell.node
-    return [Fed(life, feed, None, None if feed.sender is None else node.cell_at(feed.sender)) for feed in feeds]
+    return [
+        Fed(life, feed, None, None if feed.sender is None else node.cell_at(feed.sender), feed.chain) for feed in feeds
+    ]
 
 
 def _returned(life: ServerLife, point: ServerState) -> dict[int, Fed]:

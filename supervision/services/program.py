@@ -190,8 +190,8 @@ class Program(Actor):
         self._lines.append(text)
         self._parts.pop(stream, None)
         node = self.ctx._cell.node
-        if node.events.has_listeners:
-            node.emit(LogLine(self.ctx.path, stream, text))
+        if node.events.hears_lines:
+            node.emit(LogLine(self.ctx.path, stream, text, self.ctx._cell.life))
         if self._sender is not None:
             self._sender.send(stream, text)
         if self._sign is not None:

@@ -13,9 +13,10 @@ from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
 from ...actors.seconds import check_seconds
 from ...supervision.supervisor import Supervisor
 from .counted_work import count_work
-from .evidence import Evidence, PutAside, Told, collect, literal, put_aside
+from .evidence import Evidence, PutAside, Told, collect, put_aside
 from .lives import PastLife, done
 from .pages import MOST_ON_PAGE, HistoryPage, HistoryQuestion, answer, question
+from .paths import pattern_of
 from .recorder import HistoryRecorder
 from .why import Cause, causes, why
 
@@ -74,7 +75,7 @@ class HistoryCalls:
         Raises:
             SpecError: it cannot be asked so, or the system was made with `history=False`.
         """
-        asked = question(_pattern(target), kinds=kinds, since=since, until=until, after=after, limit=limit)
+        asked = question(pattern_of(target), kinds=kinds, since=since, until=until, after=after, limit=limit)
         return answer(self._recorder, asked)
 
     async def follow_history(
@@ -86,14 +87,14 @@ class HistoryCalls:
             SpecError: as `history`.
         """
         check_seconds("follow_history", "timeout", timeout)
-        return await self._follow(question(_pattern(target), kinds=kinds, after=after), timeout)
+        return await self._follow(question(pattern_of(target), kinds=kinds, after=after), timeout)
 
     async def _follow(self, asked: HistoryQuestion, timeout: float) -> HistoryPage:
         recorder = self._recorder
         try:
             async with asyncio.timeout(timeout):
                 while not (page := answer(recorder, asked)).events:
-                    await recorder.changed()
+                    await recorder.followers.changed()
         except TimeoutError:
             page = answer(recorder, asked)
         return page
@@ -120,23 +121,18 @@ class HistoryCalls:
         Raises:
             SpecError: the system was made with `history=False`.
         """
-        check_seconds("why", "timeout", timeout)
-        return why(await self._evidence(_path(target), timeout))
+        return why(await self._evidence("why", target, timeout))
 
     async def causes(self, target: ActorRef[Any] | str, *, timeout: float = DEFAULT_TIMEOUT) -> list[Cause]:
-        """Say what `why` says, each sentence with the name of its cause, for programs; nothing if nothing is wrong.
+        """Say what `why` says of a target, within a timeout in seconds, each sentence with the name of its cause.
 
-        Args:
-            target: an actor, or an address, whether or not anybody lives there.
-            timeout: seconds that the actor's process may take to say how it is; the rest is known without it.
-
-        Raises:
-            SpecError: the system was made with `history=False`.
+        For programs; nothing if nothing is wrong. Raises SpecError: the system was made with `history=False`.
         """
-        check_seconds("causes", "timeout", timeout)
-        return causes(await self._evidence(_path(target), timeout))
+        return causes(await self._evidence("causes", target, timeout))
 
-    async def _evidence(self, path: str, timeout: float) -> Evidence:
+    async def _evidence(self, call: str, target: ActorRef[Any] | str, timeout: float) -> Evidence:
+        check_seconds(call, "timeout", timeout)
+        path = _path(target)
         node, recorder = self._node, self._recorder
         return collect(node, recorder, path, await self._ask_itself(path, timeout), self.quarantined(path))
 
@@ -182,7 +178,3 @@ def _path(target: ActorRef[Any] | str) -> str:
     if not isinstance(path, str):
         raise SpecError("history", f"takes an actor or an address, not {target!r}")
     return path
-
-
-def _pattern(target: ActorRef[Any] | str) -> str:
-    return literal(target.path) if isinstance(target, ActorRef) else target

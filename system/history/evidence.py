@@ -20,6 +20,7 @@ from ...supervision.supervisor import Supervisor
 from .lives import WITH_THE_ROOT, PastLife
 from .pages import answer, question
 from .past_event import PastEvent, content, message_type, shortened
+from .paths import literal
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
@@ -315,8 +316,3 @@ def _allowance(cell: Cell) -> Allowance | None:
     flags = above._flags
     restarts = recent_restarts(above._restarts, cell.node.loop.time(), flags.period)
     return Allowance(flags.intensity, flags.period, len(restarts))
-
-
-def literal(address: str) -> str:
-    """A pattern that means just this address, whatever signs are in it."""
-    return "".join(f"[{sign}]" if sign in "*?[" else sign for sign in address)

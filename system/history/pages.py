@@ -11,6 +11,7 @@ import msgspec
 from ...actors.errors import SpecError
 from .past_event import PastEvent
 from .paths import matcher
+from .ring import N
 
 if TYPE_CHECKING:
     from .recorder import HistoryRecorder
@@ -72,15 +73,24 @@ def question(
     """
     if isinstance(kinds, str) or not all(isinstance(kind, str) for kind in kinds):
         raise SpecError("history", f"kinds must be names of events, such as ['ActorCrashed'], not {kinds!r}")
-    if isinstance(limit, bool) or not isinstance(limit, int) or not 1 <= limit <= MOST_ON_PAGE:
-        raise SpecError("history", f"limit must be an int from 1 to {MOST_ON_PAGE}, not {limit!r}")
-    if after is not None and (isinstance(after, bool) or not isinstance(after, int)):
-        raise SpecError("history", f"after must be the number of an event, not {after!r}")
-    for name, value in (("since", since), ("until", until)):
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value:
-            raise SpecError("history", f"{name} must be a Unix time, not {value!r}")
+    check_page("history", after=after, limit=limit, since=since, until=until)
     matcher(path)
     return HistoryQuestion(path, tuple(kinds), float(since), float(until), after, limit)
+
+
+def check_page(where: str, *, after: object, limit: object, **times: object) -> None:
+    """Check what every question for a page has: where it begins, how much is on it, and from which time that is.
+
+    Raises:
+        SpecError: a value is of the wrong type, or out of range.
+    """
+    if isinstance(limit, bool) or not isinstance(limit, int) or not 1 <= limit <= MOST_ON_PAGE:
+        raise SpecError(where, f"limit must be an int from 1 to {MOST_ON_PAGE}, not {limit!r}")
+    if after is not None and (isinstance(after, bool) or not isinstance(after, int)):
+        raise SpecError(where, f"after must be a number from a page's `next`, not {after!r}")
+    for name, value in times.items():
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value:
+            raise SpecError(where, f"{name} must be a Unix time, not {value!r}")
 
 
 def answer(recorder: HistoryRecorder, asked: HistoryQuestion) -> HistoryPage:
@@ -93,26 +103,23 @@ def answer(recorder: HistoryRecorder, asked: HistoryQuestion) -> HistoryPage:
         if (not kinds or event.kind in kinds) and asked.since <= event.at <= asked.until and is_meant(event.address)
     )
     if asked.after is None:
-        return HistoryPage(_newest(found, asked.limit), recorder.last, recorder.oldest, recorder.dropped)
-    events, is_all = _oldest(found, asked.limit)
+        return HistoryPage(newest_of(found, asked.limit), recorder.last, recorder.oldest, recorder.dropped)
+    events, is_all = oldest_of(found, asked.limit)
     return HistoryPage(events, recorder.last if is_all else events[-1].number, recorder.oldest, recorder.dropped)
 
 
-def _size(event: PastEvent) -> int:
-    return event.size_bytes
-
-
-def _newest(found: Iterable[PastEvent], limit: int) -> list[PastEvent]:
-    kept: deque[PastEvent] = deque(found, maxlen=limit)
-    size = sum(map(_size, kept))
+def newest_of(found: Iterable[N], limit: int) -> list[N]:
+    """The last `limit` of them, as far as a page has room for these."""
+    kept: deque[N] = deque(found, maxlen=limit)
+    size = sum(event.size_bytes for event in kept)
     while size > PAGE_BYTES and len(kept) > 1:
         size -= kept.popleft().size_bytes
     return list(kept)
 
 
-def _oldest(found: Iterable[PastEvent], limit: int) -> tuple[list[PastEvent], bool]:
-    """The first of them, and whether there are no others."""
-    kept: list[PastEvent] = []
+def oldest_of(found: Iterable[N], limit: int) -> tuple[list[N], bool]:
+    """The first `limit` of them, as far as a page has room for these, and whether there are no others."""
+    kept: list[N] = []
     size = 0
     for event in found:
         size += event.size_bytes

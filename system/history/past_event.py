@@ -13,7 +13,6 @@ from ...actors.events import (
     ActorCrashed,
     Event,
     HookFailed,
-    LogLine,
     ProcessDied,
     RecoveryPhase,
     ShutdownError,
@@ -36,8 +35,8 @@ OVERHEAD = 400
 """Bytes that a past event takes in memory besides its texts, about."""
 TELL_WHERE = (ActorCrashed, ProcessDied, HookFailed, ShutdownError)
 """Events that tell of a crash first; what others make of it they tell without its traceback."""
-UNKEPT: frozenset[type[Event]] = frozenset({*TRACED, LogLine, SnapshotTaken, RecoveryPhase})
-"""Events that are told again and again while all is well; the history does not keep them."""
+UNKEPT: frozenset[type[Event]] = frozenset({*TRACED, SnapshotTaken, RecoveryPhase})
+"""Events that are told again and again while all is well; the history does not keep them. Lines are kept elsewhere."""
 
 
 class PastEvent(msgspec.Struct, frozen=True):

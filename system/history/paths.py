@@ -5,8 +5,10 @@ from __future__ import annotations
 import fnmatch
 import re
 from collections.abc import Callable
+from typing import Any
 
 from ...actors.errors import SpecError
+from ...actors.kernel.ref import ActorRef
 
 LONGEST = 1_000
 """Characters of a pattern."""
@@ -41,6 +43,16 @@ def matcher(pattern: str) -> Callable[[str], bool]:
         return len(names) in reached
 
     return matches
+
+
+def literal(address: str) -> str:
+    """A pattern that means just this address, whatever signs are in it."""
+    return "".join(f"[{sign}]" if sign in "*?[" else sign for sign in address)
+
+
+def pattern_of(target: ActorRef[Any] | str) -> str:
+    """The pattern of addresses that a caller means by an actor, or by a text."""
+    return literal(target.path) if isinstance(target, ActorRef) else target
 
 
 def _takes(names: list[re.Pattern[str] | None], at: int, name: str) -> bool:

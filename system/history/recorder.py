@@ -7,7 +7,9 @@ from collections.abc import Callable
 from heapq import merge
 from typing import TYPE_CHECKING
 
-from ...actors.events import ActorKilled, ActorStarted, ChildStopped, ChildTerminated, Event, Restful
+from ...actors.events import ActorKilled, ActorStarted, ChildStopped, ChildTerminated, Event, LogLine, Restful
+from ..last_lines.followers import Followers
+from ..last_lines.line_memory import LineMemory
 from .authors import author
 from .counted_work import COUNTED, count_work
 from .lives import LivesByAddress
@@ -37,20 +39,25 @@ class HistoryRecorder:
         node: whose events they are.
         store: keeps the history over the end of the process; None: nothing does.
         log_payloads: record what was in messages, too.
+        lines: keeps what processes print; None: one of its own.
 
     Attributes:
         keeps_payloads: whether it does.
         lives: what each address went through.
+        lines: the last lines of the system, which are in no event of the history.
+        followers: those who wait for the next event.
     """
 
-    def __init__(self, node: Node, store: NoteStore | None, *, log_payloads: bool) -> None:
+    def __init__(
+        self, node: Node, store: NoteStore | None, *, log_payloads: bool, lines: LineMemory | None = None
+    ) -> None:
         self._node, self.keeps_payloads = node, log_payloads
-        self.lives = LivesByAddress()
+        self.lives, self.lines = LivesByAddress(), lines or LineMemory(node.clock.wall)
         self._tracks = {name: EventTrack(bounds, node.loop.time()) for name, bounds in BOUNDS.items()}
         self._storm_since: float | None = None
         self._storm_timer: asyncio.TimerHandle | None = None
         self._expected: dict[str, tuple[str, str]] = {}
-        self._followers: list[asyncio.Future[None]] = []
+        self.followers = Followers()
         self._last = 0
         self._writer = None if store is None else HistoryWriter(node, store)
         self._load(store)
@@ -70,6 +77,9 @@ class HistoryRecorder:
 
     def __call__(self, event: Event) -> None:
         """Record an event, unless it is of no interest later, or there are too many."""
+        if isinstance(event, LogLine):
+            self.lines.add_printed(event.address, event.stream, event.text, event.life)
+            return
         kind = type(event)
         if kind in UNKEPT or not self._admits(event, kind):
             return
@@ -128,11 +138,8 @@ class HistoryRecorder:
         self._keep(event)
         if self._writer is not None:
             self._writer.add(event)
-        if self._followers:
-            followers, self._followers = self._followers, []
-            for follower in followers:
-                if not follower.done():
-                    follower.set_result(None)
+        if self.followers:
+            self.followers.tell()
 
     def _keep(self, event: PastEvent) -> None:
         self._last = max(self._last, event.number)
@@ -170,17 +177,6 @@ class HistoryRecorder:
         """Events that have given way to newer ones."""
         return sum(track.ring.dropped for track in self._tracks.values())
 
-    def changed(self) -> asyncio.Future[None]:
-        """A future that ends with the next event."""
-        future: asyncio.Future[None] = self._node.loop.create_future()
-        self._followers.append(future)
-        future.add_done_callback(self._forget)
-        return future
-
-    def _forget(self, future: asyncio.Future[None]) -> None:
-        if future in self._followers:  # Whoever waited has been cancelled.
-            self._followers.remove(future)
-
     def close(self) -> None:
         """The system has ended: say so, and have the store keep what it does not have yet."""
         if self._storm_timer is not None:
@@ -188,8 +184,8 @@ class HistoryRecorder:
         self._note("SystemStopped", {"why": "the system stopped"})
         if self._writer is not None:
             self._writer.close()
-        for follower in list(self._followers):
-            follower.cancel()
+        self.followers.close()
+        self.lines.close()
 
 
 def expect_end(recorder: HistoryRecorder | None, address: str, because: str) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple, TypeAlias
 
+from .past_event import PastEvent
 from .quota import EventQuota
 from .ring import EventRing
 
@@ -102,7 +103,7 @@ class EventTrack:
     """
 
     def __init__(self, bounds: TrackBounds, now: float) -> None:
-        self.ring = EventRing(bounds.most, bounds.most_bytes)
+        self.ring = EventRing[PastEvent](bounds.most, bounds.most_bytes)
         self._burst = bounds.burst
         self._quota = EventQuota(bounds.burst, bounds.per_second, now)
 

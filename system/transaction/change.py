@@ -83,7 +83,8 @@ class Change:
 
         Args:
             target: the child.
-            options: restart, shutdown, backoff, significant, start_timeout, rules: as `child` takes them.
+            options: restart, shutdown, backoff, significant, start_timeout, rules, register: as `child` takes them. The
+                life that is lived now keeps the names that it has.
         """
         self.step(Respecify(target, options))
 

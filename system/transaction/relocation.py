@@ -12,7 +12,7 @@ from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any
 
 from ...actors.kernel.cell import Cell
-from ...actors.migration.move import Gate
+from ...actors.migration.move import CommitGate
 from ...supervision.arbiter import Grant, Hand, arbiter_of
 from ...supervision.respec import recipe_spec, replace_mechanism, replace_place
 from ...supervision.spec import ChildSpec
@@ -36,7 +36,7 @@ class Gated:
         self._place, self._text = place, text
         self.task: asyncio.Task[Any] | None = None
         self._path = ""  # of the actor, as it is while this is done
-        self._gate: Gate | None = None
+        self._gate: CommitGate | None = None
 
     @property
     def waits_for(self) -> str:
@@ -55,10 +55,10 @@ class Gated:
         )
         self.task.add_done_callback(seen)
 
-    async def reach(self, system: ActorSystem, work: Callable[[Gate], Coroutine[Any, Any, object]]) -> None:
+    async def reach(self, system: ActorSystem, work: Callable[[CommitGate], Coroutine[Any, Any, object]]) -> None:
         """Have it begun, if it is not, and wait until it is ready."""
         if self.task is None:
-            self._gate = Gate(system._node.loop)
+            self._gate = CommitGate(system._node.loop)
             self.begin(system, work(self._gate))
         gate, task = self._gate, self.task
         assert gate is not None
@@ -68,9 +68,9 @@ class Gated:
         if task.done():
             task.result()
 
-    async def done(self, system: ActorSystem, work: Callable[[Gate], Coroutine[Any, Any, bool]]) -> bool:
+    async def done(self, system: ActorSystem, work: Callable[[CommitGate], Coroutine[Any, Any, bool]]) -> bool:
         """Have it done at once, at an open gate. Whoever waits no more has to give it up."""
-        self._gate = Gate(system._node.loop)
+        self._gate = CommitGate(system._node.loop)
         self._gate.open()
         self.begin(system, work(self._gate))
         assert self.task is not None
@@ -155,7 +155,7 @@ class Relocation(StagedWork):
         if not self._comes_last:
             await self._move.reach(system, lambda gate: self._work(system, gate))
 
-    def _work(self, system: ActorSystem, gate: Gate | None) -> Coroutine[Any, Any, object]:
+    def _work(self, system: ActorSystem, gate: CommitGate | None) -> Coroutine[Any, Any, object]:
         cell, moves = self._place.living(system._node), system._moves
         wanted, before = self._after.mechanism, self.before.mechanism
         if not self._adapts:

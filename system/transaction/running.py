@@ -20,7 +20,7 @@ from .operation import Operation, wrong
 if TYPE_CHECKING:
     from ..system import ActorSystem
 
-OPTIONS = ("restart", "shutdown", "backoff", "significant", "start_timeout", "rules")
+OPTIONS = ("restart", "shutdown", "backoff", "significant", "start_timeout", "rules", "register")
 """What a supervisor looks up at each restart or stop, so that it can be another at any time."""
 
 

@@ -194,7 +194,7 @@ def _planned(draft: Draft, above: DraftPlace, spec: ChildSpec) -> DraftPlace:
     Raises:
         NameTaken: its name is somebody's now (it is started before the others change), or another one's to be.
     """
-    name = spec.register
+    name = None if spec.register is None else spec.register.text
     if name is not None and (name in draft.node.names or any(name in other.names for other in draft.root.walk())):
         raise NameTaken(name)
     place = above.children[spec.id] = DraftPlace(spec.id, above, None, spec)

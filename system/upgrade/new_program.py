@@ -51,9 +51,7 @@ def load_named(target: str) -> Any:
     if not module or not name:
         raise SpecError(target, "name the specs as 'module:name' or 'program.py:name', such as 'shop.main:tree'")
     is_script = module.endswith(".py")
-    folder = os.path.dirname(os.path.abspath(module)) if is_script else os.getcwd()
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
+    find_in(os.path.dirname(os.path.abspath(module)) if is_script else os.getcwd())
     problem = attempt(lambda: load_main(module, True) if is_script else _import(module))
     if problem:
         where = "" if is_script else "; it is looked for in this folder, and where PYTHONPATH says"
@@ -76,6 +74,12 @@ def specs_in(target: str, found: Any) -> Named:
     except BaseException as error:  # A program that reads its specs again goes on, whatever they raise.
         raise SpecError(target, f"it raised {type_name(type(error))}: {error_text(error)}") from error
     return specs
+
+
+def find_in(folder: str) -> None:
+    """Let modules be found in a folder first, as `python -m` does with the one it is started in."""
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
 
 
 def _import(module: str) -> None:

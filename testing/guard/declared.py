@@ -79,7 +79,7 @@ _fields: Callable[[type], tuple[tuple[str, Look], ...]] = functools.cache(_find_
 
 def _is_fixed(kind: type) -> bool:
     declared = _hints(kind)
-    return len(declared) == len(getattr(kind, "__struct_fields__", ())) and all(map(_stays, declared.values()))
+    return len(declared) == len(_struct_fields(kind)) and all(map(_stays, declared.values()))
 
 
 is_fixed: Callable[[type], bool] = functools.cache(_is_fixed)
@@ -91,7 +91,7 @@ Such a message need not be coded to be checked; of others msgspec knows more, su
 
 def _is_all_looked_at(kind: type) -> bool:
     declared = _hints(kind)
-    return len(declared) == len(getattr(kind, "__struct_fields__", ())) and all(map(_has_no_limits, declared.values()))
+    return len(declared) == len(_struct_fields(kind)) and all(map(_has_no_limits, declared.values()))
 
 
 is_all_looked_at: Callable[[type], bool] = functools.cache(_is_all_looked_at)
@@ -110,7 +110,7 @@ def _has_no_limits(declared: Any) -> bool:
 def _find_plain_look(kind: type) -> Callable[[Any], bool]:
     declared = _hints(kind)
     names, exact = tuple(declared), tuple(map(_exact, declared.values()))
-    if len(declared) != len(getattr(kind, "__struct_fields__", ())) or None in exact:
+    if len(declared) != len(_struct_fields(kind)) or None in exact:
         return lambda message: False
     if not names:
         return lambda message: True
@@ -146,6 +146,11 @@ def _stays(declared: Any) -> bool:
     return get_origin(declared) in (tuple, frozenset, typing.Union, types.UnionType) and all(map(_stays, args))
 
 
+def _struct_fields(kind: type) -> tuple[str, ...]:
+    """The names of a struct's fields; none of what is no struct, such as a class of messages that was sent itself."""
+    return kind.__struct_fields__ if issubclass(kind, msgspec.Struct) else ()
+
+
 def _hints(kind: type) -> dict[str, Any]:
     """The declared types of a struct's or a dataclass's fields; nothing where a name in them is not known."""
     try:
@@ -155,7 +160,7 @@ def _hints(kind: type) -> dict[str, Any]:
     if dataclasses.is_dataclass(kind):
         names: Iterable[str] = (field.name for field in dataclasses.fields(kind))
     else:
-        names = getattr(kind, "__struct_fields__", ())
+        names = _struct_fields(kind)
     return {name: hints[name] for name in names if name in hints}
 
 

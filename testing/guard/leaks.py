@@ -6,6 +6,7 @@ import gc
 import operator
 import os
 import signal
+import stat
 import sys
 import sysconfig
 import threading
@@ -22,7 +23,7 @@ TOLD = {
     "descriptors": "descriptor was left open",
 }
 OPEN_FILES = "/proc/self/fd"
-FILE: Callable[[os.stat_result], tuple[int, int]] = operator.attrgetter("st_dev", "st_ino")
+FILE: Callable[[os.stat_result], tuple[int, int]] = operator.itemgetter(stat.ST_DEV, stat.ST_INO)
 """Which file a descriptor is of."""
 RANDOM = ("/dev/urandom", "/dev/random")
 PAGES = ("-hands", "-hands (deleted)")

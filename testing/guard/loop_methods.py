@@ -7,6 +7,7 @@ all that is done with that loop.
 from __future__ import annotations
 
 import asyncio
+import types
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -38,12 +39,12 @@ class LoopMethods:
     def __init__(self, kind: Any) -> None:
         self._notes: dict[asyncio.AbstractEventLoop, tuple[LoopNotes, ...]] = {}
         swaps = Swaps()
-        swaps.put(kind, "call_at", self._noting_timers(method(kind, "call_at"), lambda loop: 0.0))
+        swaps.put(kind, "call_at", self._noting_timers(kind, "call_at", lambda loop: 0.0))
         if kind.call_later is not asyncio.BaseEventLoop.call_later:  # It calls `call_at`.
-            swaps.put(kind, "call_later", self._noting_timers(method(kind, "call_later"), kind.time))
-        swaps.put(kind, "create_future", self._noting_futures(method(kind, "create_future")))
-        swaps.put(kind, "create_task", self._noting_futures(method(kind, "create_task")))
-        swaps.put(kind, "call_exception_handler", self._noting_exceptions(method(kind, "call_exception_handler")))
+            swaps.put(kind, "call_later", self._noting_timers(kind, "call_later", kind.time))
+        for name in ("create_future", "create_task"):
+            swaps.put(kind, name, self._noting_futures(kind, name))
+        swaps.put(kind, "call_exception_handler", self._noting_exceptions(kind))
 
     @staticmethod
     def of(kind: type) -> LoopMethods:
@@ -66,11 +67,11 @@ class LoopMethods:
         for one in self._notes.get(loop, ()):
             one.actors_killed(node)
 
-    def _noting_timers(self, call: Any, origin: Callable[[Any], float]) -> Any:
-        notes = self._notes
+    def _noting_timers(self, kind: Any, name: str, origin: Callable[[Any], float]) -> Any:
+        notes, owner = self._notes, owner_of(kind, name)
 
         def noted(loop: Any, time: float, callback: Any, *args: Any, **options: Any) -> asyncio.Handle:
-            handle: asyncio.Handle = call(loop, time, callback, *args, **options)
+            handle: asyncio.Handle = getattr(owner, name)(loop, time, callback, *args, **options)
             for one in notes.get(loop, ()):
                 one.timer_made(handle, origin(loop) + time, callback)
             return handle
@@ -78,34 +79,33 @@ class LoopMethods:
         noted.methods = self  # type: ignore[attr-defined]  # so that the next test finds them
         return noted
 
-    def _noting_futures(self, make: Any) -> Any:
-        notes = self._notes
+    def _noting_futures(self, kind: Any, name: str) -> Any:
+        notes, owner = self._notes, owner_of(kind, name)
 
         def noted(loop: Any, *args: Any, **options: Any) -> Any:
-            made = make(loop, *args, **options)
+            made = getattr(owner, name)(loop, *args, **options)
             for one in notes.get(loop, ()):
                 one.future_made(made)
             return made
 
         return noted
 
-    def _noting_exceptions(self, call: Any) -> Any:
-        notes = self._notes
+    def _noting_exceptions(self, kind: Any) -> Any:
+        notes, owner = self._notes, owner_of(kind, "call_exception_handler")
 
         def noted(loop: Any, context: dict[str, Any]) -> None:
             for one in notes.get(loop, ()):
                 one.exception_told(context)
-            call(loop, context)
+            owner.call_exception_handler(loop, context)
 
         return noted
 
 
-def method(kind: Any, name: str) -> Any:
-    """A class's own method, or whatever its bases have when it is called: a test may exchange theirs."""
+def owner_of(kind: Any, name: str) -> Any:
+    """Whoever has the method that a class of loops has had: what keeps its own one, or the base that it comes from.
+
+    It is looked up there at each call, for a test may exchange the method of a base.
+    """
     if name in vars(kind):
-        return vars(kind)[name]
-
-    def inherited(loop: Any, *args: Any, **options: Any) -> Any:
-        return getattr(super(kind, loop), name)(*args, **options)
-
-    return inherited
+        return types.SimpleNamespace(**{name: vars(kind)[name]})
+    return next(base for base in kind.__mro__ if name in vars(base))

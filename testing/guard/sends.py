@@ -81,12 +81,12 @@ class SendChecks(TurnWatcher):
         self._images = ValueBytes()
         self._kept: dict[int, Handed] = {}
         self._bytes = 0
-        self._near: defaultdict[Cell, deque[Handed]] = defaultdict(lambda: deque(maxlen=NEAR))
+        self._near: defaultdict[Cell, deque[Handed]] = defaultdict(_few)
         self._mutated: list[str] = []
         self._aliased: list[str] = []
         self._doors = Doors.opened()
         self._doors.checks[node] = self
-        self._unwatch = watch_turns(node, self)
+        self._unwatch: Callable[[], None] = watch_turns(node, self)
 
     # -- messages ---------------------------------------------------------------------------------------------------
 
@@ -303,9 +303,19 @@ class SendChecks(TurnWatcher):
     def close(self) -> None:
         """No more checks."""
         self._unwatch()
+        self._unwatch = _nothing  # What it holds need not wait for the garbage collector.
         self._doors.close(self.node)
         self._kept.clear()
         self._near.clear()
+
+
+def _nothing() -> None:
+    """There is nothing more to end."""
+
+
+def _few() -> deque[Handed]:
+    """What an actor has given or taken last."""
+    return deque(maxlen=NEAR)
 
 
 def _is_of_library(kind: type) -> bool:

@@ -76,7 +76,7 @@ class Worker(hf.Actor):
 
     @hf.on(Seen)
     def look(self, message: Seen) -> list[str]:
-        return self.seen
+        return list(self.seen)
 
     @hf.on(Ring)
     async def ring(self, message: Ring) -> str:

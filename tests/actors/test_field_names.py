@@ -62,7 +62,7 @@ class Other(hf.Actor):
 
     @hf.on(Said, readonly=True)
     def all(self, message: Said) -> list[str]:
-        return self.said
+        return list(self.said)
 
 
 class One(Other):

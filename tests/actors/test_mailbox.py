@@ -45,7 +45,7 @@ class Box(hf.Actor):
 
     @hf.on(Seen)
     def look(self, message: Seen) -> list[int]:
-        return self.seen
+        return list(self.seen)
 
     @hf.on(Poke)
     def poke(self, message: Poke) -> None:

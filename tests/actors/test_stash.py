@@ -56,7 +56,7 @@ class Shop(hf.Actor):
 
     @hf.on(Seen)
     def look(self, message: Seen) -> list[int]:
-        return self.seen
+        return list(self.seen)
 
 
 async def test_stashed_messages_come_back_in_order_before_later_ones(system: hf.ActorSystem) -> None:

@@ -45,7 +45,7 @@ class Sink(hf.Actor):
 
     @hf.on(Notes, readonly=True)
     def read(self, message: Notes) -> list[str]:
-        return self.notes
+        return list(self.notes)
 
 
 class Do(hf.Message[str]):
@@ -76,7 +76,7 @@ class Doer(hf.Actor):
 
     @hf.on(Seen, readonly=True)
     def read(self, message: Seen) -> list[str]:
-        return self.seen
+        return list(self.seen)
 
     @hf.on(Tick)
     def tick(self, message: Tick) -> None:

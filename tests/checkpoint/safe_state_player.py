@@ -38,8 +38,9 @@ async def main(store: str, place: str, order: str, life: str) -> None:
             if life == "last" or name == "wheels":
                 await starting[-1]
         if life == "killed":
-            waiting = asyncio.ensure_future(recovering.wait())
-            await asyncio.wait([waiting, asyncio.gather(*starting)], return_when=asyncio.FIRST_COMPLETED)
+            waiting: asyncio.Future[Any] = asyncio.ensure_future(recovering.wait())
+            all_up: asyncio.Future[Any] = asyncio.gather(*starting)
+            await asyncio.wait([waiting, all_up], return_when=asyncio.FIRST_COMPLETED)
             if not recovering.is_set():  # It was not being recovered when this program began.
                 strike(system, system.ref("/app/planner", hf.Actor))
             await recovering.wait()

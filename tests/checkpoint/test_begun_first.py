@@ -101,7 +101,7 @@ class Returning(hf.Actor):
 
     @hf.on(Read, readonly=True)
     def read(self, message: Read) -> list[int]:
-        return self.seen
+        return list(self.seen)
 
 
 STACKS: dict[str, Any] = {"none": None, "pbr": PBR(), "lfr": LFR(), "tr": TR(), "tmr": TMR()}

@@ -65,7 +65,7 @@ class Hall(hf.Actor):
 
     @hf.on(Entered, readonly=True)
     def entered(self, message: Entered) -> list[int]:
-        return self.tags
+        return list(self.tags)
 
 
 class Grand(Hall):

@@ -31,7 +31,7 @@ class Moody(hf.Actor):
 
     @hf.on(Seen)
     def read(self, message: Seen) -> list[str]:
-        return self.words
+        return list(self.words)
 
 
 def moody(isolation: str, mood: Path, **options: Any) -> hf.ChildSpec:

@@ -84,7 +84,7 @@ class Ledgers(RuleBasedStateMachine):
     @rule(count=st.integers(2, 4), ended=st.integers(0, 3), gone=st.integers(0, 2))
     def admit_together(self, count: int, ended: int, gone: int) -> None:
         """Messages stand in one row; the turns of the first ones may be over, if nothing was in front of them."""
-        ledger, place, ends = self.ledger, RowPlace([], 0, []), list[tuple[Any, ...]]()
+        ledger, place, ends = self.ledger, RowPlace([]), list[tuple[Any, ...]]()
         is_ahead = self.next_input() is None
         sources = [ledger.admit(MESSAGE, "m:Do", b"%d" % number, 0.5, "/app/other") for number in range(count)]
         for source in sources:
@@ -216,6 +216,7 @@ class Ledgers(RuleBasedStateMachine):
         self.deaths[running] = self.deaths.get(running, 0) + 1
         assert (poison is source) == (self.deaths[running] >= MOST)
         if poison is None:
+            assert source.positions is not None
             self.write(("tried", running, source.deliveries), source.positions)
         else:  # Its turn ends with what it has sent.
             number = self.ledger.turn + 1
@@ -233,11 +234,12 @@ class Ledgers(RuleBasedStateMachine):
         turn = data.draw(st.integers(ledger.state_turn + 1, ledger.turn))
         later = {past.input.id for number, past in ledger.turns.items() if number > turn and past.status == STASHED}
         stash = sorted(key for key in ledger.stashed() & ledger.open.keys() if key not in later)
-        over = ledger.over_after(turn)
+        contained = ledger.contained_in(turn)
+        over = ledger.over_after(contained)
         meta = Meta(FORMAT, turn, ledger.next_id, stash, {}, [], 1, b"state", turn, over=over)
-        for position in ledger.contained_in(turn):
+        for position in ledger.needless(contained):
             self.journal.pop(position, None)
-        ledger.begin_with(meta)
+        ledger.begin_with(meta, contained)
         self.cut_at = meta
         needed = {source.id for source in ledger.handled_and_open()} | {key for _, key in ledger.shared.gone}
         for entry in self.journal.values():
@@ -371,7 +373,7 @@ def test_background_work_has_one_result() -> None:
 
 def row_of(ledger: InputLedger, position: int, count: int) -> tuple[list[Input], tuple[Any, ...]]:
     """Messages that stand in one row, and the row."""
-    place = RowPlace([position], count, [])
+    place = RowPlace([position], count)
     sources = [ledger.admit(MESSAGE, "m:Do", b"", 0.5, None) for _ in range(count)]
     for source in sources:
         source.positions, source.row = [], place
@@ -381,11 +383,12 @@ def row_of(ledger: InputLedger, position: int, count: int) -> tuple[list[Input],
 
 def snapshot(ledger: InputLedger, turn: int, journal: dict[int, tuple[Any, ...]]) -> Meta:
     stash = sorted(ledger.stashed() & ledger.open.keys())
-    over = ledger.over_after(turn)
+    contained = ledger.contained_in(turn)
+    over = ledger.over_after(contained)
     meta = Meta(FORMAT, turn, ledger.next_id, stash, {}, [], 1, b"state", turn, over=over)
-    for position in ledger.contained_in(turn):
+    for position in ledger.needless(contained):
         journal.pop(position, None)
-    ledger.begin_with(meta)
+    ledger.begin_with(meta, contained)
     return meta
 
 
@@ -395,6 +398,33 @@ def read(meta: Meta, journal: dict[int, tuple[Any, ...]]) -> InputLedger:
     for position, entry in journal.items():
         assert found.read_entry(position, entry)
     return found
+
+
+def test_what_ends_without_a_turn_is_contained_once() -> None:
+    """It was put aside in a turn before: its row stays for the message that nobody has handled."""
+    ledger, journal = InputLedger("/app/doer"), dict[int, tuple[Any, ...]]()
+    (aside, handled, waits), journal[1] = row_of(ledger, 1, 3)
+    ledger.end_turn(aside, 0, STASHED)
+    ledger.withdraw(aside)
+    ledger.drop_input(aside)
+    ledger.end_turn(handled, 1, OK)
+    meta = snapshot(ledger, 1, journal)
+    assert [*read(meta, journal).open] == [waits.id]
+
+
+def test_what_is_handled_behind_an_image_stays() -> None:
+    """It had been put aside when the image was begun, and has been handled when that is kept."""
+    ledger, journal = InputLedger("/app/doer"), dict[int, tuple[Any, ...]]()
+    (aside, handled), journal[1] = row_of(ledger, 1, 2)
+    ledger.end_turn(aside, 0, STASHED)
+    ledger.end_turn(handled, 1, OK)
+    journal[2] = ledger.end_turn(aside, 2, OK).entry(2)
+    ledger.positions_of(2).append(2)
+    meta = snapshot(ledger, 1, journal)
+    assert meta.over == [handled.id]
+    found = read(meta, journal)
+    assert [(number, turn.input.id) for number, turn in found.turns.items()] == [(2, aside.id)]
+    assert not found.open
 
 
 def test_a_row_of_which_much_is_over_for_long() -> None:
@@ -409,7 +439,7 @@ def test_a_row_of_which_much_is_over_for_long() -> None:
         assert sorted(meta.over) == [1, 2]
         found = read(meta, journal)
         assert [*found.open] == [0]
-        assert sorted(found.over_after(turn)) == [1, 2], "the next program knows it, too"
+        assert sorted(found.over_after(found.contained_in(turn))) == [1, 2], "the next program knows it, too"
         [later], journal[turn + 10] = row_of(ledger, turn + 10, 1)
         ledger.end_turn(later, turn + 1, OK)
     ledger.end_turn(sources[0], 6, OK)

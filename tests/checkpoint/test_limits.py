@@ -87,4 +87,4 @@ class Waiting(hf.Actor):
 
     @hf.on(Seen, readonly=True)
     def read(self, message: Seen) -> list[str]:
-        return self.seen
+        return list(self.seen)

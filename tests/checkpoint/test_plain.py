@@ -114,7 +114,7 @@ class Out(hf.Actor):
 
     @hf.on(Notes, readonly=True)
     def read(self, message: Notes) -> list[str]:
-        return self.notes
+        return list(self.notes)
 
 
 async def test_methods_are_called_by_messages_and_the_state_comes_back(isolation: str, store: str | None) -> None:

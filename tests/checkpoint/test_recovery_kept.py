@@ -99,7 +99,7 @@ class Shutter(hf.Actor):
 
     @hf.on(Seen)
     def read(self, message: Seen) -> list[str]:
-        return self.taken
+        return list(self.taken)
 
 
 @pytest.mark.parametrize("recovery", [hf.hybrid(interval=NEVER), hf.replay_only()], ids=["hybrid", "replay"])

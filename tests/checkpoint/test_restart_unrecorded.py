@@ -37,7 +37,7 @@ class Asker(hf.Actor):
 
     @hf.on(Said, readonly=True)
     def read(self, message: Said) -> list[str]:
-        return self.said
+        return list(self.said)
 
 
 ASKER = hf.child("asker", hf.start(Asker), recovery=hf.hybrid())

@@ -41,7 +41,7 @@ class Adder(hf.Actor):
 
     @hf.on(Look, readonly=True)
     def look(self, message: Look) -> list[int]:
-        return self.items
+        return list(self.items)
 
 
 @pytest.mark.parametrize("end", ["kill", "crash"])

@@ -55,7 +55,7 @@ class Door(hf.Actor):
 
     @hf.on(Words, readonly=True)
     def read(self, message: Words) -> list[str]:
-        return self.words
+        return list(self.words)
 
 
 class Held:

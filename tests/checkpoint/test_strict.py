@@ -131,6 +131,39 @@ async def test_each_way_to_ask_the_world_is_stopped_at_the_call(system: hf.Actor
         time.time()  # Nothing is left behind.
 
 
+class Lives(hf.Message[int]): ...
+
+
+class Reborn(hf.Actor):
+    def __init__(self) -> None:
+        self.first = self.ctx.life
+
+    async def on_start(self, restored: bool) -> None:
+        if restored:  # Else it is a turn, too.
+            self._began = self.ctx.life
+
+    @hf.on(Lives)
+    def lives(self, message: Lives) -> int:
+        return self.ctx.life
+
+
+async def test_the_number_of_the_life_differs_in_a_replay(system: hf.ActorSystem, isolation: str) -> None:
+    ref = await start(system, isolation, "reborn", hf.start(Reborn), recovery=STRICT)
+    with pytest.raises(hf.RemoteCrash, match="NotDeterministic") as caught:
+        await ref.ask(Lives(), timeout=20.0)
+    assert "ctx.life was called" in caught.value.text
+    assert "use a count in the state instead" in caught.value.text
+
+
+async def test_a_replay_that_replies_its_life_names_that(system: hf.ActorSystem) -> None:
+    ref = await start(system, "task", "reborn", hf.start(Reborn), recovery=hf.hybrid(interval=1000.0))
+    with system.events() as events:
+        assert await ref.ask(Lives(), timeout=20.0) == 1
+        ref._cell.kill()
+        failed = await events.until(hf.events.RecoveryFailed, timeout=20.0)
+    assert "ctx.life" in failed.reason
+
+
 async def test_where_it_lives_does_not_matter(isolation: str) -> None:
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
         ref = await start(system, isolation, "asker", hf.start(Asker), recovery=STRICT)

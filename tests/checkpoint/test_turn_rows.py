@@ -193,7 +193,7 @@ class Register(hf.Actor):
 
     @hf.on(Senders, readonly=True)
     def read(self, message: Senders) -> list[list[str]]:
-        return self.seen
+        return list(self.seen)
 
 
 class Teller(hf.Actor):

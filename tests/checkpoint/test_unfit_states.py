@@ -30,7 +30,7 @@ class Cart(hf.Actor):
 
     @hf.on(Items, readonly=True)
     def read(self, message: Items) -> list[str]:
-        return self.items
+        return list(self.items)
 
 
 @hf.renamed(f"{__name__}:Cart")

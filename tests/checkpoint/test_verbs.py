@@ -102,7 +102,7 @@ class Acting(hf.Actor):
 
     @hf.on(Heard, readonly=True)
     def read(self, message: Heard) -> list[str]:
-        return self.heard
+        return list(self.heard)
 
     def on_down(self, source: hf.ActorRef[Any], reason: hf.ExitReason, recovering: bool) -> None:
         self.heard.append(f"DOWN {source.path}")
@@ -373,7 +373,7 @@ class Keeper(hf.Actor):
 
     @hf.on(Heard, readonly=True)
     def read(self, message: Heard) -> list[str]:
-        return self.heard
+        return list(self.heard)
 
 
 async def test_what_was_promised_and_put_aside_is_taken_up_in_on_start(isolation: str, store: str) -> None:

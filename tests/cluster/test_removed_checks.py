@@ -13,6 +13,20 @@ LEADERSHIP = "tests/cluster/test_leadership.py"
 FLEETS = "tests/cluster/test_takeover.py"
 
 CHECKS = {
+    "a program that stands by says so, and nothing else": Check(
+        "console/client_session.py",
+        "        if not isinstance(request, About) and (why := _why_not_here(system)):\n",
+        '        if why := "":\n',
+        "tests/cluster/test_standby_seen.py",
+        "test_a_system_that_is_not_up_tells_its_role_alone",
+    ),
+    "the program that runs the tree is taken": Check(
+        "console/operate/reaching.py",
+        "    running = [one for one in meant if one.runs]\n",
+        "    running = list[RunningProgram]()\n",
+        "tests/cluster/test_standby_seen.py",
+        "test_a_program_is_chosen_by_pid_machine_and_role",
+    ),
     "servers that are away for a moment stop no start": Check(
         "cluster/leadership.py",
         "self._until = min(self._until, (now if since is None else since) + MOMENT_SECONDS)",
@@ -22,8 +36,8 @@ CHECKS = {
     ),
     "a program that begins to lead waits for servers that are silent while it opens its lines": Check(
         "system/system_connection.py",
-        "await Patience(waits=waits).answered(servers.open_lines, NowAndThen(silent))",
-        "await servers.open_lines()",
+        "await Patience(waits=waits).answered(listening, NowAndThen(silent))",
+        "await listening()",
         "tests/cluster/test_simulated_fleet.py",
         "begins_to_lead_waits_for_servers",
     ),

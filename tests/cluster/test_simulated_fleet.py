@@ -251,19 +251,25 @@ def test_what_a_program_raises_is_told() -> None:
     simulate(run, 0)
 
 
-@pytest.mark.parametrize("moment", ["check_system", "Specifications", "serve"])
+@pytest.mark.parametrize("moment", ["check_system", "Specifications", "serve", "its body"])
 def test_who_is_deposed_while_it_starts_has_lost_the_leadership(moment: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that it may be started again, and stands by: at whatever moment of its start it hears of that."""
+    """So that it may be started again, and stands by: at whatever moment of its start, or later, it hears of that."""
 
     def refused(*_: object, **__: object) -> Any:
         raise StaleEpoch("sim:broker", epoch=1, current=2)
 
+    async def lead(fleet: SimFleet) -> None:
+        async with hf.ActorSystem("app", store=fleet.servers(), log=False):
+            if moment == "its body":
+                refused()
+            raise AssertionError("it runs")
+
     async def run() -> None:
         async with SimFleet() as fleet:
-            monkeypatch.setattr(f"holdfast.system.system.{moment}", refused)
+            if moment != "its body":
+                monkeypatch.setattr(f"holdfast.system.system.{moment}", refused)
             with pytest.raises(LeadershipLost, match="in epoch 2"):
-                async with hf.ActorSystem("app", store=fleet.servers(), log=False):
-                    raise AssertionError("it runs")
+                await lead(fleet)
 
     simulate(run, 0)
 

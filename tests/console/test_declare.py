@@ -12,7 +12,7 @@ from holdfast.console.declare.tree_file import TreeFile
 from holdfast.console.declare.tree_plan import declare
 from holdfast.console.endpoint import control_endpoint
 from tests.console.commands import holdfast
-from tests.system.trees import Add, Double, ref
+from tests.system.trees import Add, Boom, Counter, Double, ref
 
 DONE, FAILED, UNUSABLE = 0, 1, 2
 SHOP = """
@@ -103,6 +103,49 @@ async def test_each_difference_is_one_step_and_state_is_kept(
     assert await steps(app, SHOP) == []
 
 
+FLEET = """
+["/app"]
+supervisor = "one_for_one"
+intensity = 1000
+
+["/app/a"]
+class = "tests.system.trees:Counter"
+args = [5]
+names = ["first"]
+"""
+
+
+async def test_a_file_says_which_names_an_actor_has_and_not_who_finds_it(app: hf.ActorSystem) -> None:
+    """A name of the next lives, too: the program has given it by the spec, with a scope that the file does not know."""
+    one = await app.start(hf.child("a", hf.start(Counter, 5), register="first", scope="fleet"))
+
+    async def lives_again() -> list[str]:
+        """The names of its next life."""
+        with pytest.raises(hf.RemoteCrash):
+            await one.ask(Boom())
+        assert await one.ask(Add(1)) == 6
+        return list(app._node.names)
+
+    assert await steps(app, FLEET) == []
+    assert await lives_again() == ["first"]
+    assert app._node.shown("first") is one._cell
+    for file, names in ((FLEET.replace("first", "till"), ["till"]), (FLEET.replace('"first"', ""), [])):
+        assert await steps(app, file)
+        assert await steps(app, file) == []
+        assert list(app._node.names) == await lives_again() == names
+    await steps(app, FLEET)
+    assert await lives_again() == ["first"]
+    with pytest.raises(hf.errors.NoSuchActor):
+        app._node.shown("first")  # It was taken away, with who has found it.
+
+
+async def test_a_new_actor_of_a_file_is_found_in_its_system(app: hf.ActorSystem) -> None:
+    assert await steps(app, FLEET) == ["add /app/a"]
+    assert app.whereis("first").path == "/app/a"
+    with pytest.raises(hf.errors.NoSuchActor):
+        app._node.shown("first")
+
+
 async def test_what_is_not_in_the_file_is_removed_and_children_of_dynamic_supervisors_stay(
     app: hf.ActorSystem,
 ) -> None:
@@ -174,6 +217,8 @@ async def test_what_is_kept_stays_whatever_it_is(app: hf.ActorSystem) -> None:
         ),
         ('["/app/a/b"]\nclass = "tests.system.trees:Counter"', r"its supervisor /app/a has no table in this file"),
         ('["/app/a"]\nclass = "tests.system.trees:Add"', r"line 2, /app/a, class: tests.system.trees:Add is no actor"),
+        ('["/app/a"]\nclass = "no_such:Class"', r"/app/a, class: class no_such:Class is not there .*'\)$"),
+        ('name = "top"\nchildren = []', r"line 1, name: this is one supervisor as hf.load_tree reads it"),
     ],
 )
 def test_an_error_names_line_and_key(text: str, problem: str) -> None:

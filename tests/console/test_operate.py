@@ -224,7 +224,7 @@ async def test_a_restart_keeps_what_is_recorded_and_what_waits(named: hf.ActorSy
     one = await named.start(kept)
     assert await one.ask(Add(5)) == 5
     await named.suspend(one)
-    waiting = one.ask(Add(2))
+    waiting = one.ask(Add(2), timeout=60.0)
     assert (await holdfast("restart", "/app/kept"))[0] == DONE
     assert await waiting == 7
 

@@ -86,7 +86,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         (tmp_path / name).write_text(text)
         (tmp_path / name).chmod(0o600)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("PYTHONSAFEPATH", "1")  # As for the command that is installed: the folder is no path by itself.
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # Files change within a second, which is what a cache looks at.
     with tempfile.TemporaryDirectory(dir="/tmp") as folder:
         monkeypatch.setenv("XDG_RUNTIME_DIR", folder)

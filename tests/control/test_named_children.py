@@ -180,20 +180,6 @@ async def test_transactions_know_of_it(system: hf.ActorSystem) -> None:
     assert system.whereis("bank").path == "/app/one"
 
 
-async def test_below_a_supervisor_in_a_process_it_is_refused(system: hf.ActorSystem) -> None:
-    why = "child 'one' cannot be registered as 'bank': it is below a supervisor with a process of its own"
-    with pytest.raises(hf.SpecError, match=why):
-        hf.supervisor("far", isolation="process", children=[hf.supervisor("mid", children=[named()])])
-    await system.start(hf.supervisor("far", isolation="process"))
-    with pytest.raises(hf.SpecError, match=why):
-        await system.ref("/app/far", hf.Supervisor).ask(hf.StartChild(named()))
-    await system.start(hf.supervisor("near", children=[named()]))
-    await is_refused(system, why, lambda change: change.move("/app/near/one", "/app/far"))
-    with pytest.raises((hf.errors.CannotMove, hf.TransactionRefused), match=why):
-        await system.set_isolation(system.ref("/app/near"), "process")
-    assert system.whereis("bank").path == "/app/near/one"
-
-
 @pytest.mark.parametrize("wrong", ["", "/app/bank", 5])
 def test_what_is_no_name_is_refused(wrong: Any) -> None:
     with pytest.raises(hf.SpecError, match="child 'one': register must be text without control characters"):

@@ -1,107 +1,98 @@
-"""The circuit c17 of ISCAS-85 as a model: its minimal diagnoses for every input and output are those of brute force.
+"""Two circuits of gates as models, c17 of ISCAS-85 and the comparator 74L85, and the minimal diagnoses of their faults.
 
-A model has no circles, and in a circuit one concludes from inputs to outputs and back. So each line has its values once
-in each layer, and the layers take turns: what a gate that works says of its output, and then of its inputs. Three
-layers are enough for c17: then two outputs that would have to agree on what a faulty gate says are found out, too.
+They are compared with those of the clauses themselves, by brute force and by another engine, and with a simulation of
+what the gates of each set could have said.
 """
 
 import itertools
-from collections.abc import Iterator, Mapping
+import random
+from collections.abc import Iterator
 
 import pytest
 
 from holdfast.diagnosis.engine import Diagnoser
-from holdfast.diagnosis.literals import Literal
-from holdfast.diagnosis.model import Model, System
-from tests.diagnosis.oracle import is_consistent
+from tests.diagnosis.circuits import C17, COMPARATOR, Circuit
+from tests.diagnosis.oracle import Sets, correction_sets, is_consistent
 
-INPUTS = ("1", "2", "3", "6", "7")
-OUTPUTS = ("22", "23")
-C17 = {
-    "10": ("1", "3"),
-    "11": ("3", "6"),
-    "16": ("2", "11"),
-    "19": ("11", "7"),
-    "22": ("10", "16"),
-    "23": ("16", "19"),
-}
-"""Gate to its two inputs; all of them are NAND."""
-LAYERS = 3
-"""From inputs to outputs, back, and once more."""
-CASES = list(itertools.product((False, True), repeat=len(INPUTS) + len(OUTPUTS)))
-
-
-def circuit() -> Model:
-    """Each gate is a component, and each line may be high or low, as is concluded in each of some layers."""
-    system = System()
-    for layer in range(LAYERS + 1):
-        for line in (*INPUTS, *C17):
-            system.proposition(f"high{layer}(w{line})", f"low{layer}(w{line})")
-            if layer:
-                system.clause(f"high{layer - 1}(w{line}) -> high{layer}(w{line})")
-                system.clause(f"low{layer - 1}(w{line}) -> low{layer}(w{line})")
-            system.clause(f"high{layer}(w{line}), low{layer}(w{line}) -> false")
-    for gate, (one, other) in C17.items():
-        system.node(f"g{gate}")
-        for layer in range(1, LAYERS + 1):
-            works, high, low = f"NAB(g{gate})", f"high{layer}", f"low{layer}"
-            if layer % 2:  # From inputs to outputs.
-                system.clause(f"{works}, {high}(w{one}), {high}(w{other}) -> {low}(w{gate})")
-                system.clause(f"{works}, {low}(w{one}) -> {high}(w{gate})")
-                system.clause(f"{works}, {low}(w{other}) -> {high}(w{gate})")
-                continue
-            system.clause(f"{works}, {low}(w{gate}) -> {high}(w{one})")
-            system.clause(f"{works}, {low}(w{gate}) -> {high}(w{other})")
-            system.clause(f"{works}, {high}(w{gate}), high{layer - 1}(w{one}) -> {low}(w{other})")
-            system.clause(f"{works}, {high}(w{gate}), high{layer - 1}(w{other}) -> {low}(w{one})")
-    return Model(system)
-
-
-def observed(values: tuple[bool, ...]) -> list[Literal]:
-    lines = (*INPUTS, *OUTPUTS)
-    return [Literal("high0" if value else "low0", (f"w{line}",)) for line, value in zip(lines, values, strict=True)]
-
-
-def faulty_sets() -> Iterator[frozenset[str]]:
-    for size in range(len(C17) + 1):
-        yield from map(frozenset, itertools.combinations((f"g{gate}" for gate in C17), size))
-
-
-def fits(values: Mapping[str, bool], faulty: frozenset[str]) -> bool:
-    """Whether there is anything that the faulty gates may say, so that inputs and outputs are as observed."""
-    for said in itertools.product((False, True), repeat=len(faulty)):
-        wires, free = dict(values), iter(said)
-        for gate, (one, other) in C17.items():
-            made = next(free) if f"g{gate}" in faulty else not (wires[one] and wires[other])
-            if wires.setdefault(gate, made) != made:
-                break
-        else:
-            return True
-    return False
-
-
-def minimal(sets: list[frozenset[str]]) -> set[frozenset[str]]:
-    return {one for one in sets if not any(other < one for other in sets)}
+SEED = 85
+PAIRS = 30
+"""Pairs of stuck gates of the comparator that are drawn."""
 
 
 @pytest.fixture(scope="module")
-def engine() -> Diagnoser:
-    return Diagnoser(circuit())
+def c17() -> Diagnoser:
+    return Diagnoser(C17.model())
 
 
-def found(engine: Diagnoser, values: tuple[bool, ...]) -> set[frozenset[str]]:
-    diagnosis = engine.diagnose_now(observed(values))
+@pytest.fixture(scope="module")
+def comparator() -> Diagnoser:
+    return Diagnoser(COMPARATOR.model(), limit=10_000, seconds=60.0)
+
+
+def found(engine: Diagnoser, circuit: Circuit, case: tuple[int, int]) -> Sets:
+    diagnosis = engine.diagnose_now(circuit.observed(case))
+    assert diagnosis.is_complete
     return {frozenset(one.bad) for one in diagnosis.candidates} or {frozenset()}
 
 
-def test_the_minimal_diagnoses_of_c17_are_those_of_its_clauses(engine: Diagnoser) -> None:
-    for values in CASES:
-        positive = observed(values)
-        consistent = [one for one in faulty_sets() if is_consistent(engine.model, positive, (), one)]
-        assert found(engine, values) == minimal(consistent), values
+def minimal(sets: list[frozenset[str]]) -> Sets:
+    return {one for one in sets if not any(other < one for other in sets)}
 
 
-def test_they_are_just_those_with_which_the_gates_could_have_said_what_is_observed(engine: Diagnoser) -> None:
-    for values in CASES:
-        wires: dict[str, bool] = dict(zip((*INPUTS, *OUTPUTS), values, strict=True))
-        assert found(engine, values) == minimal([one for one in faulty_sets() if fits(wires, one)]), values
+def test_the_minimal_diagnoses_of_c17_are_those_of_its_clauses(c17: Diagnoser) -> None:
+    gates = [f"g{gate}" for gate in C17.gates]
+    every = [frozenset(some) for size in range(len(gates) + 1) for some in itertools.combinations(gates, size)]
+    for case in itertools.product(range(32), range(4)):
+        positive = C17.observed(case)
+        consistent = [one for one in every if is_consistent(c17.model, positive, (), one)]
+        assert found(c17, C17, case) == minimal(consistent), case
+
+
+def test_they_are_just_those_with_which_the_gates_could_have_said_what_is_observed(c17: Diagnoser) -> None:
+    explained = C17.diagnoses(len(C17.gates))
+    assert len(explained) == 2**7
+    for case, sets in explained.items():
+        assert found(c17, C17, case) == sets, case
+
+
+def test_the_comparator_compares() -> None:
+    """All 2,048 inputs: bits 0 to 3 are A, 4 to 7 are B, and then come less, equal and greater of the digits below."""
+    assert (len(COMPARATOR.gates), len(COMPARATOR.inputs), len(COMPARATOR.outputs)) == (33, 11, 3)
+    said = COMPARATOR.said({})
+    for number in range(2**11):
+        a, b, (less, equal, greater) = number & 15, number >> 4 & 15, (number >> bit & 1 for bit in (8, 9, 10))
+        expected = (a < b or (a == b and less), a == b and equal, a > b or (a == b and greater))
+        assert [line >> number & 1 for line in said] == list(map(int, expected)), number
+
+
+def stuck_gates(rng: random.Random) -> Iterator[dict[str, bool]]:
+    """Each gate stuck low and stuck high, and pairs of gates."""
+    yield from ({gate: is_high} for gate in COMPARATOR.gates for is_high in (False, True))
+    for pair in rng.sample([*itertools.combinations(COMPARATOR.gates, 2)], PAIRS):
+        yield {gate: rng.random() < 0.5 for gate in pair}
+
+
+def test_stuck_gates_of_the_comparator_are_diagnosed(comparator: Diagnoser) -> None:
+    rng = random.Random(SEED)
+    print(f"seed {SEED}")
+    explained = COMPARATOR.diagnoses(2)
+    for stuck in stuck_gates(rng):
+        shown = COMPARATOR.cases(stuck)
+        if not shown:
+            assert len(stuck) == 2  # Each fault of one gate shows at some input; two may hide each other.
+            continue
+        case = rng.choice(shown)
+        sets = found(comparator, COMPARATOR, case)
+        assert sets == correction_sets(comparator.model, COMPARATOR.observed(case), ()), (stuck, case)
+        assert any(one <= {f"g{gate}" for gate in stuck} for one in sets), (stuck, case)
+        single = {one for one in sets if len(one) == 1}
+        assert single == {one for one in explained[case] if len(one) == 1}, (stuck, case)
+        for pair in explained[case]:
+            assert any(one <= pair for one in sets), (stuck, case, pair)
+
+
+def test_a_comparator_that_compares_is_healthy(comparator: Diagnoser) -> None:
+    said = COMPARATOR.said({})
+    for number in random.Random(SEED).sample(range(2**11), 100):
+        outputs = sum((line >> number & 1) << bit for bit, line in enumerate(said))
+        assert found(comparator, COMPARATOR, (number, outputs)) == {frozenset()}

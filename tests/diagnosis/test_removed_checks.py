@@ -17,6 +17,7 @@ FOLLOWING = "tests/diagnosis/live/test_following.py"
 BRIDGES = "tests/diagnosis/bridges/test_bridges.py"
 BOARD = "tests/diagnosis/board/test_board.py"
 FLOW = "tests/diagnosis/observers/test_flow.py"
+FOREIGN = "tests/diagnosis/foreign/test_foreign.py"
 
 KINDS = "tests/diagnosis/observers/test_kinds.py"
 
@@ -41,6 +42,69 @@ CHECKS = {
         "",
         KINDS,
         "was_idle_for_long",
+    ),
+    "turns that nobody saw are guessed": Check(
+        "diagnosis/observers/flow.py",
+        "return learned.most_in if self.seen >= ENOUGH else max(learned.most_in, self.guess)",
+        "return learned.most_in",
+        FLOW,
+        "nobody_saw_before",
+    ),
+    "what was guessed of bursts is forgotten": Check(
+        "diagnosis/observers/flow.py",
+        "return learned.most_in if self.seen >= ENOUGH else max(learned.most_in, self.guess)",
+        "return max(learned.most_in, self.guess)",
+        FOREIGN,
+        "in_bursts",
+    ),
+    "limits go with an actor that is moved": Check(
+        "diagnosis/live_limits.py",
+        "brought.get(component) or self._by_pattern(component)",
+        "self._by_pattern(component)",
+        FOLLOWING,
+        "limits_go_with",
+    ),
+    "actors that change places are seen to": Check(
+        "diagnosis/model_follower.py",
+        "if found is not known or limits != self._limits.applied:",
+        "if found is not known:",
+        FOLLOWING,
+        "change_places",
+    ),
+    "lives of another actor are no restarts": Check(
+        "diagnosis/observers/property.py",
+        "if cell is not self._lived:",
+        "if False:",
+        FOLLOWING,
+        "lives_of_another",
+    ),
+    "limits of nobody are refused": Check(
+        "diagnosis/live_limits.py",
+        "if name not in known and _OF_PATTERNS.isdisjoint(name):",
+        "if False:",
+        FOLLOWING,
+        "there_is_not",
+    ),
+    "an actor has no name of replicas": Check(
+        "diagnosis/generate.py",
+        'return f"{word.removesuffix(_REPLICAS)}%2E{_REPLICAS[1:]}" if word.endswith(_REPLICAS) else word',
+        "return word",
+        REPLICAS,
+        "told_apart",
+    ),
+    "a component of one's own has no name of replicas": Check(
+        "diagnosis/generate.py",
+        'raise ModelError(tuple(f"{name}: {why}" for name in taken))',
+        "pass",
+        REPLICAS,
+        "is_refused",
+    ),
+    "an actor is not repaired as replicas": Check(
+        "diagnosis/model_follower.py",
+        "for name, path in groups.items() if name not in self.addresses}",
+        "for name, path in groups.items()}",
+        REPLICAS,
+        "takes_nobody",
     ),
     "what is contested is unknown, and the rest is diagnosed": Check(
         "diagnosis/engine/minimal_diagnoses.py",
@@ -198,14 +262,14 @@ CHECKS = {
     ),
     "repair follows the system": Check(
         "diagnosis/model_follower.py",
-        "        self._reach.use(found.addresses)\n",
+        "            self._reach.use(found.addresses)\n",
         "",
         FOLLOWING,
         "of_any_name",
     ),
     "components are named by words": Check(
         "diagnosis/generate.py",
-        "names = {cell.path: word_for(cell.path[len(root.path) + 1 :]) for cell in cells}",
+        "names = {cell.path: component_for(cell.path[len(root.path) + 1 :]) for cell in cells}",
         "names = {cell.path: cell.path[len(root.path) + 1 :] for cell in cells}",
         FOLLOWING,
         "of_any_name",

@@ -132,7 +132,7 @@ def test_a_text_of_any_size_is_kept_in_a_bounded_one(size: int) -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_a_ring_keeps_the_newest_within_its_bounds(seed: int) -> None:
     chance = random.Random(seed)
-    ring = EventRing(50, 40_000)
+    ring = EventRing[PastEvent](50, 40_000)
     told = [event(number, why="x" * chance.choice([0, 100, 5_000])) for number in range(1, 300)]
     for one in told:
         ring.add(one)
@@ -144,7 +144,7 @@ def test_a_ring_keeps_the_newest_within_its_bounds(seed: int) -> None:
 
 
 def test_one_event_that_is_too_large_is_kept_alone() -> None:
-    ring = EventRing(50, 1_000)
+    ring = EventRing[PastEvent](50, 1_000)
     ring.add(event(1))
     ring.add(event(2, why="x" * 5_000))
     assert [one.number for one in ring.after(0)] == [2]
@@ -228,6 +228,21 @@ async def test_a_storm_is_recorded_in_part_and_no_more_events_are_made(monkeypat
         await failed(worker, "crash")
         await worker.ask(Do("well"))
         assert system.lives(worker)[-1].number == 202
+
+
+async def test_what_a_history_does_not_keep_is_made_for_those_who_listen() -> None:
+    """The phases of a recovery: five events for each actor of a tree that comes back."""
+    async with hf.ActorSystem("app", log=False) as system:
+        worker = await system.start(hf.child("worker", hf.start(Worker), recovery=hf.hybrid()))
+        hub = system._node.events
+        assert hub.has_listeners
+        assert not hub.hears_unkept
+        with system.events() as events:
+            assert hub.hears_unkept
+            worker.kill()
+            while (await events.until(hf.events.RecoveryPhase)).phase != "release":
+                pass
+        assert not hub.hears_unkept
 
 
 async def test_who_listens_gets_all_events_of_a_storm(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,7 +78,7 @@ async def test_following_from_outside(system: hf.ActorSystem, path: Path) -> Non
     following = asyncio.create_task(far(path, follow))
     recorder = system._history
     assert recorder is not None
-    await until(lambda: recorder._followers)
+    await until(lambda: recorder.followers)
     await failed(worker, "crash")
     assert await following == ["ActorCrashed"]
 
@@ -96,7 +96,7 @@ async def test_a_follower_that_goes_leaves_nothing_behind(system: hf.ActorSystem
             asyncio.run(run())
 
     await far(path, follow)
-    await until(lambda: not recorder._followers)
+    await until(lambda: not recorder.followers)
 
 
 @pytest.mark.parametrize("asked", [{"limit": 0}, {"path": "x" * 2_000}, {"since": float("nan")}])

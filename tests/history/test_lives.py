@@ -206,7 +206,7 @@ async def test_following_waits_until_there_is_more() -> None:
         await failed(worker, "crash")
         assert [one.kind for one in (await following).events] == ["ActorCrashed"]
         assert system._history is not None
-        await until(lambda: not system._history._followers)  # type: ignore[union-attr]  # it is there, see above
+        await until(lambda: not system._history.followers)  # type: ignore[union-attr]  # it is there, see above
 
 
 async def test_a_system_without_a_history_says_so() -> None:

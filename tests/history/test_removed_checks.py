@@ -52,7 +52,7 @@ CHECKS = {
         "test_ends_that_never_come_are_forgotten",
     ),
     "a follower that goes is forgotten": Check(
-        "system/history/recorder.py",
+        "system/last_lines/followers.py",
         "        future.add_done_callback(self._forget)\n",
         "",
         OUTSIDE,
@@ -60,7 +60,7 @@ CHECKS = {
     ),
     "a ring is bounded by bytes": Check(
         "system/history/ring.py",
-        " or (self._bytes > self._most_bytes and len(self._events) > 1)",
+        " or (self._bytes > most_bytes and len(events) > 1)",
         "",
         BOUNDS,
         "test_a_ring_keeps_the_newest_within_its_bounds",
@@ -157,7 +157,7 @@ CHECKS = {
         "test_what_cannot_be_shown_or_written_hurts_nobody",
     ),
     "an address is no pattern": Check(
-        "system/history/calls.py",
+        "system/history/paths.py",
         "    return literal(target.path) if isinstance(target, ActorRef) else target\n",
         "    return target.path if isinstance(target, ActorRef) else target\n",
         BOUNDS,

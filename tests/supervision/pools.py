@@ -78,7 +78,7 @@ class Worker(hf.Actor):
 
     @hf.on(Notes, readonly=True)
     def all_notes(self, message: Notes) -> list[str]:
-        return self.notes
+        return list(self.notes)
 
     @hf.on(Who)
     def who(self, message: Who) -> str:

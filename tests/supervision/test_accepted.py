@@ -29,7 +29,7 @@ class Keeper(hf.Actor):
 
     @hf.on(Taken)
     def all_taken(self, message: Taken) -> list[int]:
-        return self.taken
+        return list(self.taken)
 
 
 WORKER = hf.child(None, hf.start(Keeper), recovery=hf.hybrid())

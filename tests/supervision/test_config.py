@@ -185,6 +185,9 @@ def test_a_file_that_is_no_toml_is_named(tmp_path: Path) -> None:
     path.write_text("name = ")
     with pytest.raises(hf.SpecError, match=r"tree\.toml: "):
         hf.load_tree(path)
+    path.write_text("['/app/top']\nsupervisor = 'one_for_one'\n")
+    with pytest.raises(hf.SpecError, match="a whole tree for `holdfast run`"):
+        hf.load_tree(path)
     path.write_text("name = 'top'\n[[children]]\nid = 'a'\nstart = 'nowhere:X'\n")
     with pytest.raises(hf.SpecError, match=r"tree\.toml: tree\.children\[0\]\.start: 'nowhere:X'"):
         hf.load_tree(path)

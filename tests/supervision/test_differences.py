@@ -210,7 +210,7 @@ class Watches(hf.Actor):
 
     @hf.on(Told)
     def look(self, message: Told) -> list[str]:
-        return self.told
+        return list(self.told)
 
 
 @entry("monitors of one actor by another")
@@ -313,7 +313,7 @@ class Scribe(hf.Actor):
 
     @hf.on(Told)
     def look(self, message: Told) -> list[str]:
-        return self.told
+        return list(self.told)
 
     def on_stop(self, reason: hf.ExitReason) -> None:
         self.told.append(str(reason))

@@ -12,9 +12,11 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.persistence import child_key
 from tests.checkpoint.players import Doer, Note, Seen, until
 from tests.checkpoint.strikes import event
 from tests.checkpoint.trees import running
+from tests.control.players import Account, Total
 
 
 class Pupil(hf.Actor):
@@ -366,3 +368,39 @@ async def test_code_that_was_replaced_comes_back_with_the_supervisor(
             await restarted(system)
             assert await ann.ask(Note("three"), timeout=20.0) == 4
             assert system.pid_of(ann) != os.getpid()
+
+
+STORED = (
+    b"\x01\x01\x00\x00\x00\x00\x00\x00\x01\xd2\x96\xc7\x00%\xd94holdfast.actors.process.wire.start_codec:_PackedData"
+    b"\xa6fields\xde\x00\x15\xa2id\xa3one\xa5start\x98\xc7\x00%\xd90holdfast.actors.process.wire.start_codec:_Packed\xa4args"
+    b"\x92\xc7\x00\x01\x03\xa4kind\xbdtests.control.players:Account\xa6kwargs\x80\xa7restart\xa9permanent\xa8shutdown"
+    b"\xcb@\x14\x00\x00\x00\x00\x00\x00\xa9isolation\xa4task\xa8recovery\xc0\xa7mailbox\xc0\xa7backoff\xc0\xa6limits\xc0"
+    b"\xa8bindings\x80\xadis_supervisor\xc2\xabsignificant\xc2\xa5rules\x91\xc7\x00\x01\xa9mechanism\xc0\xaacomes_back"
+    b"\xc3\xa7made_up\xc2\xadstart_timeout\xcb@N\x00\x00\x00\x00\x00\x00\xa9autostart\xc3\xa4late\x91\xc7\x00\x03"
+    b"\xa8register\xa4bank\xa5scope\xa5fleet\xa4kind\xd9#holdfast.supervision.spec:ChildSpec"
+)
+"""The spec of a child with a name as it was once stored: a text, and beside it who finds the child by that."""
+
+
+@pytest.mark.parametrize(
+    ("stored", "scope"),
+    [(STORED, "fleet"), (STORED.replace(b"\xa5fleet", b"\xa6system").replace(b"\x01\xd2", b"\x01\xd3"), "system")],
+    ids=["fleet", "system"],
+)
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_name_that_an_earlier_version_has_stored_is_given_again(
+    tmp_path: Path, isolation: Any, stored: bytes, scope: str
+) -> None:
+    store = f"sqlite:{tmp_path / 'names.db'}"
+    async with hf.ActorSystem("app", log=False, store=store) as system:
+        system._node.ports.keeper.note(child_key("/app/books", "one"), stored)
+    for _ in range(2):
+        async with hf.ActorSystem("app", log=False, store=store) as system:
+            books = await system.start(hf.dynamic("books", journal=True, isolation=isolation))
+            assert system.whereis("bank").path == "/app/books/one"
+            assert system.whereis("bank")._cell.extra().belongings.names == {"bank": scope}
+            assert await system.whereis("bank").ask(Total(), 20) == 3
+            two = hf.child("two", hf.start(Account), register="till", scope=scope)  # type: ignore[arg-type]
+            if "/app/books/two" not in system.tree():
+                await books.ask(hf.StartChild(two), 20)
+            assert system.whereis("till")._cell.extra().belongings.names == {"till": scope}

@@ -35,6 +35,7 @@ CASES = [
 ]
 
 
+@pytest.mark.holdfast(exceptions=True)  # That what leaves is told is the point.
 @pytest.mark.parametrize(("place", "error"), CASES)
 async def test_what_would_end_the_program_ends_one_life(place: str, error: str) -> None:
     """In every place and phase: a start fails, an asker is told, the supervisor restarts, a stop comes to its end."""

@@ -87,6 +87,34 @@ async def test_an_end_that_hangs_is_told_with_its_stacks_and_made(what: str) -> 
 
 
 @virtual
+async def test_a_start_and_a_stop_that_wait_for_a_suspended_supervisor_are_told() -> None:
+    class Quick(hf.Actor):
+        """Has nothing to do."""
+
+    async with hf.ActorSystem(log=False) as system:
+        first = await system.start(hf.child("first", hf.start(Quick)))
+        root, loop = system.ref("/app", hf.Supervisor), asyncio.get_running_loop()
+        with system.events() as events:
+            await system.start(hf.child("second", hf.start(Quick)))
+            await system.suspend(root)
+            starting = asyncio.create_task(system.start(hf.child("third", hf.start(Quick))))
+            held = await events.until(hf.events.OrderHeld)
+            assert (held.address, held.order, held.child, held.seconds) == ("/app", "start", "/app/third", 5.0)
+            await system.resume(root)
+            await starting
+            await system.suspend(root)
+            stopping = asyncio.create_task(system.stop(first))
+            await asyncio.sleep(60.0)
+            [held] = [event for event in events.take() if isinstance(event, hf.events.OrderHeld)]
+            assert (held.order, held.child, held.seconds) == ("stop", "/app/first", 5.0)
+            await system.resume(root)
+            await stopping
+            await asyncio.sleep(60.0)
+            assert not [event for event in events.take() if isinstance(event, hf.events.OrderHeld)]
+        assert loop.time() == pytest.approx(125.0, abs=0.5)
+
+
+@virtual
 async def test_a_leaf_that_may_take_for_ever_is_waited_for() -> None:
     class Slow(hf.Actor):
         async def on_stop(self, reason: hf.ExitReason) -> None:

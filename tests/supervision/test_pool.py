@@ -102,6 +102,7 @@ async def test_hash_keeps_a_key_with_its_worker(key: Any) -> None:
                 assert await pool.ask(Job(name)) == str(hf.supervision.partition_of(name, 3))
 
 
+@pytest.mark.holdfast(types=True)
 async def test_a_message_without_its_key_is_refused_and_ends_nobody() -> None:
     async with hf.ActorSystem(log=False) as system:
         _, pool = await begin(system, routing="hash", key="key")

@@ -37,7 +37,7 @@ class Listener(hf.Actor):
 
     @hf.on(Lines)
     def lines(self, message: Lines) -> list[tuple[str, str, str]]:
-        return self.heard
+        return list(self.heard)
 
 
 @pytest.fixture

@@ -48,7 +48,7 @@ class Holder(hf.Actor):
 
     @hf.on(Kept)
     def kept(self, message: Kept) -> list[int]:
-        return self.notes
+        return list(self.notes)
 
     @hf.on(Boom)
     def boom(self, message: Boom) -> None:

@@ -64,7 +64,7 @@ class Watcher(hf.Actor):
 
     @hf.on(Heard)
     def say(self, message: Heard) -> list[str]:
-        return self.heard
+        return list(self.heard)
 
 
 async def outcome(ask: Awaitable[Any]) -> Any:

@@ -56,7 +56,7 @@ class Reader(hf.Actor):
 
     @hf.on(Taken)
     def all_taken(self, message: Taken) -> list[int]:
-        return self.taken
+        return list(self.taken)
 
     @hf.on(Where)
     def where(self, message: Where) -> str:

@@ -23,6 +23,7 @@ KINDS = "tests/migration/test_moved_kinds.py"
 JOURNALS = "tests/supervision/test_dynamic_journal.py"
 LINES = "tests/supervision/test_program_lines.py"
 NAMED = "tests/control/test_named_children.py"
+FAR_NAMED = "tests/control/test_far_names.py"
 SLOW = "tests/supervision/test_slow_restarts.py"
 UPGRADE = "tests/system/upgrade/test_check_upgrade.py"
 COLLECTIONS = "tests/system/test_full_collections.py"
@@ -31,6 +32,13 @@ TURNS = "tests/supervision/test_turn_timeout.py"
 EFFECTS = "tests/effects/test_effect_processes.py"
 
 CHECKS = {
+    "an order that waits for a suspended supervisor is told": Check(
+        "supervision/patience.py",
+        "        if more is not None and more.suspended & mailbox.BY_USER:\n",
+        "        if False and more is not None:\n",
+        "tests/supervision/test_never_waits.py",
+        "test_a_start_and_a_stop_that_wait_for_a_suspended_supervisor_are_told",
+    ),
     "a move hears that the process has died which the actor was to leave": Check(
         "actors/migration/worker.py",
         "        self.worker.on_death(self._died_before_rest)\n",
@@ -922,12 +930,12 @@ CHECKS = {
         SUPERVISORS,
         "test_all_below_it and to and process",
     ),
-    "the name of an actor below another one in a process is free when it ends": Check(
+    "the name of an actor below another one in a process is free when that ends": Check(
         "actors/kernel/lifecycle.py",
-        "            _free_names(cell)  # Of a life",
-        "            pass  # Of a life",
-        SUPERVISORS,
-        "test_who_is_tied_to_it",
+        "        free_names(cell)  # Of a life",
+        "        pass  # Of a life",
+        FAR_NAMED,
+        "test_a_name_ends_with_the_process",
     ),
     "a link through a ref from before is one with who is there now": Check(
         "actors/kernel/context.py",
@@ -1021,12 +1029,40 @@ CHECKS = {
         LINES,
         "test_a_program_that_prints_faster",
     ),
-    "nobody has a name by its spec where nobody would know of it": Check(
-        "supervision/supervisor_changes.py",
-        "        if spec.register is not None:\n",
-        "        if False:\n",
-        NAMED,
-        "test_below_a_supervisor_in_a_process",
+    "a child elsewhere has its name before it starts": Check(
+        "actors/kernel/address_host.py",
+        "            return claimed\n",
+        "            return None\n",
+        FAR_NAMED,
+        "test_a_name_has_one_holder and task",
+    ),
+    "what is sent by it at once waits for the start": Check(
+        "actors/process/worker_node.py",
+        "        cell.table = start.kind._table  # Who finds",
+        "        pass  # Who finds",
+        FAR_NAMED,
+        "test_what_is_sent_by_the_name_at_once",
+    ),
+    "the root gives it to a child whose home it has": Check(
+        "checkpoint/places/far_parent.py",
+        "            if wanted.register is not None:\n",
+        "            if False:\n",
+        FAR_NAMED,
+        "test_it_has_the_name_when_it_starts and recorded",
+    ),
+    "a life elsewhere has names until it ends": Check(
+        "actors/process/worker_node.py",
+        '            self.command(root, "undone", {"path": cell.path})\n',
+        "            pass\n",
+        FAR_NAMED,
+        "test_nobody_has_it_between_two_lives and task",
+    ),
+    "and one whose home is at the root, too": Check(
+        "checkpoint/places/far_parent.py",
+        "    lifecycle.free_names(cell)\n    links",
+        "    links",
+        FAR_NAMED,
+        "test_nobody_has_it_between_two_lives and recorded",
     ),
     "a child that is added has a name that is free now": Check(
         "system/transaction/structure.py",

@@ -58,10 +58,11 @@ async def test_a_timeout_strikes_at_its_virtual_time() -> None:
 async def test_a_thread_takes_no_virtual_time_and_its_result_comes_before_any_timer() -> None:
     loop, gate = asyncio.get_running_loop(), threading.Event()
     fired: list[float] = []
-    loop.call_later(1.0, lambda: fired.append(loop.time()))
+    timer = loop.call_later(1.0, lambda: fired.append(loop.time()))
     loop.call_soon(gate.set)
     assert await loop.run_in_executor(None, gate.wait, 10.0)
     assert (loop.time(), fired) == (0.0, [])
+    timer.cancel()
 
 
 @virtual

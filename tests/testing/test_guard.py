@@ -377,6 +377,48 @@ def test_descriptors_are_told_by_number_and_target() -> None:
         assert now[opened.fileno()] == "/dev/null"
 
 
+def test_a_number_that_has_become_another_file_is_told(suite) -> None:
+    """As many descriptors are open as before."""
+    result = suite("""
+import os
+
+@pytest.fixture(scope="module")
+def number():
+    opened = os.open("/dev/null", os.O_RDONLY)
+    yield opened
+    os.close(opened)
+
+async def test_exchanges(number, actor_system):
+    os.close(number)
+    assert os.open(__file__, os.O_RDONLY) == number
+
+async def test_does_nothing(number, actor_system): ...
+""")
+    result.assert_outcomes(passed=2, errors=1)
+    result.stdout.fnmatch_lines(["*a descriptor was left open: /*/test_*.py*"])
+
+
+def test_what_is_no_message_is_refused_as_it_is_without_the_guard(suite) -> None:
+    """The class of a message, too, whose class is no struct."""
+    result = suite("""
+async def refusals(counter, what):
+    told = []
+    for way in ("tell", "ask", "send"):
+        with pytest.raises(hf.errors.HoldfastError) as error:
+            await getattr(counter, way)(what)
+        told.append(repr(error.value))
+    return told
+
+@pytest.mark.parametrize("what", [Add, 5, None, [Add(1)], Add(1).__class__.__class__])
+async def test_sends(actor_system, what):
+    async with hf.ActorSystem(log=False) as plain:
+        both = [system.spawn(hf.start(Counter), "counter") for system in (actor_system, plain)]
+        guarded, unguarded = [await refusals(counter, what) for counter in both]
+    assert guarded == unguarded
+""")
+    result.assert_outcomes(passed=5)
+
+
 def test_a_simulated_test_is_guarded_alike(suite) -> None:
     result = suite("""
 from holdfast.testing import simulate

@@ -13,13 +13,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 from ...errors import NotGranted
 from ...events import DeadLetter
 from ...exit_reasons import unpack_exit
 from ...kernel.bindings import unclaimed
-from ...kernel.cell import GONE, Cell
+from ...kernel.cell import GONE, Cell, Scope
 from ...kernel.message import RuntimeOrder
 from ...kernel.node import cell_kind
 from . import frames
@@ -36,6 +36,8 @@ MOST_NAME_CHARS: Final = 16 * 1024 * 1024
 """The characters of all of them."""
 MOST_BINDINGS: Final = 256
 """Ports of one actor that a process may say something of."""
+MOST_NAME: Final = 1024
+"""The characters of a name beside an address."""
 MOST_LIVES: Final = 2**53
 """No address has had so many lives."""
 
@@ -152,6 +154,17 @@ class WorkerGate:
         if not self.owns(path):
             raise BadFrame(f"{what} of {path}, and the process is that of {self.home}")
         return path
+
+    def require_name(self, name: str, scope: str) -> None:
+        """A name that one of its actors is to have; whether nobody has it is seen later.
+
+        Only supervisors have children with names by their specs.
+        """
+        kind = None if self._worker.cell is None else cell_kind(self._worker.cell)
+        if kind is None or not kind._supervises:
+            raise BadFrame(f"a name for a child of {self.home}, which is no supervisor")
+        if name.startswith("/") or len(name) > MOST_NAME or scope not in get_args(Scope):
+            raise BadFrame(f"a name {name[:MOST_NAME]!r}, to be found by {scope!r}")
 
     def require_voice(self, path: str, what: str) -> None:
         """An address in whose name it acts: its own, or the one whose replica it is."""
@@ -394,6 +407,15 @@ def _gone(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     unpack_exit(frame.data.get("reason"))
 
 
+def _named(gate: WorkerGate, to: str, frame: frames.Command) -> None:
+    """A supervisor there wants a name for a child that it starts: no other actor has children with names by specs."""
+    _below(gate, to, frame)
+    text(frame, "kind")
+    gate.require_name(text(frame, "name"), text(frame, "scope"))
+    if type(frame.data.get("answer")) is not int:
+        raise BadFrame(f"an answer under {frame.data.get('answer')!r}")
+
+
 def _keep(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     _home(gate, to, frame)
     gate.require_own(frame.data.get("path"), "what is kept")
@@ -450,6 +472,8 @@ COMMANDS: Final[dict[str, Callable[[WorkerGate, str, frames.Command], None]]] = 
     "unsubscribe": _topic,
     "born": _born,
     "gone": _gone,
+    "undone": _below,
+    "name": _named,
     "keep": _keep,
     "stop": _order,
     "kill": _order,

@@ -9,20 +9,23 @@ import { ask, question, session, stream } from "./server.js";
 import { gravity } from "./tree.js";
 
 const AGAIN = 1000;
+const OBEYED = /[\x00-\x08\x0a-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]/g;
+const shownAs = (sign) => (sign < "\u0100" ? `\\x${sign.charCodeAt(0).toString(16).padStart(2, "0")}` : `\\u${sign.charCodeAt(0).toString(16)}`);
 
 export function actorView(main, path, more) {
   const crumbs = el("h1", { class: "crumbs" }), chips = el("p"), bar = el("div", { class: "bar", role: "toolbar", "aria-label": "What can be done" });
   const why = el("div"), nowBox = el("dl"), mailbox = el("div"), lives = el("div"), ties = el("div"), shield = el("div"), events = el("div"), spec = el("div"), state = el("div"), trace = el("div");
+  const lines = el("pre", { class: "mono", tabindex: "0", role: "log", "aria-label": "Last lines" });
   const section = (title, ...body) => el("section", { class: "card" }, el("h2", {}, title), body);
-  const shieldCard = section("Mechanism", shield), stateCard = section("State", state), traceCard = section("Messages", trace);
+  const shieldCard = section("Mechanism", shield), stateCard = section("State", state), traceCard = section("Messages", trace), linesCard = section("Last lines", lines);
   main.replaceChildren(el("div", { class: "wide" }, crumbs, chips, bar, section("Why", why),
-    el("div", { class: "cards" }, section("Now", nowBox, mailbox), section("Ties", ties)), shieldCard, section("Lives and recoveries", lives), stateCard, traceCard, section("Events", events), section("Spec", spec)));
+    el("div", { class: "cards" }, section("Now", nowBox, mailbox), section("Ties", ties)), shieldCard, section("Lives and recoveries", lives), stateCard, traceCard, linesCard, section("Events", events), section("Spec", spec)));
   crumbs.append(...path.split("/").slice(1).flatMap((name, at, all) => {
     const upTo = "/" + all.slice(0, at + 1).join("/");
     return [el("span", { class: "sep" }, "/"), at === all.length - 1 ? name : actorLink(upTo, name)];
   }));
-  const queue = [];
-  let isOver = false, isAsking = false, barKey = "", timer = 0, endTrace = null, lastSaid = "";
+  const queue = [], printed = [];
+  let isOver = false, isAsking = false, barKey = "", timer = 0, endTrace = null, lastSaid = "", isReading = false, lastLine = null;
 
   function draw() {
     const row = live.rows.get(path);
@@ -96,6 +99,19 @@ export function actorView(main, path, more) {
     } catch (error) { events.replaceChildren(el("p", { class: "empty" }, error.message)); }
   }
 
+  async function loadLines() {
+    if (isOver || isReading || !session.sees_state) return;
+    isReading = true;
+    try {
+      const page = await ask({ ask: "logs", question: { path: path.replace(/[*?[]/g, "[$&]"), after: lastLine, limit: 300 } });
+      if (page.dropped && lastLine !== null) printed.push(`${plural(page.dropped, "line")} came too fast and are not shown`);
+      for (const one of page.lines) printed.push(`${clock(one.at)} ${one.life ? `life ${one.life} ` : ""}${one.source === "holdfast" ? one.level : one.source}: ${one.text.replace(OBEYED, shownAs)}`);
+      printed.splice(0, printed.length - 300);
+      if (page.lines.length || lastLine === null) lines.textContent = printed.join("\n") || "No line of it is kept.";
+      lastLine = page.next;
+    } catch (error) { lines.textContent = error.message; } finally { isReading = false; }
+  }
+
   async function showState() {
     try {
       const found = await ask({ ask: "state", path });
@@ -121,7 +137,7 @@ export function actorView(main, path, more) {
   }
   const followButton = () => el("button", { type: "button", "data-verb": "trace", onclick: follow }, "Follow its messages");
 
-  stateCard.hidden = traceCard.hidden = !session.sees_state;
+  stateCard.hidden = traceCard.hidden = linesCard.hidden = !session.sees_state;
   state.replaceChildren(stateButton("Show its state"));
   trace.replaceChildren(followButton());
   const onRows = () => { draw(); };
@@ -129,10 +145,11 @@ export function actorView(main, path, more) {
   let newestSeen = live.events.length ? live.events[live.events.length - 1].number : -1;
   live.addEventListener("rows", onRows);
   live.addEventListener("events", onEvents);
-  timer = setInterval(() => { if (document.visibilityState === "visible") load(); }, AGAIN);
+  timer = setInterval(() => { if (document.visibilityState === "visible") { load(); loadLines(); } }, AGAIN);
   draw();
   load();
   loadEvents();
+  loadLines();
   if (more === "state" && session.sees_state) showState().then(() => stateCard.scrollIntoView({ block: "center" }));
   return () => { isOver = true; clearInterval(timer); endTrace?.(); live.removeEventListener("rows", onRows); live.removeEventListener("events", onEvents); };
 }

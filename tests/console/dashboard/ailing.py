@@ -34,6 +34,8 @@ class Worker(hf.Actor):
                 raise RuntimeError(EVIL_TEXT)
             case "die":
                 os.kill(os.getpid(), signal.SIGKILL)
+            case "print":
+                print(f"{EVIL_TEXT} \x1b[31m", flush=True)
             case "wait":
                 return await self.bank.ask(Work("hang"), timeout=600.0)
             case _:

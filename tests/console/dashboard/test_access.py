@@ -75,10 +75,14 @@ async def test_states_and_messages_are_for_operators_unless_it_is_said_otherwise
     system: hf.ActorSystem, reader: Browser, operator: Browser
 ) -> None:
     asked = {"ask": "state", "path": "/app/left/a"}
+    lines = {"ask": "logs", "question": {"path": "/app/**"}, "wait": 9.0}
     assert (await reader.post("/ask", asked)).status_code == 403
+    assert (await reader.post("/ask", lines)).status_code == 403
     async with reader.stream("/trace", "path=/app/left/a") as stream:
         assert await stream.answer() == 403
     assert "count" in (await operator.post("/ask", asked)).json()["value"]
+    system._node.emit(hf.events.LogLine("/app/left/a", "stdout", "printed", 1))
+    assert [one["text"] for one in (await operator.post("/ask", lines)).json()["value"]["lines"]] == ["printed"]
     shown = Browser(dashboard(system, readers=READERS, readers_see_state=True))
     assert (await shown.log_in(READERS)).json()["sees_state"] is True
     assert "count" in (await shown.ask("state", path="/app/left/a"))

@@ -258,11 +258,21 @@ def test_a_state_is_shown_saved_and_its_messages_are_followed(page: Page, served
     verb(page, "checkpoint")
     expect(page.locator("#notes")).to_contain_text("saved /app/shop/ledger")
     verb(page, "trace")
-    log = page.get_by_role("log")
+    log = page.get_by_role("log", name="Messages")
     expect(log).to_have_text("Nothing yet.")
     served.tell("/app/shop/ledger", "work")
     expect(log).to_contain_text("ended Work")
     page.get_by_role("button", name="Stop following").click()
+
+
+def test_the_last_lines_of_an_actor_are_shown_as_text(page: Page, served: Served) -> None:
+    served.tell("/app/shop/fragile", "print")
+    at(page, "actor/app/shop/fragile")
+    lines = page.get_by_role("log", name="Last lines")
+    expect(lines).to_contain_text(f"life 1 stdout: {EVIL_TEXT} \\x1b[31m")
+    expect(page.locator("main b")).to_have_count(0)
+    at(page, "actor/app/shop/ledger")
+    expect(page.get_by_role("log", name="Last lines")).to_have_text("No line of it is kept.")
 
 
 def test_bindings_are_changed(page: Page) -> None:

@@ -60,8 +60,15 @@ CHECKS = {
     ),
     "states are for operators": Check(
         f"{FOLDER}web_app.py",
-        "            check_role(login, self._state_role)\n            question",
-        "            question",
+        "        if isinstance(asked, ShowState | AskLogs):",
+        "        if isinstance(asked, AskLogs):",
+        ACCESS,
+        "test_states_and_messages",
+    ),
+    "what is printed is for operators": Check(
+        f"{FOLDER}web_app.py",
+        "        if isinstance(asked, ShowState | AskLogs):",
+        "        if isinstance(asked, ShowState):",
         ACCESS,
         "test_states_and_messages",
     ),

@@ -51,6 +51,14 @@ async def test_who_is_slower_than_before_and_keeps_up_is_no_fault() -> None:
     assert (said.first, said.false_alarms) == ((), ())
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+async def test_who_publishes_in_bursts_is_missed_soon_after_little_was_known_of_it(seed: int) -> None:
+    """While the model was made nobody saw its turns: how many there were between two messages is only guessed."""
+    (foreign,) = (one for one in SYSTEMS if one.name == "gateway")
+    said = await trial(foreign, {"uplink": "mute"}, "bursty", seed)
+    assert (said.first, said.false_alarms) == (("uplink",), ())
+
+
 @pytest.mark.parametrize("number", range(3))
 async def test_of_two_faults_both_are_named_one_after_the_other(number: int) -> None:
     foreign, struck, kind = random.Random(number).choice(PAIRS)

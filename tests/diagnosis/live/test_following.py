@@ -11,6 +11,7 @@ from holdfast.actors.events import ActorCrashed
 from holdfast.diagnosis.engine import State
 from holdfast.diagnosis.generate import generate
 from holdfast.diagnosis.literals import word_for
+from holdfast.diagnosis.observers import Limits, Property
 from holdfast.testing import advance
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
@@ -30,6 +31,10 @@ class Freeze(hf.Message):
     pass
 
 
+class Fall(hf.Message):
+    pass
+
+
 class Talker(hf.Actor):
     """Publishes on a topic of its own name, until it freezes; a new life goes on."""
 
@@ -43,6 +48,10 @@ class Talker(hf.Actor):
     @hf.on(Freeze)
     def _freeze(self, message: Freeze) -> None:
         self.timer.cancel()
+
+    @hf.on(Fall)
+    def _fall(self, message: Fall) -> None:
+        raise RuntimeError("as told")
 
 
 class Ear(hf.Actor):
@@ -108,3 +117,96 @@ async def test_topics_and_replies_are_named_by_words(system: hf.ActorSystem) -> 
     found = await generate(system, seconds=0.5)
     assert found.addresses == {"left%20arm": "/t/left arm"}
     assert found.declaration.components[0].out.keys() == {"/left%20arm", "replies(left%20arm)"}
+
+
+SHORT = {Property.MAILBOX: Limits(high=10.0)}
+"""At most so many messages wait."""
+
+
+async def pair(system: hf.ActorSystem, *names: str) -> list[hf.ActorRef[hf.Supervisor]]:
+    """Two supervisors; the first one has talkers of these names."""
+    talkers = [hf.child(name, hf.start(Talker)) for name in names]
+    return [
+        await system.start(hf.supervisor(name, children=some, intensity=100))
+        for name, some in (("one", talkers), ("two", []))
+    ]
+
+
+async def pile_up(system: hf.ActorSystem, watching: diagnosis.Watch, path: str) -> set[str]:
+    """Have more messages wait for an actor than it may; return what is not ok of properties, and let it go on."""
+    talker = system.ref(path, Talker)
+    await system.suspend(talker)
+    for _ in range(20):
+        talker.tell(Tick())
+    await advance(5.0)
+    seen = {str(atom) for atom in (await watching.observed()).negative if str(atom).endswith(".mailbox)")}
+    await system.resume(talker)
+    await advance(5.0)
+    return seen
+
+
+async def test_limits_follow_children_that_come_later(system: hf.ActorSystem) -> None:
+    one, two = await pair(system, "first")
+    watching = await diagnosis.watch(system, seconds=0.5, limits={"one/*": SHORT})
+    assert await pile_up(system, watching, "/t/one/first") == {"ok(one/first.mailbox)"}
+    await one.ask(hf.StartChild(hf.child("later", hf.start(Talker))))
+    await two.ask(hf.StartChild(hf.child("later", hf.start(Talker))))
+    await advance(3.0)
+    assert await pile_up(system, watching, "/t/one/later") == {"ok(one/later.mailbox)"}
+    assert await pile_up(system, watching, "/t/two/later") == set()
+
+
+async def test_limits_go_with_an_actor_that_is_moved_and_its_name_keeps_them_for_the_next(
+    system: hf.ActorSystem,
+) -> None:
+    one, two = await pair(system, "left", "right")
+    watching = await diagnosis.watch(system, seconds=0.5, limits={"one/left": SHORT})
+    async with system.transaction() as change:
+        change.move("/t/one/left", two)
+    await advance(3.0)
+    assert await pile_up(system, watching, "/t/two/left") == {"ok(two/left.mailbox)"}
+    assert await pile_up(system, watching, "/t/one/right") == set()
+    await one.ask(hf.StartChild(hf.child("left", hf.start(Talker))))
+    await advance(3.0)
+    assert await pile_up(system, watching, "/t/one/left") == {"ok(one/left.mailbox)"}
+    assert await pile_up(system, watching, "/t/two/left") == {"ok(two/left.mailbox)"}
+    assert await crashes_of_diagnosis(system, 5.0) == 0
+
+
+async def test_limits_of_a_component_that_there_is_not_are_refused(system: hf.ActorSystem) -> None:
+    await pair(system, "left")
+    why = "limits are given for 'one/lefd', and no component has that name; did you mean 'one/left'"
+    with pytest.raises(ValueError, match=why):
+        await diagnosis.watch(system, seconds=0.5, limits={"one/lefd": SHORT})
+
+
+async def exchange(system: hf.ActorSystem) -> None:
+    """Have `/t/one/both` and `/t/two/both` change places at once."""
+    aside = await system.start(hf.supervisor("aside"))
+    async with system.transaction() as change:
+        change.move("/t/one/both", aside)
+        change.move("/t/two/both", "/t/one")
+        change.move("/t/aside/both", "/t/two")
+    await advance(3.0)
+
+
+async def test_actors_that_change_places_take_their_limits_with_them(system: hf.ActorSystem) -> None:
+    """The wiring is as before: that alone tells nobody that they have been exchanged."""
+    _, two = await pair(system, "both")
+    await two.ask(hf.StartChild(hf.child("both", hf.start(Talker))))
+    watching = await diagnosis.watch(system, seconds=0.5, limits={"[o]ne/both": SHORT})
+    await exchange(system)
+    assert await pile_up(system, watching, "/t/two/both") == {"ok(two/both.mailbox)"}
+
+
+async def test_lives_of_another_actor_at_the_address_are_no_restarts(system: hf.ActorSystem) -> None:
+    _, two = await pair(system, "both")
+    await two.ask(hf.StartChild(hf.child("both", hf.start(Talker))))
+    for _ in range(5):
+        system.ref("/t/one/both", Talker).tell(Fall())
+        await advance(1.0)
+    watching = await diagnosis.watch(system, seconds=0.5, limits={"*/both": {Property.RESTARTS: Limits(high=3.5)}})
+    await advance(3.0)
+    await exchange(system)
+    seen = {str(atom) for atom in (await watching.observed()).negative if str(atom).endswith(".restarts)")}
+    assert seen == set()

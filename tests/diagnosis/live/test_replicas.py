@@ -12,6 +12,8 @@ import holdfast as hf
 from holdfast import diagnosis
 from holdfast.diagnosis.engine import State
 from holdfast.diagnosis.literals import caught_up, led, whole
+from holdfast.diagnosis.model import ModelError, System
+from holdfast.diagnosis.model_follower import Reach
 from holdfast.diagnosis.planning import Step
 from holdfast.diagnosis.repair import Act, ActionFailed, restart_replica
 from holdfast.testing import advance
@@ -80,6 +82,21 @@ async def test_a_replica_that_does_not_come_back_is_named_and_the_actor_is_not(m
         await asyncio.wait((striking,))
         await until(watching)
         assert (await system.get_status(alice)).life == 1
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_an_actor_called_like_the_replicas_of_another_one_is_told_apart() -> None:
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        alice = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.ftm.PBR()))
+        other = await system.start(hf.child("alice.replicas", hf.start(Counter)))
+        watching = await diagnosis.watch(system, seconds=0.1)
+        assert watching.addresses == {"alice": alice.path, "alice%2Ereplicas": other.path}
+        await until(watching)
+        assert set((await watching.diagnosis()).components) == {"alice", "alice.replicas", "alice%2Ereplicas"}
+        await system.ref("/app", hf.Supervisor).ask(hf.TerminateChild("alice.replicas"))
+        await until(watching, "alice%2Ereplicas")
+        observed = await watching.observed()
+        assert whole("alice") not in observed.negative
 
 
 class Repairing(hf.Actor):
@@ -173,3 +190,24 @@ async def test_nobody_leads_and_nobody_takes_over(pretended: tuple[diagnosis.Wat
     states["r1"] = "leads"
     await advance(8.0)
     assert (await watching.diagnosis()).state is State.HEALTHY
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_a_component_of_ones_own_called_like_the_replicas_of_a_protected_actor_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model = System()
+    model.node("alice")
+    model.node("alice.replicas")
+    async with hf.ActorSystem("app", log=False, seed=1) as system:
+        alice = await system.start(hf.child("alice", hf.start(Counter)))
+        await diagnosis.watch(system, model, addresses={"alice": alice.path}, name="unprotected")
+        monkeypatch.setattr(type(alice._cell.host.place), "replica_states", lambda place: {"r1": "leads"})
+        with pytest.raises(ModelError, match=r"alice\.replicas: this name stands for the replicas of a protected"):
+            await diagnosis.watch(system, model, addresses={"alice": alice.path})
+
+
+def test_repair_takes_nobody_for_replicas_who_is_an_actor_itself() -> None:
+    reach = Reach("/app", {})
+    reach.use({"alice": "/app/alice", "alice.replicas": "/app/double"})
+    assert reach.groups == {"alice.replicas.replicas": "/app/double"}

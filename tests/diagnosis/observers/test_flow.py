@@ -165,3 +165,19 @@ async def test_what_was_heard_before_counts_as_learned_and_the_time_until_now_as
         assert baselines.of("/in", 0.0).longest_gap == pytest.approx(0.1)
         await asyncio.sleep(3.0)
         assert said == {ok("/in"): False}
+
+
+async def test_turns_that_nobody_saw_before_count_as_many_as_there_may_have_been() -> None:
+    """A topic without inputs was silent for 12 seconds before; now its publisher has turns in such a silence."""
+    said: dict[Literal, bool] = {}
+    async with hf.ActorSystem("t", log=False, seed=1) as system:
+        system.spawn(hf.start(Notes, said))
+        now = asyncio.get_running_loop().time()
+        arrivals = [("/out", now - 60.0 + second) for second in (*range(ENOUGH), ENOUGH + 11)]
+        made = {"/out": FlowSource(("/t/filter",))}
+        start = hf.start(FlowObserver, made, leave_out=(OBSERVATIONS,), arrivals=arrivals)
+        await system.start(observer("topics", start))
+        world = World(system, said)
+        await world.set_each(0)
+        await world.send(120, 0.1)
+        assert world.bad == 0

@@ -79,7 +79,7 @@ async def said(heard: Probe, text: str) -> Observation:
 async def measured(system: hf.ActorSystem, *bounds: Bound) -> Probe:
     heard = probe(system)
     heard.subscribe(OBSERVATIONS)
-    await system.start(observer("o", hf.start(PropertyObserver, "/t/w", bounds, manner=QUICK)))
+    await system.start(observer("o", hf.start(PropertyObserver, {"w": bounds}, {"w": "/t/w"}, manner=QUICK)))
     return heard
 
 
@@ -177,7 +177,7 @@ async def test_an_actor_whose_process_does_not_answer_is_not_running(system: hf.
     await said(heard, "running(w)")
 
 
-@pytest.mark.parametrize("kind", [hf.start(NodeObserver, {}), hf.start(PropertyObserver, "/t/w", ())])
+@pytest.mark.parametrize("kind", [hf.start(NodeObserver, {}), hf.start(PropertyObserver, {}, {})])
 async def test_who_can_see_only_its_own_process_is_refused_in_another(
     system: hf.ActorSystem, kind: hf.Start[Any]
 ) -> None:

@@ -45,6 +45,12 @@ def born(bindings: Any) -> bytes:
     return command(EVIL, "born", path=f"{EVIL}/x", kind="a:B", life=1, bindings=bindings)
 
 
+def named(path: str, by: str = EVIL, **other: Any) -> bytes:
+    """A name for a child that is about to begin."""
+    told = {"path": path, "kind": "a:B", "name": "bank", "scope": "fleet", "answer": 1}
+    return command(by, "name", **{**told, **other})
+
+
 def note(kind: str, **data: Any) -> bytes:
     return frame(f.Note(kind, data))
 
@@ -114,6 +120,9 @@ BREACHES: dict[str, Callable[[], bytes]] = {
     "a port without a name": lambda: born({5: VICTIM}),
     "an order by a binding that it claims": lambda: born({"port": VICTIM}) + command(VICTIM, "kill"),
     "an order above what it claims": lambda: born({"port": SUP}) + tell([], START_CHILD, SUP),
+    "the end of another's life": lambda: command(SUP, "undone", path=VICTIM),
+    "a name for another": lambda: named(VICTIM),
+    "a name where there is no supervisor": lambda: named(f"{EVIL}/x"),
     "the end of another's child": lambda: command(SUP, "gone", path=VICTIM, reason=NORMAL),
     "the end of another": lambda: frame(f.Ended(VICTIM, 1, NORMAL)),
     "an end without a reason": lambda: frame(f.Ended(EVIL, 1, {"exit": "Nothing"})),

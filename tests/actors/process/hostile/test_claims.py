@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.kernel.cell import GivenName
 from holdfast.actors.kernel.message import message_name
 from holdfast.actors.process.wire import frames as f
 from holdfast.checkpoint.protocol import AtRoot, Wanted
 from holdfast.ftm.group.group_place import GroupPlace
-from tests.actors.process.hostile.forging import command, frame, raw
+from tests.actors.process.hostile.forging import command, frame, named, raw
 from tests.actors.process.hostile.players import Add, Evil, House, Kill, Ping, Terminate, Victim, Write
 from tests.actors.process.waiting import next_event, until
 from tests.system.trees import Stumble
@@ -138,3 +139,70 @@ async def test_bindings_that_cannot_be_are_a_breach(town: Town, told: Any) -> No
     with town.system.events() as events:
         evil.tell(Write(frame(f.Record(f"{HOUSE}/x", raw(wanted)))))
         assert (await next_event(events, hf.events.TrustBreached)).address == HOUSE
+
+
+async def breaches(town: Town, evil: hf.ActorRef[Evil], written: bytes) -> bool:
+    """Whether a process ends for what it writes; its answers come behind that."""
+    with town.system.events() as events:
+        try:
+            await evil.ask(Write(written), timeout=60)
+            await evil.ask(Ping(), timeout=60)
+        except (hf.AskFailed, hf.ActorStopped):
+            return hf.events.TrustBreached in [type(event) for event in events.take()]
+    return False
+
+
+@pytest.mark.parametrize(
+    ("path", "told"),
+    [
+        ("/app/other", {}),
+        (HOUSE, {}),
+        (f"{EVIL}//x", {}),
+        (EVIL, {"name": "/app/bank"}),
+        (EVIL, {"name": "x" * 2000}),
+        (EVIL, {"name": 5}),
+        (EVIL, {"scope": "world"}),
+        (EVIL, {"kind": None}),
+        (EVIL, {"answer": "x"}),
+    ],
+    ids=str,
+)
+async def test_a_name_that_it_may_not_give_is_a_breach(town: Town, path: str, told: Any) -> None:
+    evil = await town.settle("plain")
+    assert await breaches(town, evil, named(path, HOUSE, **told))
+    with pytest.raises(hf.errors.NoSuchActor):
+        town.system.whereis("bank")
+    await town.back()
+
+
+@pytest.mark.parametrize("name", [GivenName("/app/bank"), GivenName("x" * 2000)], ids=["address", "long"])
+async def test_nor_by_what_it_wants_of_a_child(town: Town, name: GivenName) -> None:
+    evil = await town.settle("plain")
+    wanted = Wanted(1, "a:B", [], hf.hybrid(), None, None, {}, name)
+    assert await breaches(town, evil, frame(f.Record(f"{HOUSE}/x", raw(wanted))))
+
+
+async def test_a_process_without_a_supervisor_gives_no_names(town: Town) -> None:
+    evil = await town.system.start(hf.child("evil", hf.start(Evil), isolation="process"))
+    born = command(evil.path, "born", path=f"{evil.path}/x", kind="a:B", life=1)
+    assert await breaches(town, evil, born + named(f"{evil.path}/x", evil.path))
+    with pytest.raises(hf.errors.NoSuchActor):
+        town.system.whereis("bank")
+
+
+async def test_its_own_actors_have_what_names_nobody_has_one_at_a_time(town: Town) -> None:
+    evil = await town.settle("plain")
+    town.system.register("till", town.victim)
+    pid = town.system.pid_of(town.system.ref(HOUSE))
+    for name in ("till", "bank", "house", "a\nb"):
+        assert await evil.ask(Write(named(EVIL, HOUSE, name=name)), timeout=60) == 1
+        assert await evil.ask(Ping(), timeout=60) == 1
+        assert town.system.whereis("till") == town.victim
+    assert list(town.system._node.names) == ["till"]  # The last one was none.
+    assert await evil.ask(Write(named(EVIL, HOUSE)), timeout=60) == 1
+    assert await evil.ask(Ping(), timeout=60) == 1
+    assert town.system.whereis("bank") == evil
+    await evil.ask(Write(command(HOUSE, "undone", path=EVIL)), timeout=60)
+    assert await evil.ask(Ping(), timeout=60) == 1
+    assert list(town.system._node.names) == ["till"]
+    assert town.system.pid_of(town.system.ref(HOUSE)) == pid

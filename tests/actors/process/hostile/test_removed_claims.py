@@ -67,6 +67,34 @@ CHECKS = {
         "tests/actors/process/hostile/test_hostile.py",
         "test_a_breach_ends_the_worker_and_nobody_else",
     ),
+    "a process has names given if it has a supervisor": Check(
+        GATE,
+        "        if kind is None or not kind._supervises:\n",
+        "        if False:\n",
+        CLAIMS,
+        "test_a_process_without_a_supervisor_gives_no_names",
+    ),
+    "and such as are names": Check(
+        GATE,
+        '        if name.startswith("/") or len(name)',
+        "        if False and len(name)",
+        CLAIMS,
+        "test_nor_by_what_it_wants_of_a_child",
+    ),
+    "also by what it wants of a child": Check(
+        "checkpoint/home/life_ports.py",
+        "            if record.register is not None:\n",
+        "            if False:\n",
+        CLAIMS,
+        "test_nor_by_what_it_wants_of_a_child",
+    ),
+    "one for each": Check(
+        "actors/process/stand_ins.py",
+        "        lifecycle.free_names(cell)  # A life has one name",
+        "        pass  # A life has one name",
+        CLAIMS,
+        "test_its_own_actors_have_what_names_nobody_has",
+    ),
 }
 
 test_the_table_is_true, test_a_test_fails = as_tests(CHECKS)

@@ -1,0 +1,95 @@
+"""Each look of the guard is there for a reason: take it out, and a test fails.
+
+`HOLDFAST_REMOVED=1 python -m pytest tests/testing/test_removed_checks.py` does so, in a copy; otherwise it is only
+looked whether the looks and the tests are where this table says.
+"""
+
+from __future__ import annotations
+
+from tests.removing import Check, as_tests
+
+GUARD = "tests/testing/test_guard.py"
+PLUGIN = "tests/testing/test_plugin.py"
+LOOPS = "tests/testing/test_loop_methods.py"
+
+CHECKS = {
+    "a descriptor that is open by another number is looked for": Check(
+        "testing/guard/leaks.py",
+        "        return found if len(found) == count > 0 else _identified([*map(int, os.listdir(OPEN_FILES))])\n",
+        "        return found\n",
+        GUARD,
+        "test_each_leak_is_found and descriptors",
+    ),
+    "a number that has become another file is told": Check(
+        "testing/guard/leaks.py",
+        "        new = [number for number, file in found.items() if self._files.get(number) != file]\n",
+        "        new = [number for number in found if number not in self._files]\n",
+        GUARD,
+        "test_a_number_that_has_become_another_file",
+    ),
+    "futures are noted as they are made": Check(
+        "testing/guard/loop_methods.py",
+        "                one.future_made(made)\n",
+        "                pass\n",
+        LOOPS,
+        "test_two_who_note",
+    ),
+    "timers are noted as they are made": Check(
+        "testing/guard/loop_methods.py",
+        "                one.timer_made(handle, origin(loop) + time, callback)\n",
+        "                pass\n",
+        LOOPS,
+        "test_two_who_note",
+    ),
+    "a method is looked up where it comes from, at each call": Check(
+        "testing/guard/loop_methods.py",
+        "    return next(base for base in kind.__mro__ if name in vars(base))\n",
+        "    return types.SimpleNamespace(**{name: getattr(kind, name)})\n",
+        LOOPS,
+        "test_what_a_test_exchanges",
+    ),
+    "threads that the test has started are told": Check(
+        "testing/guard/thread_leaks.py",
+        "                for one in notes:\n",
+        "                for one in ():\n",
+        GUARD,
+        "test_each_leak_is_found and threads",
+    ),
+    "what is compared is looked at after each turn": Check(
+        "testing/guard/sends.py",
+        "                if not one.turns and len(one.body) <= SMALL:\n",
+        "                if not one:\n",
+        GUARD,
+        "test_what_two_share and replier",
+    ),
+    "a message is compared when its turn is over": Check(
+        "testing/guard/sends.py",
+        "            self._require_same(sent, cell)\n",
+        "",
+        PLUGIN,
+        "test_a_message_that_is_mutated_by_its_receiver",
+    ),
+    "types are looked at within containers": Check(
+        "testing/guard/sends.py",
+        "        if not self.are_types_expected and (problem := wrong_field(message)) is not None:\n",
+        "        if (problem := None) is not None:\n",
+        GUARD,
+        "test_types_are_looked_at",
+    ),
+    "the class of a message is no struct": Check(
+        "testing/guard/declared.py",
+        "    return kind.__struct_fields__ if issubclass(kind, msgspec.Struct) else ()\n",
+        '    return getattr(kind, "__struct_fields__", ())\n',
+        GUARD,
+        "test_what_is_no_message",
+    ),
+    "the guard ends with the fixture that was the first": Check(
+        "testing/plugin.py",
+        "            await self._own.close()\n",
+        "",
+        PLUGIN,
+        "test_a_leak_fails_the_test",
+    ),
+}
+
+test_the_table_is_true, test_each_look_is_missed = as_tests(CHECKS)
