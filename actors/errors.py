@@ -127,11 +127,27 @@ class ActorStopped(SendError):
         return f"{self.actor} has stopped{why}; the message was not handled"
 
 
-class MailboxFull(SendError, text="mailbox of {actor} is full (capacity {capacity} messages)"):
-    """The mailbox is at capacity: wait, shed load, or raise the capacity."""
+class MailboxFull(SendError):
+    """The mailbox is at capacity: wait, shed load, or raise the capacity. The message was not handled.
+
+    Attributes:
+        actor: the address of the receiver.
+        capacity: messages that its mailbox takes.
+        displaced_by: the overflow policy by which the message was dropped after it had been taken, because newer ones
+            came: "drop_oldest" or "latest". "" if it was never taken.
+    """
 
     actor: str
     capacity: int
+    displaced_by: str = ""
+
+    def __str__(self) -> str:
+        if not self.displaced_by:
+            return f"mailbox of {self.actor} is full (capacity {self.capacity} messages)"
+        return (
+            f"{self.actor} had taken the message, and dropped it for a newer one "
+            f"(capacity {self.capacity} messages, overflow={self.displaced_by!r}); ask again, or choose another policy"
+        )
 
 
 class UnknownMessage(SendError):

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 OURS = __name__.partition(".")[0]
 """The package whose frames are not the user's."""
+DRIVEN = "driven_turn"
+"""The local in which a generator of ours holds the coroutine that it sends to by hand: Python sees no await there."""
 
 
 def blocked_below(top: Cell) -> str:
@@ -86,4 +88,4 @@ def _awaited(work: Coroutine[Any, Any, Any]) -> Iterator[tuple[Any, CodeType | N
                 yield at, None, None
                 return
         yield at, code, frame
-        at = inner
+        at = frame.f_locals.get(DRIVEN) if inner is None and frame is not None else inner

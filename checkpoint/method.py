@@ -26,6 +26,8 @@ Durability = Literal["memory", "os", "fsync"]
 OnEscalate = Literal["restore", "older_snapshot", "fresh"]
 Pacing = Literal["fast", "original"] | float
 JOURNAL_LIMIT = 256_000_000
+HUNG_DELIVERIES = 2
+"""Turns of one message, in a row, that did not end, after which it is the message, and not who handles it."""
 OF_LIVES = ("name", "interval", "check_readonly", "key_variables", "origin", "strict", "check_replay")
 """The settings that concern a life, not its home."""
 
@@ -90,6 +92,10 @@ class Method:
     def trigger(self) -> int:
         """Bytes of journal at which something has to be done."""
         return min(self.journal_limit, self.journal_bytes or self.journal_limit)
+
+    def most_deliveries(self, *, has_hung: bool) -> int:
+        """Ends in the turn of one message after which it is put aside; `has_hung`: the last turn did not end."""
+        return min(HUNG_DELIVERIES, self.max_deliveries) if has_hung else self.max_deliveries
 
     @property
     def records(self) -> bool:

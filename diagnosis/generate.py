@@ -234,7 +234,11 @@ def _below(cell: Cell, out: Collection[str]) -> Iterator[Cell]:
         if child.path in out or child.is_dead:
             continue
         spec = child.spec
-        if spec is not None and not spec.is_supervisor and spec.restart != "temporary":
+        if isinstance(spec, ChildSpec):
+            is_component = not spec.is_supervisor and spec.restart != "temporary"
+        else:  # The spec of a recorded actor may be in its supervisor's process; no supervisor is recorded.
+            is_component = spec is not None
+        if is_component:
             yield child
         yield from _below(child, out)
 

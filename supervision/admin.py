@@ -159,7 +159,9 @@ class RestartChild(RuntimeOrder[Any]):
     With `fresh` what was recorded of it (of a supervisor: of all below it) is erased first. With `running` a child that
     runs is stopped first: from there to its start it is one call, which goes on if whoever has asked ends meanwhile. If
     that start fails, the caller is told so, and the supervisor tries on as after a crash.
-    With `unless_parked` a child that was stopped by order is refused (ChildParked): so asks repair. With `older` it
+    With `unless_parked` a child that was stopped by order is refused (ChildParked): so asks repair. With `blames_turn`
+    a turn that has to be cut off for this did not end, which counts against its message as a death does: so asks
+    repair, too, and else nobody's order counts. With `older` it
     begins with its snapshot before the newest; if there is none, one that ran goes on as it was, and the reply is
     ControlFailed.
     """
@@ -169,6 +171,7 @@ class RestartChild(RuntimeOrder[Any]):
     running: bool = False
     unless_parked: bool = False
     older: bool = False
+    blames_turn: bool = False
 
 
 class DeleteChild(RuntimeOrder[None]):

@@ -765,6 +765,8 @@ class Supervisor(Inquiries):
         has_run = message.running and one.state == UP
         if has_run:
             row = StartRow((one,), RESTARTING)
+            if message.blames_turn and one.cell is not None:
+                one.cell.host.home.hangs(one.cell)
             await self._stop(one, row=row, by=by, because="it was restarted by order")
             if one.row is not row:  # Whoever has it now says what becomes of it.
                 raise StartFailed(self._path_of(one), "it was stopped, or started by somebody else, meanwhile")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import sys
 from typing import Any
 
@@ -86,6 +87,10 @@ from .transaction.events import ScriptLoaded, TransactionCommitted, TransactionR
 
 BURST = 10
 """Records of one kind within a second; what is more is counted and told with the next one."""
+LETTERS_EVERY = 10.0
+"""Seconds between two records of dead letters that are alike: a mailbox that drops by its policy does so all day."""
+MOST_LETTERS = 1_000
+"""Sorts of dead letters that are remembered for that."""
 WAIT = 1.0
 """Seconds after a crash in which its supervisor is expected to say what it knows of it."""
 
@@ -130,6 +135,7 @@ class LogSink:
         self._lines = lines
         self._second: dict[type, tuple[int, int]] = {}
         self._crashes: dict[str, tuple[Event, asyncio.TimerHandle]] = {}  # by address: what waits for its supervisor
+        self._letters: dict[tuple[str, type, str], tuple[float, int]] = {}  # when one was told, and how many not since
 
     def __call__(self, event: Event) -> None:
         match event:
@@ -143,6 +149,8 @@ class LogSink:
             case ChildStartFailed():
                 crash = self._crash_at(event.address)
                 self._write(event, **({} if crash is None else self._describe(crash)))
+            case DeadLetter():
+                self._write_letter(event)
             case _ if type(event) in WRITTEN:
                 self._write(event)
             case _:
@@ -177,6 +185,23 @@ class LogSink:
         crash = self._crash_at(address)
         if crash is not None:
             self._write(crash)
+
+    # -- dead letters -----------------------------------------------------------------------------------------------
+
+    def _write_letter(self, letter: DeadLetter) -> None:
+        """Tell of the first of those that are alike, and then once in a while how many there have been (`alike`)."""
+        now, sort = self._loop.time(), (letter.address, type(letter.message), letter.why)
+        told, left_out = self._letters.get(sort, (-math.inf, 0))
+        if now - told < LETTERS_EVERY:
+            self._letters[sort] = told, left_out + 1
+            return
+        if len(self._letters) >= MOST_LETTERS:
+            self._letters.clear()
+        self._letters[sort] = now, 0
+        if left_out:
+            self._write(letter, alike=left_out)
+        else:
+            self._write(letter)
 
     # -- records ----------------------------------------------------------------------------------------------------
 

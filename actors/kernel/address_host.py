@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from ..events import ActorKilled
 from .cell import RUNNING
@@ -16,9 +16,36 @@ from .cell import RUNNING
 if TYPE_CHECKING:
     from ..control.orders_lane import QueuedOrder as QueuedOrder
     from ..exit_reasons import ExitReason
+    from ..overflow import Overflow
     from .actor import Start
     from .cell import Cell, GivenName
     from .envelope import Ask, Item
+
+
+class Work(NamedTuple):
+    """What an actor is at, as far as its home knows: read by those who observe it, and never in its turns.
+
+    Attributes:
+        mark: what it has in hand, or had last; another object there means that it has got on.
+        is_in_turn: it has something in hand.
+        since: when it began to wait in that turn, on the loop clock; None if that is not known.
+    """
+
+    mark: object = None
+    is_in_turn: bool = False
+    since: float | None = None
+
+
+class Capacity(Protocol):
+    """A mailbox that takes so many messages, wherever it is kept."""
+
+    overflow: Overflow
+    capacity: int
+
+    @property
+    def count(self) -> int:
+        """Messages that wait for their turn."""
+        ...
 
 
 class Home:
@@ -48,6 +75,15 @@ class Home:
         """Messages that wait and those in hand; cheap, for it may be a guess."""
         raise NotImplementedError
 
+    def work(self, cell: Cell, running: int) -> Work:
+        """What the actor is at; `running` is the number of the input in hand, -1 if none is known."""
+        turn = cell.more.turn if cell.more is not None else None
+        return Work(cell.item, turn is not None, None if turn is None else turn.since)
+
+    def mailbox(self, cell: Cell) -> Capacity | None:
+        """How full the mailbox is; None if it takes any number of messages."""
+        return cell.more.bound if cell.more is not None else None
+
     def progress(self, cell: Cell) -> object:
         """How far the start that is under way has come, as `Host.progress` says."""
         return None
@@ -59,6 +95,9 @@ class Home:
     def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
         """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
         return True
+
+    def hangs(self, cell: Cell) -> None:
+        """The life is told to end because it works badly: a turn that has to be cut off for that did not end."""
 
     def faulted(self, cell: Cell, by: str) -> None:
         """The life is killed, and no supervisor has ordered that: a turn in hand counts it as any death.
@@ -240,6 +279,12 @@ class AddressHost:
 
     def load(self, cell: Cell) -> int:
         return self.home.load(cell)
+
+    def work(self, cell: Cell) -> Work:
+        return self.home.work(cell, self.place.running(cell))
+
+    def mailbox(self, cell: Cell) -> Capacity | None:
+        return self.home.mailbox(cell)
 
     def progress(self, cell: Cell) -> object:
         return self.home.progress(cell)

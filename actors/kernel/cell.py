@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..control.tracing import TurnTap
     from ..errors import StartFailed
     from .actor import Actor, Start
-    from .address_host import Home, Parent, Place, QueuedOrder
+    from .address_host import Capacity, Home, Parent, Place, QueuedOrder, Work
     from .context import ActorContext
     from .loop import Suspended
     from .mailbox import Bound
@@ -117,6 +117,14 @@ class Host(Protocol):
 
     def load(self, cell: Cell) -> int:
         """Messages that wait and those in hand, as far as is known in this process; cheap, for it may be a guess."""
+        ...
+
+    def work(self, cell: Cell) -> Work:
+        """What the actor is at, as far as is known in this process."""
+        ...
+
+    def mailbox(self, cell: Cell) -> Capacity | None:
+        """How full the mailbox is; None if it takes any number of messages."""
         ...
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:

@@ -239,10 +239,10 @@ class Bound:
             return
         raise error
 
-    def _lose(self, cell: Cell, item: Any) -> None:
+    def _lose(self, cell: Cell, item: Any, displaced_by: str = "") -> None:
         message = item.message if isinstance(item, (Envelope, Ask)) else item
         if isinstance(item, Ask):
-            item.fail(MailboxFull(cell.path, self.capacity))
+            item.fail(MailboxFull(cell.path, self.capacity, displaced_by))
         sender = item.sender if isinstance(item, (Envelope, Ask)) else None
         cell.node.dead_letter(cell, message, f"mailbox full ({self.capacity}, {self.overflow})", sender)
 
@@ -254,7 +254,7 @@ class Bound:
             item = deque.popleft(queue)
             if counts(item):
                 self.count -= 1
-                self._lose(cell, item)
+                self._lose(cell, item, self.overflow)
             else:
                 kept.append(item)
         queue.extendleft(reversed(kept))
@@ -364,7 +364,8 @@ def bounded(capacity: int, *, overflow: Overflow = "block") -> Bounded:
     Args:
         capacity: messages, >= 1.
         overflow: "block" (tell raises MailboxFull, send waits, ask waits to its deadline), "reject" (all raise),
-            "drop_newest", "drop_oldest", or "latest" (only the newest is kept); the loser goes to dead letters.
+            "drop_newest", "drop_oldest", or "latest" (only the newest is kept). The loser goes to dead letters. Asks
+            are no exception: one that waits is displaced by what comes later, and fails with MailboxFull.
     """
     check("bounded", capacity, overflow)
     return Bounded(capacity, overflow)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from ..control.orders_lane import QueuedOrder
 from ..errors import HoldfastError, error_text
 from ..kernel import lifecycle, mailbox
+from ..kernel.address_host import Work
 from ..kernel.cell import GONE, RUNNING, Cell, Host
 from ..kernel.codec import Parcel
 from ..kernel.context import Piped
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
     from ..exit_reasons import ExitReason
     from ..kernel.actor import Actor
-    from ..kernel.address_host import Parent
+    from ..kernel.address_host import Capacity, Parent
 
 ATTEMPTS = itertools.count(1)
 """Numbers of attempts to have an actor in another process come to rest: what it says to an earlier one is void."""
@@ -236,6 +237,12 @@ class Transit:
 
     def load(self, cell: Cell) -> int:
         return len(cell.queue or ())
+
+    def work(self, cell: Cell) -> Work:
+        return Work()  # While it moves it is not up, and nothing is held against it.
+
+    def mailbox(self, cell: Cell) -> Capacity | None:
+        return None
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         self.waiting.append(lambda host: host.told(cell, verb, data))

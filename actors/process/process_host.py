@@ -16,7 +16,7 @@ from ..errors import AskFailed, BadMessage, HoldfastError, StartFailed
 from ..events import ActorStarted, StoreRefused
 from ..exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
 from ..kernel import lifecycle, links, mailbox
-from ..kernel.address_host import AddressHost, Home, Parent, Place
+from ..kernel.address_host import AddressHost, Home, Parent, Place, Work
 from ..kernel.cell import DOWN, GONE, RUNNING, Cell, GivenName
 from ..kernel.codec import Parcel
 from ..kernel.envelope import Ask, Envelope, Item
@@ -360,6 +360,14 @@ class FlightHome(WorkerHome):
             return queued
         begun = max(outlet.worker.page[0], outlet.worker.page[1])
         return queued + sum(number > begun for number, _ in outlet.flight)
+
+    def work(self, cell: Cell, running: int) -> Work:
+        """The oldest message that was sent to the process and is not handled, or how many were."""
+        outlet: Outlet | None = cell.extra().outlet
+        if outlet is None or outlet.worker is None:
+            return Work()
+        outlet.trim()
+        return Work(outlet.flight[0][1], is_in_turn=True) if outlet.flight else Work(outlet.sent)
 
     def load(self, cell: Cell) -> int:
         queued = len(cell.queue or ())

@@ -87,7 +87,7 @@ class HomeBound:
         """End queued messages, oldest first, until `keep` are left."""
         home = self._home
         batch = Batch()
-        error = Answer(*home.node.codec.encode_error(MailboxFull(home.path, self.capacity)))
+        error = Answer(*home.node.codec.encode_error(MailboxFull(home.path, self.capacity, self.overflow)))
         for source in list(self._counted.values()):
             if self.count <= keep:
                 break

@@ -107,7 +107,7 @@ class Holding:
     def _drop(self, topic: str, rule: Held, keep: int) -> None:
         """End held messages, oldest first, until `keep` are left: in the journal too."""
         home, batch = self._home, Batch()
-        answer = Answer(*home.node.codec.encode_error(MailboxFull(home.path, rule.capacity)))
+        answer = Answer(*home.node.codec.encode_error(MailboxFull(home.path, rule.capacity, rule.overflow)))
         mine = [source for source, by in self._counted.values() if by == topic]
         for source in mine[: len(mine) - keep]:
             self.dropped += 1
@@ -291,6 +291,11 @@ class Intake:
     holding: Holding | None = None
     inlets: dict[str, Inlet] = dataclasses.field(default_factory=dict)
     last: Input | None = None
+
+    @property
+    def mailbox(self) -> HomeBound | None:
+        """The bound of the mailbox itself, also while messages are held."""
+        return self.bound.inner if isinstance(self.bound, Holding) else self.bound
 
 
 def hold(home: Switch, running: int = -1) -> None:

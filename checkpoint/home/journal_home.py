@@ -10,12 +10,13 @@ import asyncio
 import functools
 import time
 from collections.abc import Awaitable, Callable, Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ...actors.errors import HoldfastError, StartFailed, StartIgnored
 from ...actors.events import ActorStarted, Recovered, RecoveryFailed
-from ...actors.exit_reasons import KILLED, ExitReason
+from ...actors.exit_reasons import KILLED, ExitReason, Hung
 from ...actors.kernel import links
+from ...actors.kernel.address_host import Work
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.lifecycle import MAILBOX
 from ...actors.persistence import UNFIT
@@ -32,7 +33,7 @@ from .recorded_home import RecordedHome
 from .switch import Switch
 
 if TYPE_CHECKING:
-    from ...actors.kernel.address_host import Parent
+    from ...actors.kernel.address_host import Capacity, Parent
     from ...actors.kernel.envelope import Item
     from ...actors.process.worker_pool import Worker
 
@@ -87,7 +88,7 @@ class JournalHome(RecordedHome):
         self.clock: RecoveryClock | None = None
         self.recovery: Recovery | None = None  # that of the life which is begun now
         self.page: memoryview | None = None  # of a life in this process: which input it has in hand
-        self.is_faulted = False  # the life is being killed, and no supervisor has ordered that
+        self.fault: Literal["", "killed", "hung"] = ""  # why the end that is ordered counts against the turn in hand
 
     def enter(self, cell: Cell) -> Entered:
         """As `open`, and it is a recovery if anything comes back, or if one is not over."""
@@ -174,8 +175,9 @@ class JournalHome(RecordedHome):
         self.clock.mark("noticed", noticed)
         self.clock.mark("detect")
         end = cell.extra().reason if reason is None else reason
-        switch.died(running, ordered=ordered and not self.is_faulted, reason=end)
-        self.is_faulted = False
+        has_hung = self.fault == "hung" or isinstance(end, Hung)
+        switch.died(running, ordered=ordered and not self.fault, has_hung=has_hung, reason=end)
+        self.fault = ""
         if recovers is None:
             recovers = self.recovers(end) and cell.spec is not None and cell.spec.restarts(end)
         if recovers:
@@ -204,17 +206,36 @@ class JournalHome(RecordedHome):
         """Whether an end for this reason is followed by a recovery."""
         return not reason.is_clean
 
+    def hangs(self, cell: Cell) -> None:
+        self._blame_turn(cell, "hung")
+
     def faulted(self, cell: Cell, by: str) -> None:
         super().faulted(cell, by)
+        self._blame_turn(cell, "killed")
+
+    def _blame_turn(self, cell: Cell, fault: Literal["killed", "hung"]) -> None:
+        """The end that comes counts against the turn in hand, unless that rests as it has said."""
         switch = self.switch
         rests = switch is not None and switch.rests_in(cell.host.place.running(cell))
-        self.is_faulted = cell.state is RUNNING and not rests
+        self.fault = fault if cell.state is RUNNING and not rests else ""
 
     def is_open(self, cell: Cell) -> bool:
         return self.switch is not None and self.switch.life.is_released
 
     def backlog(self, cell: Cell, running: int) -> int:
         return 0 if self.switch is None else self.switch.ledger.backlog(running)
+
+    def work(self, cell: Cell, running: int) -> Work:
+        """The input in hand, or the number of the turn that has ended last: the same for every place."""
+        switch = self.switch
+        if switch is None:
+            return Work()
+        source, turn = switch.ledger.open.get(running), cell.more.turn if cell.more is not None else None
+        mark: object = switch.ledger.turn if source is None else source
+        return Work(mark, source is not None, None if turn is None else turn.since)
+
+    def mailbox(self, cell: Cell) -> Capacity | None:
+        return None if self.switch is None else self.switch.intake.mailbox
 
     def load(self, cell: Cell) -> int:
         """Messages that wait and those in hand; what the actor has put aside is among them."""

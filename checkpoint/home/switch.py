@@ -382,8 +382,11 @@ class Switch:
         if holding is not None:
             holding.let_in()
 
-    def died(self, running: int, ordered: bool, reason: ExitReason) -> None:
-        """The life is over. `running` is the input in hand, -1 if none; `ordered`: it was not its doing."""
+    def died(self, running: int, ordered: bool, reason: ExitReason, *, has_hung: bool = False) -> None:
+        """The life is over.
+
+        `running` is the input in hand, -1 if none; `ordered`: it was not its doing; `has_hung`: that turn did not end.
+        """
         ends = self.ledger.own_end.wanted
         self.life.has_ended = ends is not None and self.life.is_live and is_end_of(ends.exit_reason, reason)
         self.life.die()
@@ -391,7 +394,8 @@ class Switch:
         self.replay.cancel()
         if self.intake.bound is not None:
             self.intake.bound.restart()
-        poison = self.ledger.count_death(running, is_ordered=ordered, most=self.method.max_deliveries)
+        most = self.method.most_deliveries(has_hung=has_hung)
+        poison = self.ledger.count_death(running, is_ordered=ordered, most=most)
         if poison is not None:
             put_into_quarantine(self, poison)
 

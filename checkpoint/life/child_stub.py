@@ -111,6 +111,10 @@ class RootHome(Home):
     def recovers(self, reason: ExitReason) -> bool:
         return not reason.is_clean
 
+    def hangs(self, cell: Cell) -> None:
+        if cell.state is RUNNING:
+            self.guest.command(cell, "hangs", {})
+
     def faulted(self, cell: Cell, by: str) -> None:
         if cell.state is RUNNING:
             self.guest.command(cell, "faulted", {"by": by})

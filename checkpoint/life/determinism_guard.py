@@ -145,21 +145,21 @@ class DeterminismGuard:
                 raise caught
 
     @types.coroutine
-    def drive(self, turn: Coroutine[Any, Any, T]) -> Generator[Any, Any, T]:
+    def drive(self, driven_turn: Coroutine[Any, Any, T]) -> Generator[Any, Any, T]:
         """Run a turn to its end, watched whenever it has the thread."""
-        step, value = turn.send, None
+        step, value = driven_turn.send, None
         while True:
             try:
                 yielded = self.call(step, value)
             except StopIteration as done:
                 return done.value  # type: ignore[no-any-return]  # what the turn returns
             try:
-                step, value = turn.send, (yield yielded)
+                step, value = driven_turn.send, (yield yielded)
             except GeneratorExit:
-                turn.close()
+                driven_turn.close()
                 raise
             except BaseException as error:
-                step, value = turn.throw, error
+                step, value = driven_turn.throw, error
 
     def _look(self, frame: FrameType, event: str, arg: Any) -> None:
         """Called by the interpreter at each call; what is raised here is raised at the call, in place of it."""

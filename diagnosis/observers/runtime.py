@@ -9,6 +9,7 @@ from collections import Counter, deque
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Final
 
+from ...actors.control.orders_lane import OrderAsk
 from ...actors.errors import AskTimeout
 from ...actors.events import ActorCrashed, EventStream
 from ...actors.exit_reasons import Crash
@@ -16,7 +17,8 @@ from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.envelope import Ask, chain_of
 from ...actors.kernel.message import Refusal
 from ...actors.kernel.node import Node
-from ...actors.process.open_asks import open_asks, outlet_of
+from ...actors.overflow import DROPS
+from ...actors.process.open_asks import open_asks
 from ...supervision.intensity import recent_restarts
 from ..literals import Literal, crashes, keeps_up, progress, replies, room, waits_for
 from .backlog import Backlog
@@ -47,6 +49,10 @@ class _Seen:
     """What it had in hand at the last look; another one means that it has got on."""
     since: float = 0.0
     """When it was seen to get on for the last time."""
+    idle: float = 0.0
+    """When it was seen with nothing to do for the last time: who has nothing to do does not stand still."""
+    is_in_turn: bool = False
+    """Whether it had something in hand at the last look."""
     turns: int = 0
     """Looks in which it had got on."""
     longest: float = 0.0
@@ -125,7 +131,7 @@ class RuntimeObserver(Observer):
         return self.ctx._cell.node
 
     def _note(self, ask: Ask, error: BaseException) -> None:
-        if len(self._failed) < MOST:
+        if len(self._failed) < MOST and not isinstance(ask, OrderAsk):  # Orders pass ahead of messages: no work of its.
             self._failed.append((ask, error))
 
     def spares(self, grace: Any, about: Literal) -> bool:
@@ -228,33 +234,40 @@ class RuntimeObserver(Observer):
         self, component: str, cell: Cell, asked_since: float | None, waits: Mapping[str, set[str]], now: float
     ) -> bool:
         seen = self._seen(component)
-        mark, began = _in_hand(cell)
+        work = cell.host.work(cell)
         if seen.life != cell.life:
-            seen.life, seen.mark, seen.since = cell.life, mark, now
+            seen.life, seen.mark, seen.since = cell.life, work.mark, now
             seen.unanswered.clear()
             seen.backlog.clear()
-        has_got_on = mark is not seen.mark
-        stood = now - seen.since
+        has_got_on = work.mark is not seen.mark
+        if has_got_on or (seen.is_in_turn and not work.is_in_turn):  # A turn is over that was seen, or that was missed.
+            stood = now - max(seen.since, seen.idle)
+            seen.longest = max(seen.longest, stood if seen.is_in_turn or stood > self._patience else 0.0)
+        seen.is_in_turn = work.is_in_turn
         if has_got_on:
-            seen.longest = max(seen.longest, stood if began is not None or stood > self._patience else 0.0)
-            seen.mark, seen.since, seen.turns = mark, now if began is None else max(began, seen.since), seen.turns + 1
+            seen.mark, seen.turns = work.mark, seen.turns + 1
+            seen.since = now if work.since is None else max(work.since, seen.since)
         waits_now = sorted(waits.get(component, ()))
         seen.waited.append(waits_now[0] if waits_now else "")
         backlog = cell.host.backlog(cell)
         seen.backlog.take(backlog, now)
         limit = max(self._patience, LONGER * seen.longest) if seen.turns >= LOOKS else float("inf")
-        is_busy = began is not None or backlog > 0
+        is_busy = work.is_in_turn or backlog > 0
+        if not is_busy:
+            seen.idle = now
         is_wanted = asked_since is not None or backlog > 0
         keeps = self.manner.time_to_live
         while seen.unanswered and now - seen.unanswered[0][0] > keeps:
             seen.unanswered.popleft()
-        stands = is_busy and is_wanted and now - seen.since > limit
+        stands = is_busy and is_wanted and now - max(seen.since, seen.idle) > limit
         # A turn that was under way when an ask of it ran out, and still is; or several asks that ran out.
         unanswered = [at for at, made in seen.unanswered if is_busy and seen.since <= max(made, at - self._patience)]
         is_late = stands or bool(unanswered) or len(seen.unanswered) > 1
-        seen.full = None if cell.has_room and not _is_full(cell) else now if seen.full is None else seen.full
+        bound = cell.host.mailbox(cell)
+        turns_away = bound is not None and bound.overflow not in DROPS and bound.count >= bound.capacity
+        seen.full = None if cell.has_room and not turns_away else now if seen.full is None else seen.full
         is_full = seen.full is not None and now - seen.full >= self._patience
-        if cell.more is not None and cell.more.bound is not None and not is_full:
+        if bound is not None and not is_full:
             self.verdict(room(component), True)
         if not is_late and not is_full and component not in self._loops:
             answered = isinstance(cell.item, Ask) and cell.item.is_done and not seen.unanswered
@@ -327,21 +340,6 @@ class RuntimeObserver(Observer):
             return None
         usual, count = Counter(seen.waited).most_common(1)[0]
         return usual if usual and 2 * count > len(seen.waited) and usual in self._actors else None
-
-
-def _in_hand(cell: Cell) -> tuple[object, float | None]:
-    """What an actor has in hand, or had last, and since when its turn waits; of one in a process what it was sent."""
-    outlet = outlet_of(cell)
-    if outlet is not None:
-        done = outlet.worker
-        return (outlet.flight[0][1] if outlet.flight else outlet.sent), (0.0 if outlet.flight and done else None)
-    turn = cell.more.turn if cell.more is not None else None
-    return cell.item, None if turn is None else turn.since
-
-
-def _is_full(cell: Cell) -> bool:
-    bound = cell.more.bound if cell.more is not None else None
-    return bound is not None and bound.count >= bound.capacity
 
 
 def _is_anothers(reason: Crash) -> bool:

@@ -195,7 +195,7 @@ async def _restart(act: Act, node: str, *, addresses: Mapping[str, str], timeout
     address = addresses[node]
     keeper, child = _keeper(act, address)
     act.check()
-    order = RestartChild(child, running=True, unless_parked=True, older=older)
+    order = RestartChild(child, running=True, unless_parked=True, older=older, blames_turn=True)
     try:
         await _ordered(act, keeper, address, order, 2 * timeout)
     except ChildBusy as error:

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from ...checkpoint.protocol import TurnEnd
     from .replicas import Replicas
 
-MOST = 2
-"""Attempts after which it is the message, and not who handles it."""
 ANSWERED_WITHIN = 5.0
 """Seconds after which a replica that was told to end a turn is told again."""
 STUCK_AFTER: Final = 5.0
@@ -61,7 +59,7 @@ class Stuck:
             self._counted.add((known.epoch, number))
             source.deliveries += 1
             replicas.node.emit(TurnHung(replicas.path, name, known.epoch, source.name, source.deliveries))
-        if source.deliveries >= min(MOST, self._switch.method.max_deliveries):
+        if source.deliveries >= self._switch.method.most_deliveries(has_hung=True):
             self._given_up.add(number)
             self._tell(name, number, again=False)
         elif replicas.backups():

@@ -247,6 +247,10 @@ async def test_the_loser_s_ask_gets_mailbox_full(system: hf.ActorSystem, overflo
     gate.set()
     outcomes = await asyncio.gather(*asks, return_exceptions=True)
     assert [not isinstance(outcome, hf.MailboxFull) for outcome in outcomes] == answered
+    (full,) = [outcome for outcome in outcomes if isinstance(outcome, hf.MailboxFull)]
+    was_taken = answered == [False, True]
+    assert full.displaced_by == (overflow if was_taken else "")
+    assert ("had taken the message, and dropped it for a newer one" in str(full)) == was_taken
 
 
 async def test_an_actor_that_overflows_its_own_mailbox_in_a_turn_lives_on(system: hf.ActorSystem) -> None:

@@ -212,6 +212,7 @@ def test_a_refusal_with_wrong_fields_is_a_programming_error(values: Any, named: 
         Plain(),
         hf.ActorStopped("/t/a", "normal"),
         hf.MailboxFull("/t/a", 3),
+        hf.MailboxFull("/t/a", 3, "latest"),
         hf.UnknownMessage("/t/a", "m.M"),
         hf.errors.BadMessage("/t/a", "m.M", "why"),
         hf.errors.AskDeadlock("/t/a", ("/t/b",)),

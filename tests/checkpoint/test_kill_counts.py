@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.supervision.admin import CountChildren, RestartChild
 from tests.checkpoint.players import Do, Doer, Note, Notes, Seen, Sink, until
 from tests.checkpoint.strikes import NEVER, doer, event, home, let_through
 from tests.effects.patient import Call, Count, Go, patient
@@ -31,12 +32,12 @@ class Killer(hf.Actor):
 
 
 def team(
-    isolation: str, *others: hf.ChildSpec[Any], strategy: Any = "one_for_one", **options: Any
+    isolation: str, *others: hf.ChildSpec[Any], strategy: Any = "one_for_one", deliveries: int = 2, **options: Any
 ) -> hf.ChildSpec[Any]:
-    """A supervisor with an actor that is given up after two deaths in one turn."""
+    """A supervisor with an actor of which a message is put aside after so many deaths in its turn."""
     own: Any = "process" if isolation == "process" else "task"
     mechanism = hf.ftm.PBR() if isolation == "PBR" else None
-    method = hf.hybrid(interval=NEVER, max_deliveries=2)
+    method = hf.hybrid(interval=NEVER, max_deliveries=deliveries)
     spec = hf.child("doer", hf.start(Doer), isolation=own, recovery=method, mechanism=mechanism, **options)
     above: Any = "process" if isolation == "subtree" else "task"
     return hf.supervisor("team", strategy=strategy, children=[spec, *others], isolation=above, intensity=99)
@@ -80,6 +81,41 @@ async def test_what_a_supervisor_ends_is_not_counted(system: hf.ActorSystem, gat
     await until(gate.exists, IN_TIME)
     let_through(gate)
     assert await asked == "0"
+
+
+@pytest.mark.parametrize("isolation", ["task", "process", "subtree", "PBR"])
+async def test_a_turn_that_is_cut_off_twice_because_it_hangs_is_put_aside(
+    system: hf.ActorSystem, gate: Path, isolation: str
+) -> None:
+    """Repair says with its order that the actor works badly; without that word it is an operator's, and counts not."""
+    await system.start(team(isolation, deliveries=3, shutdown=0.2))
+    ref, above = system.ref(WHOM, Doer), system.ref("/app/team", hf.Supervisor)
+    bad = asyncio.ensure_future(ref.ask(Do([f"gate {gate}"]), timeout=IN_TIME))
+    for blames in (False, False, True, True):
+        await until(gate.exists, IN_TIME)
+        gate.unlink()
+        assert not system.quarantined(ref)
+        await above.ask(RestartChild("doer", running=True, blames_turn=blames), timeout=IN_TIME)
+    with pytest.raises(hf.Quarantined):
+        await bad
+    assert [one.attempts for one in system.quarantined(ref)] == [2]
+    assert await ref.ask(Note("behind"), timeout=IN_TIME) == 1
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_turn_that_ends_when_repair_wants_it_to_counts_nothing(
+    system: hf.ActorSystem, gate: Path, isolation: str
+) -> None:
+    await system.start(team(isolation, deliveries=1))
+    ref, above = system.ref(WHOM, Doer), system.ref("/app/team", hf.Supervisor)
+    asked = asyncio.ensure_future(ref.ask(Do([f"gate {gate}"]), timeout=IN_TIME))
+    await until(gate.exists, IN_TIME)
+    again = asyncio.ensure_future(above.ask(RestartChild("doer", running=True, blames_turn=True), timeout=IN_TIME))
+    await above.ask(CountChildren())  # It has taken the order by now.
+    let_through(gate)
+    await again
+    assert await asked == "0"
+    assert await ref.ask(Note("behind"), timeout=IN_TIME) == 1
 
 
 @pytest.mark.parametrize("isolation", ["task", "process"])

@@ -59,7 +59,7 @@ CHECKS = {
     ),
     "a kill from outside is no order": Check(
         "checkpoint/home/journal_home.py",
-        "ordered=ordered and not self.is_faulted",
+        "ordered=ordered and not self.fault",
         "ordered=ordered",
         KILLS,
         "put_aside and task-root",
@@ -87,8 +87,8 @@ CHECKS = {
     ),
     "a turn that rests is not what it was killed for": Check(
         "checkpoint/home/journal_home.py",
-        "cell.state is RUNNING and not rests\n",
-        "cell.state is RUNNING\n",
+        "if cell.state is RUNNING and not rests else",
+        "if cell.state is RUNNING else",
         KILLS,
         "rests_is_killed and task",
     ),

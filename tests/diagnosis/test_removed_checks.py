@@ -19,7 +19,30 @@ BOARD = "tests/diagnosis/board/test_board.py"
 FLOW = "tests/diagnosis/observers/test_flow.py"
 FOREIGN = "tests/diagnosis/foreign/test_foreign.py"
 
+KINDS = "tests/diagnosis/observers/test_kinds.py"
+
 CHECKS = {
+    "a recorded actor has in hand what its home says": Check(
+        "checkpoint/home/journal_home.py",
+        "        return Work(mark, source is not None, None if turn is None else turn.since)\n",
+        "        return Work(cell.item)\n",
+        KINDS,
+        "seen_to_work_and_to_hang and process-hybrid",
+    ),
+    "a mailbox that drops what waits may be full": Check(
+        "diagnosis/observers/runtime.py",
+        "bound is not None and bound.overflow not in DROPS and bound.count >= bound.capacity",
+        "bound is not None and bound.count >= bound.capacity",
+        KINDS,
+        "full_by_its_policy",
+    ),
+    "who has nothing to do does not stand still": Check(
+        "diagnosis/observers/runtime.py",
+        "        if not is_busy:\n            seen.idle = now\n",
+        "",
+        KINDS,
+        "was_idle_for_long",
+    ),
     "turns that nobody saw are guessed": Check(
         "diagnosis/observers/flow.py",
         "return learned.most_in if self.seen >= ENOUGH else max(learned.most_in, self.guess)",

@@ -15,7 +15,7 @@ from ...control.trace_tail import enveloped, follow
 from ...errors import AskDeadlock, BadMessage, BadReply, HoldfastError, type_name
 from ...exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...kernel import links
-from ...kernel.address_host import AddressHost, Home, Place
+from ...kernel.address_host import AddressHost, Capacity, Home, Place, Work
 from ...kernel.cell import Cell
 from ...kernel.codec import Codec, Parcel, Raw
 from ...kernel.envelope import Ask, Chain, Envelope, Item, chain_of, message_in, waiters
@@ -436,6 +436,12 @@ class RemoteHome(Home):
     def load(self, cell: Cell) -> int:
         return 0
 
+    def work(self, cell: Cell, running: int) -> Work:
+        return Work()  # Its own process knows.
+
+    def mailbox(self, cell: Cell) -> Capacity | None:
+        return None
+
     def faulted(self, cell: Cell, by: str) -> None:
         self.peer.require_granted(cell.path, "kill")
         connection = self.peer.connection
@@ -523,6 +529,8 @@ def obey(node: Node, cell: Cell, name: str, frame: frames.Command, *, by_root: b
             cell.request_stop(unpack_exit(data.get("reason")))
         case "kill":
             cell.kill()
+        case "hangs":
+            cell.host.home.hangs(cell)
         case "faulted":
             by = data.get("by")
             cell.host.home.faulted(cell, by if isinstance(by, str) else "")

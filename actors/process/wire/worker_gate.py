@@ -478,6 +478,7 @@ COMMANDS: Final[dict[str, Callable[[WorkerGate, str, frames.Command], None]]] = 
     "stop": _order,
     "kill": _order,
     "faulted": _order,
+    "hangs": _order,
     "exit": _tie("source", both=True),
     "down": _tie("source", both=True),
     "monitor": _tie("watcher", both=False),

@@ -13,7 +13,31 @@ ACTORS = "tests/diagnosis/repair/test_actors.py"
 LOOP = "tests/diagnosis/repair/test_loop.py"
 WORSE = "tests/diagnosis/repair/test_no_worse.py"
 
+KILLS = "tests/checkpoint/test_kill_counts.py"
+HUNG = "tests/diagnosis/repair/test_hung_turns.py"
+
 CHECKS = {
+    "a turn that repair has to cut off counts against its message": Check(
+        "diagnosis/repair/stock.py",
+        ", older=older, blames_turn=True)",
+        ", older=older)",
+        HUNG,
+        "whose_turn_hangs_again and task",
+    ),
+    "only who says so blames the turn": Check(
+        "supervision/supervisor.py",
+        "if message.blames_turn and one.cell is not None:",
+        "if one.cell is not None:",
+        KILLS,
+        "cut_off_twice_because_it_hangs and task",
+    ),
+    "the second turn that does not end is the last": Check(
+        "checkpoint/method.py",
+        "min(HUNG_DELIVERIES, self.max_deliveries) if has_hung else self.max_deliveries",
+        "self.max_deliveries",
+        KILLS,
+        "cut_off_twice_because_it_hangs and task",
+    ),
     "a restart by order whose start fails is tried on": Check(
         "supervision/supervisor.py",
         '            if has_run and one.spec.restart != "temporary":\n',
