@@ -318,8 +318,8 @@ def _kill(root: Root) -> None:
     pool = vars(system).get("_workers")  # None: it did not come so far.
     if isinstance(pool, SimulatedWorkers):
         pool.end()
+    LoopMethods.of(type(loop)).actors_killed(loop, node)  # First: what is dropped is collected at once.
     loop.drop(root)
-    LoopMethods.of(type(loop)).actors_killed(loop, node)
     node.threads.close()
     cells = [] if node.root is None else [node.root]
     for cell in cells:  # It grows meanwhile.
