@@ -32,14 +32,32 @@ _BUSY_SECONDS: Final = 0.25  # Nobody holds a lock for long, except a stopped pr
 
 
 def create_database(path: str, folder: str, key: bytes | None) -> None:
-    """Make the database in `folder` and link it into place: half a database is then never seen under its name."""
-    identity = str(uuid.uuid4())
-    cipher = new_cipher(key, identity)
+    """Make the database in `folder` and link it into place: half a database is then never seen under its name.
+
+    Another opener may be quicker, and as the owner sweep ours away at any moment: then there is one, and ours is not
+    needed.
+    """
     new = os.path.join(folder, f"new-{os.getpid()}-{threading.get_ident()}")
     with contextlib.suppress(FileNotFoundError):
         os.unlink(new)  # left by an earlier process with our pid
-    os.close(os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600))  # SQLite gives -wal and -shm the same mode
-    with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as db:
+    try:
+        _write_database(new, key)
+        os.link(new, path)
+    except (OSError, sqlite3.Error):
+        if not os.path.exists(path):
+            raise
+    else:
+        sync(os.path.dirname(path))
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(new)
+
+
+def _write_database(path: str, key: bytes | None) -> None:
+    """Make a new store, all of which is on the disk."""
+    identity = str(uuid.uuid4())
+    cipher = new_cipher(key, identity)
+    os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600))  # SQLite gives -wal and -shm the same mode
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as db:
         create_tables(db, cipher)
         db.executemany("INSERT INTO notes VALUES (NULL, ?, ?, ?)", new_notes(identity, cipher))
         # What is left in the WAL would be missing under the other name, and closing says nothing of what it could not
@@ -47,14 +65,7 @@ def create_database(path: str, folder: str, key: bytes | None) -> None:
         (is_busy, left, _) = db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
         if is_busy or left:
             raise sqlite3.OperationalError(f"{left} pages of the new database stay in its WAL")
-    sync(new)
-    try:
-        os.link(new, path)
-        sync(os.path.dirname(path))
-    except (FileExistsError, FileNotFoundError):
-        pass  # Another opener was quicker, and as the owner it may have swept ours away.
-    with contextlib.suppress(FileNotFoundError):
-        os.unlink(new)
+    sync(path)
 
 
 def create_tables(db: sqlite3.Connection, cipher: Cipher) -> None:

@@ -835,6 +835,13 @@ CHECKS = {
         "tests/checkpoint/test_controller_safe_state.py",
         "test_what_is_restarted_in_good_order and task",
     ),
+    "who is overtaken while it makes a store opens the one that is there": Check(
+        "checkpoint/sqlite/database.py",
+        "        if not os.path.exists(path):\n            raise\n",
+        "        raise\n",
+        "tests/checkpoint/sqlite/test_owners.py",
+        "whoever_makes_the_store_first",
+    ),
     "the next program knows who was left in safe state": Check(
         "checkpoint/recovery/safe_states.py",
         "            self._journal.note(KEPT, noted)\n",

@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,7 +22,7 @@ from holdfast.checkpoint.journal import (
     StoreFailed,
     StoreInUse,
 )
-from holdfast.checkpoint.sqlite import SqliteJournal
+from holdfast.checkpoint.sqlite import SqliteJournal, database
 from holdfast.checkpoint.sqlite.row_codec import crc_of
 from tests.checkpoint.sqlite.stores import KEY, A, disown, edit, end, inputs, line, made, numbers, reopened, spawn
 
@@ -106,6 +107,31 @@ def test_of_many_openers_one_wins(path: Path) -> None:
     assert sorted(said) == [b""] * 4 + [b"open 1\n"]
     for child in children:
         end(child)
+
+
+@pytest.mark.parametrize("step", ["create_tables", "new_notes", "sync", "os.link"])
+def test_whoever_makes_the_store_first_may_sweep_what_another_one_makes(
+    path: Path, step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two programs open a store that is not there yet, and one is overtaken at each step of making it."""
+    name = step if step.startswith("os.") else f"holdfast.checkpoint.sqlite.database.{step}"
+    right = os.link if step == "os.link" else getattr(database, step)
+    overtaken: list[int] = []
+
+    def overtake() -> None:
+        with closing(SqliteJournal(path)) as journal:
+            overtaken.append(journal.epoch)
+
+    def slow(*arguments: Any) -> Any:
+        monkeypatch.setattr(name, right)
+        other = threading.Thread(target=overtake)
+        other.start()
+        other.join()
+        return right(*arguments)
+
+    monkeypatch.setattr(name, slow)
+    with closing(SqliteJournal(path)) as journal:
+        assert (overtaken, journal.epoch) == ([1], 2)
 
 
 def test_an_owner_whose_epoch_is_stale_writes_nothing(store: SqliteJournal, path: Path) -> None:
