@@ -40,7 +40,7 @@ class StandstillWatch:
         self._is_watched = False
 
     def begin(self, number: int, _: object) -> None:
-        """A signal has come."""
+        """Begin to watch the loop: a signal has come."""
         if not self._is_watched:
             self._is_watched = True
             threading.Thread(target=self._look, args=(number,), name="holdfast end", daemon=True).start()

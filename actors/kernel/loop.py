@@ -498,7 +498,7 @@ class Runner(Coroutine[Any, Any, None]):
         return self._step(turn, self._context, turn.coroutine.throw, error)
 
     def close(self) -> None:
-        """Give the turn up."""
+        """Give up the turn that it waits with."""
         if self._turn is not None:
             self._turn.coroutine.close()
 

@@ -123,6 +123,20 @@ class Waiting(msgspec.Struct, frozen=True):
     sender: str = ""
 
 
+class Below(msgspec.Struct, frozen=True):
+    """What is known of those at one distance below a supervisor.
+
+    Attributes:
+        events: the newest about what weighs much there, oldest first.
+        now: those that are there: its children by name; further below, by address, only those that do not get on.
+        ended: the last lives of those that are not there now, by address; further below only ends by a fault.
+    """
+
+    events: list[PastEvent] = []
+    now: list[ChildNow] = []
+    ended: dict[str, PastLife] = {}
+
+
 class Evidence(msgspec.Struct, frozen=True):
     """All that is known about an address at one moment.
 
@@ -140,12 +154,8 @@ class Evidence(msgspec.Struct, frozen=True):
         allowance: what its supervisor allows, if that is in this process.
         quarantined: its messages in quarantine.
         suspects_gap: whether events were left out lately because there were too many.
-        below: the newest events about what weighs much at its children, oldest first.
-        children: if it is a supervisor that answers, its children.
-        ended_below: the last lives of its children that are not there now, by address.
-        deeper: the newest events about what weighs much further below, oldest first.
-        deeper_now: those further below who do not get on now, by their addresses, as far as this process knows.
-        deeper_ended: the last lives of those further below that ended by a fault and are not there now, by address.
+        below: its children, if it is a supervisor that answers.
+        deeper: whoever is further below, at any depth, as far as this process knows.
         own_allowance: what it allows itself, if it is a supervisor that answers.
         protection: its mechanisms and replicas, if somebody lives there.
         memory: of its own process, if its limits bound that.
@@ -165,12 +175,8 @@ class Evidence(msgspec.Struct, frozen=True):
     allowance: Allowance | None = None
     quarantined: list[PutAside] = []
     suspects_gap: bool = False
-    below: list[PastEvent] = []
-    children: list[ChildNow] = []
-    ended_below: dict[str, PastLife] = {}
-    deeper: list[PastEvent] = []
-    deeper_now: list[ChildNow] = []
-    deeper_ended: dict[str, PastLife] = {}
+    below: Below = Below()
+    deeper: Below = Below()
     own_allowance: Allowance | None = None
     protection: ProtectionStatus | None = None
     memory: ProcessMemory | None = None
@@ -233,12 +239,16 @@ def collect(
         None if cell is None else _allowance(cell),
         [put_aside(one) for one in quarantined],
         recorder.is_in_storm,
-        answer(recorder, question(f"{literal(address)}/*", kinds=CHILD_KINDS, limit=MOST)).events,
-        children,
-        _ended_below(recorder, address, children),
-        _deeper(recorder, address),
-        [] if cell is None else _deeper_now(cell),
-        _deeper_ended(node, recorder, address),
+        Below(
+            answer(recorder, question(f"{literal(address)}/*", kinds=CHILD_KINDS, limit=MOST)).events,
+            children,
+            _ended_below(recorder, address, children),
+        ),
+        Below(
+            _deeper(recorder, address),
+            [] if cell is None else _deeper_now(cell),
+            _deeper_ended(node, recorder, address),
+        ),
         _own_allowance(told.overview),
         None if cell is None else protection_of(cell),
         None if cell is None else _memory(cell),
@@ -273,7 +283,7 @@ def _ended_below(recorder: HistoryRecorder, address: str, children: list[ChildNo
 
 
 def _deeper(recorder: HistoryRecorder, address: str) -> list[PastEvent]:
-    """What happened further below."""
+    """What weighs much of that which happened further below."""
     events = answer(recorder, question(f"{literal(address)}/*/*/**", kinds=DEEPER_KINDS, limit=MOST)).events
     return [event for event in events if not _is_part(event.address, address)]
 

@@ -33,7 +33,7 @@ def restarts_of_children(evidence: Evidence) -> list[str]:
     """Which children it has restarted lately, how often, and what it allows."""
     own = evidence.own_allowance
     since = evidence.now - max(LATELY, own.period if own is not None else 0.0)
-    lately = [event for event in evidence.below if event.kind == "ChildRestarted" and event.at >= since]
+    lately = [event for event in evidence.below.events if event.kind == "ChildRestarted" and event.at >= since]
     if not lately:
         return []
     counted = Counter(event.address for event in lately).most_common(MOST_NAMED)
@@ -50,7 +50,7 @@ def restarts_of_children(evidence: Evidence) -> list[str]:
 
 def ended_children(evidence: Evidence) -> list[str]:
     """Which children have ended, or could not be started, and are not there now."""
-    ended = sorted(evidence.ended_below.items(), key=lambda one: one[1].ended or 0.0)
+    ended = sorted(evidence.below.ended.items(), key=lambda one: one[1].ended or 0.0)
     said: list[str] = []
     for path, life in ended[-MOST_NAMED:]:
         ago = evidence.ago(life.ended or evidence.now)
@@ -81,7 +81,7 @@ def troubled_children(evidence: Evidence) -> list[str]:
     said = [
         f"Of its child {_name(event.address)}, {TROUBLE[event.kind]} {evidence.ago(event.at)}: ask why of "
         f"{event.address}."
-        for event in evidence.below
+        for event in evidence.below.events
         if event.kind in TROUBLE and evidence.now - event.at <= NEWS
     ]
     return _first(said[::-1])
@@ -89,7 +89,7 @@ def troubled_children(evidence: Evidence) -> list[str]:
 
 def overdue_children(evidence: Evidence) -> list[str]:
     """Which children had not ended in time when they were told to, and were killed."""
-    events = [event for event in evidence.below if event.kind == "StopOverdue"]
+    events = [event for event in evidence.below.events if event.kind == "StopOverdue"]
     return _first(
         [
             f"Its child {_name(event.address)} had not ended within {event.fields.get('seconds')} s when it was told "
@@ -115,10 +115,10 @@ def _deeper_trouble(evidence: Evidence) -> dict[str, tuple[float, str]]:
         if weight > found.get(path, (0.0, ""))[0]:
             found[path] = weight, words
 
-    for one in evidence.deeper_now:
+    for one in evidence.deeper.now:
         held = one.state == "suspended"
         add(one.name, 1.0 if held else 2.0, "is suspended" if held else f"does not get on{_hangs(one)}")
-    for event in evidence.deeper:
+    for event in evidence.deeper.events:
         ago = evidence.ago(event.at)
         if evidence.now - event.at > NEWS:
             continue
@@ -126,11 +126,13 @@ def _deeper_trouble(evidence: Evidence) -> dict[str, tuple[float, str]]:
             add(event.address, 3.0, f"has something to tell: {TROUBLE[event.kind]} {ago}")
         elif event.kind != "ChildRestarted":
             add(event.address, 5.0, f"gave up {ago}" if event.kind == "SupervisorGaveUp" else f"ended {ago}")
-    for path, life in evidence.deeper_ended.items():
+    for path, life in evidence.deeper.ended.items():
         if life.ended is not None and evidence.now - life.ended <= NEWS:
             ended = "could not be started" if life.reason_kind == "StartFailed" else "ended and is not there"
             add(path, 4.0, f"{ended}, {evidence.ago(life.ended)} ({life.reason[:MOST_TEXT]})")
-    restarts = [one for one in evidence.deeper if one.kind == "ChildRestarted" and evidence.now - one.at <= LATELY]
+    restarts = [
+        one for one in evidence.deeper.events if one.kind == "ChildRestarted" and evidence.now - one.at <= LATELY
+    ]
     for path, count in Counter(event.address for event in restarts).items():
         first = next(event for event in restarts if event.address == path)
         within = max(1, round(evidence.now - first.at))
@@ -145,7 +147,7 @@ def _stacks(event: PastEvent) -> str:
 
 
 def _in(evidence: Evidence, *states: str) -> list[ChildNow]:
-    return [one for one in evidence.children if one.state in states]
+    return [one for one in evidence.below.now if one.state in states]
 
 
 def _hangs(one: ChildNow) -> str:

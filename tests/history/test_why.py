@@ -8,6 +8,7 @@ import holdfast as hf
 from holdfast.ftm.group.protected import ProtectionStatus
 from holdfast.system.history.evidence import (
     Allowance,
+    Below,
     ChildNow,
     Evidence,
     Outstanding,
@@ -225,12 +226,14 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a child restarted": (
         {
-            "below": [
-                told("ChildRestarted", f"{AT}/a", 985.0, reason="KeyError: 7", allowed=3),
-                told("ChildRestarted", f"{AT}/b", 990.0, reason="SIGKILL", allowed=3),
-                told("ChildRestarted", f"{AT}/a", 995.0, reason="KeyError: 8", allowed=3),
-                told("ChildRestarted", f"{AT}/old", 100.0, reason="long ago", allowed=3),
-            ],
+            "below": Below(
+                events=[
+                    told("ChildRestarted", f"{AT}/a", 985.0, reason="KeyError: 7", allowed=3),
+                    told("ChildRestarted", f"{AT}/b", 990.0, reason="SIGKILL", allowed=3),
+                    told("ChildRestarted", f"{AT}/a", 995.0, reason="KeyError: 8", allowed=3),
+                    told("ChildRestarted", f"{AT}/old", 100.0, reason="long ago", allowed=3),
+                ]
+            ),
             "own_allowance": Allowance(3, 5.0, 3),
         },
         (
@@ -239,38 +242,44 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         ),
     ),
     "a child restarted, and the supervisor is silent": (
-        {"below": [told("ChildRestarted", f"{AT}/a", reason="KeyError: 7", allowed=3)]},
+        {"below": Below(events=[told("ChildRestarted", f"{AT}/a", reason="KeyError: 7", allowed=3)])},
         "Within the last 10 s it restarted a once (KeyError: 7); it allows 3 within its period.",
     ),
     "a child that has ended": (
         {
-            "ended_below": {
-                f"{AT}/a": life(1, 998.0, "shutdown", "Shutdown", by="an operator", because="it was stopped by order")
-            }
+            "below": Below(
+                ended={
+                    f"{AT}/a": life(
+                        1, 998.0, "shutdown", "Shutdown", by="an operator", because="it was stopped by order"
+                    )
+                }
+            )
         },
         "Its child a ended 2.0 s ago and is not there: shutdown, by an operator (it was stopped by order).",
     ),
     "a child that could not be started": (
-        {"ended_below": {f"{AT}/a": life(1, 998.0, "no file", "StartFailed")}},
+        {"below": Below(ended={f"{AT}/a": life(1, 998.0, "no file", "StartFailed")})},
         "Its child a could not be started 2.0 s ago: no file.",
     ),
     "a child that is stopped": (
-        {"children": [ChildNow("a", "stopping", "shop.Pay", 12.0, "shop.py:41, await answer")]},
+        {"below": Below(now=[ChildNow("a", "stopping", "shop.Pay", 12.0, "shop.py:41, await answer")])},
         "Its child a is being stopped: it has been in the turn of shop.Pay for 12 s at shop.py:41, await answer.",
     ),
     "a child that starts": (
-        {"children": [ChildNow("a", "starting", awaited="/app/b"), ChildNow("c", "running")]},
+        {"below": Below(now=[ChildNow("a", "starting", awaited="/app/b"), ChildNow("c", "running")])},
         "Its child a is starting, and waits for /app/b to be there.",
     ),
     "a child in trouble": (
-        {"below": [told("ReplicaLost", f"{AT}/a"), told("ReplicaLost", f"{AT}/a", 100.0)]},
+        {"below": Below(events=[told("ReplicaLost", f"{AT}/a"), told("ReplicaLost", f"{AT}/a", 100.0)])},
         f"Of its child a, a replica was lost 10 s ago: ask why of {AT}/a.",
     ),
     "a child that was killed": (
         {
-            "below": [
-                told("StopOverdue", f"{AT}/a", seconds=5.0, stacks=f"{AT}/a (ending) has been in the turn of Pay:")
-            ]
+            "below": Below(
+                events=[
+                    told("StopOverdue", f"{AT}/a", seconds=5.0, stacks=f"{AT}/a (ending) has been in the turn of Pay:")
+                ]
+            )
         },
         (
             "Its child a had not ended within 5.0 s when it was told to, and was killed 10 s ago: "
@@ -278,19 +287,21 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         ),
     ),
     "a child that waits": (
-        {"children": [ChildNow("a", "running", "shop.Pay", 3.0), ChildNow("b", "running", "shop.Pay", 0.5)]},
+        {"below": Below(now=[ChildNow("a", "running", "shop.Pay", 3.0), ChildNow("b", "running", "shop.Pay", 0.5)])},
         "Its child a does not get on: it has been in the turn of shop.Pay for 3.0 s.",
     ),
     "trouble further below": (
         {
-            "deeper": [
-                told("ChildRestarted", f"{AT}/a/b", 960.0, reason="KeyError: 7"),
-                told("ChildRestarted", f"{AT}/a/b", 980.0, reason="KeyError: 8"),
-            ],
+            "deeper": Below(
+                events=[
+                    told("ChildRestarted", f"{AT}/a/b", 960.0, reason="KeyError: 7"),
+                    told("ChildRestarted", f"{AT}/a/b", 980.0, reason="KeyError: 8"),
+                ]
+            ),
         },
         f"Below it, {AT}/a/b was restarted 2 times within the last 40 s (KeyError: 8): ask why of {AT}/a/b.",
     ),
-    "a child that is suspended": ({"children": [ChildNow("a", "suspended")]}, "Its child a is suspended."),
+    "a child that is suspended": ({"below": Below(now=[ChildNow("a", "suspended")])}, "Its child a is suspended."),
     "little memory is left": (
         {"memory": ProcessMemory(250_000_000, 300_000_000)},
         (
@@ -368,7 +379,7 @@ def test_the_worst_trouble_further_below_is_told_first_and_the_rest_is_counted()
     ]
     now = [ChildNow(f"{AT}/a/e", "suspended"), ChildNow(f"{AT}/a/f", "running", "shop.Pay", 3.0)]
     ended = {f"{AT}/a/g": life(1, 998.0, "no file", "StartFailed")}
-    assert why(Evidence(AT, NOW, deeper=deeper, deeper_now=now, deeper_ended=ended)) == [
+    assert why(Evidence(AT, NOW, deeper=Below(deeper, now, ended))) == [
         f"Below it, {AT}/a/b was restarted 2 times within the last 20 s (KeyError: 8): ask why of {AT}/a/b.",
         f"Below it, {AT}/a/g could not be started, 2.0 s ago (no file): ask why of {AT}/a/g.",
         f"Below it, {AT}/a/c/d has something to tell: a recovery failed 10 s ago: ask why of {AT}/a/c/d.",
@@ -377,12 +388,12 @@ def test_the_worst_trouble_further_below_is_told_first_and_the_rest_is_counted()
 
 
 def test_of_many_children_some_are_named() -> None:
-    said = why(Evidence(AT, NOW, children=[ChildNow(f"c{n}", "suspended") for n in range(9)]))
+    said = why(Evidence(AT, NOW, below=Below(now=[ChildNow(f"c{n}", "suspended") for n in range(9)])))
     assert said == [*(f"Its child c{n} is suspended." for n in range(3)), "The same is true of 6 more."]
     ended = {f"{AT}/c{n}": life(1, 900.0 + n, "killed", "Killed") for n in range(5)}
-    assert why(Evidence(AT, NOW, ended_below=ended))[-1] == "2 more of its children are not there."
+    assert why(Evidence(AT, NOW, below=Below(ended=ended)))[-1] == "2 more of its children are not there."
     below = [told("ChildRestarted", f"{AT}/c{n}", reason="SIGKILL", allowed=9) for n in range(5)]
-    assert "c2 once (SIGKILL), 2 others; it allows 9" in why(Evidence(AT, NOW, below=below))[0]
+    assert "c2 once (SIGKILL), 2 others; it allows 9" in why(Evidence(AT, NOW, below=Below(below)))[0]
 
 
 def test_several_causes_are_told_together() -> None:
