@@ -257,11 +257,10 @@ async def test_what_was_taken_is_handled_by_nobody_if_the_leader_dies_with_that_
             spec = hf.child("patient", hf.start(Patient), recovery=hf.hybrid(), mechanism=ALL[name])
             ref = await system.start(spec)
             await whole(system, ref)
-            ref.tell(Go(["s0.1"]))  # All that comes meanwhile is in one batch.
+            page.arm(Fault("crash", step, "Inward", nth=2, leads=True))  # The first one ends the wait before.
+            ref.tell(Go(["s0.01"]))  # All of this is in one batch.
             asked, call = ref.ask(Go(["c", "c"]), IN_TIME), ref.ask(Call("a"), IN_TIME)
             count = ref.ask(Count(), IN_TIME)
-            await waits(system)
-            page.arm(Fault("crash", step, "Inward", nth=2, leads=True))  # The first one ends the wait before.
             await call
             await ref.ask(Call("b"), IN_TIME)
             assert await asked == "call a, call b"
@@ -291,12 +290,11 @@ async def test_a_follower_does_not_handle_what_a_turn_has_waited_for(late: str) 
             ref = await system.start(spec)
             await whole(system, ref)
             with system.events() as stream:
-                ref.tell(Go(["s0.05"]))  # All that comes meanwhile is in one batch.
+                if late == "batch":  # The news that it has been waited for overtakes it.
+                    page.arm(Fault("delay", "proceed", "Work", leads=False))
+                ref.tell(Go(["s0.01" if late == "batch" else "s0.05"]))  # All of this is in one batch.
                 asked, call = ref.ask(Go(["c"]), IN_TIME), ref.ask(Call("a"), IN_TIME)
                 count = ref.ask(Count(), IN_TIME)
-                if late == "batch":
-                    await waits(system)
-                    page.arm(Fault("delay", "proceed", "Work", leads=False))
                 await asyncio.gather(asked, call, count)
                 assert page.has_fired or late == "nothing"
                 for number in range(2):
