@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from ..events import ActorKilled
 from .cell import RUNNING
+from .envelope import Ask, Item
 
 if TYPE_CHECKING:
     from ..control.orders_lane import QueuedOrder as QueuedOrder
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from ..overflow import Overflow
     from .actor import Start
     from .cell import Cell, GivenName
-    from .envelope import Ask, Item
 
 
 class Work(NamedTuple):
@@ -29,11 +29,13 @@ class Work(NamedTuple):
         mark: what it has in hand, or had last; another object there means that it has got on.
         is_in_turn: it has something in hand.
         since: when it began to wait in that turn, on the loop clock; None if that is not known.
+        has_answered: what it has in hand, or had last, is an ask, and whoever made that has an answer.
     """
 
     mark: object = None
     is_in_turn: bool = False
     since: float | None = None
+    has_answered: bool = False
 
 
 class Capacity(Protocol):
@@ -77,8 +79,9 @@ class Home:
 
     def work(self, cell: Cell, running: int) -> Work:
         """What the actor is at; `running` is the number of the input in hand, -1 if none is known."""
-        turn = cell.more.turn if cell.more is not None else None
-        return Work(cell.item, turn is not None, None if turn is None else turn.since)
+        turn, item = cell.more.turn if cell.more is not None else None, cell.item
+        has_answered = isinstance(item, Ask) and item.is_done
+        return Work(item, turn is not None, None if turn is None else turn.since, has_answered)
 
     def mailbox(self, cell: Cell) -> Capacity | None:
         """How full the mailbox is; None if it takes any number of messages."""

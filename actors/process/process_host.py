@@ -87,12 +87,13 @@ class Outlet:
         except IndexError:  # Not even this one is left, and it has not gone out yet.
             worker.breach(f"its page says that message {done} is done, and {number} were sent")
 
-    def trim(self) -> None:
-        """Forget what has been handled."""
-        worker, flight = self.worker, self.flight
+    def trim(self) -> object:
+        """Forget what has been handled; returns the newest of it, None if there was nothing to forget."""
+        worker, flight, newest = self.worker, self.flight, None
         done = worker.number(1, self.sent) if worker is not None else 0
         while flight and flight[0][0] <= done:
-            flight.popleft()
+            _, newest = flight.popleft()
+        return newest
 
     @property
     def has_room(self) -> bool:
@@ -366,8 +367,11 @@ class FlightHome(WorkerHome):
         outlet: Outlet | None = cell.extra().outlet
         if outlet is None or outlet.worker is None:
             return Work()
-        outlet.trim()
-        return Work(outlet.flight[0][1], is_in_turn=True) if outlet.flight else Work(outlet.sent)
+        newest = outlet.trim()
+        has_answered = isinstance(newest, Ask) and newest.is_done
+        if outlet.flight:
+            return Work(outlet.flight[0][1], is_in_turn=True, has_answered=has_answered)
+        return Work(outlet.sent, has_answered=has_answered)
 
     def load(self, cell: Cell) -> int:
         queued = len(cell.queue or ())

@@ -232,7 +232,9 @@ class JournalHome(RecordedHome):
             return Work()
         source, turn = switch.ledger.open.get(running), cell.more.turn if cell.more is not None else None
         mark: object = switch.ledger.turn if source is None else source
-        return Work(mark, source is not None, None if turn is None else turn.since)
+        ended = switch.ledger.turns.get(switch.ledger.turn)
+        has_answered = ended is not None and bool(ended.reply) and ended.input.ask is None  # Else it is to come later.
+        return Work(mark, source is not None, None if turn is None else turn.since, has_answered)
 
     def mailbox(self, cell: Cell) -> Capacity | None:
         return None if self.switch is None else self.switch.intake.mailbox

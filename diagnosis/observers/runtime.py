@@ -270,7 +270,7 @@ class RuntimeObserver(Observer):
         if bound is not None and not is_full:
             self.verdict(room(component), True)
         if not is_late and not is_full and component not in self._loops:
-            answered = isinstance(cell.item, Ask) and cell.item.is_done and not seen.unanswered
+            answered = work.has_answered and not seen.unanswered
             self.verdict(
                 progress(component),
                 True if has_got_on else None if now - seen.since > keeps else self.said(progress(component)),

@@ -288,6 +288,13 @@ CHECKS = {
         FOLLOWING,
         "of_any_name",
     ),
+    "an answer that is to come later is none yet": Check(
+        "checkpoint/home/journal_home.py",
+        "bool(ended.reply) and ended.input.ask is None",
+        "bool(ended.reply)",
+        "tests/diagnosis/live/test_processes.py",
+        "test_who_answers_is_seen_to and recorded and process",
+    ),
     "an alert needs the token": Check(
         "diagnosis/bridges/alert_app.py",
         "if not hmac.compare_digest(given, self._authorization):",

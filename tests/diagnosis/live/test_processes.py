@@ -2,12 +2,14 @@
 
 import asyncio
 from collections.abc import AsyncIterator
+from typing import Any
 
 import pytest
 
 import holdfast as hf
 from holdfast.diagnosis import DIAGNOSIS, OBSERVATIONS, generate, observer, watch
 from holdfast.diagnosis.engine import Diagnosis, State
+from holdfast.diagnosis.literals import progress, replies
 from holdfast.diagnosis.observations import Observation
 from holdfast.diagnosis.observers import Manner, TimeoutObserver
 from holdfast.testing import probe
@@ -71,7 +73,14 @@ class Wanted(hf.Message[int]):
     is_last: bool = False
 
 
+class WantedLater(hf.Message[int]): ...
+
+
 class Oracle(hf.Actor):
+    @hf.on(WantedLater)
+    def _owe(self, message: WantedLater) -> "hf.ReplyHandle[int]":
+        return self.ctx.reply_handle()
+
     @hf.on(Wanted)
     async def _answer(self, message: Wanted) -> int:
         if message.is_last:
@@ -101,3 +110,43 @@ async def test_a_frozen_callee_in_a_process_is_certain_behind_who_asks_it_from_a
     assert [one.bad for one in found.candidates] == [("oracle",)]
     asking.cancel()
     await system.stop(watching.tree)
+
+
+PLAIN, RECORDED = None, hf.hybrid()
+
+
+@pytest.mark.parametrize(
+    ("recovery", "place"),
+    [(PLAIN, "task"), (PLAIN, "process"), (RECORDED, "task"), (RECORDED, "process"), (RECORDED, "below")],
+    ids=[
+        "plain task",
+        "plain process",
+        "recorded task",
+        "recorded process",
+        "recorded below a supervisor in a process",
+    ],
+)
+async def test_who_answers_is_seen_to_wherever_it_is(system: hf.ActorSystem, recovery: Any, place: str) -> None:
+    """An answer that is owed is none."""
+    spec = hf.child(
+        "oracle", hf.start(Oracle), recovery=recovery, isolation="process" if place == "process" else "task"
+    )
+    if place == "below":
+        await system.start(hf.supervisor("all", children=[spec], isolation="process"))
+    else:
+        await system.start(spec)
+    path = "all/oracle" if place == "below" else "oracle"
+    oracle = system.ref(f"/t/{path}", Oracle)
+    watching = await watch(system, seconds=0.5)
+    owed = []
+    async with asyncio.timeout(60.0):
+        while progress(path) not in (await watching.observed()).positive:
+            owed.append(oracle.ask(WantedLater(), timeout=600.0))
+            await asyncio.sleep(0.05)
+        assert replies(path) not in (await watching.observed()).positive
+        while replies(path) not in (await watching.observed()).positive:
+            assert await oracle.ask(Wanted(), timeout=60.0) == 1
+            await asyncio.sleep(0.05)
+    await system.stop(watching.tree)
+    for one in owed:
+        one.cancel()

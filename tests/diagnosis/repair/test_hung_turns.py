@@ -54,7 +54,8 @@ class Listener(hf.Actor):
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
 @pytest.mark.parametrize(("isolation", "bad"), [("task", Hang()), ("process", Spin())], ids=str)
-async def test_an_actor_whose_turn_hangs_again_is_healed_by_repair(isolation: Any, bad: hf.Message) -> None:
+@pytest.mark.parametrize("by", ["send", "ask"])
+async def test_an_actor_whose_turn_hangs_again_is_healed_by_repair(isolation: Any, bad: hf.Message, by: str) -> None:
     spec = hf.child("node", hf.start(Node), isolation=isolation, recovery=hf.hybrid(), shutdown=0.2)
     async with hf.ActorSystem("t", log=False) as system:
         await system.start(hf.supervisor("all", children=[spec], intensity=20))
@@ -63,10 +64,17 @@ async def test_an_actor_whose_turn_hangs_again_is_healed_by_repair(isolation: An
         system.spawn(hf.start(Listener, repaired))
         await node.ask(Count(), timeout=IN_TIME)
         watching = await diagnosis.watch(system, seconds=0.1, hung_after=0.5, repair="on", policy=POLICY)
-        await node.send(bad)
+        asked: list[asyncio.Future[Any]] = []
+        if by == "ask":  # That asks of it run out is one more symptom, which has to go.
+            asked = [node.ask(bad, timeout=IN_TIME), *(node.ask(Count(), timeout=1.0) for _ in range(2))]
+        else:
+            await node.send(bad)
         async with asyncio.timeout(IN_TIME):
-            await repaired
+            while not repaired.done():
+                last = await node.ask(Count(), timeout=IN_TIME)
+                await asyncio.wait([repaired], timeout=0.05)
+        await asyncio.gather(*asked, return_exceptions=True)
         (aside,) = system.quarantined(node)
         assert (type(aside.message), aside.attempts) == (type(bad), 2)
-        assert await node.ask(Count(), timeout=IN_TIME) == 2
+        assert await node.ask(Count(), timeout=IN_TIME) == last + 1
         assert (await watching.diagnosis()).state is State.HEALTHY
