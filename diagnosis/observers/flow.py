@@ -13,6 +13,8 @@ from typing import Any, Final
 import msgspec
 
 from ...actors.kernel.actor import on
+from ...actors.kernel.address_host import Work
+from ...actors.kernel.cell import Cell
 from ..kept_file import read_kept, write_kept
 from ..literals import ok, word_for
 from .hearing import Heard, listen
@@ -24,9 +26,9 @@ LONGER: Final = 4.0
 """Times the longest silence so far, after which a topic that should flow is silent for too long."""
 REGULAR: Final = 3.0
 """A topic whose longest silence was at most so many times its mean one goes by a clock."""
-BLOCK: Final = 200
-"""Messages that come in over which those that go out are counted."""
-BLOCKS: Final = 5
+BLOCK: Final = 50
+"""Messages that come in, at least, over which those that go out are counted."""
+BLOCKS: Final = 6
 """Blocks from which it is known how much goes out at least."""
 MOST_ARRIVALS: Final = 50_000
 """Messages that are noted while nobody observes yet."""
@@ -43,7 +45,7 @@ class Usual(msgspec.Struct):
         longest_gap: seconds of the longest silence.
         most_in: most that came in between two messages.
         blocks: blocks of inputs that were counted.
-        least_out: the smallest part of what came in that went out, of all blocks.
+        least_out: the smallest part of what came in that went out, of all blocks; of two poor ones in a row neither.
     """
 
     count: int = 0
@@ -109,10 +111,11 @@ class FlowSource(msgspec.Struct, frozen=True):
 class _Flow:
     """What is seen of one topic."""
 
-    __slots__ = ("began", "came_in", "guess", "in_block", "last", "marks", "out_of_block", "poor", "seen")
+    __slots__ = ("began", "came_in", "guess", "in_block", "last", "marks", "out_of_block", "poor", "recent", "seen")
 
     began: float
     last: float | None
+    recent: list[float]
 
     def __init__(self, now: float) -> None:
         self.marks: tuple[object, ...] = ()
@@ -127,6 +130,19 @@ class _Flow:
         """Nothing that came before counts."""
         self.began, self.last = now, None
         self.came_in = self.in_block = self.out_of_block = self.poor = 0
+        self.recent = []
+
+    def end_block(self, learned: Usual) -> None:
+        """Compare what has gone out of a block of inputs with what is usual; a single poor one is usual, too.
+
+        What is learned is two blocks old: so the one in which it became poor makes no other poor one usual.
+        """
+        part, self.in_block, self.out_of_block = self.out_of_block / self.in_block, 0, 0
+        is_poor = learned.blocks >= BLOCKS and part < learned.least_out / 2
+        self.poor = self.poor + 1 if is_poor else 0
+        self.recent = [*self.recent, part] if self.poor < 2 else []
+        if len(self.recent) > 2:
+            learned.take_block(self.recent.pop(0))
 
 
 class FlowObserver(Observer):
@@ -244,9 +260,10 @@ class FlowObserver(Observer):
     def _flows_well(self, topic: str, made: FlowSource) -> bool | None:
         flow, now = self._flows[topic], self.now
         learned = self._learned(topic)
+        cells = [cell for path in made.publishers if (cell := self.ctx._cell.node.find(path)) is not None]
+        works = [cell.host.work(cell) for cell in cells]
         if not made.inputs:  # Its publishers' turns are what comes in.
-            cells = [self.ctx._cell.node.find(path) for path in made.publishers]
-            marks = tuple(None if cell is None else cell.item for cell in cells)
+            marks = tuple(work.mark for work in works)
             had_turns = len(marks) == len(flow.marks) and any(
                 one is not old for one, old in zip(marks, flow.marks, strict=True)
             )
@@ -261,12 +278,12 @@ class FlowObserver(Observer):
         is_by_clock = not made.inputs and learned.longest_gap <= REGULAR * learned.mean_gap
         if (is_due and silent > self._patience) or (is_by_clock and is_long):
             return False
-        if made.inputs and flow.in_block >= BLOCK:
-            part, flow.in_block, flow.out_of_block = flow.out_of_block / flow.in_block, 0, 0
-            is_poor = learned.blocks >= BLOCKS and part < learned.least_out / 2
-            flow.poor = flow.poor + 1 if is_poor else 0
-            if not is_poor:
-                learned.take_block(part)
+        if made.inputs and flow.in_block >= BLOCK and all(map(_is_idle, cells, works)):  # All of it was worked off.
+            flow.end_block(learned)
         if flow.poor > 1:
             return False
         return True if flow.last is not None and silent < max(self._patience, LONGER * learned.mean_gap) else None
+
+
+def _is_idle(cell: Cell, work: Work) -> bool:
+    return not work.is_in_turn and not cell.host.backlog(cell)

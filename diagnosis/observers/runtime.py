@@ -250,7 +250,8 @@ class RuntimeObserver(Observer):
         waits_now = sorted(waits.get(component, ()))
         seen.waited.append(waits_now[0] if waits_now else "")
         backlog = cell.host.backlog(cell)
-        seen.backlog.take(backlog, now)
+        aside = len(cell.more.stash or ()) if cell.more is not None else 0  # It may never be taken up again.
+        seen.backlog.take(backlog + aside, now)
         limit = max(self._patience, LONGER * seen.longest) if seen.turns >= LOOKS else float("inf")
         is_busy = work.is_in_turn or backlog > 0
         if not is_busy:

@@ -24,7 +24,7 @@ KINDS = "tests/diagnosis/observers/test_kinds.py"
 CHECKS = {
     "a recorded actor has in hand what its home says": Check(
         "checkpoint/home/journal_home.py",
-        "        return Work(mark, source is not None, None if turn is None else turn.since)\n",
+        "        return Work(mark, source is not None, None if turn is None else turn.since, has_answered)\n",
         "        return Work(cell.item)\n",
         KINDS,
         "seen_to_work_and_to_hang and process-hybrid",
@@ -56,6 +56,41 @@ CHECKS = {
         "return max(learned.most_in, self.guess)",
         FOREIGN,
         "in_bursts",
+    ),
+    "what goes out is counted when all that came in is worked off": Check(
+        "diagnosis/observers/flow.py",
+        "flow.in_block >= BLOCK and all(map(_is_idle, cells, works))",
+        "flow.in_block >= BLOCK",
+        FLOW,
+        "a_burst_that_is_larger_than_ever",
+    ),
+    "a single block of which little goes out is usual": Check(
+        "diagnosis/observers/flow.py",
+        "[*self.recent, part] if self.poor < 2 else []",
+        "[*self.recent, part] if self.poor < 1 else []",
+        FLOW,
+        "now_and_then",
+    ),
+    "the block in which it became poor is not learned": Check(
+        "diagnosis/observers/flow.py",
+        "        if len(self.recent) > 2:\n",
+        "        if self.recent:\n",
+        FLOW,
+        "too_little_goes_out",
+    ),
+    "a source in a process is seen to have turns": Check(
+        "diagnosis/observers/flow.py",
+        "marks = tuple(work.mark for work in works)",
+        "marks = tuple(cell.item for cell in cells)",
+        FLOW,
+        "a_source_in_a_process",
+    ),
+    "what is put aside waits, too": Check(
+        "diagnosis/observers/runtime.py",
+        "seen.backlog.take(backlog + aside, now)",
+        "seen.backlog.take(backlog, now)",
+        "tests/diagnosis/observers/test_runtime.py",
+        "puts_everything_aside",
     ),
     "limits go with an actor that is moved": Check(
         "diagnosis/live_limits.py",

@@ -2,6 +2,7 @@
 
 import asyncio
 import dataclasses
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -13,26 +14,64 @@ PATIENCE = 1.0
 
 @dataclasses.dataclass
 class Faults:
-    """What is wrong with whom, by the last part of the address: "freeze", "slow", "lag", "mute" or "crash"."""
+    """What is wrong with whom, by the last part of the address.
+
+    freeze   a turn waits for ever                pause    one turn in ten waits for five seconds
+    slow     a turn takes too long for askers     stumble  one turn in three does
+    lag      a turn takes half a second
+    crash    each turn raises                     falter   one turn in three does
+    end      it ends itself in each turn          unborn   it raises, and so does each start of it
+    mute     it publishes nothing                 stutter  it publishes one in three
+    deaf     it does nothing with what it gets    stash    it puts everything aside
+    owe      it never answers
+    """
 
     of: dict[str, str] = dataclasses.field(default_factory=dict)
+    turns: Counter[str] = dataclasses.field(default_factory=Counter)
 
-    async def strike(self, name: str) -> bool:
-        """Let happen what is wrong with an actor. Returns whether it is to keep silent."""
-        match self.of.get(name):
+    def begin(self, actor: hf.Actor) -> None:
+        """Let happen what is wrong with the start of an actor."""
+        if self.of.get(name_of(actor)) == "unborn":
+            raise RuntimeError(f"{name_of(actor)} cannot start")
+
+    async def strike(self, actor: hf.Actor) -> str:
+        """Let happen what is wrong with a turn. Returns "mute", "deaf" or "owe" if that is the rest of it."""
+        name = name_of(actor)
+        self.turns[name] += 1
+        kind, turn = self.of.get(name, ""), self.turns[name]
+        match kind:
             case "freeze":
                 await asyncio.Event().wait()
             case "slow":
                 await asyncio.sleep(2.5 * PATIENCE)
+            case "stumble" if turn % 3 == 0:
+                await asyncio.sleep(2.5 * PATIENCE)
+            case "pause" if turn % 10 == 0:
+                await asyncio.sleep(5.0)
             case "lag":
                 await asyncio.sleep(0.5)
-            case "crash":
+            case "crash" | "unborn":
                 raise RuntimeError(f"{name} is broken")
-            case "mute":
-                return True
+            case "falter" if turn % 3 == 0:
+                raise RuntimeError(f"{name} is broken now and then")
+            case "end":
+                actor.ctx.stop()
+                return "deaf"
+            case "stash":
+                actor.ctx.stash()
+                return "deaf"
+            case "stutter" if turn % 3:
+                return "mute"
+            case "mute" | "deaf" | "owe":
+                return kind
             case _:
                 pass
-        return False
+        return ""
+
+
+def name_of(actor: hf.Actor) -> str:
+    """Return the last part of an actor's address."""
+    return actor.ctx.path.rpartition("/")[2]
 
 
 class Item(hf.Message):
@@ -54,16 +93,19 @@ class Stage(hf.Actor):
         self._count = 0
 
     def on_start(self, restored: bool) -> None:
+        self._faults.begin(self)
         if self._hears:
             self.ctx.subscribe(self._hears)
 
     @hf.on(Item)
     async def take(self, message: Item) -> None:
-        is_mute = await self._faults.strike(self.ctx.path.rpartition("/")[2])
+        rest = await self._faults.strike(self)
+        if rest == "deaf":
+            return
         for address in self._asks:
             await self.ctx.find(address, Service).ask(Wanted(message.number), timeout=PATIENCE)
         self._count += 1
-        if self._out and not is_mute and self._count % self._each == 0:
+        if self._out and not rest and self._count % self._each == 0:
             await self.ctx.publish(self._out, message)
 
 
@@ -84,9 +126,13 @@ class Service(hf.Actor):
     def __init__(self, faults: Faults, *, asks: str = "", every: int = 1):
         self._faults, self._asks, self._every = faults, asks, every
 
+    def on_start(self, restored: bool) -> None:
+        self._faults.begin(self)
+
     @hf.on(Wanted)
-    async def answer(self, message: Wanted) -> int:
-        await self._faults.strike(self.ctx.path.rpartition("/")[2])
+    async def answer(self, message: Wanted) -> "int | hf.ReplyHandle[int]":
+        if await self._faults.strike(self) == "owe":
+            return self.ctx.reply_handle()
         if self._asks and message.number % self._every == 0:
             await self.ctx.find(self._asks, Service).ask(message, timeout=PATIENCE)
         return message.number
@@ -102,11 +148,12 @@ class Device(hf.Actor):
         self._faults, self._out, self._every = faults, out, every
 
     def on_start(self, restored: bool) -> None:
+        self._faults.begin(self)
         self.ctx.every(self._every, Beat())
 
     @hf.on(Beat)
     async def beat(self, message: Beat) -> None:
-        if not await self._faults.strike(self.ctx.path.rpartition("/")[2]):
+        if not await self._faults.strike(self):
             await self.ctx.publish(self._out, Item(0))
 
 
@@ -117,11 +164,12 @@ class Sink(hf.Actor):
         self._faults, self._topic = faults, topic
 
     def on_start(self, restored: bool) -> None:
+        self._faults.begin(self)
         self.ctx.subscribe(self._topic)
 
     @hf.on(Item)
     async def take(self, message: Item) -> None:
-        await self._faults.strike(self.ctx.path.rpartition("/")[2])
+        await self._faults.strike(self)
 
 
 def child(name: str, kind: Callable[..., Any], *args: Any, **kwargs: Any) -> hf.ChildSpec:
@@ -174,6 +222,14 @@ def _matching(faults: Faults) -> list[hf.ChildSpec]:
     ]
 
 
+ANY = "freeze crash falter pause end unborn stash"
+"""What can be wrong with everybody."""
+SERVICE = f"{ANY} slow stumble owe"
+SOURCE = f"{ANY} mute deaf"
+STAGE = f"{SOURCE} stumble"
+LAST = f"{ANY} lag"
+
+
 def _each(names: dict[str, str]) -> tuple[tuple[str, str], ...]:
     return tuple((name, kind) for name, kinds in names.items() for kind in kinds.split())
 
@@ -185,12 +241,12 @@ SYSTEMS = (
         "reader",
         _each(
             {
-                "upstream": "freeze slow crash",
-                "cache": "freeze slow crash",
-                "reader": "freeze mute crash",
-                "parser": "freeze mute crash",
-                "writer": "freeze mute crash lag",
-                "sink": "freeze crash lag",
+                "upstream": SERVICE,
+                "cache": SERVICE,
+                "reader": STAGE,
+                "parser": f"{STAGE} stutter",
+                "writer": f"{STAGE} stutter lag",
+                "sink": LAST,
             }
         ),
     ),
@@ -200,12 +256,12 @@ SYSTEMS = (
         "uplink",
         _each(
             {
-                "registry": "freeze slow crash",
-                "thermometer": "freeze mute crash",
-                "meter": "freeze mute crash",
-                "uplink": "freeze mute crash",
-                "rules": "freeze mute crash lag",
-                "motor": "freeze crash lag",
+                "registry": SERVICE,
+                "thermometer": SOURCE,
+                "meter": SOURCE,
+                "uplink": STAGE,
+                "rules": f"{STAGE} lag",
+                "motor": LAST,
             }
         ),
     ),
@@ -215,12 +271,12 @@ SYSTEMS = (
         "gate",
         _each(
             {
-                "ledger": "freeze slow crash",
-                "risk": "freeze slow crash",
-                "gate": "freeze mute crash",
-                "book": "freeze mute crash",
-                "clearing": "freeze mute crash lag",
-                "report": "freeze crash lag",
+                "ledger": SERVICE,
+                "risk": SERVICE,
+                "gate": STAGE,
+                "book": f"{STAGE} stutter",
+                "clearing": f"{STAGE} lag",
+                "report": LAST,
             }
         ),
     ),

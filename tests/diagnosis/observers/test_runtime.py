@@ -49,6 +49,8 @@ class Worker(hf.Actor):
                 raise Sorry
             case ["refused", address]:
                 await self.ctx.find(address, Worker).ask(Go("refuse"))
+            case ["aside"]:
+                self.ctx.stash()
             case ["long", seconds]:
                 await asyncio.sleep(float(seconds))
             case _:
@@ -226,6 +228,14 @@ async def test_children_that_come_later_and_those_that_go_are_followed(system: h
     found = await watching.diagnosis()
     assert "all/late" not in found.components
     assert found.state is State.HEALTHY
+
+
+async def test_who_puts_everything_aside_and_takes_nothing_up_again_is_found(system: hf.ActorSystem) -> None:
+    watching = await watched(system)
+    for _ in range(150):
+        worker(system, "c").tell(Go("aside"))
+        await advance(0.1)
+    assert (await watching.diagnosis()).certain == ("all/c",)
 
 
 async def test_nothing_is_told_when_nobody_looks(system: hf.ActorSystem) -> None:
