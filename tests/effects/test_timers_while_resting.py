@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.home.recorded_home import switch_of
 from holdfast.ftm import LFR, PBR
 from holdfast.testing import advance
 from tests.checkpoint.test_engines import killed
