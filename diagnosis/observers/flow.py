@@ -140,6 +140,12 @@ class _Flow:
         self.came_in = self.in_block = self.out_of_block = self.poor = 0
         self.recent = []
 
+    def look_at(self, publishers: list[Cell]) -> None:
+        """See whether one of its publishers was started again."""
+        lives = tuple(cell.life for cell in publishers)
+        if lives != self.lives:
+            self.lives, self.is_cut = lives, bool(self.lives)
+
     def takes_silence(self) -> bool:
         """A silence has just ended: whether it is to be learned.
 
@@ -218,9 +224,13 @@ class FlowObserver(Observer):
     def _arrived(self, topic: str, now: float) -> None:
         flow = self._flows.get(topic)
         if flow is not None:
-            if flow.takes_silence() and flow.last is not None:
-                self._learned(topic).take(now - flow.last, flow.came_in)
-                flow.seen += flow.came_in > 0
+            if flow.last is not None:
+                learned, gap = self._learned(topic), now - flow.last
+                if gap > learned.longest_gap or flow.came_in > learned.most_in:
+                    flow.look_at(self._publishers(self._made[topic]))
+                if flow.takes_silence():
+                    learned.take(gap, flow.came_in)
+                    flow.seen += flow.came_in > 0
             flow.last, flow.came_in = now, 0
             flow.out_of_block += 1
         for user in self._users.get(topic, ()):
@@ -276,14 +286,15 @@ class FlowObserver(Observer):
     def _learned(self, topic: str) -> Usual:
         return self._baselines.of(topic, self.ctx._cell.node.clock.wall())
 
+    def _publishers(self, made: FlowSource) -> list[Cell]:
+        return [cell for path in made.publishers if (cell := self.ctx._cell.node.find(path)) is not None]
+
     def _flows_well(self, topic: str, made: FlowSource) -> bool | None:
         flow, now = self._flows[topic], self.now
         learned = self._learned(topic)
-        cells = [cell for path in made.publishers if (cell := self.ctx._cell.node.find(path)) is not None]
+        cells = self._publishers(made)
         works = [cell.host.work(cell) for cell in cells]
-        lives = tuple(cell.life for cell in cells)
-        if lives != flow.lives:
-            flow.lives, flow.is_cut = lives, bool(flow.lives)
+        flow.look_at(cells)
         if not made.inputs:  # Its publishers' turns are what comes in.
             marks = tuple(work.mark for work in works)
             had_turns = len(marks) == len(flow.marks) and any(
