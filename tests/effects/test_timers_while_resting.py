@@ -40,6 +40,13 @@ class Alarm(hf.Actor):
         self.ticks = 0
 
     def on_start(self, restored: bool) -> None:
+        self.set()
+
+    @property
+    def due(self) -> Any:
+        return self._due
+
+    def set(self) -> None:
         self._due = self.ctx.tell_after(DAY, Tick())
 
     @hf.on(Tick)
@@ -48,9 +55,9 @@ class Alarm(hf.Actor):
 
     @hf.on(Cancel)
     async def cancel(self, message: Cancel) -> int:
-        self._due.cancel()
+        self.due.cancel()
         if message.sets:
-            self._due = self.ctx.tell_after(DAY, Tick())
+            self.set()
         if message.waits:
             await self.ctx.wait_for(Call)
         return self.ticks
@@ -68,22 +75,21 @@ class Late(Alarm):
 
     def __init__(self) -> None:
         super().__init__()
-        self.due: Any = None
+        self.kept: Any = None
+
+    @property
+    def due(self) -> Any:
+        return self.kept
+
+    def set(self) -> None:
+        self.kept = self.ctx.tell_after(DAY, Tick())
 
     def on_start(self, restored: bool) -> None:
         if not restored:
-            self.due = self.ctx.tell_after(DAY, Tick())
+            self.set()
 
     def on_recovered(self) -> None:
-        self.due = self.ctx.tell_after(DAY, Tick())
-
-    @hf.on(Cancel)
-    async def cancel(self, message: Cancel) -> int:
-        self._due = self.due
-        try:
-            return await super().cancel(message)
-        finally:
-            self.due = self._due
+        self.set()
 
 
 def alarm(kind: type[Alarm] = Alarm, **more: Any) -> hf.ChildSpec[Alarm]:

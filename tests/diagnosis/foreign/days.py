@@ -7,26 +7,19 @@ its own. A line is printed for each of them as it ends. The exit status is 1 if 
 from __future__ import annotations
 
 import argparse
-import asyncio
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 
-from holdfast.testing.clock import VirtualClockLoop
 from tests.diagnosis.foreign.systems import SYSTEMS
-from tests.diagnosis.foreign.trials import TRAFFICS, trial
-
-JUMPS = 1_000_000_000
-"""Jumps of the virtual clock in a run; a day takes about two million."""
+from tests.diagnosis.foreign.trials import TRAFFICS, run
 
 
 def healthy(name: str, kind: str, seed: int, hours: float) -> tuple[tuple[str, ...], float]:
     """Run a system under traffic for `hours` virtual hours; the false alarms, and the seconds of a core it took."""
     (foreign,) = (one for one in SYSTEMS if one.name == name)
-    with asyncio.Runner(loop_factory=lambda: VirtualClockLoop(jumps=JUMPS)) as runner:
-        outcome = runner.run(trial(foreign, {}, kind, seed, hours * 3600.0))
-    return outcome.false_alarms, time.process_time()
+    return run(foreign, {}, kind, seed, hours * 3600.0).false_alarms, time.process_time()
 
 
 def main(arguments: list[str] | None = None) -> int:

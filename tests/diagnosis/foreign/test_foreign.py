@@ -8,9 +8,9 @@ import statistics
 import pytest
 
 from tests.diagnosis.foreign.systems import SYSTEMS, Foreign
-from tests.diagnosis.foreign.trials import TRAFFICS, Outcome, trial
+from tests.diagnosis.foreign.trials import TRAFFICS, Outcome, run, trial
 
-pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
+VIRTUAL = pytest.mark.asyncio(loop_factories=["virtual"])
 
 NO_FAULTS = {("lag", "quiet"), ("stutter", "quiet")}
 """Who is slower than before, and keeps up, is no fault; and thirty messages say nothing of how many of them go out."""
@@ -32,6 +32,7 @@ TRIALS = int(os.environ.get("HOLDFAST_FOREIGN", "0"))
 """Rounds over all faults and traffics; 0: a small selection."""
 
 
+@VIRTUAL
 @pytest.mark.parametrize("seed", [1])
 @pytest.mark.parametrize("kind", TRAFFICS)
 @pytest.mark.parametrize("foreign", SYSTEMS, ids=lambda foreign: foreign.name)
@@ -39,6 +40,7 @@ async def test_traffic_is_no_fault(foreign: Foreign, kind: str, seed: int) -> No
     assert (await trial(foreign, {}, kind, seed, 20.0)).false_alarms == ()  # Days of it: `days.py`.
 
 
+@VIRTUAL
 @pytest.mark.parametrize("number", range(6))
 async def test_the_root_cause_is_named_first(number: int) -> None:
     foreign, fault, kind = random.Random(number).choice(ALL)
@@ -47,12 +49,14 @@ async def test_the_root_cause_is_named_first(number: int) -> None:
     assert (said.false_alarms, said.first) == ((), (fault[0],))
 
 
+@VIRTUAL
 async def test_who_is_slower_than_before_and_keeps_up_is_no_fault() -> None:
     (foreign,) = (one for one in SYSTEMS if one.name == "matching")
     said = await trial(foreign, {"report": "lag"}, "quiet", 1)
     assert (said.first, said.false_alarms) == ((), ())
 
 
+@VIRTUAL
 @pytest.mark.parametrize("seed", [0, 1])
 async def test_who_publishes_in_bursts_is_missed_soon_after_little_was_known_of_it(seed: int) -> None:
     """While the model was made nobody saw its turns: how many there were between two messages is only guessed."""
@@ -61,6 +65,7 @@ async def test_who_publishes_in_bursts_is_missed_soon_after_little_was_known_of_
     assert (said.first, said.false_alarms) == (("uplink",), ())
 
 
+@VIRTUAL
 @pytest.mark.parametrize("number", range(3))
 async def test_of_two_faults_both_are_named_one_after_the_other(number: int) -> None:
     foreign, struck, kind = random.Random(number).choice(PAIRS)
@@ -70,14 +75,14 @@ async def test_of_two_faults_both_are_named_one_after_the_other(number: int) -> 
     assert (said.false_alarms, {*said.first} - {*struck}, said.found) == ((), set(), frozenset(struck))
 
 
-async def test_of_many_pairs_of_faults_most_are_named() -> None:
+def test_of_many_pairs_of_faults_most_are_named() -> None:
     if not TRIALS:
         pytest.skip("the campaign sets HOLDFAST_FOREIGN, and has the time for it")
     rng = random.Random(TRIALS)
     first = both = 0
     for number in range(20 * TRIALS):
         foreign, struck, kind = rng.choice(PAIRS)
-        said = await trial(foreign, struck, kind, number)
+        said = run(foreign, struck, kind, number)
         is_first = bool(said.first) and {*said.first} <= struck.keys() and not said.false_alarms
         first, both = first + is_first, both + (said.found == struck.keys())
         if not is_first or said.found != struck.keys():
@@ -87,14 +92,14 @@ async def test_of_many_pairs_of_faults_most_are_named() -> None:
     assert both >= 0.85 * 20 * TRIALS
 
 
-async def test_of_many_faults_nearly_all_are_named() -> None:
+def test_of_many_faults_nearly_all_are_named() -> None:
     if not TRIALS:
         pytest.skip("the campaign sets HOLDFAST_FOREIGN, and has the time for it")
     wrong: list[tuple[str, tuple[str, str], str, int, Outcome]] = []
     outcomes: list[Outcome] = []
     for seed in range(TRIALS):
         for foreign, fault, kind in ALL:
-            said = await trial(foreign, dict([fault]), kind, seed)
+            said = run(foreign, dict([fault]), kind, seed)
             outcomes.append(said)
             if said.first != (fault[0],) or said.false_alarms:
                 wrong.append((foreign.name, fault, kind, seed, said))

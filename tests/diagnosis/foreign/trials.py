@@ -10,6 +10,7 @@ import holdfast as hf
 from holdfast import diagnosis
 from holdfast.diagnosis import DIAGNOSIS
 from holdfast.diagnosis.engine import Diagnosis, State
+from holdfast.testing.clock import VirtualClockLoop
 from tests.diagnosis.foreign.systems import Faults, Foreign, Item, Stage
 
 TRAFFICS = ("steady", "bursty", "doubled", "quiet")
@@ -19,6 +20,8 @@ CHANGED = 20.0
 """Seconds of the changed traffic before the fault."""
 WITHIN = 30.0
 """Seconds in which a fault is to be named."""
+JUMPS = 1_000_000_000
+"""Jumps of the virtual clock in a run; a day takes about two million."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,3 +128,9 @@ async def trial(foreign: Foreign, struck: dict[str, str], kind: str, seed: int, 
             return Outcome(false_alarms, names, _names(first.certain), at - began, frozenset(found))
         finally:
             driving.cancel()
+
+
+def run(foreign: Foreign, struck: dict[str, str], kind: str, seed: int, healthy: float = 0.0) -> Outcome:
+    """Run one trial in a loop of its own, for as long as it takes."""
+    with asyncio.Runner(loop_factory=lambda: VirtualClockLoop(jumps=JUMPS)) as runner:
+        return runner.run(trial(foreign, struck, kind, seed, healthy))
