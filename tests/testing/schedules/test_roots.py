@@ -420,3 +420,22 @@ def test_what_a_client_has_not_awaited_is_a_leak_also_if_the_root_is_killed_late
 
     with pytest.raises(UnexpectedEnd, match="nobody has awaited the ask of Ping"):
         run()
+
+
+class Pipes(hf.Actor):
+    @hf.on(Ping)
+    def ping(self, message: Ping) -> int:
+        self.ctx.pipe_to_self(asyncio.sleep(1.0), lambda _: Told(0))
+        return 1
+
+    @hf.on(Told)
+    def told(self, message: Told) -> None:
+        pass
+
+
+@simulate(seeds=8, **DISK)
+async def test_background_work_that_ends_as_the_test_does_holds_up_no_shutdown(system: GuardedSystem) -> None:
+    """With seed 3, its result is submitted and the actor that has it written is told so, and then that one ends."""
+    pipes = await system.start(hf.child("pipes", hf.start(Pipes), recovery=hf.hybrid()))
+    await pipes.ask(Ping())
+    await asyncio.sleep(1.0)
