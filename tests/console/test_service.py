@@ -315,12 +315,16 @@ async def test_the_tests_of_a_new_project_pass_and_it_runs(project: Path) -> Non
     assert (await holdfast("new", "stall"))[0] == DONE
     folder = project / "stall"
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"), cwd=folder, stdout=asyncio.subprocess.PIPE
+        *(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"),
+        cwd=folder,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
     )
     async with asyncio.timeout(60):
         output, _ = await process.communicate()
     assert process.returncode == 0, output.decode()
     assert "2 passed" in output.decode()
+    assert "Warning" not in output.decode()
     assert "holdfast run stall.tree:tree --name stall" in (folder / "stall.service").read_text()
     os.chdir(folder)
     async with running("stall.tree:tree", "--name", "stall"):

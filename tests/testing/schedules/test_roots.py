@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import gc
+import warnings
 from collections.abc import Awaitable
 from pathlib import Path
 from typing import Any
@@ -439,3 +441,18 @@ async def test_background_work_that_ends_as_the_test_does_holds_up_no_shutdown(s
     pipes = await system.start(hf.child("pipes", hf.start(Pipes), recovery=hf.hybrid()))
     await pipes.ask(Ping())
     await asyncio.sleep(1.0)
+
+
+def test_background_work_that_had_not_begun_when_the_root_was_killed_is_closed() -> None:
+    async def killed(system: GuardedSystem, simulation: Simulation) -> None:
+        system.expect_crashes()
+        pipes = await system.start(hf.child("pipes", hf.start(Pipes), recovery=hf.hybrid()))
+        await pipes.ask(Ping())
+        await simulation.crash_root()
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for seed in range(12):
+            run_seed(killed, seed, OWN, DISK)
+        gc.collect()
+    assert [str(one.message) for one in caught if "never awaited" in str(one.message)] == []
