@@ -31,17 +31,21 @@ class DurableTies:
         self._home = home
         self._kept: Counter[Tie] = Counter()
         self._untied: Counter[Tie] = Counter()  # as read back from the store
+        self._turn, self._before = -1, Counter[Tie]()  # the last turn that has changed them, and what there was then
 
-    def turn(self, verb: str, path: str) -> None:
+    def turn(self, turn: int, verb: str, path: str) -> None:
         """A turn has tied or untied something."""
+        if turn != self._turn:
+            self._turn, self._before = turn, Counter(self._kept)
         if verb in UNDONE_BY:
-            self.over(UNDONE_BY[verb], path)
+            self._kept -= Counter({(UNDONE_BY[verb], path): 1})
         elif verb != "link" or not self.has(verb, path):
             self._kept[verb, path] += 1
 
     def over(self, verb: str, path: str) -> None:
-        """One such tie is over: the actor is told of the other one's end, or has untied it."""
-        self._kept -= Counter({(verb, path): 1})
+        """One such tie is over: the actor is told of the other one's end."""
+        gone = Counter({(verb, path): 1})
+        self._kept, self._before = self._kept - gone, self._before - gone
 
     def has(self, verb: str, path: str) -> bool:
         """Whether there is such a tie, or will be when the other one is there."""
@@ -63,9 +67,9 @@ class DurableTies:
                 connect(cell, node.cell_at(path), undo[verb])
         self._untied = self._kept - stand
 
-    def saved(self) -> list[Tie]:
-        """All of them, as a snapshot has them."""
-        return list(self._kept.elements())
+    def saved(self, turn: int) -> list[Tie]:
+        """All of them, as a snapshot of the state after a turn has them: what a later one does is in the journal."""
+        return list((self._before if self._turn > turn else self._kept).elements())
 
     def replace(self, ties: list[Tie]) -> None:
         """These, as a snapshot has them."""

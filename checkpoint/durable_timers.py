@@ -30,6 +30,12 @@ def said_by(name: str, body: bytes, interval: float) -> str:
     return f"{zlib.crc32(body, zlib.crc32(f'{name}|{interval}'.encode())):08x}"
 
 
+def made_by(key: str) -> int:
+    """The turn that has made a timer, or behind which a hook has; -1 if its key does not say."""
+    made = BEGUN.match(key)
+    return -1 if made is None else int(made[0])
+
+
 class Timers:
     """The timers of one home."""
 
@@ -38,6 +44,7 @@ class Timers:
         self._states: dict[str, TimerState] = {}
         self._made: set[str] = set()  # by hooks, since the last snapshot
         self._same: dict[str, str] = {}  # timers that a hook wanted, and which they are
+        self._over: dict[str, tuple[int, Clock]] = {}  # cancelled since the last snapshot, and by which turn
         self.claimed: set[str] = set()  # timers that the present life's hooks have wanted
 
     def operate(self, out: Out) -> None:
@@ -52,12 +59,16 @@ class Timers:
     # -- of hooks, which run at each life ---------------------------------------------------------------------------
 
     def is_new(self, out: Out) -> bool:
-        """Whether a timer that a hook wants is really one more: not one that runs, has come, or says the same."""
-        if out.to in self._states or out.to in self._made:
-            self.claimed.add(out.to)
+        """Whether a timer that a hook wants is really one more: not one that ran, or had come, when its life began.
+
+        One that ran then, and does not run now, was cancelled or has come in a turn that is handled again.
+        """
+        wanted = self._same.get(out.to, out.to)
+        if wanted != out.to or wanted in self._states or wanted in self._made:
+            self.claimed.add(wanted)
             return False
         clock = (out.name, out.body, out.interval)
-        for key, other in self.running().items():
+        for key, other in self.after(made_by(out.to)).items():
             if other == clock and key not in self.claimed:
                 self.claimed.add(key)
                 self._same[out.to] = key
@@ -76,21 +87,51 @@ class Timers:
     def _meant(self, key: str) -> str | None:
         """What a hook was given before this process began, for a timer that ran already: the one that says the same."""
         made = HOOKS.fullmatch(key)
-        clocks = self.running()
+        clocks = {} if made is None else self.after(int(made["turn"]))
         if made is None or key in clocks:
             return None
-        for other, clock in clocks.items():
-            begun = BEGUN.match(other)
-            if begun is not None and int(begun[0]) <= int(made["turn"]) and said_by(*clock) == made["said"]:
-                return other
-        return None
+        alike = (other for other, clock in clocks.items() if made_by(other) >= 0 and said_by(*clock) == made["said"])
+        return next(alike, None)
 
     def made_again(self, key: str) -> None:
         """The journal has this one."""
         if not key.partition(".")[0].isdigit():  # Else a turn has made it.
             self._made.add(key)
 
-    def running(self) -> dict[str, Clock]:
+    def cancelled(self, turn: int, key: str, clock: Clock | None = None) -> None:
+        """A turn has cancelled one; `clock`: what it says, if that is not known here yet."""
+        clock = clock or self._clock_of(key)
+        if clock is not None:
+            self._over[key] = turn, clock
+
+    def _clock_of(self, key: str) -> Clock | None:
+        state, home = self._states.get(key), self._home
+        if state is not None:
+            return state.name, state.body, state.interval
+        kept = (out for out in home.outputs.kept if out.verb == "timer" and out.to == key)
+        ticks = (source for source in home.ledger.open.values() if source.kind == TICK and source.origin == key)
+        return next(((out.name, out.body, out.interval) for out in kept), None) or next(
+            ((source.name, source.body, 0.0) for source in ticks), None
+        )
+
+    def claims(self, turn: int) -> dict[str, Clock]:
+        """Those that ran after this turn, and that a later one has cancelled."""
+        return {key: clock for key, (by, clock) in self._over.items() if made_by(key) <= turn < by}
+
+    def after(self, turn: int) -> dict[str, Clock]:
+        """Those that ran after this turn, or had come and waited, whatever later ones have done since."""
+        clocks = {key: clock for key, clock in self._running().items() if made_by(key) <= turn} | self.claims(turn)
+        for number, ended in self._home.ledger.turns.items():
+            source = ended.input
+            if source.kind == TICK and made_by(source.origin) <= turn < number:
+                clocks.setdefault(source.origin, (source.name, source.body, 0.0))
+        return clocks
+
+    def forget(self, turn: int) -> None:
+        """A snapshot of the state after this turn is kept: no life begins before that any more."""
+        self._over = {key: over for key, over in self._over.items() if over[0] > turn}
+
+    def _running(self) -> dict[str, Clock]:
         """All of them, and those that have come and wait to be handled."""
         clocks = {key: (one.name, one.body, one.interval) for key, one in self._states.items()}
         for source in self._home.ledger.open.values():
@@ -101,11 +142,11 @@ class Timers:
     def at(self, meta: Meta) -> dict[str, Clock]:
         """Those that ran when a snapshot was taken, or had come and waited."""
         clocks = {key: (name, body, interval) for key, (name, body, _, interval) in meta.timers.items()}
-        home = self._home
-        for source in home.ledger.handled_and_open():
+        clocks |= meta.claims
+        for source in self._home.ledger.handled_and_open():
             if source.kind == TICK and source.id < meta.next_id:
                 clocks.setdefault(source.origin, (source.name, source.body, 0.0))
-        return clocks
+        return {key: clock for key, clock in clocks.items() if made_by(key) <= meta.turn}
 
     # -- over lives -------------------------------------------------------------------------------------------------
 
@@ -145,7 +186,8 @@ class Timers:
                 timer.due -= now
 
     def resume(self) -> None:
-        """A life begins: what was stopped with the address runs on."""
+        """A life begins: what was stopped with the address runs on, and its hooks want theirs again."""
+        self.claimed.clear()
         loop = self._home.node.loop
         for key, timer in self._states.items():
             if timer.handle is None:
@@ -158,6 +200,8 @@ class Timers:
             if timer.handle is not None:
                 timer.handle.cancel()
         self._made.clear()
+        self._same.clear()
+        self._over.clear()
         waiting = {source.origin for source in self._home.ledger.open.values() if source.kind == TICK}
         self._states = {
             key: TimerState(name, body, max(0.0, left), interval)

@@ -17,7 +17,18 @@ from ..exit_reasons import NORMAL, ExitReason
 from ..seconds import check_seconds
 from . import links, mailbox
 from .blocking_handlers import is_async
-from .envelope import NO_DEADLINE, Ask, Chain, Envelope, Item, ReplyHandle, chain_of, message_in, waiters
+from .envelope import (
+    NO_DEADLINE,
+    Ask,
+    Chain,
+    Envelope,
+    Item,
+    ReplyHandle,
+    chain_of,
+    in_next_pass,
+    message_in,
+    waiters,
+)
 from .links import Monitor
 from .message import Message, reply_type, require_message
 from .timers import Timer
@@ -137,7 +148,11 @@ class ActorContext:
             self._alive()
         if type(message) not in cell.table:
             cell.require(message)
-        accepted = cell.offer(Envelope(message, self._cell))
+        try:
+            accepted = cell.offer(Envelope(message, self._cell))
+        except HoldfastError:
+            await asyncio.sleep(0)  # Who sends again and again leaves the loop to those for whom it waits.
+            raise
         if accepted is not None:
             await accepted
 
@@ -151,7 +166,7 @@ class ActorContext:
         chain = self._chain()
         if waits_for(self, cell, chain):
             future.set_exception(AskDeadlock(cell.path, waiters(chain)))
-            return future
+            return in_next_pass(future)
         ask = Ask(message, self._cell, chain, timeout, NO_DEADLINE, future, cell)
         node.deadlines.add(ask)
         try:
@@ -159,7 +174,7 @@ class ActorContext:
         except BaseException:
             future.cancel()
             raise
-        return future
+        return in_next_pass(future) if future.done() else future
 
     def _chain(self) -> Chain:
         """This turn, and those that wait for it; nothing in a background task whose turn is over."""

@@ -6,6 +6,7 @@ for a message, `run` for everything else.
 
 from __future__ import annotations
 
+import asyncio
 import types
 from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
@@ -266,6 +267,27 @@ class Ask(Item, msgspec.Struct, eq=False):
 
     def undelivered(self, cell: Cell, reason: str) -> None:
         self.fail(cell.stopped_error(reason))
+
+
+def in_next_pass(outcome: asyncio.Future[R]) -> asyncio.Future[R]:
+    """The same outcome, in the next pass of the loop.
+
+    An ask that is refused at the call ends so: who asks again and again until it gets through leaves the loop to those
+    for whom it waits.
+    """
+    later: asyncio.Future[R] = outcome.get_loop().create_future()
+    outcome.get_loop().call_soon(_hand_on, outcome, later)
+    return later
+
+
+def _hand_on(outcome: asyncio.Future[Any], later: asyncio.Future[Any]) -> None:
+    error = outcome.exception()
+    if later.done():
+        return
+    if error is not None:
+        later.set_exception(error)
+    else:
+        later.set_result(outcome.result())
 
 
 async def _finish(cell: Cell, ask: Ask, handler: Coroutine[Any, Any, object]) -> None:

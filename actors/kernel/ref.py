@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Generic, Literal
 
 from typing_extensions import TypeVar
 
-from ..errors import ActorRestarting, SpecError
-from .envelope import NO_DEADLINE, Ask
+from ..errors import ActorRestarting, HoldfastError, SpecError
+from .envelope import NO_DEADLINE, Ask, in_next_pass
 from .message import Message
 
 if TYPE_CHECKING:
@@ -81,7 +81,11 @@ class ActorRef(Generic[A_co]):
             await room
         if type(message) not in cell.table:
             cell.require(message)
-        accepted = cell.offer(message)
+        try:
+            accepted = cell.offer(message)
+        except HoldfastError:
+            await asyncio.sleep(0)  # Who sends again and again leaves the loop to those for whom it waits.
+            raise
         if accepted is not None:
             await accepted
 
@@ -126,7 +130,7 @@ class ActorRef(Generic[A_co]):
         except BaseException:
             future.cancel()  # Refused at the call: nobody holds the future.
             raise
-        return future
+        return in_next_pass(future) if future.done() else future
 
     def stop(self) -> None:
         """Ask the actor to stop after what it has begun; a second stop is no error."""
@@ -163,4 +167,4 @@ def _restarting(cell: Cell, restarting: str, sender: ActorContext | None) -> asy
         return None
     future: asyncio.Future[Any] = cell.node.loop.create_future()
     future.set_exception(ActorRestarting(cell.path))
-    return future
+    return in_next_pass(future)

@@ -84,16 +84,16 @@ class Outputs:
             case "forward":
                 self._forward(turn, key, out, batch)
             case "timer" | "cancel":
-                out = home.timers.known_as(out)
                 self._keep(turn, out, batch)
                 if out.verb == "cancel":
+                    home.timers.cancelled(turn, out.to)
                     home.timers.drop_ticks(out.to, key, batch)
                 batch.after.append(lambda: self._operate(out))
             case "subscribe" | "unsubscribe":
                 self._keep(turn, out, batch)
                 batch.after.append(lambda: self._subscribe(out))
             case "monitor" | "watch" | "demonitor" | "unwatch" | "link" | "unlink":
-                home.ties.turn(out.verb, out.to)
+                home.ties.turn(turn, out.verb, out.to)
                 home.note(turn, ("tie", turn, out.verb, out.to), batch)
                 batch.after.append(lambda: connect(cell, node.cell_at(out.to), out.verb))
             case "pipe":

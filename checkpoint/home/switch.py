@@ -302,7 +302,6 @@ class Switch:
         self.arrival.cancel()  # The last life may have died in the middle of a snapshot.
         self.due.restarted()
         self.timers.resume()
-        self.timers.claimed.clear()
         if self.life.has_ended:
             self.forget_end()
         live: asyncio.Future[float] = self.node.loop.create_future()
@@ -353,7 +352,8 @@ class Switch:
             port.to_life(first.feed())
         gone, begun = self.ledger.ended_in_the_stash(), -1 if first is not None else self.ledger.begun
         ledger, own = self.ledger, self.ledger.own_end
-        port.to_life(Go(recovered, ledger.turn, gone, self.timers.running(), begun, own.wanted, own.past))
+        timers = self.timers.after(ledger.turn)
+        port.to_life(Go(recovered, ledger.turn, gone, timers, begun, own.wanted, own.past))
 
     def let_at(self) -> None:
         """Let the actor at what is new, if nobody else has a say in that."""
@@ -461,6 +461,8 @@ class Switch:
     def _take(self, turn: int, key: int, outs: list[Out], batch: Batch) -> None:
         """Let new outputs out; drop those that are out already."""
         ledger = self.ledger
+        if any(out.verb == "cancel" for out in outs):  # Lives may know a timer of a hook by other names.
+            outs = [self.timers.known_as(out) if out.verb == "cancel" else out for out in outs]
         again = ledger.compare_outputs(turn, key, outs, functools.partial(is_as_before, self))
         if turn <= ledger.turn:
             self.life.see_again(turn, outs[-1].k if outs else 0)

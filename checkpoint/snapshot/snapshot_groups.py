@@ -179,7 +179,8 @@ def _image(home: Switch) -> HomeImage:
         blocks=[],
         earlier=[],
         owed=home.calls.debts(),
-        ties=home.ties.saved(),
+        ties=home.ties.saved(home.ledger.turn + 1),
+        claims={key: clock for key, clock in home.timers.at(newest).items() if key not in timers},
         made=msgspec.structs.replace(newest.made, shapes=home.shapes.as_now()),
     )
     return HomeImage(home.path, msgspec.msgpack.encode(meta), [list(entry) for entry in home.ledger.entries()])

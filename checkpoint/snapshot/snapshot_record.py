@@ -16,7 +16,7 @@ from ..encoding.compression import PLAIN, compressor, decompress
 from ..inputs import Contained, spread
 from ..journal import DamagedStore, Entry
 from ..journal import Saved as Journaled
-from ..protocol import DOWN, EXIT, OK, STASHED, TICK, TIMED, Answer, Snapshot, timed, untimed
+from ..protocol import DOWN, EXIT, OK, STASHED, TICK, TIMED, Answer, Clock, Snapshot, timed, untimed
 from ..schema import as_shape, first_of, kind_in, shape_name
 from ..upgrade.mapping import BodyMapper, NotMapped
 from ..upgrade.old_records import OldRecords
@@ -62,7 +62,7 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     what is true of it, TRAPS and REPLACED (a bool in stores of before, which is the former).
 
     `made`: of what class its state is; stores of before do not say. `over`: inputs that it contains, and that stand in
-    a row of the journal with others.
+    a row of the journal with others. `claims`: timers that ran after `turn`, and that a later turn has cancelled.
     """
 
     format: int
@@ -84,6 +84,7 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     marks: int | bool = 0
     made: ClassRecord = ClassRecord()
     over: list[int] = []
+    claims: dict[str, Clock] = {}
 
     @property
     def traps(self) -> bool:
@@ -144,7 +145,8 @@ def meta_now(home: Switch, turn: int, stash: list[int], state: bytes = b"") -> M
         turn,
         time=now,
         owed=home.calls.debts(),
-        ties=home.ties.saved(),
+        ties=home.ties.saved(turn),
+        claims=home.timers.claims(turn),
         made=ClassRecord(home.shapes.kind, [] if home.ledger.newest is None else home.ledger.newest.made.variables),
     )
 
@@ -217,6 +219,7 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
         home.journal.cut(home.path, encode_meta(meta, home.method.compress), drop, turn=meta.turn, keep=keep)
     home.images.cancel()
     home.ledger.begin_with(meta, contained)
+    home.timers.forget(meta.turn)
 
 
 def go_back(home: Switch, meta: Meta) -> None:
@@ -249,6 +252,8 @@ def load(home: Switch, planted: Journaled | None = None) -> None:
             for key, (name, body, left, interval) in meta.timers.items()
         }
         home.shapes.old.timers |= home.shapes.timer_mappers(meta.timers, meta.made.shapes)
+        for key, clock in meta.claims.items():
+            home.timers.cancelled(meta.turn + 1, key, clock)
     for position, entry in saved.entries:
         _reload(home, position, entry, timers)
     home.ledger.read = home.ledger.next_id
@@ -342,7 +347,7 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
             home.homes.rejoin.read(home, position, origin, name, body, sender)
         case ("tie", turn, verb, path):
             ledger.positions_of(turn).append(position)
-            home.ties.turn(verb, path)
+            home.ties.turn(turn, verb, path)
         case ("later", turn, key):
             ledger.positions_of(turn).append(position)
             source = ledger.turns[turn].input
@@ -361,7 +366,8 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
                         home.shapes.old.timers[key] = mapper
                     home.timers.made_again(key)
                 case "cancel":
-                    timers.pop(key, None)
+                    if (timer := timers.pop(key, None)) is not None:
+                        home.timers.cancelled(turn, key, (timer[0], timer[1], timer[3]))
                 case "subscribe":
                     home.topics[key] = None
                 case _:

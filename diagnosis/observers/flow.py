@@ -30,6 +30,8 @@ BLOCK: Final = 50
 """Messages that come in, at least, over which those that go out are counted."""
 BLOCKS: Final = 6
 """Blocks from which it is known how much goes out at least."""
+TOO_OFTEN: Final = 3
+"""Silences that were told as faults, and have ended by themselves, after which the next ones are usual."""
 MOST_ARRIVALS: Final = 50_000
 """Messages that are noted while nobody observes yet."""
 Arrival = tuple[str, float]
@@ -111,7 +113,10 @@ class FlowSource(msgspec.Struct, frozen=True):
 class _Flow:
     """What is seen of one topic."""
 
-    __slots__ = ("began", "came_in", "guess", "in_block", "last", "marks", "out_of_block", "poor", "recent", "seen")
+    __slots__ = (
+        "began", "came_in", "guess", "in_block", "is_cut", "is_missed", "last", "lives", "marks", "missed",
+        "out_of_block", "poor", "recent", "seen",
+    )  # fmt: skip
 
     began: float
     last: float | None
@@ -119,7 +124,10 @@ class _Flow:
 
     def __init__(self, now: float) -> None:
         self.marks: tuple[object, ...] = ()
-        self.guess = self.seen = 0
+        self.lives: tuple[int, ...] = ()  # of its publishers
+        self.is_cut = False  # one of them was started again since the last message
+        self.is_missed = False  # it should flow, and does not
+        self.guess = self.seen = self.missed = 0
         self.begin(now)
 
     def most_in(self, learned: Usual) -> int:
@@ -131,6 +139,23 @@ class _Flow:
         self.began, self.last = now, None
         self.came_in = self.in_block = self.out_of_block = self.poor = 0
         self.recent = []
+
+    def look_at(self, publishers: list[Cell]) -> None:
+        """See whether one of its publishers was started again."""
+        lives = tuple(cell.life for cell in publishers)
+        if lives != self.lives:
+            self.lives, self.is_cut = lives, bool(self.lives)
+
+    def takes_silence(self) -> bool:
+        """A silence has just ended: whether it is to be learned.
+
+        Not one in which a publisher was started again, nor one that was told as a fault, unless that happens again and
+        again and ends by itself: such is the way of that topic.
+        """
+        is_cut, is_missed = self.is_cut, self.is_missed
+        self.is_cut = self.is_missed = False
+        self.missed += is_missed and not is_cut
+        return not is_cut and (not is_missed or self.missed >= TOO_OFTEN)
 
     def end_block(self, learned: Usual) -> None:
         """Compare what has gone out of a block of inputs with what is usual; a single poor one is usual, too.
@@ -200,8 +225,12 @@ class FlowObserver(Observer):
         flow = self._flows.get(topic)
         if flow is not None:
             if flow.last is not None:
-                self._learned(topic).take(now - flow.last, flow.came_in)
-                flow.seen += flow.came_in > 0
+                learned, gap = self._learned(topic), now - flow.last
+                if gap > learned.longest_gap or flow.came_in > learned.most_in:
+                    flow.look_at(self._publishers(self._made[topic]))
+                if flow.takes_silence():
+                    learned.take(gap, flow.came_in)
+                    flow.seen += flow.came_in > 0
             flow.last, flow.came_in = now, 0
             flow.out_of_block += 1
         for user in self._users.get(topic, ()):
@@ -257,11 +286,15 @@ class FlowObserver(Observer):
     def _learned(self, topic: str) -> Usual:
         return self._baselines.of(topic, self.ctx._cell.node.clock.wall())
 
+    def _publishers(self, made: FlowSource) -> list[Cell]:
+        return [cell for path in made.publishers if (cell := self.ctx._cell.node.find(path)) is not None]
+
     def _flows_well(self, topic: str, made: FlowSource) -> bool | None:
         flow, now = self._flows[topic], self.now
         learned = self._learned(topic)
-        cells = [cell for path in made.publishers if (cell := self.ctx._cell.node.find(path)) is not None]
+        cells = self._publishers(made)
         works = [cell.host.work(cell) for cell in cells]
+        flow.look_at(cells)
         if not made.inputs:  # Its publishers' turns are what comes in.
             marks = tuple(work.mark for work in works)
             had_turns = len(marks) == len(flow.marks) and any(
@@ -277,6 +310,7 @@ class FlowObserver(Observer):
         is_due = flow.came_in > ENOUGH // 2 + LONGER * flow.most_in(learned)
         is_by_clock = not made.inputs and learned.longest_gap <= REGULAR * learned.mean_gap
         if (is_due and silent > self._patience) or (is_by_clock and is_long):
+            flow.is_missed = True
             return False
         if made.inputs and flow.in_block >= BLOCK and all(map(_is_idle, cells, works)):  # All of it was worked off.
             flow.end_block(learned)

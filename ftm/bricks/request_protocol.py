@@ -452,7 +452,10 @@ class RequestProtocol(Transfer):
     async def _give_back(self, handle: ReplyHandle[bool]) -> None:
         self._is_leaving = True
         try:
-            handle.reply(await self._has_given_back())
+            has_left = await self._has_given_back()
+            if has_left:  # Home sends all of it again; what has not begun here would be run without its knowing.
+                self._held.clear()
+            handle.reply(has_left)
         except HoldfastError as error:
             handle.fail(error)
         finally:

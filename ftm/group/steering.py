@@ -98,9 +98,11 @@ async def _withdraw(group: Group) -> None:
     order = Withdraw(known.epoch, group.adaptation.config)
     if primary is None or not await _has_left(group, primary, order):
         return
-    await asyncio.gather(*(_has_left(group, name, order) for name in members if name != primary))
-    if known.primary == primary and known.epoch == order.epoch:  # Else whoever leads next is sent all of it anyway.
-        group.withdraw()
+    try:
+        await asyncio.gather(*(_has_left(group, name, order) for name in members if name != primary))
+    finally:
+        if known.primary == primary and known.epoch == order.epoch:  # Else whoever leads next is sent all of it anyway.
+            group.withdraw()
 
 
 async def _has_left(group: Group, name: str, order: Withdraw) -> bool:

@@ -1,6 +1,7 @@
 """An ask has exactly one outcome (DESIGN 3 "Sending", 4 "Deadlocks"; T20)."""
 
 import asyncio
+import contextlib
 import gc
 import time
 import weakref
@@ -10,6 +11,8 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.kernel.node import Node
+
+IN_TIME = 20.0  # seconds
 
 
 class Work(hf.Message[str]):
@@ -500,3 +503,55 @@ def test_a_deadline_is_over_when_the_machine_says_so_though_the_loop_is_late() -
         assert not node.clock.is_past(time.monotonic() + 60.0)
     finally:
         loop.close()
+
+
+class Late(hf.Actor):
+    """It starts slowly, and takes a while for each message."""
+
+    async def on_start(self, restored: bool) -> None:
+        await asyncio.sleep(0.05)
+
+    @hf.on(Work)
+    async def work(self, message: Work) -> str:
+        await asyncio.sleep(0.001)
+        return "done"
+
+
+async def insistently(ref: hf.ActorRef[Late], how: str) -> str:
+    """Ask or send until that gets through, as fast as that can be."""
+    while True:
+        with contextlib.suppress(hf.ActorStopped, hf.MailboxFull, hf.errors.ActorRestarting):
+            if how == "send":
+                await ref.send(Work())
+                return "done"
+            return await ref.ask(Work(), restarting="fail" if how == "fail" else "wait")
+
+
+@pytest.mark.parametrize("by", ["nobody", "an actor"])
+@pytest.mark.parametrize("how", ["ask", "send", "fail", "full"])
+async def test_who_insists_leaves_the_loop_to_those_for_whom_it_waits(how: str, by: str) -> None:
+    """Whatever is refused at the call ends in the next pass of the loop."""
+
+    class Insists(hf.Actor):
+        @hf.on(Work)
+        async def work(self, message: Work) -> str:
+            return await insistently(late, how)
+
+    mailbox = hf.bounded(2, overflow="reject") if how == "full" else None
+    spec = hf.child("late", hf.start(Late), mailbox=mailbox, backoff=hf.Backoff(initial=0.01, maximum=0.01))
+    async with hf.ActorSystem("t", log=False, intensity=99) as system:
+        inner = hf.supervisor("inner", children=[spec], intensity=9 if how == "fail" else 0)
+        await system.start(inner)
+        late = system.ref("/t/inner/late", Late)
+        insisting = [system.spawn(hf.start(Insists), f"i{number}") for number in range(3)]
+        if how != "full":
+            late.kill()
+            if how != "fail":  # Its supervisor ends with it, and is started again.
+                async with asyncio.timeout(IN_TIME):
+                    while not late._cell.is_dead:
+                        await asyncio.sleep(0)
+        if by == "nobody":
+            said = await asyncio.gather(*(insistently(late, how) for _ in range(6)))
+        else:
+            said = await asyncio.gather(*(one.ask(Work(), IN_TIME) for one in insisting))
+        assert {*said} == {"done"}

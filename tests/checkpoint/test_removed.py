@@ -14,6 +14,8 @@ CHUNKS_KEPT = "tests/checkpoint/test_chunks_kept.py"
 
 KILLS = "tests/checkpoint/test_kill_counts.py"
 
+TIMERS = "tests/effects/test_timers_while_resting.py"
+
 CHECKS = {
     "what was submitted is written at the end, whether the message handler comes or not": Check(
         "checkpoint/group_commit.py",
@@ -21,6 +23,34 @@ CHECKS = {
         "                pass  # The message handler may have ended",
         "tests/checkpoint/test_commits.py",
         "test_what_is_waited_for_needs_no_time",
+    ),
+    "a timer that is over since the snapshot is not begun again": Check(
+        "checkpoint/durable_timers.py",
+        "self.after(made_by(out.to)).items()",
+        "self._running().items()",
+        TIMERS,
+        "test_a_timer_that_is_over",
+    ),
+    "a snapshot knows the timers that the turn behind it has cancelled": Check(
+        "checkpoint/snapshot/snapshot_record.py",
+        "        claims=home.timers.claims(turn),\n",
+        "",
+        TIMERS,
+        "test_the_next_root_finds",
+    ),
+    "a snapshot of before a turn has none of its ties": Check(
+        "checkpoint/durable_links.py",
+        "(self._before if self._turn > turn else self._kept)",
+        "(self._kept)",
+        TIMERS,
+        "test_the_next_root_ties_once",
+    ),
+    "a hook gets no timer that a later turn has set": Check(
+        "checkpoint/durable_timers.py",
+        "for key, clock in clocks.items() if made_by(key) <= meta.turn}",
+        "for key, clock in clocks.items()}",
+        TIMERS,
+        "test_a_group_goes_back",
     ),
     "what has diverged is not tried again": Check(
         "actors/persistence.py",

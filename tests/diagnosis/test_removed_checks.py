@@ -85,6 +85,20 @@ CHECKS = {
         FLOW,
         "a_source_in_a_process",
     ),
+    "a silence in which a publisher was started again is not usual": Check(
+        "diagnosis/observers/flow.py",
+        "return not is_cut and (",
+        "return (",
+        FLOW,
+        "found_again",
+    ),
+    "a silence that was told as a fault is not usual": Check(
+        "diagnosis/observers/flow.py",
+        "(not is_missed or self.missed >= TOO_OFTEN)",
+        "True",
+        FLOW,
+        "found_again",
+    ),
     "what is put aside waits, too": Check(
         "diagnosis/observers/runtime.py",
         "seen.backlog.take(backlog + aside, now)",

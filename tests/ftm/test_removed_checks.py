@@ -23,6 +23,13 @@ CHECKS = {
         FAILOVER,
         "test_a_first_start_loses_no_protection",
     ),
+    "who has left a turn that rests begins nothing of what home sends again": Check(
+        "ftm/bricks/request_protocol.py",
+        "            if has_left:  # Home",
+        "            if False:  # Home",
+        "tests/effects/test_timers_while_resting.py",
+        "whoever_leads_next and lfr",
+    ),
     "whoever leads next hears which message its turn has waited for": Check(
         "checkpoint/home/pending_asks.py",
         "taken = self.rests.taken.get((turn, k), -1)",

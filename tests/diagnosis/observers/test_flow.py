@@ -136,6 +136,37 @@ async def test_a_clock_that_has_stopped_is_seen_though_somebody_is_started_meanw
     assert world.said[ok("/in")] is False
 
 
+@pytest.mark.parametrize("how", ["it is started again", "it is started again soon", "it goes on by itself"])
+async def test_a_silence_that_was_a_fault_is_found_again(how: str) -> None:
+    """Of those that end by themselves the first two are no measure; then they are usual."""
+    said: dict[Literal, bool] = {}
+    async with hf.ActorSystem("t", log=False, seed=1) as system:
+        system.spawn(hf.start(Notes, said))
+        source = await system.start(hf.child("filter", hf.start(Filter)))
+        made = {"/out": FlowSource((source.path,))}
+        await system.start(observer("topics", hf.start(FlowObserver, made, leave_out=(OBSERVATIONS,))))
+
+        async def flow() -> None:
+            for number in range(200):
+                source.tell(Item(number))
+                await asyncio.sleep(0.05)
+
+        await flow()
+        for _ in range(3 if how == "it goes on by itself" else 2):
+            assert said[ok("/out")] is True
+            if how == "it is started again soon":
+                await asyncio.sleep(1.8)
+                await system.ref("/t", hf.Supervisor).ask(hf.RestartChild("filter", running=True))
+                await flow()
+            await asyncio.sleep(5.0)
+            assert said[ok("/out")] is False
+            if how == "it is started again":
+                await system.ref("/t", hf.Supervisor).ask(hf.RestartChild("filter", running=True))
+            await flow()
+        await asyncio.sleep(5.0)
+        assert (said.get(ok("/out")) is False) is (how != "it goes on by itself")
+
+
 async def test_of_a_topic_of_which_half_is_lost_too_little_goes_out(world: World) -> None:
     await world.send(600, 0.05)
     assert world.said[ok("/out")]
