@@ -381,6 +381,7 @@ class Commits:
             if self._syncing is not None:
                 await asyncio.wait([self._syncing])
             else:
+                self.flush()  # The message handler may have ended after it was woken: nobody waits for it here.
                 await asyncio.sleep(0)
 
     def close(self) -> None:

@@ -124,6 +124,8 @@ class Controls:
     ) -> None:
         """Have a suspended actor go on as another class, now and after restarts.
 
+        A variable that the actor has not yet is what `__init__` of the new class gives it.
+
         Args:
             ref: the actor.
             new: the class, or `start(Class, ...)` if its arguments are to change too.
@@ -133,7 +135,8 @@ class Controls:
 
         Raises:
             NotSuspended: suspend it first. ControlFailed: `change` or `migrate` raised, or the class needs a `migrate`
-                and has none; the old class stays.
+                and has none; variables may have been renamed; `__init__` does more than set variables, and there is no
+                `change`. The old class stays.
             SpecError: the class does not take the arguments, or cannot be imported by the actor's process.
         """
         cell = self._living(ref)

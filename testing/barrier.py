@@ -84,6 +84,8 @@ async def patience(timeout: float | None, node: Node | None = None) -> AsyncGene
 async def idle(system: ActorSystem, *, timeout: float = TIMEOUT) -> None:
     """Wait until nothing is queued and nothing that runs could go on.
 
+    Time that has to pass (a timer, a back-off before a restart) and work in threads are not waited for.
+
     Args:
         system: a running one. Its actors in processes of their own are asked for a round trip each; of a subtree in a
             process only the turns of its supervisor are known, and what an actor there tells itself is not.

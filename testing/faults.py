@@ -97,6 +97,8 @@ POINTS: dict[str, Point] = {
     )
 }
 """Every point, by name."""
+TURNS = ("turn begin", "turn end")
+"""The points that the turns of a replay pass, too."""
 
 
 class InjectedCrash(HoldfastError, text="injected crash at {at!r}, chance {number} (seed {seed})"):
@@ -132,8 +134,11 @@ class Strikes:
         seconds: float | tuple[float, float],
         after: int,
         times: int | None,
+        *,
+        replays: bool,
     ) -> None:
         self.at, self.path, self.seed = point.name, path, faults.seed
+        self.replays = replays
         self.least, self.longest = seconds if isinstance(seconds, tuple) else (seconds, seconds)
         self.chances = 0
         self.is_over = False
@@ -231,6 +236,7 @@ class Faults:
         seconds: float | tuple[float, float] = 1.0,
         after: int = 0,
         times: int | None = None,
+        replays: bool = False,
         **odds: float,
     ) -> Strikes:
         """Faults at one point, from now to the end of the context: `async with faults.on(ref, at="admit", drop=0.1):`.
@@ -242,6 +248,8 @@ class Faults:
                 after the next message, or so much later if there is none.
             after: this many chances are let pass first.
             times: at most so many strikes; None: no limit.
+            replays: at "turn begin" and "turn end": the turns of a replay are chances, too. Left out, only turns that
+                no life has ended before are.
             odds: by kind of fault (crash, hang, delay, drop, duplicate, reorder, corrupt, fail), the probability with
                 which it strikes at each chance; together at most 1.
 
@@ -253,9 +261,11 @@ class Faults:
         point = POINTS.get(at)
         if point is None:
             raise SpecError("faults", f"at must be one of {', '.join(POINTS)}, not {at!r}")
-        strikes = Strikes(self, _path(target), point, _checked(point, odds), seconds, after, times)
+        strikes = Strikes(self, _path(target), point, _checked(point, odds), seconds, after, times, replays=replays)
         if not 0 <= strikes.least <= strikes.longest < math.inf:
             raise SpecError("faults", f"seconds must be >= 0, or (least, longest), not {seconds!r}")
+        if replays and at not in TURNS:
+            raise SpecError("faults", f"replays=True is for {' and '.join(map(repr, TURNS))}, not for {at!r}")
         INSTALL[at](strikes, target)
         self.installed.append(strikes)
         return strikes

@@ -209,6 +209,8 @@ class TurnFaults(TurnWatcher):
     def begins(self, cell: Cell, item: Any) -> Substitute | None:
         if cell is not self._cell or not (message_of(item) is not None or isinstance(item, Fed)):
             return None
+        if isinstance(item, Fed) and item.feed.turn >= 0 and not self._strikes.replays:
+            return None  # It has ended in an earlier life: faults are meant for what happens from now on.
         return self._before if self._strikes.at == "turn begin" else self._after
 
     def _before(self, handler: Handler) -> Handler:

@@ -7,7 +7,7 @@ import dataclasses
 import inspect
 import operator
 from collections.abc import Callable, Generator, Iterable
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from ..errors import ControlFailed, error_text, portable, type_name
 from ..state_hooks import state_getter, state_setter
@@ -150,19 +150,34 @@ def change_state(actor: Actor, change: Callable[[Any], Any]) -> None:
         actor.ctx._replaced()
 
 
-def tried_state(actor: Actor, changes: Iterable[Callable[[Any], Any]], verb: str) -> tuple[Any, list[bytes]]:
-    """The state that the actor would have with these changes, one after the other; it has what it had.
+class Tried(NamedTuple):
+    """What has come of the trial of a change.
 
-    Also what its home would be told of it, as bytes.
+    Attributes:
+        state: the state that the actor would have.
+        saved: what its home would be told of it, as bytes.
+        added: the attributes that it would have and has not, whether they are of the state or not.
+        first_variables: those that `__init__` of its class would have set.
+    """
+
+    state: Any
+    saved: list[bytes]
+    added: dict[str, Any]
+    first_variables: list[str]
+
+
+def tried_state(actor: Actor, changes: Iterable[Callable[[Any], Any]], verb: str) -> Tried:
+    """Try these changes, one after the other; the actor has what it had.
 
     Raises:
         ControlFailed: one of them raised, or what it returned is no state, or cannot be kept.
     """
+    had = {name for name, _ in attributes(actor)}
     with _changing(actor, verb, is_trial=True):
         for change in changes:
             put_state(actor, change(state_to_change(actor)))
-        saved = actor.ctx._saved()
-        return state_to_change(actor), saved
+        added = {name: value for name, value in attributes(actor) if name not in had}
+        return Tried(state_to_change(actor), actor.ctx._saved(), added, actor.ctx._first_variables)
 
 
 @contextlib.contextmanager
@@ -170,12 +185,13 @@ def _changing(actor: Actor, verb: str, *, is_trial: bool) -> Generator[None]:
     """Have the state as it was before, behind a trial and behind whatever raises."""
     ctx = actor.ctx
     ctx._may_replace()
-    kind, before = type(actor), dict(vars(actor))
+    kind, before, first_variables = type(actor), dict(vars(actor)), ctx._first_variables
     hooked = state_to_change(actor) if state_setter(actor) is not None else None
     values = live_state(actor) if state_getter(actor) is None else None
 
     def put_back() -> None:
         actor.__class__ = kind
+        ctx._first_variables = first_variables
         vars(actor).clear()
         vars(actor).update(before)
         if values is not None:

@@ -20,7 +20,8 @@ from ..process.wire.start_codec import imported, pack_recipe, unpack_recipe
 from ..state_hooks import migrated
 from ..turn_stacks import waits_at
 from ..values import UnsavableValue
-from .live_state import change_state, keeping_variables, state_to_show, tried_state
+from .live_state import Tried, change_state, keeping_variables, state_to_show, tried_state
+from .other_class import add_variables, become_other
 from .state_outline import outline_of
 from .tracing import Statistics, tap_of
 
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 
 Change = Callable[[Any], Any]
 """Takes a state and returns the one that shall be in its place."""
-"""Takes a state and the class it is of, and returns it as the new class wants it."""
 
 
 class Order:
@@ -123,23 +123,22 @@ class ReplaceCode(Order):
             raise NotSuspended(cell.path, self.verb)
         start, old = next_start(cell, self.start, keeps_arguments=self.keeps_arguments), type(actor)
         try:
-            change_state(actor, self.becoming(actor))
+            change_state(actor, self.becoming(actor, start))
         except ControlFailed as error:
             raise ControlFailed(cell.path, self.verb, error.problem) from error
         return has_become(cell, old, start)
 
-    def becoming(self, actor: Actor) -> Change:
+    def becoming(self, actor: Actor, start: Start[Any]) -> Change:
         """Takes the actor's state, makes the actor one of the new class, and returns the state as that wants it."""
-        new = self.start.kind
 
         def become(state: Any) -> Any:
             version = actor.schema_version
             if self.change is not None:
-                state = self.change(state)
-            elif version != new.schema_version:
-                state = migrated(new, state, version, actor.ctx.path)
-            cast("Any", actor).__class__ = new
-            return state
+                return become_other(actor, start, self.change(state), is_said=True, is_whole=True)
+            is_older = version != start.kind.schema_version
+            if is_older:
+                state = migrated(start.kind, state, version, actor.ctx.path)
+            return become_other(actor, start, state, is_said=is_older)
 
         return become
 
@@ -201,9 +200,9 @@ def next_start(cell: Cell, new: Start[Any], *, keeps_arguments: bool) -> Start[A
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Prepared:
-    """What an actor will go on with: its state, and its recipe if its class is another one."""
+    """What an actor will go on with: what has come of the trial, and its recipe if its class is another one."""
 
-    state: Any
+    tried: Tried
     start: Start[Any] | None
 
 
@@ -227,18 +226,18 @@ class Prepare(Order):
         if not self.wanted:
             return None, []
         start: Start[Any] | None = None
+        changes: list[Change] = []
         for one in self.wanted:
             if isinstance(one, ReplaceCode):
                 start = next_start(cell, one.start, keeps_arguments=one.keeps_arguments)
-        changes = [
-            keeping_variables(actor, one.change) if isinstance(one, ReplaceState) else one.becoming(actor)
-            for one in self.wanted
-        ]
-        state, saved = tried_state(actor, changes, self.wanted[0].verb)
-        hold.prepared = Prepared(state, start)
+                changes.append(one.becoming(actor, start))
+            else:
+                changes.append(keeping_variables(actor, one.change))
+        tried = tried_state(actor, changes, self.wanted[0].verb)
+        hold.prepared = Prepared(tried, start)
         if cell.node.ports.uplink is None:
             return None, []
-        return None if start is None else pack_recipe(start, cell.path), saved
+        return None if start is None else pack_recipe(start, cell.path), tried.saved
 
     def pack(self, where: str) -> dict[str, Any]:
         return {"attempt": self.attempt, "wanted": [[one.verb, one.pack(where)] for one in self.wanted]}
@@ -348,7 +347,9 @@ def go_on_with(cell: Cell, actor: Actor, prepared: Prepared) -> None:
     def put(_: Any) -> Any:
         if start is not None:
             cast("Any", actor).__class__ = start.kind
-        return prepared.state
+            add_variables(actor, prepared.tried.added)
+            actor.ctx._first_variables = prepared.tried.first_variables
+        return prepared.tried.state
 
     change_state(actor, put)
     if start is not None:

@@ -648,6 +648,15 @@ class ActorContext:
         """The key variables that a recovery file names for this actor; None if none does."""
         return None
 
+    @property
+    def _first_variables(self) -> list[str]:
+        """The variables of the state that `__init__` has set, where that is kept."""
+        return []
+
+    @_first_variables.setter
+    def _first_variables(self, names: list[str]) -> None:
+        """The actor is of another class from now on."""
+
     def _may_replace(self) -> None:
         """The state is about to be replaced from outside. Raises ControlFailed if it cannot be now."""
 

@@ -485,6 +485,14 @@ class RecordedContext(ActorContext):
     def _named_variables(self) -> tuple[str, ...] | None:
         return self.recorded.method.key_variables
 
+    @property
+    def _first_variables(self) -> list[str]:
+        return self.recorded.saving.variables
+
+    @_first_variables.setter
+    def _first_variables(self, names: list[str]) -> None:
+        self.recorded.saving.variables = names if self._named_variables is None else list(self._named_variables)
+
     def _may_replace(self) -> None:
         problem = self.recorded.may_replace()
         if problem:

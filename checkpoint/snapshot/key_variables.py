@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 from ...actors.control.live_state import attributes
 from ...actors.errors import type_name
 from ...actors.kernel.actor import Actor
-from ...actors.state_hooks import StateMismatch, migrated, state_getter, state_setter
+from ...actors.state_hooks import StateMismatch, as_named_now, migrated, state_getter, state_setter
 from ...actors.values import ByteParts, UnsavableValue, adopt_value, decode_value, encode_value
-from ...actors.values.renamed import former_members
 from ..method import Method
 from .state_image import is_image, read_image
 
@@ -121,43 +120,6 @@ def restore_state(
             saved = version, form, named
     put_back(actor, meant(saved))
     return StatePutBack(dropped, is_mapped)
-
-
-def as_named_now(
-    actor: Actor, state: dict[str, Any], before: list[str], now: list[str]
-) -> tuple[dict[str, Any], list[str]]:
-    """A saved state under the names that its variables have now, without those that the class has no more.
-
-    Variables that are only made later than in `__init__` are nobody's concern here.
-
-    Returns:
-        The state, and the names of what was dropped.
-
-    Raises:
-        StateMismatch: variables have gone and others have come: perhaps they were renamed, and nobody has said so.
-    """
-    kind, names = type(actor._state_root()), renames_in(actor, state)
-    state = {names.get(name, name): value for name, value in state.items()}
-    before = [names.get(name, name) for name in before]
-    gone = [name for name in before if name in state and name not in now] if now else []
-    come = [name for name in now if name not in before]
-    if gone and come:
-        raise StateMismatch(
-            actor.ctx.path,
-            f"it was saved with the variables ({', '.join(before)}), {type_name(kind)} has ({', '.join(now)}): "
-            f"{', '.join(gone)} would be lost; if it was renamed, say @hf.renamed({come[0]}={gone[0]!r}) above the "
-            "class; else raise its schema_version, and say in migrate(state, from_version) what becomes of it",
-        )
-    return {name: value for name, value in state.items() if name not in gone}, gone
-
-
-def renames_in(actor: Actor, state: dict[str, Any]) -> dict[str, str]:
-    """What the variables of a saved state are called now, by what they were called then, where that is another name."""
-    names: dict[str, str] = {}
-    for new, olds in former_members(type(actor._state_root())).items():
-        found = [old for old in olds if old in state and new not in state]
-        names |= dict.fromkeys(found[:1], new)
-    return names
 
 
 def put_back(actor: Actor, saved: Any) -> None:

@@ -8,11 +8,11 @@ import msgspec
 
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.node import Node, Ports
-from ...actors.state_hooks import migrated
+from ...actors.state_hooks import migrated, renames_in
 from ...actors.values import decode_value, state_digest
 from ..home.homes import Homes
 from ..journal import Saved
-from ..snapshot.key_variables import renames_in, save_state
+from ..snapshot.key_variables import save_state
 from ..snapshot.shared_blocks import by_segment
 from ..snapshot.snapshot_record import Meta, decode_meta, encode_meta
 from ..snapshot.state_image import is_image, read_image

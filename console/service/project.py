@@ -146,6 +146,7 @@ packages = ["$name"]
 [tool.pytest.ini_options]
 pythonpath = ["."]
 testpaths = ["tests"]
+asyncio_default_fixture_loop_scope = "function"
 """
 DOCKERFILE: Final = """FROM python:3.13-slim
 RUN useradd --create-home $name && mkdir -p /var/lib/$name && chown $name /var/lib/$name

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import inspect
 import itertools
 import threading
 from collections import Counter, deque
@@ -230,15 +231,25 @@ class ControlledLoop(VirtualClockLoop):
         """As every loop. What was left of killed processes is collected now: Python runs the `finally` of each then."""
         dead, self._dead = self._dead, []
         for task in dead:
-            try:
-                task.get_coro().close()
-            except BaseException:  # Whatever it raises, nobody is there to hear of it.
-                pass
+            _close(task.get_coro())
         super().close()
 
     def scheduled_timers(self) -> int:
         """How many timers there are."""
         return len(self._scheduled)
+
+
+def _close(coroutine: Any) -> None:
+    """Close a coroutine; of one that has not begun, those too that it was given, which nobody awaits any more."""
+    given: list[Any] = []
+    if inspect.iscoroutine(coroutine) and inspect.getcoroutinestate(coroutine) == inspect.CORO_CREATED:
+        given = [one for one in inspect.getcoroutinelocals(coroutine).values() if inspect.iscoroutine(one)]
+    try:
+        coroutine.close()
+    except BaseException:  # Whatever it raises, nobody is there to hear of it.
+        pass
+    for one in given:
+        _close(one)
 
 
 def _given(args: Any) -> int:

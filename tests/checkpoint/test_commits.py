@@ -130,6 +130,17 @@ async def test_what_is_safe_only_when_it_is_synced_waits_for_that_whatever_is_wa
         assert (done, engine.syncs) == (["a"], 1)
 
 
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_what_is_waited_for_needs_no_time_if_the_message_handler_was_woken_and_does_not_come(engine: Any) -> None:
+    done: list[str] = []
+    async with opened(engine) as commits:
+        commits.wake_handler = lambda: None
+        commits.submit(Effect("a", done))
+        began = asyncio.get_running_loop().time()
+        await commits.settled()
+        assert (done, asyncio.get_running_loop().time()) == (["a"], began)
+
+
 async def test_each_has_its_own_lane_but_never_overtakes_itself(engine: Any) -> None:
     done: list[str] = []
     async with opened(engine) as commits:

@@ -104,7 +104,7 @@ def test_a_renamed_variable_is_refused_until_somebody_says_what_becomes_of_it(tm
     run(tmp_path, CODE, what)
     renamed = CODE.replace("self.xs", "self.ys")
     done = run(tmp_path, renamed, "read")
-    assert "it was saved with the variables (xs, total), evolving.A has (ys, total): xs would be lost" in done.stderr
+    assert "its class had the variables (xs, total), evolving.A has (ys, total): xs would be lost" in done.stderr
     migrate = """class A(hf.Actor):
     schema_version = 2
 

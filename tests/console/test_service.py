@@ -39,6 +39,11 @@ class Clock(hf.Actor):
         self.count += 1
         self.release = "first"
 """
+CHANGED = (
+    ACTORS.replace('"first"', '"second"')
+    .replace('0, ""', '0, ""\n        self.added = 0')
+    .replace("self.count += 1", "self.count += 1\n        self.added += 1")
+)
 TREE = """
 import holdfast as hf
 from clock import Clock
@@ -180,11 +185,12 @@ async def test_a_main_that_does_not_end_does_not_hold_up_the_end_of_the_system(p
 async def test_sighup_has_changed_code_taken_up_with_state_kept(project: Path, target: str) -> None:
     async with running(target) as service:
         before = await service.state()
-        (project / "clock.py").write_text(ACTORS.replace('"first"', '"second"'))
+        (project / "clock.py").write_text(CHANGED)
         assert "STATUS=app runs" in await service.reload()
         while (after := await service.state())["release"] != "second":
             await asyncio.sleep(0.01)
         assert after["count"] >= before["count"] > 0
+        assert after["count"] > after["added"] > 0
         assert after["life"] == 1
 
 
@@ -203,6 +209,7 @@ async def test_sighup_has_another_tree_planted(project: Path) -> None:
         ("clock.py", ACTORS + "\n1 / 0\n", "ZeroDivisionError"),
         ("clock.py", ACTORS + "\nraise SystemExit(3)\n", "SystemExit"),
         ("clock.py", ACTORS + "\nraise KeyboardInterrupt\n", "KeyboardInterrupt"),
+        ("clock.py", ACTORS.replace("count", "number"), "count would be lost; if it was renamed, say @hf.renamed"),
         ("words.py", WORDS + "\n\nclass Tock(hf.Message): ...\n", "words: it defines messages"),
         ("tree.py", TREE.replace('"clock", hf', '"/", hf'), "the id must be text without '/' and control characters"),
         ("tree.py", TREE.replace("Clock)", "Clock, 7)"), "too many positional arguments"),
@@ -315,12 +322,16 @@ async def test_the_tests_of_a_new_project_pass_and_it_runs(project: Path) -> Non
     assert (await holdfast("new", "stall"))[0] == DONE
     folder = project / "stall"
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"), cwd=folder, stdout=asyncio.subprocess.PIPE
+        *(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"),
+        cwd=folder,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
     )
     async with asyncio.timeout(60):
         output, _ = await process.communicate()
     assert process.returncode == 0, output.decode()
     assert "2 passed" in output.decode()
+    assert "Warning" not in output.decode()
     assert "holdfast run stall.tree:tree --name stall" in (folder / "stall.service").read_text()
     os.chdir(folder)
     async with running("stall.tree:tree", "--name", "stall"):

@@ -117,6 +117,74 @@ class Cents(Account):
         return self.total // 100
 
 
+class Puts(hf.Message[int]): ...
+
+
+@hf.renamed(f"{__name__}:Account")
+class Tally(Account):
+    """The next release of `Account`: it has two variables more, one of which is no part of the state."""
+
+    def __init__(self, total: int = 0) -> None:
+        super().__init__(total)
+        self.puts = 100
+        self._add = self.more
+
+    def more(self) -> None:
+        self.puts += 1
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self._add()
+        self.total += message.n
+        return self.total
+
+    @hf.on(Puts)
+    def count(self, message: Puts) -> int:
+        return self.puts
+
+
+@hf.renamed(f"{__name__}:Account")
+class Summed(hf.Actor):
+    """One variable of `Account` has another name, and nobody has said so."""
+
+    def __init__(self, total: int = 0) -> None:
+        self.sum = total
+        self.seen: list[int] = []
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.sum += message.n
+        return self.sum
+
+
+@hf.renamed(f"{__name__}:Account", sum="total")
+class SaidSummed(Summed):
+    """The same, and somebody has said so."""
+
+
+@hf.renamed(f"{__name__}:Account")
+class Sum(hf.Actor):
+    """Begins with one variable alone."""
+
+    def __init__(self, total: int = 0) -> None:
+        self.sum = total
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.sum += message.n
+        return self.sum
+
+
+@hf.renamed(f"{__name__}:Account")
+class Timed(Account):
+    """Has a variable more, and its `__init__` does more than set it."""
+
+    def __init__(self, total: int = 0) -> None:
+        super().__init__(total)
+        self.timer = "set"
+        self.ctx.every(3600.0, Add())
+
+
 class Deaf(Account):
     """A newer class that cannot read an older state."""
 
@@ -218,6 +286,14 @@ def no_state(state: dict[str, Any]) -> list[int]:
 
 def reverse(state: list[int]) -> list[int]:
     return [*reversed(state), 7]
+
+
+def as_sum(state: dict[str, Any]) -> dict[str, Any]:
+    return {"sum": state["total"], "seen": state["seen"]}
+
+
+def with_timer(state: dict[str, Any]) -> dict[str, Any]:
+    return {**state, "timer": "said"}
 
 
 def keep(state: Any) -> Any:

@@ -17,10 +17,18 @@ from tests.control.players import (
     Cents,
     Deaf,
     Euros,
+    Puts,
+    SaidSummed,
+    Sum,
+    Summed,
+    Tally,
+    Timed,
     Total,
     Whole,
+    as_sum,
     cannot,
     keep,
+    with_timer,
 )
 
 
@@ -92,6 +100,74 @@ async def test_one_hook_reads_older_states_of_whatever_kind(tmp_path: Path, repl
     async with hf.ActorSystem("app", log=False, store=store) as system:
         one = await system.start(account(Cents))
         assert await one.ask(Euros()) == 1
+
+
+@pytest.mark.parametrize("how", ["by itself", "in a transaction", "with a change"])
+async def test_a_variable_that_only_the_new_class_has_is_what_its_init_gives(
+    system: hf.ActorSystem, start_one: Starter, way: str, how: str
+) -> None:
+    one = await start_one(hf.start(Account, 5))
+    assert await one.ask(Add(1)) == 6
+    if how == "in a transaction":
+        async with system.transaction() as change:
+            change.replace_code(one, Tally)
+    else:
+        await system.suspend(one)
+        await system.replace_code(one, Tally, keep if how == "with a change" else None)
+        await system.resume(one)
+    assert await system.get_state(one) == {"total": 6, "seen": [1], "puts": 100}
+    assert await one.ask(Add(1)) == 7
+    assert await one.ask(Puts()) == 101
+    one.kill()
+    assert await one.ask(Puts(), timeout=30.0) == (101 if "recorded" in way else 100)
+
+
+async def test_a_variable_that_a_change_keeps_is_there_in_the_next_life(system: hf.ActorSystem) -> None:
+    """`seen` is none that the new class begins with, and `total` was said to be another one."""
+    one = await system.start(hf.child("one", hf.start(Account), recovery=hf.hybrid(interval=3600.0)))
+    assert await one.ask(Add(2)) == 2
+    await system.suspend(one)
+    await system.replace_code(one, Sum, as_sum)
+    await system.resume(one)
+    one.kill()
+    assert await one.ask(Add(1), timeout=30.0) == 3
+    assert await system.get_state(one) == {"sum": 3, "seen": [2]}
+
+
+async def test_a_variable_that_may_have_been_renamed_is_refused(
+    system: hf.ActorSystem, start_one: Starter, way: str
+) -> None:
+    one = await start_one(hf.start(Account, 5))
+    await system.suspend(one)
+    with pytest.raises(hf.errors.ControlFailed, match=r"total would be lost; if it was renamed, say @hf.renamed\(sum="):
+        await system.replace_code(one, Summed)
+    assert (await system.get_status(one)).kind == "tests.control.players.Account"
+    assert await system.get_state(one) == {"total": 5, "seen": []}
+    await system.replace_code(one, SaidSummed)
+    await system.resume(one)
+    assert await one.ask(Add(1)) == 6
+    one.kill()
+    assert await one.ask(Add(1), timeout=30.0) == (7 if "recorded" in way else 6)
+
+
+async def test_an_init_that_does_more_than_set_variables_is_refused(
+    system: hf.ActorSystem, start_one: Starter, way: str
+) -> None:
+    one = await start_one(hf.start(Account, 5))
+    with pytest.raises(hf.HoldfastError, match=r"Timed.__init__ says which variables are new, and it cannot run in"):
+        async with system.transaction() as change:
+            change.replace_code(one, Timed)
+    assert await one.ask(Add(1)) == 6
+    await system.suspend(one)
+    with pytest.raises(hf.errors.ControlFailed, match=r"only a life that begins can do that.*give a `change` that"):
+        await system.replace_code(one, Timed)
+    await system.replace_code(one, Timed, with_timer)
+    await system.resume(one)
+    assert await system.get_state(one) == {"total": 6, "seen": [1], "timer": "said"}
+    if "recorded" not in way:  # There `__init__` may set no timer at all.
+        one.kill()
+        assert await one.ask(Total(), timeout=30.0) == 5
+        assert await system.get_state(one) == {"total": 5, "seen": [], "timer": "set"}
 
 
 async def test_a_class_that_does_not_take_the_arguments_is_refused(system: hf.ActorSystem, start_one: Starter) -> None:

@@ -1,6 +1,7 @@
 """The idle barrier and the virtual clock's `advance`: what happens by itself has happened, and nothing else has."""
 
 import asyncio
+import threading
 
 import pytest
 
@@ -46,6 +47,22 @@ async def test_turns_that_wait_and_background_work_go_on_to_their_end(
     actor_system.spawn(hf.start(Relay)).tell(Tell(probe.ref))
     await idle(actor_system)
     assert probe.waiting == (Add(7),)
+
+
+async def test_work_in_a_thread_is_not_waited_for(actor_system: GuardedSystem, probe: Probe) -> None:
+    let_go = threading.Event()
+
+    class Works(hf.Actor):
+        @hf.on(Tell, to_thread=True)
+        def tell(self, message: Tell) -> None:
+            let_go.wait(30.0)
+            message.to.tell(Add(7))
+
+    actor_system.spawn(hf.start(Works)).tell(Tell(probe.ref))
+    await idle(actor_system)
+    assert probe.waiting == ()
+    let_go.set()
+    await probe.expect(Add(7))
 
 
 @virtual

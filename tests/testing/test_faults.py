@@ -81,6 +81,11 @@ async def test_what_cannot_strike_is_refused(
         faults.on(counter, at=at, **odds)
 
 
+async def test_only_turns_are_handled_again_in_a_replay(counter: Ref, faults: Faults) -> None:
+    with pytest.raises(hf.SpecError, match="replays=True is for 'turn begin' and 'turn end', not for 'admit'"):
+        faults.on(counter, at="admit", drop=1.0, replays=True)
+
+
 async def test_a_failure_lists_what_struck(counter: Ref, faults: Faults) -> None:
     async def lose() -> None:
         async with faults.on(counter, at="admit", drop=1.0, times=1):
@@ -225,6 +230,29 @@ async def test_turn_begin_crash_leaves_the_state_and_the_queue(
 
 
 @virtual
+@virtual
+@pytest.mark.parametrize("at", ["turn begin", "turn end"])
+@pytest.mark.parametrize("replays", [False, True])
+async def test_turns_of_a_replay_are_struck_only_if_that_is_said(
+    actor_system: GuardedSystem, faults: Faults, at: str, replays: bool
+) -> None:
+    """The next life begins behind a back-off, when the fault for the message after it is there already."""
+    spec = hf.child("counter", hf.start(Counter), recovery=hf.replay_only(), backoff=hf.Backoff())
+    counter = await actor_system.start(spec)
+    assert await counter.ask(Add(1)) == 1
+    actor_system.expect_crashes()
+    async with faults.on(counter, at=at, crash=1.0, times=1):
+        with pytest.raises(hf.RemoteCrash):
+            await counter.ask(Add(10))
+    await idle(actor_system)
+    assert (await actor_system.get_status(counter)).state == "restarting", "`idle` waits for no time to pass"
+    async with faults.on(counter, at=at, crash=1.0, times=1, replays=replays) as strikes:
+        answers = await asyncio.gather(counter.ask(Add(100)), return_exceptions=True)
+    assert [strike.what for strike in strikes.struck] == ["Add(n=1)" if replays else "Add(n=100)"]
+    assert isinstance(answers[0], hf.RemoteCrash) is not replays
+    assert await counter.ask(Total(), timeout=60.0) == (101 if replays else 1)
+
+
 async def test_turn_begin_hang_ends_with_a_kill(actor_system: GuardedSystem, counter: Ref, faults: Faults) -> None:
     async with faults.on(counter, at="turn begin", hang=1.0, times=1):
         hung, queued = counter.ask(Add(1), timeout=60.0), counter.ask(Add(2), timeout=60.0)

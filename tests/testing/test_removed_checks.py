@@ -13,6 +13,13 @@ PLUGIN = "tests/testing/test_plugin.py"
 LOOPS = "tests/testing/test_loop_methods.py"
 
 CHECKS = {
+    "faults strike no turn that has ended before": Check(
+        "testing/injectors.py",
+        "        if isinstance(item, Fed) and item.feed.turn >= 0 and not self._strikes.replays:\n",
+        "        if False:\n",
+        "tests/testing/test_faults.py",
+        "test_turns_of_a_replay_are_struck_only_if_that_is_said",
+    ),
     "a descriptor that is open by another number is looked for": Check(
         "testing/guard/leaks.py",
         "        return found if len(found) == count > 0 else _identified([*map(int, os.listdir(OPEN_FILES))])\n",

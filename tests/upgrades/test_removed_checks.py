@@ -9,7 +9,44 @@ READ = "tests/upgrades/test_where_records_are_read.py"
 MAPPING = "tests/upgrades/test_mapping.py"
 UNFIT = "tests/checkpoint/test_unfit_states.py"
 
+CODE = "tests/control/test_code.py"
+
 CHECKS = {
+    "another class of a live actor has its new variables": Check(
+        "actors/control/other_class.py",
+        "        state = {**values, **given}\n",
+        "",
+        CODE,
+        "test_a_variable_that_only_the_new_class_has",
+    ),
+    "a variable of a live actor that may have been renamed is not lost": Check(
+        "actors/control/other_class.py",
+        "        if not is_said:\n",
+        "        if False:\n",
+        CODE,
+        "test_a_variable_that_may_have_been_renamed",
+    ),
+    "an init in the middle of a life does nothing but set variables": Check(
+        "actors/control/other_class.py",
+        '        raise SpecError(self.path, "only a life',
+        '        return\n        raise SpecError(self.path, "only a life',
+        CODE,
+        "test_an_init_that_does_more",
+    ),
+    "a transaction puts in force what init has set beside the state": Check(
+        "actors/control/orders.py",
+        "            add_variables(actor, prepared.tried.added)\n",
+        "",
+        CODE,
+        "test_a_variable_that_only_the_new_class_has",
+    ),
+    "a recorded actor remembers which variables its new class begins with": Check(
+        "actors/control/other_class.py",
+        "    actor.ctx._first_variables = list(values or ())\n",
+        "",
+        CODE,
+        "test_a_variable_that_a_change_keeps",
+    ),
     "what was recorded is mapped before its home is used": Check(
         "checkpoint/home/homes.py",
         "            mapped = take_over(switch)\n",
@@ -100,7 +137,7 @@ CHECKS = {
         "checkpoint/schema.py", "        self.noted.clear()\n", "", READ, "test_code_that_is_loaded_once_more"
     ),
     "a variable that may have been renamed is not dropped": Check(
-        "checkpoint/snapshot/key_variables.py", "    if gone and come:\n", "    if False:\n", TABLE, "test_states"
+        "actors/state_hooks.py", "    if gone and come:\n", "    if False:\n", TABLE, "test_states"
     ),
     "a replica goes back to a state of the class as it is now": Check(
         "ftm/replica/protected_actor.py",

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import gc
+import warnings
 from collections.abc import Awaitable
 from pathlib import Path
 from typing import Any
@@ -420,3 +422,37 @@ def test_what_a_client_has_not_awaited_is_a_leak_also_if_the_root_is_killed_late
 
     with pytest.raises(UnexpectedEnd, match="nobody has awaited the ask of Ping"):
         run()
+
+
+class Pipes(hf.Actor):
+    @hf.on(Ping)
+    def ping(self, message: Ping) -> int:
+        self.ctx.pipe_to_self(asyncio.sleep(1.0), lambda _: Told(0))
+        return 1
+
+    @hf.on(Told)
+    def told(self, message: Told) -> None:
+        pass
+
+
+@simulate(seeds=8, **DISK)
+async def test_background_work_that_ends_as_the_test_does_holds_up_no_shutdown(system: GuardedSystem) -> None:
+    """With seed 3, its result is submitted and the actor that has it written is told so, and then that one ends."""
+    pipes = await system.start(hf.child("pipes", hf.start(Pipes), recovery=hf.hybrid()))
+    await pipes.ask(Ping())
+    await asyncio.sleep(1.0)
+
+
+def test_background_work_that_had_not_begun_when_the_root_was_killed_is_closed() -> None:
+    async def killed(system: GuardedSystem, simulation: Simulation) -> None:
+        system.expect_crashes()
+        pipes = await system.start(hf.child("pipes", hf.start(Pipes), recovery=hf.hybrid()))
+        await pipes.ask(Ping())
+        await simulation.crash_root()
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for seed in range(12):
+            run_seed(killed, seed, OWN, DISK)
+        gc.collect()
+    assert [str(one.message) for one in caught if "never awaited" in str(one.message)] == []
