@@ -69,6 +69,7 @@ async def test_an_actor_whose_turn_hangs_again_is_healed_by_repair(isolation: An
             asked = [node.ask(bad, timeout=IN_TIME), *(node.ask(Count(), timeout=1.0) for _ in range(2))]
         else:
             await node.send(bad)
+        last = 1
         async with asyncio.timeout(IN_TIME):
             while not repaired.done():
                 last = await node.ask(Count(), timeout=IN_TIME)
