@@ -454,9 +454,13 @@ class NameTaken(HoldfastError, text="{actor} exists already; choose another name
 
 
 class NoSuchActor(HoldfastError, text="there is no actor at {actor}"):
-    """Nobody lives at this address."""
+    """Nobody lives at this address, or has this name."""
 
     actor: str
+
+    def __str__(self) -> str:
+        # An address begins with a slash, a name never does.
+        return super().__str__() if self.actor.startswith("/") else f"no actor has the name {self.actor!r}"
 
 
 class NoSuchEvent(HoldfastError, text="no {event} has come {when}"):

@@ -424,7 +424,7 @@ def failure(error: BaseException) -> ControlResponse:
         try:
             args = encode_value(tuple(error.args))
         except HoldfastError:
-            pass  # A refusal with a ref in it, say: its text has to do.
+            pass  # A refusal with a lock in it, say: its text has to do.
     return ControlResponse(error=type_name(type(error)), args=args, text=error_text(error))
 
 

@@ -8,6 +8,11 @@
 `tree(...)` is the same in single parts, as the supervision tree that a user adds to a system.
 """
 
+from importlib.util import find_spec
+
+if missing := [name for name in ("clingo", "yaml") if find_spec(name) is None]:
+    raise ImportError(f"holdfast.diagnosis needs {' and '.join(missing)}: pip install 'holdfast[diagnosis]'")
+
 from .assembly import observer, tree
 from .diagnoser import DiagnoserActor
 from .generate import Generated, Wired, generate, observers_for

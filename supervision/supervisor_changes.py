@@ -21,8 +21,6 @@ from ..actors.kernel import mailbox
 from ..actors.kernel.cell import GONE, Cell
 from ..actors.kernel.message import RuntimeOrder
 from ..actors.kernel.node import Node
-from ..actors.kernel.ref import ActorRef
-from ..actors.migration.luggage import PackedHandle, lift
 from ..actors.process.wire.start_codec import unpack_told
 from ..actors.values import UnsavableValue, decode_value, encode_value
 from .admin import Boxed, ChangeSupervisor, opened
@@ -257,12 +255,8 @@ def _opened(data: Any) -> Boxed | None:
 
 def _saved(supervisor: Supervisor) -> bytes | None:
     """The state of a class of the user's own, as bytes; None if there is none, or it cannot be saved."""
-
-    def stand_in(value: Any) -> Any:
-        return PackedHandle("ref", value.path) if isinstance(value, ActorRef) else value
-
     try:
-        state = lift(live_state(supervisor), stand_in)
+        state = live_state(supervisor)
         return encode_value(state, where=supervisor.ctx.path) if state else None
     except UnsavableValue:
         return None  # It begins afresh there.
@@ -273,12 +267,8 @@ def _saved(supervisor: Supervisor) -> bytes | None:
 
 def _restore(supervisor: Supervisor, state: bytes) -> None:
     node = supervisor.ctx._cell.node
-
-    def found(value: Any) -> Any:
-        return node.cell_at(value.key).ref if isinstance(value, PackedHandle) else value
-
     try:
-        put_state(supervisor, lift(decode_value(state, imports=node.ports.uplink is not None), found))
+        put_state(supervisor, decode_value(state, imports=node.ports.uplink is not None, refs=node.ref_at))
     except Exception as error:  # The user's own `set_state`, or a class that is not there: it begins afresh.
         _tell_failed(supervisor, "set_state", error)
 

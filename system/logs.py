@@ -114,8 +114,8 @@ Fields = dict[str, Any]
 class LogSink:
     """Writes what an operator wants to see; formats only what is written.
 
-    A crash is told by several events: the actor's, that of its process, and its supervisor's. The record waits for the
-    last of them, at most `WAIT` seconds.
+    A crash is told by several events: the actor's, that of its process, and its supervisor's; a recovery that fails by
+    its own and its supervisor's. The record waits for the last of them, at most `WAIT` seconds.
 
     Args:
         system: the system's name.
@@ -146,9 +146,13 @@ class LogSink:
                     self._hold(event)
             case ChildTerminated():
                 self._write(self._crash_at(event.address) or event, restarts=event.restarts, allowed=event.allowed)
+            case RecoveryFailed():
+                if event.address not in self._crashes:
+                    self._hold(event)
+                elif not self._is_told_by_crash(event):
+                    self._write(event)
             case ChildStartFailed():
-                crash = self._crash_at(event.address)
-                self._write(event, **({} if crash is None else self._describe(crash)))
+                self._write_start(event, self._crash_at(event.address))
             case DeadLetter():
                 self._write_letter(event)
             case _ if type(event) in WRITTEN:
@@ -168,10 +172,10 @@ class LogSink:
         self._release(event.address)
         self._crashes[event.address] = event, self._loop.call_later(WAIT, self._release, event.address)
 
-    def _is_told_by_crash(self, died: ProcessDied) -> bool:
-        """Whether the process died of the crash that we know already."""
-        held = self._crashes.get(died.address)
-        return held is not None and isinstance(held[0], ActorCrashed) and str(held[0].reason) == str(died.reason)
+    def _is_told_by_crash(self, event: ProcessDied | RecoveryFailed) -> bool:
+        """Whether the process died, or the recovery failed, of the crash that we know already."""
+        held, _ = self._crashes.get(event.address, (None, None))
+        return isinstance(held, ActorCrashed) and str(held.reason) in str(event.reason)
 
     def _crash_at(self, address: str) -> Event | None:
         """The crash that waits, which need not do so any longer."""
@@ -202,6 +206,15 @@ class LogSink:
             self._write(letter, alike=left_out)
         else:
             self._write(letter)
+
+    def _write_start(self, event: ChildStartFailed, crash: Event | None) -> None:
+        """A start has failed; of a recovery that has failed for the same reason there is one record."""
+        if isinstance(crash, RecoveryFailed):
+            self._write(crash)
+            if event.reason in crash.reason:
+                return
+            crash = None
+        self._write(event, **({} if crash is None else self._describe(crash)))
 
     # -- records ----------------------------------------------------------------------------------------------------
 

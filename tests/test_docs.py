@@ -8,6 +8,7 @@ with a comment holding a path is a quotation instead: it must stand word for wor
 import ast
 import doctest
 import importlib
+import importlib.util
 import os
 import pkgutil
 import re
@@ -15,6 +16,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import types
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -122,6 +124,22 @@ def run(path: Path) -> tuple[int, str]:
             output, _ = process.communicate()
             output += f"\nstopped after {TIME_LIMIT:g} s"
     return process.returncode, output
+
+
+def test_each_parameter_has_a_row_of_its_own_in_the_book() -> None:
+    """Of a row for several the book would know no types and no defaults."""
+    failures, count = doctest.testmod(named_module(ROOT / "docs/book_doctests.py"))
+    assert (failures, count) == (0, 1)
+
+
+def named_module(path: Path) -> types.ModuleType:
+    """A module that belongs to no package, by its file."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if ">>>" in source_of(name).read_text("utf-8")])

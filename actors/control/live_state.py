@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Opaque:
-    """Stands in a state for a value that cannot leave its process: a socket, a lock, a ref."""
+    """Stands in a state for a value that cannot leave its process: a socket, a lock."""
 
     text: str
 
@@ -48,17 +48,21 @@ def _holder(root: object, path: str) -> tuple[Any, str]:
     return operator.attrgetter(above)(root) if above else root, name
 
 
-def copied(state: Any, otherwise: Callable[[Any], Any]) -> Any:
-    """A copy of a state; `otherwise` says what becomes of a value that cannot be copied."""
+def _copied(actor: Actor, state: Any, otherwise: Callable[[Any], Any]) -> Any:
+    """A copy of an actor's state; `otherwise` says what becomes of a value that cannot be copied."""
+
+    def copy(value: Any) -> Any:
+        return decode_value(encode_value(value), refs=actor.ctx._cell.node.ref_at)
+
     try:
-        return decode_value(encode_value(state))
+        return copy(state)
     except UnsavableValue:
         if type(state) is not dict:
             return otherwise(state)
     values: dict[str, Any] = {}
     for name, value in cast("dict[str, Any]", state).items():
         try:
-            values[name] = decode_value(encode_value(value))
+            values[name] = copy(value)
         except UnsavableValue:
             values[name] = otherwise(value)
     return values
@@ -69,12 +73,12 @@ def state_to_show(actor: Actor) -> Any:
     state = live_state(actor)
     if state_getter(actor) is None:
         state = {**actor._overview(), **state}
-    return copied(state, lambda value: Opaque(portable(repr(value))))
+    return _copied(actor, state, lambda value: Opaque(portable(repr(value))))
 
 
 def state_to_change(actor: Actor) -> Any:
     """A copy that can be put back: what cannot be copied is in it as it is."""
-    return copied(live_state(actor), lambda value: value)
+    return _copied(actor, live_state(actor), lambda value: value)
 
 
 def put_state(actor: Actor, state: Any) -> None:

@@ -13,7 +13,7 @@ from ..kernel.message import Message
 from ..process.wire import frames
 from ..process.wire.frames import BadFrame
 from ..process.wire.peer import Peer, RelayedAsk
-from ..values import decode_value, encode_value
+from ..values import SavedRef, decode_value, encode_value
 from .orders import ORDERS, Mark, Order, status_of
 
 if TYPE_CHECKING:
@@ -35,7 +35,8 @@ class OrderAsk(Ask, eq=False):
     def answer(self, reply: object) -> None:
         """The reply came from another process."""
         try:
-            value = decode_value(reply, imports=False)  # type: ignore[arg-type]  # bytes: it is the reply of `OrderAsked`
+            refs = SavedRef if self.to is None else self.to.node.ref_at
+            value = decode_value(reply, imports=False, refs=refs)  # type: ignore[arg-type]  # bytes: it is the reply of `OrderAsked`
         except HoldfastError as error:
             self.fail(error)
         else:
@@ -198,7 +199,7 @@ def obey_order(guest: Guest, cell: Cell, frame: frames.Command) -> None:
     if kind is None:
         raise BadFrame(f"unknown order {verb!r}")
     try:
-        fields: Any = decode_value(body)
+        fields: Any = decode_value(body, refs=cell.node.ref_at)
         call = QueuedOrder(ask, kind.unpack(fields))
     except HoldfastError as error:
         ask.fail(error)

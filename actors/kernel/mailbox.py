@@ -363,9 +363,10 @@ def bounded(capacity: int, *, overflow: Overflow = "block") -> Bounded:
 
     Args:
         capacity: messages, >= 1.
-        overflow: "block" (tell raises MailboxFull, send waits, ask waits to its deadline), "reject" (all raise),
-            "drop_newest", "drop_oldest", or "latest" (only the newest is kept). The loser goes to dead letters. Asks
-            are no exception: one that waits is displaced by what comes later, and fails with MailboxFull.
+        overflow: "block" (tell raises MailboxFull, send and publish wait, ask waits to its deadline), "reject" (all of
+            these raise but publish), "drop_newest", "drop_oldest", or "latest" (only the newest is kept). The loser
+            goes to dead letters. Asks are no exception: one that waits is displaced by what comes later, and fails
+            with MailboxFull.
     """
     check("bounded", capacity, overflow)
     return Bounded(capacity, overflow)

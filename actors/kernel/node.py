@@ -316,6 +316,10 @@ class Node(RunLoop):
         """The cell at an address; if there is none, a stand-in whose messages are dead letters."""
         return self.find(path) or self.nowhere(path)
 
+    def ref_at(self, path: str) -> ActorRef[Any]:
+        """A ref to an address, whoever lives there, now or later."""
+        return self.cell_at(path).ref
+
     def nowhere(self, path: str) -> Cell:
         """A stand-in for an address where nobody lives; somebody may come to live there."""
         cell = Cell(self, None, path, LOCAL)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal
 from typing_extensions import TypeVar
 
 from ..errors import ActorRestarting, HoldfastError, SpecError
+from ..values.saved_refs import Addressed
 from .envelope import NO_DEADLINE, Ask, in_next_pass
 from .message import Message
 
@@ -30,7 +31,7 @@ current: contextvars.ContextVar[ActorContext] = contextvars.ContextVar("holdfast
 """The actor whose turn (or background task) this is. Set once in each life's own `contextvars.Context`."""
 
 
-class ActorRef(Generic[A_co]):
+class ActorRef(Addressed, Generic[A_co]):
     """A handle on an address: it stays good over restarts, may travel in messages, and compares by address.
 
     What it sends takes one path: the address's `admit` (mailbox.py), its queue, and a turn (loop.py).

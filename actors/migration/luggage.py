@@ -1,6 +1,6 @@
 """Packs and unpacks what an actor takes along when it moves between a task and an OS process.
 
-Handles that only mean something at one place (timers, rights to reply, refs, watches) may be in the state: they are
+Handles that only mean something at one place (timers, rights to reply, watches) may be in the state: they are
 packed by what they stand for, and the actor finds handles of the same meaning in their place.
 """
 
@@ -19,7 +19,6 @@ from ..kernel.codec import Parcel
 from ..kernel.envelope import Ask, Envelope, Item, ReplyHandle
 from ..kernel.links import Down, Exit, Monitor
 from ..kernel.message import message_name
-from ..kernel.ref import ActorRef
 from ..kernel.timers import Timer
 from ..state_hooks import state_getter
 from ..values import UnsavableValue, decode_value, encode_value
@@ -42,7 +41,7 @@ class Stays(HoldfastError, text="{why}"):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class PackedHandle:
-    """Stands in a packed state for a handle: "timer", "reply", "ref" or "watch", and what it is known by."""
+    """Stands in a packed state for a handle: "timer", "reply" or "watch", and what it is known by."""
 
     kind: str
     key: Any
@@ -109,8 +108,6 @@ class StatePacker:
                 return PackedHandle("reply", -1)
             self._owed.add(id(ask))
             return PackedHandle("reply", self._owe(ask))
-        if isinstance(value, ActorRef):
-            return PackedHandle("ref", value.path)
         if isinstance(value, Monitor):
             return PackedHandle("watch", [value.name, value.for_good])
         return value
@@ -165,12 +162,12 @@ def unpack(
                 return timers[value.key] if value.key >= 0 else over(cell)
             case "reply":
                 return ReplyHandle[Any](None) if value.key < 0 else actor.ctx._promise(owed(value.key))
-            case "ref":
-                return cell.node.cell_at(value.key).ref
             case _:
                 return watched(*value.key)
 
-    holds, values = cast("list[Any]", decode_value(state, imports=cell.node.ports.uplink is not None))
+    node = cell.node
+    imports = node.ports.uplink is not None
+    holds, values = cast("list[Any]", decode_value(state, imports=imports, refs=node.ref_at))
     put_state(actor, lift(values, found) if holds else values)
 
 

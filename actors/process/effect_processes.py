@@ -133,7 +133,7 @@ class EffectProcesses:
             FunctionRaised: it has raised something else. FunctionDied: its process has ended.
         """
         name, first, named = pack_function(function, "effect", "isolation='process'")
-        given = [encode_value(value, where="the arguments") for value in ([*first, *args], named)]
+        given = [encode_value(value, where="the arguments", refs=False) for value in ([*first, *args], named)]
         async with self._room:
             kind, *answer = await self._answered(msgspec.msgpack.encode((name, *given, fencing_token())))
         match kind:

@@ -21,6 +21,7 @@ from ..errors import DamagedValue, UnsavableValue
 from .budget import LargeInts, TooMany, check_containers
 from .byte_parts import ByteParts, in_one
 from .forms import FORMAT, LENGTH
+from .saved_refs import SavedRef
 from .value_describer import Describer, ValueDescription
 from .value_reader import Decoder, unpack
 from .value_writer import ALONE, Links, pieces, walked_pieces
@@ -30,6 +31,7 @@ __all__ = [
     "ByteParts",
     "DamagedValue",
     "Links",
+    "SavedRef",
     "ValueDescription",
     "UnsavableValue",
     "adopt_value",
@@ -42,7 +44,7 @@ __all__ = [
 ]
 
 
-def encode_value(value: object, *, where: str = "value") -> bytes:
+def encode_value(value: object, *, where: str = "value", refs: bool = True) -> bytes:
     """Save a value with the types of all that is in it.
 
     What can change (a list, dict, array, dataclass ...) and is reached twice is one object again when read; only arrays
@@ -51,9 +53,10 @@ def encode_value(value: object, *, where: str = "value") -> bytes:
     Args:
         value: of the builtin types and those of collections, datetime (UTC, fixed offset, ZoneInfo), decimal,
             fractions, uuid and pathlib; a random.Random; an Enum, dataclass, msgspec.Struct or NamedTuple whose class
-            can be imported; a numpy array or scalar of any dtype without objects, Generator or RandomState. A subclass
-            of one of these is another type.
+            can be imported; a ref, of which the address is saved; a numpy array or scalar of any dtype without objects,
+            Generator or RandomState. A subclass of one of these is another type.
         where: the name of the value in errors.
+        refs: False where the reader has no actors, and can make no refs.
 
     Raises:
         UnsavableValue: something in it is of another type, contains itself, or is nested deeper than about 300 levels.
@@ -64,7 +67,7 @@ def encode_value(value: object, *, where: str = "value") -> bytes:
     Traceback (most recent call last):
     holdfast.actors.errors.UnsavableValue: balance['x'][1]: a value of type object cannot be saved; make it ...
     """
-    return b"".join(pieces(value, where, canonical=False))
+    return b"".join(pieces(value, where, canonical=False, refs=refs))
 
 
 def state_digest(value: object) -> bytes:
@@ -85,7 +88,13 @@ def state_digest(value: object) -> bytes:
     return digest.digest()
 
 
-def decode_value(data: bytes | memoryview, *, imports: bool = True, shared: dict[int, object] | None = None) -> object:
+def decode_value(
+    data: bytes | memoryview,
+    *,
+    imports: bool = True,
+    shared: dict[int, object] | None = None,
+    refs: Callable[[str], object] = SavedRef,
+) -> object:
     """Read what `encode_value` wrote. Arrays are writable and own their memory.
 
     Classes are found by importing their module, and must be of the kind that was saved. No `__init__` is called; only
@@ -96,6 +105,7 @@ def decode_value(data: bytes | memoryview, *, imports: bool = True, shared: dict
         imports: False for bytes that another process made: it has nothing imported here, and no more lists and dicts
             made than `MOST_CONTAINERS`.
         shared: what values that were written before it share with it (`Links`); what is read is added.
+        refs: gives the ref of an address (`Node.ref_at`); left out, a `SavedRef` stands for it, which cannot send.
 
     Raises:
         DamagedValue: whatever is wrong with the bytes.
@@ -106,19 +116,26 @@ def decode_value(data: bytes | memoryview, *, imports: bool = True, shared: dict
     Traceback (most recent call last):
     holdfast.actors.errors.DamagedValue: a saved value cannot be read: it is cut short; use an older one
     """
-    return _read(data, lambda buffers: Decoder(buffers, imports=imports, shared=shared), is_checked=not imports)
+    return _read(
+        data, lambda buffers: Decoder(buffers, imports=imports, shared=shared, refs=refs), is_checked=not imports
+    )
 
 
-def adopt_value(data: memoryview | ByteParts, *, shared: dict[int, object] | None = None) -> object:
+def adopt_value(
+    data: memoryview | ByteParts,
+    *,
+    shared: dict[int, object] | None = None,
+    refs: Callable[[str], object] = SavedRef,
+) -> object:
     """Read what `encode_value` wrote into memory that is the reader's own: large arrays stay where they lie in it.
 
     Such an array is writable and keeps the memory alive; but it does not own it, so that it cannot be resized in place.
-    `shared` is as for `decode_value`.
+    `shared` and `refs` are as for `decode_value`.
 
     Raises:
         DamagedValue: whatever is wrong with the bytes.
     """
-    return _read(data, lambda buffers: Decoder(buffers, adopts=True, shared=shared), is_checked=False)
+    return _read(data, lambda buffers: Decoder(buffers, adopts=True, shared=shared, refs=refs), is_checked=False)
 
 
 def describe_value(data: bytes | memoryview, *, shared: dict[int, object] | None = None) -> object:

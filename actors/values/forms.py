@@ -21,6 +21,7 @@ from msgpack import ExtType
 
 from ..errors import DamagedValue, UnsavableValue
 from .byte_parts import in_one
+from .saved_refs import Addressed
 
 FORMAT: Final = 1
 HEAD: Final = struct.Struct(">BBQ")  # format, flag, length of the tree
@@ -115,7 +116,8 @@ KNOWN: Final[dict[type, tuple[ExtType, Callable[[Any], Iterable[Any]]]]] = {
     kind: (ExtType(code, b""), parts) for code, kind, parts, _ in TYPES
 }
 # The marks of what is not in the table.
-SHARED, AGAIN, BUFFER, DEFAULTDICT, ENUM, DATACLASS, STRUCT, NAMED, TUPLES = (ExtType(n, b"") for n in range(32, 41))
+SHARED, AGAIN, BUFFER, DEFAULTDICT, ENUM, DATACLASS, STRUCT, NAMED = (ExtType(n, b"") for n in range(32, 40))
+TUPLES, REF = (ExtType(n, b"") for n in range(40, 42))
 ARRAY, TEXT, BITS, SEED, GENERATOR, RANDOM_STATE, ARRAYS = (ExtType(n, b"") for n in range(48, 55))
 
 SCALARS: Final = frozenset({type(None), bool, int, float, str, bytes, Blob})
@@ -125,6 +127,6 @@ CHANGING: Final[frozenset[type]] = frozenset({list, dict, set, OrderedDict, Coun
 
 def can_change(kind: type) -> bool:
     """Whether it makes a difference that two places hold the same object of this type."""
-    if kind in CHANGING or kind in KNOWN or issubclass(kind, (tuple, enum.Enum)):
+    if kind in CHANGING or kind in KNOWN or issubclass(kind, (tuple, enum.Enum, Addressed)):
         return kind in CHANGING
     return kind.__module__ != "numpy" or kind.__name__ in ("ndarray", "void")  # the others are numpy's scalars

@@ -18,6 +18,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 from .classes import class_mark, slots_of
 from .forms import KNOWN, NAMED, SCALARS, STRUCT, can_change
+from .saved_refs import Addressed
 
 Objects: TypeAlias = Sequence[Any]
 _LEAVES: Final = SCALARS | {kind for kind in KNOWN if not can_change(kind)} - {tuple, frozenset}
@@ -117,7 +118,11 @@ def _never_change(objects: Objects, most: int) -> bool:
 @lru_cache(256)
 def form_of(kind: Any) -> Form:
     """How objects of a type are looked into."""
-    if kind in _LEAVES or issubclass(kind, enum.Enum) or (kind.__module__ == "numpy" and not can_change(kind)):
+    if (
+        kind in _LEAVES
+        or issubclass(kind, (enum.Enum, Addressed))
+        or (kind.__module__ == "numpy" and not can_change(kind))
+    ):
         return Form(None, is_leaf=True)
     if kind in (list, set, deque, tuple, frozenset):
         return Form(_items, is_frozen=kind in (tuple, frozenset))

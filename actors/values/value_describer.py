@@ -26,6 +26,10 @@ class Describer(Decoder):
     def make_defaultdict(self, parts: list[Any]) -> object:
         return dict(zip(parts[1::2], parts[2::2], strict=True))
 
+    def make_ref(self, parts: list[Any]) -> object:
+        [path] = parts
+        return ValueDescription("holdfast:ActorRef", (("path", path),))
+
     def make_enum(self, parts: list[Any]) -> object:
         kind, member = parts
         return ValueDescription(str(kind), (("", member),))

@@ -23,6 +23,7 @@ from .forms import (
     DEFAULTDICT,
     ENUM,
     NAMED,
+    REF,
     SHARED,
     STRUCT,
     TUPLES,
@@ -31,6 +32,7 @@ from .forms import (
     Make,
     pairs,
 )
+from .saved_refs import SavedRef
 
 
 def _make_tuples(rows: list[Any]) -> list[Any]:
@@ -79,8 +81,9 @@ class Decoder:
         imports: bool = True,
         adopts: bool = False,
         shared: dict[int, object] | None = None,
+        refs: Callable[[str], object] = SavedRef,
     ) -> None:
-        self._imports, self._make_int = imports, LargeInts().make
+        self._imports, self._make_int, self._refs = imports, LargeInts().make, refs
         self.buffers = buffers  # those not yet read: they lie in the order in which the tree names them
         self.open_marks = 0
         self.shared: dict[int, object] = {} if shared is None else shared
@@ -91,6 +94,7 @@ class Decoder:
             AGAIN.code: self.make_again,
             DEFAULTDICT.code: self.make_defaultdict,
             ENUM.code: self.make_enum,
+            REF.code: self.make_ref,
             DATACLASS.code: partial(self.make_record, DATACLASS),
             STRUCT.code: partial(self.make_record, STRUCT),
             NAMED.code: partial(self.make_record, NAMED),
@@ -135,6 +139,12 @@ class Decoder:
         if len(parts) > MANY_KEYS:
             spread(parts[1::2])
         return defaultdict(factory, pairs(parts[1:]))
+
+    def make_ref(self, parts: list[Any]) -> object:
+        [path] = parts
+        if not isinstance(path, str):
+            raise DamagedValue("it has a ref without an address")
+        return self._refs(path)
 
     def find(self, mark: ExtType, name: str) -> tuple[Any, dict[str, Any], Defaults]:
         if name not in self.classes:

@@ -26,6 +26,7 @@ from .forms import (
     FORMAT,
     HEAD,
     KNOWN,
+    REF,
     SCALARS,
     SHARED,
     TUPLES,
@@ -35,6 +36,7 @@ from .forms import (
     flat,
     pairs,
 )
+from .saved_refs import Addressed
 
 HEAD_ALONE: Final = bytes((FORMAT, 0))
 TUPLE: Final = KNOWN[tuple][0]
@@ -56,13 +58,13 @@ ALONE: Final = Links()
 """Of a value that shares nothing with others."""
 
 
-def pieces(value: object, where: str, *, canonical: bool) -> list[Any]:
-    """The bytes of a value, in parts to be joined; `canonical` as in `_Encoder`."""
-    return walked_pieces(value, where, canonical=canonical)[0]
+def pieces(value: object, where: str, *, canonical: bool, refs: bool = True) -> list[Any]:
+    """The bytes of a value, in parts to be joined; `canonical` and `refs` as in `_Encoder`."""
+    return walked_pieces(value, where, canonical=canonical, refs=refs)[0]
 
 
 def walked_pieces(
-    value: object, where: str, *, canonical: bool = False, links: Links = ALONE
+    value: object, where: str, *, canonical: bool = False, links: Links = ALONE, refs: bool = True
 ) -> tuple[list[Any], dict[int, object]]:
     """As `pieces`, and what can change and was reached, by id: two values that share none of it can be kept apart.
 
@@ -71,12 +73,13 @@ def walked_pieces(
         where: its name in errors.
         canonical: as in `_Encoder`.
         links: what it shares with others, whose reader has the same `shared`.
+        refs: as in `_Encoder`.
     """
     try:
-        encoder = _Encoder(canonical, {*links.given}, links)
+        encoder = _Encoder(canonical, {*links.given}, links, refs)
         tree = encoder.lowered(value)
         while encoder.met_again and not canonical:
-            encoder = _Encoder(canonical, encoder.shared | encoder.met_again, links)
+            encoder = _Encoder(canonical, encoder.shared | encoder.met_again, links, refs)
             tree = encoder.lowered(value)
         packed = encoder.packed(tree, None)
     except UnsavableValue as refusal:
@@ -90,11 +93,18 @@ def walked_pieces(
 
 
 class _Encoder:
-    """One walk through a value. `canonical`: the order of sets and arrays, and what is shared, leave no trace."""
+    """One walk through a value.
 
-    def __init__(self, canonical: bool, shared: set[int], links: Links) -> None:
-        self.canonical = canonical
-        self.shared = shared  # the ids of what is known to be reached twice
+    Args:
+        canonical: the order of sets and arrays, and what is shared, leave no trace.
+        shared: the ids of what is known to be reached twice.
+        links: what it shares with others.
+        refs: False where the reader could make no refs of their addresses: then they are refused.
+    """
+
+    def __init__(self, canonical: bool, shared: set[int], links: Links, refs: bool) -> None:
+        self.canonical, self.refs = canonical, refs
+        self.shared = shared
         self.met_again: set[int] = set()  # and of what turned out to be
         self.given = links.given
         self.numbers: dict[int, int] = dict(links.known)  # of the shared ones that can be referred to, by id
@@ -214,6 +224,8 @@ class _Encoder:
                 form = array_form(np, kind, x, in_order=not self.canonical)
                 if form is not None:
                     return form
+            if self.refs and issubclass(kind, Addressed):
+                return [REF, x.path]
             if (mark := class_mark(kind)) is None:
                 raise UnsavableValue("", f"a value of type {type_name(kind)}")
             self.classes[kind] = mark, class_name(kind), slots_of(kind)

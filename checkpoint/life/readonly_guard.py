@@ -62,7 +62,7 @@ def _looked_at(handler: Any, life: Life, message: str) -> Any:
 
 def _seen(actor: Actor, life: Life) -> dict[str, Any]:
     """What a snapshot would hold, variable by variable."""
-    saved: Any = decode_value(save_state(actor))
+    saved: Any = decode_value(save_state(actor), refs=life.cell.node.ref_at)
     state = saved[2]
     parts: dict[str, Any] = state if isinstance(state, dict) and saved[1] == "keys" else {"its state": state}
     seen: dict[str, Any] = {name: state_digest(value) for name, value in parts.items()}

@@ -288,7 +288,7 @@ class Life:
         if isinstance(awaited, Asked):
             return self.cell.node.codec.decode_reply(awaited.message, answer.body)
         if isinstance(awaited, EffectCall):
-            return decode_value(answer.body)
+            return decode_value(answer.body, refs=self.cell.node.ref_at)
         kind = next(kind for kind in awaited if message_name(kind) == answer.name)
         return self.cell.node.codec.decode(kind, answer.body)
 

@@ -22,4 +22,4 @@ def digest_of(actor: Actor) -> int:
     Raises:
         UnsavableValue, StateMismatch: the state cannot be saved.
     """
-    return int.from_bytes(state_digest(decode_value(save_state(actor)))[:7]) | 1
+    return int.from_bytes(state_digest(decode_value(save_state(actor), refs=actor.ctx._cell.node.ref_at))[:7]) | 1

@@ -19,6 +19,7 @@ import msgspec
 
 from ...actors.values import UnsavableValue, walked_pieces
 from ...actors.values.arrays import is_array
+from ...actors.values.saved_refs import Addressed
 from .image_parts import Chunk
 
 MANY: Final = 64
@@ -41,7 +42,7 @@ def _told(value: object) -> object:
         if array.nbytes >= LARGE_ENTRY:
             raise ValueError("it is large")
         return array.tobytes()
-    return None
+    return value.path if isinstance(value, Addressed) else None
 
 
 _told_by: Final = msgspec.msgpack.Encoder(enc_hook=_told).encode  # Only for checksums and sizes.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 from ...actors.control.live_state import attributes
@@ -12,7 +13,7 @@ from ...actors.kernel.actor import Actor
 from ...actors.state_hooks import StateMismatch, as_named_now, migrated, state_getter, state_setter
 from ...actors.values import ByteParts, UnsavableValue, adopt_value, decode_value, encode_value
 from ..method import Method
-from .state_image import is_image, read_image
+from .state_image import read_saved
 
 
 class StateForm(NamedTuple):
@@ -105,11 +106,8 @@ def restore_state(
     Raises:
         DamagedValue, StateMismatch: the data is damaged, or of another class or schema version.
     """
-    saved: Any
-    if isinstance(data, ByteParts):
-        saved = read_image(data, adopt_value) if is_image(data) else adopt_value(data)
-    else:
-        saved = read_image(data) if is_image(data) else decode_value(data)
+    read = adopt_value if isinstance(data, ByteParts) else decode_value
+    saved: Any = read_saved(data, partial(read, refs=actor.ctx._cell.node.ref_at))
     dropped: list[str] = []
     is_mapped = isinstance(saved, tuple) and len(saved) == 3 and saved[0] != actor.schema_version
     if isinstance(saved, tuple) and len(saved) == 3 and saved[:2] == (actor.schema_version, "keys"):

@@ -221,6 +221,19 @@ def is_image(data: bytes | memoryview | ByteParts) -> bool:
     return len(data) > 0 and (data.first if isinstance(data, ByteParts) else data[0]) in (WHOLE, LINKED)
 
 
+def read_saved(data: bytes | memoryview | ByteParts, read: Callable[..., object] = decode_value) -> object:
+    """What was saved of an actor, as an image or as one value: schema version, form and state.
+
+    Args:
+        data: the bytes.
+        read: makes values of their bytes, as `decode_value` does.
+
+    Raises:
+        DamagedValue: whatever is wrong with the bytes.
+    """
+    return read_image(data, read) if is_image(data) else read(data)
+
+
 def read_image(
     data: bytes | memoryview | ByteParts, read: Callable[..., object] = decode_value
 ) -> tuple[int, str, object]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
@@ -15,7 +16,7 @@ from ..journal import Saved
 from ..snapshot.key_variables import save_state
 from ..snapshot.shared_blocks import by_segment
 from ..snapshot.snapshot_record import Meta, decode_meta, encode_meta
-from ..snapshot.state_image import is_image, read_image
+from ..snapshot.state_image import read_saved
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
@@ -96,7 +97,7 @@ def state_differences(actor: Actor, saved: bytes) -> list[str]:
 
 def _read(actor: Actor, data: bytes) -> Any:
     """A saved state as the actor's class now wants it."""
-    saved: Any = read_image(data) if is_image(data) else decode_value(data)
+    saved: Any = read_saved(data, partial(decode_value, refs=actor.ctx._cell.node.ref_at))
     version, form, state = saved
     kind = type(actor)
     if form == "keys" and isinstance(state, dict):

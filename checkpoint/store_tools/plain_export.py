@@ -26,7 +26,7 @@ from ..journal import DamagedStore, Entry, StoreFailed
 from ..protocol import REPLY, START, Answer, untimed
 from ..schema import Shape, as_shape, first_of, shape_name
 from ..snapshot.snapshot_record import Meta, decode_meta
-from ..snapshot.state_image import is_image, read_image
+from ..snapshot.state_image import read_saved
 from ..sqlite.entry_chains import Chain, StoreScan
 from ..sqlite.read_back import checked_entry
 from ..store_key import StoreKey, read_store_key
@@ -247,7 +247,7 @@ def plain_state(data: bytes) -> Record:
     if not data:
         return {"schema_version": None, "variables": {}}
     try:
-        read = read_image(data, describe_value) if is_image(data) else describe_value(data)
+        read = read_saved(data, describe_value)
     except DamagedValue as error:
         return {"encoded": as_plain(data), "problem": str(error)}
     if not isinstance(read, tuple) or len(read) != 3:

@@ -66,6 +66,9 @@ ADVICE: Final[dict[str, TroubleAdvice]] = {
     "recovery fails": TroubleAdvice(ILL, "Mend what it tells, then restart it.", ("restart",)),
     "suspended": TroubleAdvice(ODD, "Resume it, when you are done.", ("resume",)),
     "restarting": TroubleAdvice(ODD, "Wait; if it does not come back, its history says why."),
+    "its process does not answer": TroubleAdvice(
+        ILL, "Have the process go on, or end it: its supervisor restarts the actor.", ("kill",)
+    ),
     "its turn waits": TroubleAdvice(
         ILL, "Put a time limit around this line. Until then, end the turn: whoever has asked hears of it.", ("kill",)
     ),

@@ -16,6 +16,8 @@ from ..runtime_folder import found_sockets, sweep
 from .patterns import select
 from .reaching import (
     FAILED,
+    NOBODY,
+    OF_ITS_OWN,
     UNUSABLE,
     Json,
     Paths,
@@ -47,7 +49,7 @@ def ls(as_json: Json = False) -> None:
         show_json([{**msgspec.structs.asdict(one), "socket": str(one.socket)} for one in systems])
         return
     if not systems:
-        typer.echo("no system of yours runs with a control endpoint", err=True)
+        typer.echo(f"{NOBODY}; {OF_ITS_OWN}", err=True)
     lines = [("NAME", "NODE", "PID", "ROLE", "SINCE", "ACTORS")]
     lines += [
         (one.name, one.node or "?", str(one.pid), one.role_text, _when(one.since), _count(one.actors))

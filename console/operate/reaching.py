@@ -140,6 +140,10 @@ Paths = Annotated[
 OnePath = Annotated[str, typer.Argument(metavar="PATH", help="An address or a name.", autocompletion=complete_path)]
 
 
+NOBODY = "no system of yours is found by its name"
+OF_ITS_OWN = "a program whose endpoint has a path of its own is reached by --socket FILE"
+
+
 def chosen(system: str | None, socket: Path | None) -> Path:
     """The socket of the system that is meant; of several programs of it that of the one that runs its tree.
 
@@ -155,10 +159,9 @@ def chosen(system: str | None, socket: Path | None) -> Path:
         return meant[0].path
     if not meant:
         there = ", ".join(f"{one.system} (pid {one.pid})" for one in live)
-        wanted = f"no system {system!r} runs" if system else "no system of yours runs with a control endpoint"
-        raise NoSystem(
-            f"{wanted}; {f'there are {there}' if there else 'a program opens one by control_endpoint(system)'}"
-        )
+        wanted = f"no system {system!r} is found by its name" if system else NOBODY
+        others = f"there are {there}" if there else "a program opens a control endpoint by control_endpoint(system)"
+        raise NoSystem(f"{wanted}; {others}; {OF_ITS_OWN}")
     return _one_of([program_at(one) for one in meant], node).socket
 
 

@@ -11,15 +11,16 @@ from __future__ import annotations
 
 import zlib
 from array import array
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from ...actors.errors import DamagedValue
-from ...actors.values import decode_value
+from ...actors.values import SavedRef, decode_value
 from ...checkpoint.snapshot.key_variables import save_state, state_of
-from ...checkpoint.snapshot.state_image import Imager, Key, is_image, pieces_of, read_image
+from ...checkpoint.snapshot.state_image import Imager, Key, pieces_of, read_saved
 from .entry_rows import MANY, Rows
 
 if TYPE_CHECKING:
@@ -75,12 +76,10 @@ class Image(msgspec.Struct, array_like=True):
         self.check()
         return b"".join([block for piece in self.pieces for block in piece.blocks])
 
-    def value(self) -> Any:
-        """What was saved: (schema version, form, state); None if nothing was."""
+    def value(self, refs: Callable[[str], object] = SavedRef) -> Any:
+        """What was saved: (schema version, form, state); None if nothing was. `refs` is as for `decode_value`."""
         data = self.whole()
-        if not data:
-            return None
-        return read_image(data) if is_image(data) else decode_value(data)
+        return read_saved(data, partial(decode_value, refs=refs)) if data else None
 
 
 class Patched(msgspec.Struct, array_like=True):

@@ -59,7 +59,7 @@ def rewind_to(life: ServerLife, point: ServerState, names: set[str] | None, *, h
         has_deltas: the actor says itself what has changed.
     """
     actor: Any = life.cell.actor
-    saved = point.data.value()
+    saved = point.data.value(life.cell.node.ref_at)
     put_back(actor, saved)
     _apply_deltas(actor, point.deltas, has_deltas=has_deltas)
     if names is not None:
@@ -71,7 +71,7 @@ def rewind_to(life: ServerLife, point: ServerState, names: set[str] | None, *, h
 
 def _apply_deltas(actor: Any, deltas: list[bytes], *, has_deltas: bool) -> None:
     for delta in deltas:
-        actor.apply_delta(decode_value(delta))
+        actor.apply_delta(decode_value(delta, refs=actor.ctx._cell.node.ref_at))
     if has_deltas:
         actor.get_delta()  # What has changed up to here is known.
 

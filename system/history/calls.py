@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ...actors.control.orders import Status
-from ...actors.errors import HoldfastError, SpecError
+from ...actors.errors import AskTimeout, HoldfastError, NoSuchActor, SpecError
 from ...actors.kernel.node import cell_kind
 from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
 from ...actors.seconds import check_seconds
 from ...supervision.supervisor import Supervisor
 from .counted_work import count_work
-from .evidence import Evidence, PutAside, Told, collect, put_aside
+from .evidence import Evidence, PutAside, Silence, Told, collect, put_aside, silence_of
 from .lives import PastLife, done
 from .pages import MOST_ON_PAGE, HistoryPage, HistoryQuestion, answer, question
 from .paths import pattern_of
@@ -42,6 +43,10 @@ class HistoryCalls:
 
     async def get_status(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Status:
         """Say how an actor is now; see `Controls`."""
+        raise NotImplementedError
+
+    def pid_of(self, ref: ActorRef[Any]) -> int:
+        """Return the pid of the OS process that an actor lives in; see `ActorSystem`."""
         raise NotImplementedError
 
     async def get_state(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Any:
@@ -156,8 +161,10 @@ class HistoryCalls:
                 before = status.queued
                 await asyncio.sleep(BETWEEN)
                 status = await self.get_status(cell.ref, timeout=timeout)
+        except AskTimeout:
+            return Told(silence=self._silence(cell.ref, timeout))
         except HoldfastError:
-            return Told()  # It has ended meanwhile, or does not answer: the rest is known all the same.
+            return Told()  # It has ended meanwhile: the rest is known all the same.
         kind = cell_kind(cell)
         if kind is None or not issubclass(kind, Supervisor):
             return Told(status, before)
@@ -165,6 +172,14 @@ class HistoryCalls:
             return Told(status, before, await self.get_state(cell.ref, timeout=timeout))
         except HoldfastError:
             return Told(status, before)  # It has a turn in hand that does not end: its status says so.
+
+    def _silence(self, ref: ActorRef[Any], seconds: float) -> Silence | None:
+        """That the process of an actor has not answered; None if it lives in this one, or nowhere at the moment."""
+        try:
+            pid = self.pid_of(ref)
+        except NoSuchActor:
+            return None
+        return None if pid == os.getpid() else silence_of(pid, seconds)
 
     @property
     def _recorder(self) -> HistoryRecorder:

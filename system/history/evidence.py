@@ -137,6 +137,20 @@ class Below(msgspec.Struct, frozen=True):
     ended: dict[str, PastLife] = {}
 
 
+class Silence(msgspec.Struct, frozen=True):
+    """An actor in another process has not answered a question that is answered ahead of all messages.
+
+    Attributes:
+        pid: of its process.
+        seconds: for which it was waited.
+        is_stopped: the kernel lets the process do nothing, as after SIGSTOP.
+    """
+
+    pid: int
+    seconds: float
+    is_stopped: bool
+
+
 class Evidence(msgspec.Struct, frozen=True):
     """All that is known about an address at one moment.
 
@@ -160,6 +174,7 @@ class Evidence(msgspec.Struct, frozen=True):
         protection: its mechanisms and replicas, if somebody lives there.
         memory: of its own process, if its limits bound that.
         waiting: what waits most in its mailbox.
+        silence: that its process has not answered.
     """
 
     address: str
@@ -181,6 +196,7 @@ class Evidence(msgspec.Struct, frozen=True):
     protection: ProtectionStatus | None = None
     memory: ProcessMemory | None = None
     waiting: Waiting | None = None
+    silence: Silence | None = None
 
     def ago(self, at: float) -> str:
         """A moment as people say it: how long ago, or the time of day if that is long."""
@@ -206,11 +222,13 @@ class Told(msgspec.Struct, frozen=True):
         status: how it is; None if nobody lives there, or it does not say.
         queued_before: how many messages waited a moment before; None: nobody has looked.
         overview: of a supervisor, its state.
+        silence: that nothing was said.
     """
 
     status: Status | None = None
     queued_before: int | None = None
     overview: dict[str, Any] = {}
+    silence: Silence | None = None
 
 
 def collect(
@@ -253,6 +271,7 @@ def collect(
         None if cell is None else protection_of(cell),
         None if cell is None else _memory(cell),
         None if cell is None else _waiting(cell),
+        told.silence,
     )
 
 
@@ -329,6 +348,16 @@ def _own_allowance(overview: dict[str, Any]) -> Allowance | None:
     if "intensity" not in overview:
         return None
     return Allowance(overview["intensity"], overview["period"], overview["restarts"])
+
+
+def silence_of(pid: int, seconds: float) -> Silence:
+    """What is to be said of a process that has not answered for so long."""
+    import psutil  # only now: a system that runs no process does without it
+
+    try:
+        return Silence(pid, seconds, psutil.Process(pid).status() == psutil.STATUS_STOPPED)
+    except psutil.Error:
+        return Silence(pid, seconds, is_stopped=False)  # It has ended meanwhile.
 
 
 def _memory(cell: Cell) -> ProcessMemory | None:

@@ -279,6 +279,18 @@ def _waits(evidence: Evidence) -> list[str]:
     return [f"{said}{at}: {asked}{more}."]
 
 
+def _silent(evidence: Evidence) -> list[str]:
+    """Its process does not answer what every loop that runs answers at once."""
+    silence = evidence.silence
+    if silence is None:
+        return []
+    process = f"The process of {evidence.address} (pid {silence.pid})"
+    if silence.is_stopped:
+        return [f"{process} is stopped, as by SIGSTOP: SIGCONT lets it go on."]
+    waited = seconds_text(silence.seconds)
+    return [f"{process} has not answered within {waited}: its event loop does not run, or the machine is very busy."]
+
+
 def _mailbox(evidence: Evidence) -> list[str]:
     status = evidence.status
     if status is None or status.queued < MANY or status.state == "suspended":
@@ -377,6 +389,7 @@ RULES: dict[str, Rule] = {
     "recovery fails": _recovery_fails,
     "suspended": _suspended,
     "restarting": _restarting,
+    "its process does not answer": _silent,
     "its turn waits": _waits,
     "mailbox": _mailbox,
     "memory": _memory,

@@ -54,7 +54,7 @@ async def test_names_end_with_the_life(system: hf.ActorSystem) -> None:
     with pytest.raises(hf.RemoteCrash):
         await one.ask(Do(lambda _: 1 / 0))
     assert await one.ask(Do(lambda actor: actor.ctx.life)) == 2
-    with pytest.raises(hf.errors.NoSuchActor, match="leader"):
+    with pytest.raises(hf.errors.NoSuchActor, match=r"^no actor has the name 'leader'$"):
         system.whereis("leader")
 
 

@@ -7,6 +7,7 @@ import datetime as dt
 import enum
 import random
 from collections import Counter, OrderedDict, deque
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,15 +15,16 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.state_hooks import StateMismatch
-from holdfast.actors.values import DamagedValue, UnsavableValue
+from holdfast.actors.values import DamagedValue, SavedRef, UnsavableValue
 from holdfast.checkpoint.snapshot.key_variables import restore_state, save_state
 
 
 class Place:
-    """Stands for `ctx`: all that saving asks of it is the address, and that no recovery file names its variables."""
+    """Stands for `ctx`: saving asks it for the address, variables that a recovery file names, and refs of its node."""
 
     path = "/app/it"
     _named_variables = None
+    _cell = SimpleNamespace(node=SimpleNamespace(ref_at=SavedRef))
 
 
 def at_place(actor: hf.Actor) -> Any:

@@ -22,6 +22,7 @@ from tests.console.commands import holdfast
 from tests.system.trees import Add, Counter, ref
 
 DONE, FAILED, UNUSABLE = 0, 1, 2
+PATHS = "a program whose endpoint has a path of its own is reached by --socket FILE"
 
 
 @pytest.fixture(autouse=True)
@@ -60,12 +61,28 @@ async def test_a_system_is_found_by_its_name_and_by_its_pid(named: hf.ActorSyste
 async def test_no_system_and_several_are_told_apart(named: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch) -> None:
     status, _, errors = await holdfast("tree", "--system", "till")
     assert status == UNUSABLE
-    assert errors == f"holdfast tree: no system 'till' runs; there are app (pid {os.getpid()})\n"
+    assert (
+        errors == f"holdfast tree: no system 'till' is found by its name; there are app (pid {os.getpid()}); {PATHS}\n"
+    )
     async with hf.ActorSystem("other", log=False) as other, control_endpoint(other):
         status, _, errors = await holdfast("tree")
         assert (status, "several systems run: app" in errors) == (UNUSABLE, True)
         monkeypatch.setenv("HOLDFAST_SYSTEM", "other")
         assert (await holdfast("tree", "--paths"))[:2] == (DONE, "/other\n")
+
+
+async def test_a_program_with_a_path_of_its_own_is_said_to_be_reached_by_it(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    async with control_endpoint(system, tmp_path / "own.sock") as where:
+        opens = "a program opens a control endpoint by control_endpoint(system)"
+        status, _, errors = await holdfast("tree")
+        assert (status, errors) == (
+            UNUSABLE,
+            f"holdfast tree: no system of yours is found by its name; {opens}; {PATHS}\n",
+        )
+        assert (await holdfast("ls"))[::2] == (DONE, f"no system of yours is found by its name; {PATHS}\n")
+        assert (await holdfast("tree", "--paths", "--socket", where))[0] == DONE
 
 
 DIES = """

@@ -1,5 +1,7 @@
 """Model files: two forms, and errors that name file and line (D29)."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -154,3 +156,15 @@ def test_what_is_too_deep_or_no_text_is_refused(tmp_path: Path) -> None:
     path.write_bytes(b"nodes: \xff")
     with pytest.raises(ModelError, match="no UTF-8"):
         load(path)
+
+
+def test_without_the_extra_it_is_said_what_to_install() -> None:
+    program = (
+        "import importlib.util as finder\n"
+        "real = finder.find_spec\n"
+        "finder.find_spec = lambda name, *rest: None if name == 'yaml' else real(name, *rest)\n"
+        "from holdfast import diagnosis\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    said = "ImportError: holdfast.diagnosis needs yaml: pip install 'holdfast[diagnosis]'"
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (1, said)

@@ -23,6 +23,13 @@ CHECKS = {
         LIVE,
         "trouble_at_any_depth and task",
     ),
+    "a process that does not answer is told": Check(
+        "system/history/calls.py",
+        "            return Told(silence=self._silence(cell.ref, timeout))\n",
+        "            return Told()\n",
+        LIVE,
+        "test_a_process_that_stands_still and unrecorded",
+    ),
     "a supervisor tells of few who are in trouble further below": Check(
         "system/history/why_children.py",
         "for path, (_, words) in worst[:MOST_NAMED]]",

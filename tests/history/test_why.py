@@ -14,6 +14,7 @@ from holdfast.system.history.evidence import (
     Outstanding,
     ProcessMemory,
     PutAside,
+    Silence,
     Waiting,
 )
 from holdfast.system.history.why import RULES, why
@@ -45,6 +46,8 @@ CRASHES = [
     life(n, 990.0 + n, "ZeroDivisionError: by zero", "Crash", traceback=TRACE, restarts=n, allowed=3) for n in (1, 2, 3)
 ]
 
+NO_WORD = f"The process of {AT} (pid 7) has not answered within 5.0 s"
+
 CASES: dict[str, tuple[dict[str, Any], str]] = {
     "nobody": ({}, f"Nobody lives at {AT}, and the history knows of no life there."),
     "all is well": (
@@ -54,6 +57,14 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     "no word": (
         {"is_there": True, "lives": [life(1)]},
         f"{AT} does not say how it is, and the history knows of nothing that is wrong.",
+    ),
+    "its process is stopped": (
+        {"is_there": True, "lives": [life(1)], "silence": Silence(7, 5.0, is_stopped=True)},
+        f"The process of {AT} (pid 7) is stopped, as by SIGSTOP: SIGCONT lets it go on.",
+    ),
+    "its process is silent": (
+        {"is_there": True, "lives": [life(1)], "silence": Silence(7, 5.0, is_stopped=False)},
+        f"{NO_WORD}: its event loop does not run, or the machine is very busy.",
     ),
     "gone": ({"lives": [life(1)]}, f"Nobody lives at {AT} any more, and how its last life ended is not known."),
     "crash loop": (

@@ -56,6 +56,21 @@ async def test_nobody_and_nothing(system: hf.ActorSystem) -> None:
     assert await said(system, ref) == "/app/worker is running, in life 1, and nothing is wrong as far as is known."
 
 
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["unrecorded", "recorded"])
+async def test_a_process_that_stands_still_is_told(system: hf.ActorSystem, recovery: Any) -> None:
+    ref = await system.start(worker(isolation="process", recovery=recovery))
+    pid = system.pid_of(ref)
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        [told] = await system.why(ref, timeout=1.0)
+        with pytest.raises(hf.AskTimeout):
+            await system.get_status(ref, timeout=0.2)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    assert told == f"The process of /app/worker (pid {pid}) is stopped, as by SIGSTOP: SIGCONT lets it go on."
+    assert "nothing is wrong" in await said(system, ref)
+
+
 async def test_a_crash_loop() -> None:
     async with hf.ActorSystem("app", log=False, intensity=3, period=60.0) as system:
         ref = await system.start(worker())

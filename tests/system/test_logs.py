@@ -5,6 +5,7 @@ import logging
 import subprocess
 import sys
 from collections.abc import Iterator, MutableMapping
+from itertools import count
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ import holdfast as hf
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 Record = MutableMapping[str, Any]
+NUMBERS = count()
 
 
 class Boom(hf.Message):
@@ -26,6 +28,14 @@ class Ping(hf.Message[str]): ...
 class Stillborn(hf.Actor):
     def on_start(self, restored: bool) -> None:
         raise OSError("no device")
+
+
+class Draws(hf.Actor):
+    """Gives another reply each time: its replay diverges."""
+
+    @hf.on(Ping)
+    def ping(self, message: Ping) -> str:
+        return f"{next(NUMBERS)}"
 
 
 class Silent(hf.Actor):
@@ -117,6 +127,29 @@ async def test_a_child_that_cannot_start_has_one_record_with_the_traceback(recor
     (record,) = records
     assert (record["event"], record["log_level"], record["message"]) == ("child not started", "error", "on_start")
     assert "no device" in record["exception"]
+
+
+async def test_a_recovery_that_fails_has_one_record_for_each_attempt(records: list[Record]) -> None:
+    async with hf.ActorSystem(intensity=1000) as system:
+        ref = await system.start(hf.child("draws", hf.start(Draws), recovery=hf.hybrid(), backoff=hf.Backoff()))
+        await ref.ask(Ping())
+        with system.events() as stream:
+            ref.kill()
+            for _ in range(3):
+                await stream.until(hf.events.ChildStartFailed)
+        attempts = [record["event"] for record in records if record["event"] != "child ended"]
+        assert attempts == ["recovery failed"] * 3
+    assert all("diverged at turn 1" in record["reason"] for record in of(records, "recovery failed"))
+
+
+async def test_a_recorded_actor_that_crashes_as_it_starts_has_its_traceback_told_with_the_start(
+    records: list[Record],
+) -> None:
+    async with hf.ActorSystem() as system:
+        with pytest.raises(hf.StartFailed):
+            await system.start(hf.child("stillborn", hf.start(Stillborn), recovery=hf.hybrid()))
+    assert [record["event"] for record in records] == ["recovery failed", "child not started"]
+    assert ["exception" in record for record in records] == [False, True]
 
 
 @pytest.mark.parametrize("log_payloads", [False, True])

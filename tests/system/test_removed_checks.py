@@ -33,6 +33,13 @@ TURNS = "tests/supervision/test_turn_timeout.py"
 EFFECTS = "tests/effects/test_effect_processes.py"
 
 CHECKS = {
+    "a recovery that fails is logged once": Check(
+        "system/logs.py",
+        "            if event.reason in crash.reason:\n                return\n",
+        "",
+        "tests/system/test_logs.py",
+        "test_a_recovery_that_fails_has_one_record",
+    ),
     "an order that waits for a suspended supervisor is told": Check(
         "supervision/patience.py",
         "        if more is not None and more.suspended & mailbox.BY_USER:\n",

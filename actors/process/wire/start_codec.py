@@ -68,7 +68,7 @@ def pack_recipe(start: Start[Any], where: str) -> bytes:
         UnsavableValue: naming the argument that cannot be encoded.
         SpecError: the class cannot be found by name.
     """
-    return encode_value(_lower(start, where), where=f"{where}: start({start.kind.__name__}, ...)")
+    return encode_value(_lower(start, where), where=f"{where}: start({start.kind.__name__}, ...)", refs=False)
 
 
 def pack_data(value: object, where: str) -> bytes:
@@ -77,7 +77,7 @@ def pack_data(value: object, where: str) -> bytes:
     Raises:
         UnsavableValue, SpecError: as `pack_recipe`.
     """
-    return encode_value(_lower(value, where), where=where)
+    return encode_value(_lower(value, where), where=where, refs=False)
 
 
 def unpack_data(data: bytes) -> Any:

@@ -105,6 +105,8 @@ FORGED = {
     "something beside the rows": mark(54, "<f8", mark(1, 1), mark(34, 0), 0, None),
     "something nowhere in the rows": mark(54, "<f8", mark(1, 1), mark(34, 0), 0),
     "tuples of texts": mark(40, "ab"),
+    "ref without an address": mark(41, 7),
+    "ref with more than an address": mark(41, "/app/a", "/app/b"),
     "tuple without a field": mark(39, f"{HERE}:Size", "height", 1),
 }
 

@@ -83,6 +83,7 @@ class Account(hf.Actor):
     def __init__(self, balance: int = 0) -> None:
         self.balance = balance
         self.memos: list[str] = []
+        self.ledger: hf.ActorRef[Ledger] | None = None
 
     def on_start(self, restored: bool) -> None:
         if restored:
@@ -98,6 +99,7 @@ class Account(hf.Actor):
         ledger = self.ctx.find("/app/ledger", Ledger)
         self.balance += message.cents - await ledger.ask(Rate())
         self.memos.append(message.memo)
+        self.ledger = ledger
         ledger.tell(Note(message.memo))
         return self.balance
 

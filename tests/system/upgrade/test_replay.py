@@ -42,6 +42,7 @@ def test_each_turn_is_shown_and_the_state_after_the_last_one(store: Path) -> Non
         "/app/bank/alice after turn 5 of 8:",
         "    balance = 245",
         '    memos = ["m1", "m2", "m3", "m4", "m5"]',
+        '    ledger = {"ref": "/app/ledger"}',
     ]
     assert everything(store.parent) == before
 
@@ -83,7 +84,9 @@ def test_the_debugger_stops_before_the_handler_of_the_turn(store: Path) -> None:
     line = next(number for number, one in enumerate(SHOP.splitlines(), 1) if "ledger = self.ctx.find" in one)
     assert f"shop.py({line})pay()\n-> ledger = self.ctx.find" in said
     assert "(Pdb) 80\n(Pdb) 373\n(Pdb) " in said
-    assert said.endswith('    memos = ["m1", "m2", "m3", "m4", "m5", "m6", "m7", "m8"]\n')
+    assert said.endswith(
+        '    memos = ["m1", "m2", "m3", "m4", "m5", "m6", "m7", "m8"]\n    ledger = {"ref": "/app/ledger"}\n'
+    )
     assert replay(store, store.parent, ALICE, *SPEC, "--break", keys="q\n")[0] == 1
 
 

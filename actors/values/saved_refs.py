@@ -1,0 +1,37 @@
+"""Refs among values: what is saved of one is its address."""
+
+from __future__ import annotations
+
+
+class Addressed:
+    """What stands for the address of an actor: a ref, or what was saved of one."""
+
+    __slots__ = ()
+
+    @property
+    def path(self) -> str:
+        """The address, such as `/app/bank/alice`."""
+        raise NotImplementedError
+
+
+class SavedRef(Addressed):
+    """Stands for a ref where values are read that no actor gets: nothing can be sent by it. Equal if the address is."""
+
+    __slots__ = ("_path",)
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+
+    @property
+    def path(self) -> str:
+        """The address, such as `/app/bank/alice`."""
+        return self._path
+
+    def __repr__(self) -> str:
+        return f"<ActorRef {self._path}>"
+
+    def __eq__(self, other: object) -> bool:
+        return self._path == other._path if isinstance(other, SavedRef) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self._path)
