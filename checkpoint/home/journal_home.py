@@ -332,7 +332,8 @@ class JournalHome(RecordedHome):
         diverged, reason = self.switch.life.diverged, str(cell.extra().reason)
         gone = "its supervisor has ended, and may start it again" if restarting else "nobody lives at its address now"
         unfit = reason if UNFIT in reason else gone
-        keeps = restarting or diverged is not None  # Other code may go on with what waits, and with the turn in hand.
+        # A start that has failed leaves what waits, and the turn in hand, to one that does not.
+        keeps = restarting or diverged is not None or (self.switch.has_past and not self.switch.life.has_come_up)
         drop_all(self.switch, unfit if diverged is None else str(diverged), keep_tells=keeps)
         let_go(self.switch)
         self.switch.ties.untie()

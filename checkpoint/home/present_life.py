@@ -46,6 +46,7 @@ class PresentLife:
         port: the way to it; None between two lives.
         live: ends when it has caught up, with the seconds its restore took.
         live_at: when it had, on the machine's clock.
+        has_come_up: whether the last one that was started has.
         settled: ends when the turn that had begun before is as far as it was, or waits; None if nobody follows a start.
         owed: how many outputs that turn had let out.
         told: how many outcomes the life was told.
@@ -64,6 +65,7 @@ class PresentLife:
     port: LifePort | None = None
     live: asyncio.Future[float] | None = None
     live_at: float = 0.0
+    has_come_up: bool = False
     settled: asyncio.Future[None] | None = None
     owed: int = 0
     told: int = 0
@@ -112,7 +114,7 @@ class PresentLife:
     def follow(self) -> None:
         """Somebody waits until its start is over, and ends it if that fails."""
         assert self.live is not None
-        self.settled = self.live.get_loop().create_future()
+        self.settled, self.has_come_up = self.live.get_loop().create_future(), False
 
     def attach(self, port: LifePort) -> None:
         """Begin the replay to it."""
@@ -120,7 +122,7 @@ class PresentLife:
 
     def come_up(self, restore_seconds: float) -> None:
         """Tell whoever waits for it that it has caught up."""
-        self.live_at = time.monotonic()
+        self.live_at, self.has_come_up = time.monotonic(), True
         if self.live is not None and not self.live.done():
             self.live.set_result(restore_seconds)
 

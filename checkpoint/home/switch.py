@@ -129,6 +129,11 @@ class Switch:
         return self.ledger.turn
 
     @property
+    def has_past(self) -> bool:
+        """Whether something is recorded that a next life goes on with."""
+        return self.method.records and not self.ledger.is_new
+
+    @property
     def turns(self) -> dict[int, Turn]:
         """The ended turns since the newest snapshot."""
         return self.ledger.turns

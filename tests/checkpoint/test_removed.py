@@ -89,10 +89,17 @@ CHECKS = {
     ),
     "the code before goes on with what waits, and with the turn in hand": Check(
         "checkpoint/home/journal_home.py",
-        "        keeps = restarting or diverged is not None",
-        "        keeps = restarting",
+        "        keeps = restarting or diverged is not None or",
+        "        keeps = restarting or",
         IN_HAND,
         "test_other_code_is_refused and task and one",
+    ),
+    "what waits at an actor whose start has failed waits for one that does not": Check(
+        "checkpoint/home/journal_home.py",
+        " or (self.switch.has_past and not self.switch.life.has_come_up)\n",
+        "\n",
+        "tests/checkpoint/test_failed_starts.py",
+        "test_what_waits_stays and task and on_start",
     ),
     "a turn that has killed its own actor does not wait": Check(
         "actors/kernel/lifecycle.py",
