@@ -35,8 +35,9 @@ async def noted(notes: hf.ActorRef[Sink], count: int) -> None:
 
 async def rests(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
     """Wait until its turn waits for a message."""
-    while "wait_for" not in (await system.get_status(ref)).turn_at:
-        await asyncio.sleep(0.005)
+    async with asyncio.timeout(20.0):
+        while "wait_for" not in (await system.get_status(ref)).turn_at:
+            await asyncio.sleep(0.005)
 
 
 async def given_up(stream: hf.events.EventStream) -> list[hf.events.Event]:

@@ -65,11 +65,12 @@ async def start(system: hf.ActorSystem, how: str, isolation: Any) -> hf.ActorRef
 
 async def approve(ref: hf.ActorRef[Flow], system: hf.ActorSystem, count: int) -> None:
     """Approve the order in hand, and wait until so many are done."""
-    while "wait_for" not in (await system.get_status(ref)).turn_at:
-        await asyncio.sleep(0.005)
-    ref.tell(Approved())
-    while len(await ref.ask(Look(), timeout=30.0)) < count:
-        await asyncio.sleep(0.005)
+    async with asyncio.timeout(20.0):
+        while "wait_for" not in (await system.get_status(ref)).turn_at:
+            await asyncio.sleep(0.005)
+        ref.tell(Approved())
+        while len(await ref.ask(Look(), timeout=30.0)) < count:
+            await asyncio.sleep(0.005)
 
 
 @pytest.mark.parametrize("how", ["init", "state", "on_start", "on_recovered"])
