@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import Protocol
 
-from .errors import DIVERGED, RAISED_AGAIN, ControlFailed
+from .errors import DIVERGED, RAISED_AGAIN, ControlFailed, ReplayDiverged, type_name
+from .exit_reasons import Crash, ExitReason
 
 UNFIT = "what is recorded of it does not fit the code"
 """How the reason of a failed start begins if only other code can help, and no older state."""
@@ -17,6 +18,11 @@ def is_in_vain(why: str) -> bool:
     A handler that raises when it handles something again may have met trouble that passes.
     """
     return UNFIT in why or (DIVERGED in why and RAISED_AGAIN not in why)
+
+
+def ends_in_vain(reason: ExitReason) -> bool:
+    """Whether a life that has ended for this reason is followed by one that ends for it again: it went another way."""
+    return isinstance(reason, Crash) and reason.type_name == type_name(ReplayDiverged) and is_in_vain(reason.text)
 
 
 class Keeper(Protocol):

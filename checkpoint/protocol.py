@@ -264,7 +264,10 @@ class Kept(msgspec.Struct, array_like=True, tag=8):
 
 
 class Over(msgspec.Struct, array_like=True, tag=9):
-    """The life that was wanted as `number`, which replicas have lived at the root, is over. `Closed` is the answer."""
+    """The life that was wanted as `number` is over, if it was lived at the root; else it has to end, for this reason.
+
+    `Closed` is the answer.
+    """
 
     number: int
     reason: dict[str, Any]
@@ -397,6 +400,12 @@ class Glanced(msgspec.Struct, array_like=True, tag=25):
     answer: Answer
 
 
+class Waits(msgspec.Struct, array_like=True, tag=26):
+    """The turn that had begun in an earlier life waits now, and this life has heard so many outcomes so far."""
+
+    heard: int
+
+
 class Unsaved(msgspec.Struct, array_like=True, tag=16):
     """The state could not be saved: no snapshot came of it."""
 
@@ -458,6 +467,7 @@ ToHome = (
     | Wanted
     | Closed
     | Marked
+    | Waits
 )
 
 

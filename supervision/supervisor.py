@@ -17,7 +17,7 @@ from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Start, on
 from ..actors.kernel.cell import DOWN, GONE, Cell, GivenName
 from ..actors.kernel.envelope import Item, ReplyHandle
-from ..actors.persistence import UNFIT, is_in_vain
+from ..actors.persistence import UNFIT, ends_in_vain, is_in_vain
 from .admin import (
     AlreadyPresent,
     AlreadyStarted,
@@ -368,6 +368,8 @@ class Supervisor(Inquiries):
             self._end_with_significant(one, reason)
         elif spec.backoff is not None:
             self._later(one, reason)
+        elif ends_in_vain(reason):
+            self._give_up_in_vain(one, reason)
         else:
             self._restart(one, reason)
 
@@ -546,11 +548,15 @@ class Supervisor(Inquiries):
         if is_in_vain(str(reason)):
             if one.cell is not None:
                 one.cell.extra().reason = reason  # Whoever waits there is told this, and not how its last life ended.
-            why = Shutdown(f"{self._path_of(one)} cannot be started again: {reason}; {IN_VAIN}")
-            self._give_up(one, why, why)
+            self._give_up_in_vain(one, reason)
             return
         one.retry += 1
         self.ctx._cell.push(RestartAgain(one, one.retry, reason))  # Through our own mailbox: we answer in between.
+
+    def _give_up_in_vain(self, one: Child, reason: ExitReason) -> None:
+        """We end, for each further life of this child would end as the last one did."""
+        why = Shutdown(f"{self._path_of(one)} cannot be started again: {reason}; {IN_VAIN}")
+        self._give_up(one, why, why)
 
     # -- stopping ---------------------------------------------------------------------------------------------------
 

@@ -91,6 +91,10 @@ class Home:
         """How far the start that is under way has come, as `Host.progress` says."""
         return None
 
+    def cause(self, reason: ExitReason) -> ExitReason:
+        """Why the present life ends, as all are told: `reason`, unless that only carries out what the home wants."""
+        return reason
+
     def recovers(self, reason: ExitReason) -> bool:
         """Whether a life that ended for this reason is brought back with its state."""
         return False

@@ -82,6 +82,7 @@ class HerePlace(Place):
             cell.node.loop.call_later(GRACE, abandon, turn)
         elif cell.state is RUNNING:
             cell.urge(Kill())
+            cell.node.loop.call_soon(_strike, cell, cell.life)
 
     def control(self, cell: Cell, call: QueuedOrder) -> None:
         if call.is_urgent:
@@ -112,6 +113,12 @@ class NearParent(Parent):
 
     def is_restarting(self, cell: Cell) -> bool:
         return parent_ended(cell)
+
+
+def _strike(cell: Cell, life: int) -> None:
+    """A kill has come in the first step of a turn: if that waits now, perhaps for ever, it does not wait any longer."""
+    if cell.life == life and cell.state is RUNNING and cell.more is not None and cell.more.turn is not None:
+        cell.host.kill(cell)
 
 
 def outside_turn(
@@ -525,6 +532,7 @@ def _kill_orphans(cell: Cell) -> None:
 
 def ended(cell: Cell, reason: ExitReason) -> None:
     """The life is over: undo what it had, tell who wants to know, and pass the address on."""
+    reason = cell.host.home.cause(reason)
     cell.state = DOWN
     cell.scheduled = True
     more, ctx = cell.more, cell.ctx

@@ -502,7 +502,7 @@ class WorkerPlace(Place):
         """The process is gone, or the life in it has ended."""
         over = self.home.lost(cell, self.workers.of(cell), reason)
         if over is not None:
-            self.parent.life_over(cell, reason, over)
+            self.parent.life_over(cell, self.home.cause(reason), over)
 
     def retired(self, cell: Cell) -> None:
         worker = self.workers.of(cell)

@@ -299,6 +299,15 @@ class InputLedger:
             cause = f"the reply to {past.input.name} is not what it was before the crash; {DIVERGES}"
             raise ReplayDiverged(self.path, number, seen + 1, cause)
 
+    def judge_begun(self, end: TurnEnd, seen: int, owed: int) -> None:
+        """Compare a turn without an end, which an earlier life had begun, with what that has let out.
+
+        Raises:
+            ReplayDiverged: it has let out less, and each replay of it would say so.
+        """
+        if seen < owed and end.status in (OK, STASHED):
+            raise ReplayDiverged(self.path, end.turn, seen + 1)
+
     def digest_of(self, turn: int, k: int) -> int:
         """The digest of what was output (turn, k) before; 0: that is not known any more."""
         past = self.turns.get(turn)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ...actors.errors import HoldfastError, StartFailed, StartIgnored
 from ...actors.events import ActorStarted, Recovered, RecoveryFailed
-from ...actors.exit_reasons import KILLED, ExitReason, Hung
+from ...actors.exit_reasons import KILLED, ExitReason, Hung, crash
 from ...actors.kernel import links
 from ...actors.kernel.address_host import Work
 from ...actors.kernel.cell import RUNNING, Cell
@@ -93,6 +93,7 @@ class JournalHome(RecordedHome):
     def enter(self, cell: Cell) -> Entered:
         """As `open`, and it is a recovery if anything comes back, or if one is not over."""
         entered = self.open(cell)
+        entered.switch.life.follow()
         recoveries = self.homes.recoveries
         self.recovery = None
         if entered.recovering or recoveries.of(cell.path) is not None:
@@ -174,7 +175,7 @@ class JournalHome(RecordedHome):
         self.clock = RecoveryClock()
         self.clock.mark("noticed", noticed)
         self.clock.mark("detect")
-        end = cell.extra().reason if reason is None else reason
+        end = self.cause(cell.extra().reason if reason is None else reason)
         has_hung = self.fault == "hung" or isinstance(end, Hung)
         switch.died(running, ordered=ordered and not self.fault, has_hung=has_hung, reason=end)
         self.fault = ""
@@ -201,6 +202,11 @@ class JournalHome(RecordedHome):
     def progress(self, cell: Cell) -> object:
         """How far the replay has come."""
         return None if self.switch is None else self.switch.progress
+
+    def cause(self, reason: ExitReason) -> ExitReason:
+        """Its replay has led elsewhere, if that is so: it was killed because of that."""
+        diverged = None if self.switch is None else self.switch.life.diverged
+        return reason if diverged is None else crash(diverged)
 
     def recovers(self, reason: ExitReason) -> bool:
         """Whether an end for this reason is followed by a recovery."""
@@ -326,7 +332,9 @@ class JournalHome(RecordedHome):
         diverged, reason = self.switch.life.diverged, str(cell.extra().reason)
         gone = "its supervisor has ended, and may start it again" if restarting else "nobody lives at its address now"
         unfit = reason if UNFIT in reason else gone
-        drop_all(self.switch, unfit if diverged is None else str(diverged), keep_tells=restarting)
+        # A start that has failed leaves what waits, and the turn in hand, to one that does not.
+        keeps = restarting or diverged is not None or (self.switch.has_past and not self.switch.life.has_come_up)
+        drop_all(self.switch, unfit if diverged is None else str(diverged), keep_tells=keeps)
         let_go(self.switch)
         self.switch.ties.untie()
         if restarting:
@@ -367,6 +375,9 @@ class JournalHome(RecordedHome):
                 return  # It was up, and has ended in a turn: that is told by its end, and no start has failed.
             clock.mark("replay", switch.life.live_at)
             await self._let_at(switch, clock, restore_seconds)
+            await switch.life.settles()
+            if switch.life.port is None:
+                return  # As above.
         except HoldfastError as error:
             if not isinstance(error, StartIgnored):
                 node.emit(RecoveryFailed(cell.path, str(error)))
@@ -377,6 +388,8 @@ class JournalHome(RecordedHome):
                 raise StartFailed(cell.path, "it was stopped while it started") from None
             node.emit(RecoveryFailed(cell.path, str(diverged)))
             raise StartFailed(cell.path, str(diverged)) from diverged
+        finally:
+            switch.life.settled = None
         if node.events.has_listeners:
             node.emit(ActorStarted(cell.path, cell.life))
         if entered.recovering:

@@ -252,5 +252,6 @@ class PendingCalls:
 
     def _tell(self, turn: int, k: int, answer: Answer) -> None:
         if self._home.life.port is not None:
+            self._home.life.told += 1
             taken = self.rests.taken.get((turn, k), -1)  # Whoever leads now may have been given that by the last one.
             self._home.life.port.to_life(Outcome(turn, k, answer, taken, self._home.ledger.digest_of(turn, k)))

@@ -46,6 +46,10 @@ class PresentLife:
         port: the way to it; None between two lives.
         live: ends when it has caught up, with the seconds its restore took.
         live_at: when it had, on the machine's clock.
+        has_come_up: whether the last one that was started has.
+        settled: ends when the turn that had begun before is as far as it was, or waits; None if nobody follows a start.
+        owed: how many outputs that turn had let out.
+        told: how many outcomes the life was told.
         is_released: whether it gets what is new.
         waits_for_release: whether somebody else says when it gets that.
         is_kept_back: whether it waits for the others of its group.
@@ -61,6 +65,10 @@ class PresentLife:
     port: LifePort | None = None
     live: asyncio.Future[float] | None = None
     live_at: float = 0.0
+    has_come_up: bool = False
+    settled: asyncio.Future[None] | None = None
+    owed: int = 0
+    told: int = 0
     is_released: bool = False
     waits_for_release: bool = False
     is_kept_back: bool = False
@@ -101,34 +109,64 @@ class PresentLife:
         self.is_released = self.waits_for_release = self.is_void = self.has_ended = False
         self.replayed, self.diverged = 0, None
         self.abandon()
-        self.live = live
+        self.live, self.settled = live, None
+
+    def follow(self) -> None:
+        """Somebody waits until its start is over, and ends it if that fails."""
+        assert self.live is not None
+        self.settled, self.has_come_up = self.live.get_loop().create_future(), False
 
     def attach(self, port: LifePort) -> None:
         """Begin the replay to it."""
-        self.port, self.seen_turn = port, -1
+        self.port, self.seen_turn, self.owed, self.told = port, -1, 0, 0
 
     def come_up(self, restore_seconds: float) -> None:
         """Tell whoever waits for it that it has caught up."""
-        self.live_at = time.monotonic()
+        self.live_at, self.has_come_up = time.monotonic(), True
         if self.live is not None and not self.live.done():
             self.live.set_result(restore_seconds)
 
+    def settle(self) -> None:
+        """Tell whoever follows its start that nothing more comes of what was recorded."""
+        if self.settled is not None and not self.settled.done():
+            self.settled.set_result(None)
+
+    async def settles(self) -> None:
+        """Wait until nothing more comes of what was recorded, unless others say when it goes on with that.
+
+        Raises:
+            ReplayDiverged: it has gone another way.
+        """
+        if self.settled is not None and self.is_released:
+            await self.settled
+        if self.diverged is not None:
+            raise self.diverged
+
+    def waits(self, heard: int) -> None:
+        """The turn that had begun waits, and it has heard so many outcomes: if that is all, it goes on when it can."""
+        if heard >= self.told:
+            self.settle()
+
     def fail(self, error: Exception) -> bool:
-        """Tell whoever waits for it that it will not catch up; False if nobody does."""
-        if self.live is None or self.live.done():
-            return False
-        self.live.set_exception(error)
-        self.live.exception()  # Whoever waited may be gone.
-        return True
+        """Tell whoever waits for it that it will not catch up; False if nobody does, or follows its start."""
+        is_awaited = self.settled is not None
+        if self.live is not None and not self.live.done():
+            self.live.set_exception(error)
+            self.live.exception()  # Whoever waited may be gone.
+            is_awaited = True
+        self.settle()
+        return is_awaited
 
     def abandon(self) -> None:
         """Nobody waits for it any more."""
         if self.live is not None and not self.live.done():
             self.live.cancel()
+        self.settle()
 
     def die(self) -> None:
         """It is over: what comes is for the next one."""
         self.port, self.is_released = None, False
+        self.settle()
 
     def resume(self, port: LifePort | None) -> None:
         """Go on with a life that was at rest, in the place of one that has not become the next one."""

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import AskDeadlock, HoldfastError, ReplayDiverged, StartIgnored
 from ...actors.events import RecoveryFailed
+from ...actors.exit_reasons import crash
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, Chain, Item, waiters
@@ -55,6 +56,7 @@ from ..protocol import (
     ToHome,
     TurnEnd,
     Unsaved,
+    Waits,
     Wanted,
     answer_digest,
     pieces,
@@ -125,6 +127,11 @@ class Switch:
     def turn(self) -> int:
         """The number of the last ended turn."""
         return self.ledger.turn
+
+    @property
+    def has_past(self) -> bool:
+        """Whether something is recorded that a next life goes on with."""
+        return self.method.records and not self.ledger.is_new
 
     @property
     def turns(self) -> dict[int, Turn]:
@@ -293,7 +300,7 @@ class Switch:
         """How far the present life has come with what was handled before; a pause that is repeated counts as a step."""
         if self.replay.pauses_at(self.life.seen_turn):
             return object()
-        return self.life.seen_turn, self.life.port is not None
+        return self.life.seen_turn, self.life.seen_k, self.life.port is not None
 
     def prepare(self) -> asyncio.Future[float]:
         """A new life begins: hold what comes. The future ends when it is live, with the seconds its restore took."""
@@ -374,7 +381,11 @@ class Switch:
             if bound is None or bound.may_feed(source):
                 if source.ask is not None and port.begins:
                     source.ask.started = True
+                if source.id == begun and port.begins:
+                    self.life.owed = len(ledger.released)
                 port.to_life(source.feed(-1, pipes if index == 0 else (), has_begun=source.id == begun))
+        if not self.life.owed:
+            self.life.settle()
         if bound is not None:
             bound.refill()
         self.due.on_want(self)
@@ -439,6 +450,8 @@ class Switch:
                     self.due.failed(record.problem)
                 case Marked():
                     self.images.mark(record)
+                case Waits():
+                    life.waits(record.heard)
                 case Ignored():
                     life.fail(StartIgnored(self.path, record.why))
                 case Wanted() | Closed() | TurnEnd():
@@ -449,7 +462,7 @@ class Switch:
                 return  # Whoever waits for it tells of it, and ends the life: its supervisor is not to hear of a kill.
             self.node.emit(RecoveryFailed(self.path, str(error)))
             if self.cell is not None:
-                self.cell.kill()
+                self.cell.host.place.end(self.cell, crash(error))
 
     def _released(self, record: Released) -> None:
         batch, known = Batch(), len(self.ledger.released)
@@ -457,6 +470,8 @@ class Switch:
         if record.turn > self.ledger.turn and len(self.ledger.released) > known:
             self.note(record.turn, self.ledger.released_entry(record.turn, known), batch)
         batch.commit(self.journal)
+        if self.life.owed and self.life.seen_of(record.turn) >= self.life.owed:
+            self.life.settle()
 
     def _take(self, turn: int, key: int, outs: list[Out], batch: Batch) -> None:
         """Let new outputs out; drop those that are out already."""
@@ -464,7 +479,7 @@ class Switch:
         if any(out.verb == "cancel" for out in outs):  # Lives may know a timer of a hook by other names.
             outs = [self.timers.known_as(out) if out.verb == "cancel" else out for out in outs]
         again = ledger.compare_outputs(turn, key, outs, functools.partial(is_as_before, self))
-        if turn <= ledger.turn:
+        if turn <= ledger.turn or self.life.owed:
             self.life.see_again(turn, outs[-1].k if outs else 0)
         for out in outs[:again]:
             if out.verb in AWAITED:
@@ -501,6 +516,10 @@ class Switch:
         batch = Batch()
         if end.outs or ledger.released:
             self._take(end.turn, end.id, end.outs, batch)
+        if self.life.owed:
+            ledger.judge_begun(end, self.life.seen_of(end.turn), self.life.owed)
+            self.life.owed = 0
+            self.life.settle()
         if end.ends is not None:
             self._end_with(end.ends, batch)
         was_asked = source.ask is not None and end.status == OK

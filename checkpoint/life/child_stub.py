@@ -66,6 +66,7 @@ class RootHome(Home):
         self.guest = guest
         self.bound: Bounded | None = None
         self.life: Life | None = None  # that is lived here
+        self.ends: ExitReason | None = None  # why that is to end, as the home says
         self._homeward: Homeward | None = None
 
     def enter(self, cell: Cell) -> None:
@@ -107,6 +108,9 @@ class RootHome(Home):
         if life is None or (life.feed is None and not cell.queue):
             return object()  # It waits for the root.
         return life.turn
+
+    def cause(self, reason: ExitReason) -> ExitReason:
+        return reason if self.ends is None else self.ends
 
     def recovers(self, reason: ExitReason) -> bool:
         return not reason.is_clean

@@ -130,11 +130,13 @@ class TurnWaits:
         outcomes: futures of what comes of outputs, by (turn, output), each with what it has to be.
         moment: until when the handler of the turn in hand has waited, in Unix time.
         resting: how many moments and messages the turn in hand waits for.
+        heard: how many outcomes the home has told.
     """
 
     outcomes: dict[tuple[int, int], tuple[asyncio.Future[Any], Awaited]] = dataclasses.field(default_factory=dict)
     moment: float = 0.0
     resting: int = 0
+    heard: int = 0
 
     def rested(self) -> None:
         """Something has come that a turn has waited for, perhaps an earlier one."""

@@ -458,7 +458,10 @@ class RecordedContext(ActorContext):
         return self.recorded.waits.resting > 0 or not self.recorded.is_live
 
     def _turn_waits(self) -> None:
-        self.recorded.mark(WAITS)
+        life = self.recorded
+        life.mark(WAITS)
+        if life.stage.begun >= 0:
+            life.say_it_waits()
 
     def _turn_goes_on(self) -> None:
         self.recorded.mark()
@@ -477,6 +480,7 @@ class RecordedContext(ActorContext):
             self._cell.urge(call)  # The next life obeys it, before the turn that was left is run again.
             return True
         if self.recorded.is_live:
+            self.recorded.say_it_waits()  # The order may be that nothing is handled.
             return False
         self.recorded.stage.postponed.append(call)
         return True

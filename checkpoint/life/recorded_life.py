@@ -64,6 +64,7 @@ from ..protocol import (
     ToLife,
     TurnEnd,
     Unsaved,
+    Waits,
     pieces,
     untimed,
 )
@@ -205,6 +206,8 @@ class Life:
                 self._take(record)
             case Outcome():
                 self._outcome(record)
+                if self.stage.begun >= 0:
+                    self.cell.node.loop.call_soon(self.say_it_waits)  # Behind the turn, if that has waited for this.
             case Perform():
                 self._perform(record)
             case Glance():  # Not here and now: this may be called in a turn of the very actor.
@@ -255,6 +258,7 @@ class Life:
             cell.schedule()
 
     def _outcome(self, record: Outcome) -> None:
+        self.waits.heard += 1
         if record.taken >= 0:
             self.drop_queued(record.taken)
         waiting = self.waits.outcomes.pop((record.turn, record.k), None)
@@ -326,6 +330,11 @@ class Life:
             self.page[0] = (
                 0 if how and self.waits.resting else feed.id + 1 | how
             )  # What rests for days ends no process.
+
+    def say_it_waits(self) -> None:
+        """Say that the turn which had begun in an earlier life does not get on by itself, or does not begin."""
+        if self.stage.begun >= 0 and self.is_live and not self.stage.is_over:
+            self.port.to_home(Waits(self.waits.heard))
 
     def close_turn(self, status: str, answer: Answer) -> None:
         """A turn has ended: report it, with what it sent."""

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, cast
 import msgspec
 
 from ...actors.errors import ControlFailed, StartFailed, StartIgnored
-from ...actors.exit_reasons import ExitReason
+from ...actors.exit_reasons import ExitReason, unpack_exit
 from ...actors.kernel.address_host import AddressHost
-from ...actors.kernel.cell import DOWN, Cell
+from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.lifecycle import HERE, NEAR
 from ...actors.persistence import child_key
 from ...actors.process.wire import frames
@@ -255,6 +255,7 @@ class ChildHere(ChildPlace):
         if not self.is_starting(record.number) or cell.state is not DOWN:
             return
         assert port is not None
+        self.home.ends = None
         cell.life = record.life - 1
         page = self.home.guest.page[record.slot : record.slot + 1]
         life = Life(cell, port, self._method, page, may_fork=True)
@@ -278,6 +279,11 @@ class ChildHere(ChildPlace):
         else:  # Its replay diverged: the next life begins when this one is over.
             self._problem = record.problem
             cell.kill()
+
+    def told_by_root(self, record: Over | Respec) -> None:
+        if isinstance(record, Over) and record.number == self._number and self.cell.state is RUNNING:
+            self.home.ends = unpack_exit(record.reason)
+            self.cell.kill()
 
     def closed_here(self) -> None:
         life, cell, self.home.life = self.home.life, self.cell, None

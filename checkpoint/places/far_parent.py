@@ -454,6 +454,11 @@ class SlotPlace(Place):
     def kill(self, cell: Cell) -> None:
         self._tell(cell, "kill", {})
 
+    def end(self, cell: Cell, reason: ExitReason) -> None:
+        parent = self._parent
+        if parent.wanted is not None and cell.state is RUNNING:
+            parent.port().to_life(Over(parent.wanted.number, pack_exit(reason)))
+
     def _tell(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         worker = self._parent.worker
         if worker is not None and cell.state is RUNNING:

@@ -177,3 +177,19 @@ async def test_a_stop_that_comes_when_a_turn_has_just_failed_finds_the_asker_ans
     with pytest.raises(hf.RemoteCrash, match="boom"):
         await ref.ask(Do(work), timeout=30.0)
     assert "boom" in str(await ended)
+
+
+async def test_a_turn_that_kills_its_own_actor_does_not_wait_for_ever(doer: Doers) -> None:
+    """Neither in its first step nor in a later one."""
+    for steps in range(2):
+
+        async def work(actor: Any, steps: int = steps) -> None:
+            await pause(steps)
+            actor.ctx.ref.kill()
+            await asyncio.Event().wait()
+
+        victim = doer()
+        asked = victim.ask(Do(work), timeout=30.0)
+        with pytest.raises(hf.AskFailed, match="killed"):
+            await asked
+        assert await victim._cell.ended() == hf.KILLED

@@ -15,6 +15,7 @@ CHUNKS_KEPT = "tests/checkpoint/test_chunks_kept.py"
 KILLS = "tests/checkpoint/test_kill_counts.py"
 
 TIMERS = "tests/effects/test_timers_while_resting.py"
+IN_HAND = "tests/checkpoint/test_diverging_in_hand.py"
 
 CHECKS = {
     "what was submitted is written at the end, whether the message handler comes or not": Check(
@@ -51,6 +52,97 @@ CHECKS = {
         "for key, clock in clocks.items()}",
         TIMERS,
         "test_a_group_goes_back",
+    ),
+    "a turn in hand that goes another way ends the life": Check(
+        "checkpoint/home/switch.py",
+        "                self.cell.host.place.end(self.cell, crash(error))\n",
+        "                pass\n",
+        IN_HAND,
+        "test_when_it_is_up_already and task",
+    ),
+    "a start is not over before the turn in hand has come as far as it was": Check(
+        "checkpoint/home/present_life.py",
+        "            await self.settled\n",
+        "            pass\n",
+        IN_HAND,
+        "test_other_code_is_refused and process and one",
+    ),
+    "what has gone another way behind its last wait has failed to start": Check(
+        "checkpoint/home/present_life.py",
+        "        is_awaited = self.settled is not None\n",
+        "        is_awaited = False\n",
+        IN_HAND,
+        "test_its_start_fails and task",
+    ),
+    "a start does not wait for a turn that waits": Check(
+        "checkpoint/life/recorded_context.py",
+        "            life.say_it_waits()\n",
+        "            pass\n",
+        IN_HAND,
+        "test_a_start_does_not_wait_for_what_no_journal_has and task",
+    ),
+    "a start does not wait for a turn that must not begin": Check(
+        "checkpoint/life/recorded_context.py",
+        "            self.recorded.say_it_waits()  # The order",
+        "            pass  # The order",
+        IN_HAND,
+        "test_a_start_does_not_wait_for_an_actor_that_is_suspended",
+    ),
+    "a turn that waits for what it was just told does not wait": Check(
+        "checkpoint/home/present_life.py",
+        "        if heard >= self.told:\n",
+        "        if True:\n",
+        IN_HAND,
+        "test_other_code_is_refused and process and one",
+    ),
+    "a turn in hand has to send again all that it had sent": Check(
+        "checkpoint/home/input_ledger.py",
+        "        if seen < owed and end.status in (OK, STASHED):\n",
+        "        if False:\n",
+        IN_HAND,
+        "test_other_code_is_refused and task and nothing",
+    ),
+    "an end because of a divergence is told as such": Check(
+        "checkpoint/home/journal_home.py",
+        "        return reason if diverged is None else crash(diverged)\n",
+        "        return reason\n",
+        IN_HAND,
+        "test_when_it_is_up_already and process",
+    ),
+    "a life below a supervisor in a process ends for the reason that its home has told": Check(
+        "checkpoint/life/child_stub.py",
+        "        return reason if self.ends is None else self.ends\n",
+        "        return reason\n",
+        IN_HAND,
+        "test_when_it_is_up_already and subtree",
+    ),
+    "a life that has gone another way is not followed by one that does so again": Check(
+        "supervision/supervisor.py",
+        "        elif ends_in_vain(reason):\n",
+        "        elif False:\n",
+        IN_HAND,
+        "test_when_it_is_up_already and task",
+    ),
+    "the code before goes on with what waits, and with the turn in hand": Check(
+        "checkpoint/home/journal_home.py",
+        "        keeps = restarting or diverged is not None or",
+        "        keeps = restarting or",
+        IN_HAND,
+        "test_other_code_is_refused and task and one",
+    ),
+    "what waits at an actor whose start has failed waits for one that does not": Check(
+        "checkpoint/home/journal_home.py",
+        " or (self.switch.has_past and not self.switch.life.has_come_up)\n",
+        "\n",
+        "tests/checkpoint/test_failed_starts.py",
+        "test_what_waits_stays and task and on_start",
+    ),
+    "a turn that has killed its own actor does not wait": Check(
+        "actors/kernel/lifecycle.py",
+        "            cell.node.loop.call_soon(_strike, cell, cell.life)\n",
+        "            pass\n",
+        "tests/actors/test_kill.py",
+        "test_a_turn_that_kills_its_own_actor",
     ),
     "what has diverged is not tried again": Check(
         "actors/persistence.py",
