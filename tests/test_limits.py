@@ -105,12 +105,13 @@ async def test_a_child_without_mechanisms_leaves_them_out() -> None:
         hf.child("one", hf.start(Keeper), mechanism=())
 
 
-async def test_a_ref_cannot_be_a_key_variable() -> None:
+async def test_a_ref_can_be_a_key_variable_and_no_argument_of_a_start_in_another_process() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         friend = await system.start(hf.child("friend", hf.start(Keeper)))
         spec = hf.child("one", hf.start(Acquainted, friend), recovery=hf.hybrid())
-        with pytest.raises(hf.HoldfastError, match=r"friend: a value of type .*ActorRef cannot be saved"):
-            await system.start(spec)
+        assert (await system.get_state(await system.start(spec)))["friend"] == friend
+        with pytest.raises(hf.errors.SpecError, match=r"a value of type .*ActorRef cannot be sent to another process"):
+            hf.child("two", hf.start(Acquainted, friend), isolation="process")
 
 
 async def test_without_recovery_what_was_put_aside_dies_with_its_process() -> None:

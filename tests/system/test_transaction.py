@@ -230,7 +230,7 @@ async def test_an_address_that_was_left_is_free_for_another(system: hf.ActorSyst
         (lambda change: change.intensity("/app/left", -1, 5.0), "intensity must be"),
         (lambda change: change.bind("/app/right/client", "gate", "/app/left/a"), "no binding 'gate'"),
         (lambda change: change.register("first", "/app/left/b"), "first exists already"),
-        (lambda change: change.unregister("nobody"), "no actor at nobody"),
+        (lambda change: change.unregister("nobody"), "no actor has the name 'nobody'"),
         (lambda change: change.isolation("/app/left/a", "thread"), "isolation must be one of"),
         (lambda change: change.remove("/app"), "leave the system"),
         (lambda change: change.suspend("/app/right/e"), "no actor at /app/right/e"),
