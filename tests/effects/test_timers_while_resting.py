@@ -250,8 +250,7 @@ async def test_the_next_root_ties_once_what_a_turn_has_tied_that_waits(tmp_path:
         hf.child("patient", hf.start(Watcher), recovery=hf.hybrid(interval=1e9)),
     ]
     async with hf.ActorSystem("app", log=False, store=store_in(first), intensity=99) as system:
-        for spec in specs:
-            ref = await system.start(spec)
+        _, ref = [await system.start(spec) for spec in specs]
         assert await ref.ask(Ticks(), IN_TIME) == 0
         ref.ask(Cancel(), IN_TIME).add_done_callback(lambda done: done.exception())
         await waits(system)
@@ -260,8 +259,7 @@ async def test_the_next_root_ties_once_what_a_turn_has_tied_that_waits(tmp_path:
         await system._homes.settled()
         store = await left_by(system, first)
     async with hf.ActorSystem("app", log=False, store=store, intensity=99) as system:
-        for spec in specs:
-            ref = await system.start(spec)
+        _, ref = [await system.start(spec) for spec in specs]
         await waits(system)
         ref.tell(Call())
         assert await ref.ask(Ticks(), IN_TIME) == 0
