@@ -270,8 +270,8 @@ CHECKS = {
     ),
     "a sibling's end is told": Check(
         "supervision/supervisor.py",
-        "            tell_stopped(cell, self.ctx.path if by is None else by, because)\n",
-        "",
+        "                tell_stopped(cell, self.ctx.path if by is None else by, because)\n",
+        "                pass\n",
         LIVE,
         "test_a_sibling_s_restart",
     ),
