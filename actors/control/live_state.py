@@ -154,7 +154,7 @@ def change_state(actor: Actor, change: Callable[[Any], Any]) -> None:
         actor.ctx._replaced()
 
 
-class Tried(NamedTuple):
+class TriedState(NamedTuple):
     """What has come of the trial of a change.
 
     Attributes:
@@ -170,7 +170,7 @@ class Tried(NamedTuple):
     first_variables: list[str]
 
 
-def tried_state(actor: Actor, changes: Iterable[Callable[[Any], Any]], verb: str) -> Tried:
+def tried_state(actor: Actor, changes: Iterable[Callable[[Any], Any]], verb: str) -> TriedState:
     """Try these changes, one after the other; the actor has what it had.
 
     Raises:
@@ -181,7 +181,7 @@ def tried_state(actor: Actor, changes: Iterable[Callable[[Any], Any]], verb: str
         for change in changes:
             put_state(actor, change(state_to_change(actor)))
         added = {name: value for name, value in attributes(actor) if name not in had}
-        return Tried(state_to_change(actor), actor.ctx._saved(), added, actor.ctx._first_variables)
+        return TriedState(state_to_change(actor), actor.ctx._saved(), added, actor.ctx._first_variables)
 
 
 @contextlib.contextmanager

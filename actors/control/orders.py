@@ -20,7 +20,7 @@ from ..process.wire.start_codec import imported, pack_recipe, unpack_recipe
 from ..state_hooks import migrated
 from ..turn_stacks import waits_at
 from ..values import UnsavableValue
-from .live_state import Tried, change_state, keeping_variables, state_to_show, tried_state
+from .live_state import TriedState, change_state, keeping_variables, state_to_show, tried_state
 from .other_class import add_variables, become_other
 from .state_outline import outline_of
 from .tracing import Statistics, tap_of
@@ -202,7 +202,7 @@ def next_start(cell: Cell, new: Start[Any], *, keeps_arguments: bool) -> Start[A
 class Prepared:
     """What an actor will go on with: what has come of the trial, and its recipe if its class is another one."""
 
-    tried: Tried
+    tried: TriedState
     start: Start[Any] | None
 
 

@@ -88,7 +88,8 @@ async def past_resting_turns(group: Group, future: asyncio.Future[Any]) -> None:
     """Wait for a future that ends when nothing is inside: whatever turn rests meanwhile is left, and sent again."""
     while not (await asyncio.wait((future,), timeout=LOOK_AGAIN))[0]:
         if group.switch.calls.rests.is_busy:
-            await _withdraw(group)
+            # Whoever waits may give up; what the replicas have left is sent again all the same.
+            await asyncio.shield(asyncio.ensure_future(_withdraw(group)))
 
 
 async def _withdraw(group: Group) -> None:
@@ -98,11 +99,9 @@ async def _withdraw(group: Group) -> None:
     order = Withdraw(known.epoch, group.adaptation.config)
     if primary is None or not await _has_left(group, primary, order):
         return
-    try:
-        await asyncio.gather(*(_has_left(group, name, order) for name in members if name != primary))
-    finally:
-        if known.primary == primary and known.epoch == order.epoch:  # Else whoever leads next is sent all of it anyway.
-            group.withdraw()
+    await asyncio.gather(*(_has_left(group, name, order) for name in members if name != primary))
+    if known.primary == primary and known.epoch == order.epoch:  # Else whoever leads next is sent all of it anyway.
+        group.withdraw()
 
 
 async def _has_left(group: Group, name: str, order: Withdraw) -> bool:
