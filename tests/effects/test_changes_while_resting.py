@@ -12,12 +12,14 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm import LFR, PBR, TMR, TR
+from holdfast.ftm.group.steering import LOOK_AGAIN, past_resting_turns
 from tests.effects import test_glances
 from tests.effects.clerk import IN_TIME, lines, note
-from tests.effects.patient import Call, Count, Go, Look, patient
+from tests.effects.patient import Call, Count, Go, Look, Patient, patient
 from tests.effects.test_effects_protected import leader_dies, whole
 from tests.effects.test_glances import sleeper
 from tests.effects.test_long_waits import end_of, running, waits
+from tests.ftm.test_failover import group_of
 
 OTHER: dict[str, Any] = {"task": "process", "process": "task"}
 
@@ -225,3 +227,24 @@ async def test_an_effect_that_is_out_beside_the_wait_is_waited_for(tmp_path: Pat
         await waits(system)
         await ref.ask(Call("a"), IN_TIME)
         assert await asked == "1, a"
+
+
+@pytest.mark.parametrize("later", [0.0, 0.001, 0.002, 0.004, 0.008, 0.016])
+async def test_who_gives_up_waiting_for_a_turn_that_rests_leaves_it_to_go_on(later: float) -> None:
+    """So many seconds behind the moment at which the replicas are told to leave it: it is sent again all the same."""
+    async with hf.ActorSystem("app", log=False, intensity=99) as system:
+        spec = hf.child("patient", hf.start(Patient), recovery=hf.hybrid(), mechanism=LFR())
+        ref = await system.start(spec)
+        await whole(system, ref)
+        asked = ref.ask(Go(["c"]), IN_TIME)
+        for _ in range(3):
+            await waits(system)
+            group = group_of(ref)
+            leaving = asyncio.ensure_future(past_resting_turns(group, group.quiet()))
+            await asyncio.wait((leaving,), timeout=LOOK_AGAIN + later)
+            leaving.cancel()
+            await asyncio.gather(leaving, return_exceptions=True)
+            await asyncio.sleep(LOOK_AGAIN)  # Whoever has left it has done so.
+        await waits(system)
+        ref.tell(Call("a"))
+        assert await asked == "call a"

@@ -23,6 +23,13 @@ CHECKS = {
         FAILOVER,
         "test_a_first_start_loses_no_protection",
     ),
+    "a turn that was left is sent again though nobody waits for that any more": Check(
+        "ftm/group/steering.py",
+        "await asyncio.shield(asyncio.ensure_future(_withdraw(group)))",
+        "await _withdraw(group)",
+        "tests/effects/test_changes_while_resting.py",
+        "test_who_gives_up_waiting",
+    ),
     "who has left a turn that rests begins nothing of what home sends again": Check(
         "ftm/bricks/request_protocol.py",
         "            if has_left:  # Home",
