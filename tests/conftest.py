@@ -31,6 +31,7 @@ import hypothesis
 import psutil
 import pytest
 import pytest_asyncio
+import structlog
 import uvloop
 
 from holdfast.actors.kernel.loop import RunLoop
@@ -81,16 +82,20 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say how long each folder of tests took, and how to repeat what was drawn."""
-    seconds: defaultdict[str, float] = defaultdict(float)
+    """Say how long each folder of tests and the slowest files took, and how to repeat what was drawn."""
+    rooms: defaultdict[str, float] = defaultdict(float)
+    files: defaultdict[str, float] = defaultdict(float)
     for reports in terminalreporter.stats.values():
         for report in reports:
             if isinstance(report, pytest.TestReport):
-                seconds[report.nodeid.rpartition("::")[0].split("/")[1]] += report.duration
-    if len(seconds) > 1:
-        terminalreporter.section("seconds per room")
-        longest_first = sorted(seconds, key=seconds.__getitem__, reverse=True)
-        terminalreporter.line(", ".join(f"{room} {seconds[room]:.0f}" for room in longest_first))
+                file = report.nodeid.partition("::")[0].removeprefix("tests/")
+                rooms[file.partition("/")[0]] += report.duration
+                files[file] += report.duration
+    if len(rooms) > 1:
+        for title, seconds in (("seconds per room", rooms), ("seconds of the slowest files", files)):
+            longest_first = sorted(seconds, key=seconds.__getitem__, reverse=True)
+            terminalreporter.section(title)
+            terminalreporter.line(", ".join(f"{name} {seconds[name]:.0f}" for name in longest_first[:30]))
     if RANDOM:
         terminalreporter.line(f"Hypothesis drew at random: HOLDFAST_RANDOM={os.environ['HOLDFAST_RANDOM']} repeats it")
 
@@ -224,6 +229,14 @@ def nothing_left(warm_servers: WarmServers | None) -> Iterator[None]:
     assert not left, f"the test left child processes: {left}"
     grown = leaks.files()
     assert not grown, f"the test left files open: {grown}"
+
+
+@pytest.fixture(autouse=True)
+def structlog_as_it_was() -> Iterator[None]:
+    """Have no test find structlog set up by another one: our records go to standard logging then, as a user's do."""
+    yield
+    if structlog.is_configured():
+        structlog.reset_defaults()
 
 
 @pytest.fixture(autouse=True)

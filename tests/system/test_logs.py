@@ -176,14 +176,10 @@ class FromStandard(logging.Handler):
 @pytest.fixture
 def standard() -> Iterator[FromStandard]:
     """A program that has set up standard logging, and never heard of structlog."""
-    before = structlog.get_config() if structlog.is_configured() else None
-    structlog.reset_defaults()
     logger, handler = logging.getLogger("holdfast"), FromStandard()
     logger.addHandler(handler)
     yield handler
     logger.removeHandler(handler)
-    if before is not None:
-        structlog.configure(**before)
 
 
 async def test_standard_logging_gets_the_record_where_structlog_is_not_set_up(standard: FromStandard) -> None:

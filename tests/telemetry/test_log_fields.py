@@ -76,12 +76,10 @@ def kept() -> Iterator[Kept]:
 
 
 @pytest.fixture
-def shown() -> Iterator[list[Any]]:
+def shown() -> list[Any]:
     capture = structlog.testing.LogCapture()
-    before = structlog.get_config()
     structlog.configure(processors=[add_turn, capture])
-    yield capture.entries
-    structlog.configure(**before)
+    return capture.entries
 
 
 async def test_records_of_a_turn_have_its_fields(kept: Kept, shown: list[Any]) -> None:
