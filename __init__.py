@@ -72,7 +72,7 @@ from holdfast.system.system import ActorSystem
 from holdfast.system.system_connection import connect
 from holdfast.system.transaction.errors import TransactionFailed, TransactionRefused
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 __all__ = [
     "Actor",

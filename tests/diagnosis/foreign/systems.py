@@ -28,11 +28,19 @@ class Faults:
 
     of: dict[str, str] = dataclasses.field(default_factory=dict)
     turns: Counter[str] = dataclasses.field(default_factory=Counter)
+    is_of_a_life: bool = False
+    """Whether nothing is wrong any more with a later life."""
+    came_out: Callable[[str], None] = lambda name: None
+    """Called with the name of each who takes what the system makes, whenever it has taken something."""
 
     def begin(self, actor: hf.Actor) -> None:
         """Let happen what is wrong with the start of an actor."""
-        if self.of.get(name_of(actor)) == "unborn":
-            raise RuntimeError(f"{name_of(actor)} cannot start")
+        name = name_of(actor)
+        is_unborn = self.of.get(name) == "unborn"
+        if self.is_of_a_life:
+            self.of.pop(name, None)
+        if is_unborn:
+            raise RuntimeError(f"{name} cannot start")
 
     async def strike(self, actor: hf.Actor) -> str:
         """Let happen what is wrong with a turn. Returns "mute", "deaf" or "owe" if that is the rest of it."""
@@ -169,7 +177,8 @@ class Sink(hf.Actor):
 
     @hf.on(Item)
     async def take(self, message: Item) -> None:
-        await self._faults.strike(self)
+        if not await self._faults.strike(self):
+            self._faults.came_out(name_of(self))
 
 
 def child(name: str, kind: Callable[..., Any], *args: Any, **kwargs: Any) -> hf.ChildSpec:

@@ -4,7 +4,8 @@ import asyncio
 import contextlib
 import dataclasses
 import random
-from collections.abc import Collection
+from collections.abc import AsyncIterator, Collection, Coroutine
+from typing import Any, TypeVar
 
 import holdfast as hf
 from holdfast import diagnosis
@@ -12,6 +13,8 @@ from holdfast.diagnosis import DIAGNOSIS
 from holdfast.diagnosis.engine import Diagnosis, State
 from holdfast.testing.clock import VirtualClockLoop
 from tests.diagnosis.foreign.systems import Faults, Foreign, Item, Stage
+
+T = TypeVar("T")
 
 TRAFFICS = ("steady", "bursty", "doubled", "quiet")
 WARM = 40.0
@@ -101,36 +104,48 @@ async def trial(foreign: Foreign, struck: dict[str, str], kind: str, seed: int, 
     faults = Faults()
     said: list[tuple[float, Diagnosis]] = []
     loop = asyncio.get_running_loop()
+    async with under_traffic(foreign, faults, kind, seed) as system:
+        system.spawn(hf.start(Listener, said))
+        await diagnosis.watch(system, seconds=3.0)
+        await asyncio.sleep(WARM + CHANGED + healthy)
+        false_alarms = tuple(str(one) for _, one in said)
+        if not struck:
+            return Outcome(false_alarms)
+        said.clear()
+        began = loop.time()
+        faults.of |= struck
+        found = set[str]()
+        for _ in struck:
+            if named := await _named(said, loop.time() + WITHIN, struck.keys() - found):
+                found |= named
+                if found != struck.keys():
+                    await _mend(system, faults, named)
+        if not said:
+            return Outcome(false_alarms)
+        at, first = said[0]
+        names = _names(first.candidates[0].bad)
+        return Outcome(false_alarms, names, _names(first.certain), at - began, frozenset(found))
+
+
+@contextlib.asynccontextmanager
+async def under_traffic(foreign: Foreign, faults: Faults, kind: str, seed: int) -> AsyncIterator[hf.ActorSystem]:
+    """A system in which a foreign one runs, and is told what comes."""
     async with hf.ActorSystem("app", log=False, seed=seed) as system:
         await system.start(hf.supervisor("all", children=foreign.children(faults), intensity=1000, period=5.0))
-        system.spawn(hf.start(Listener, said))
         entry = system.ref(f"/app/all/{foreign.entry}", Stage)
         driving = asyncio.create_task(_traffic(entry, kind, random.Random(seed)))
         try:
-            await diagnosis.watch(system, seconds=3.0)
-            await asyncio.sleep(WARM + CHANGED + healthy)
-            false_alarms = tuple(str(one) for _, one in said)
-            if not struck:
-                return Outcome(false_alarms)
-            said.clear()
-            began = loop.time()
-            faults.of |= struck
-            found = set[str]()
-            for _ in struck:
-                if named := await _named(said, loop.time() + WITHIN, struck.keys() - found):
-                    found |= named
-                    if found != struck.keys():
-                        await _mend(system, faults, named)
-            if not said:
-                return Outcome(false_alarms)
-            at, first = said[0]
-            names = _names(first.candidates[0].bad)
-            return Outcome(false_alarms, names, _names(first.certain), at - began, frozenset(found))
+            yield system
         finally:
             driving.cancel()
 
 
-def run(foreign: Foreign, struck: dict[str, str], kind: str, seed: int, healthy: float = 0.0) -> Outcome:
+def in_its_own_loop(trial: Coroutine[Any, Any, T]) -> T:
     """Run one trial in a loop of its own, for as long as it takes."""
     with asyncio.Runner(loop_factory=lambda: VirtualClockLoop(jumps=JUMPS)) as runner:
-        return runner.run(trial(foreign, struck, kind, seed, healthy))
+        return runner.run(trial)
+
+
+def run(foreign: Foreign, struck: dict[str, str], kind: str, seed: int, healthy: float = 0.0) -> Outcome:
+    """Run one trial in a loop of its own, for as long as it takes."""
+    return in_its_own_loop(trial(foreign, struck, kind, seed, healthy))
