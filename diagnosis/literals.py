@@ -109,7 +109,7 @@ def room(component: str) -> Literal:
 
 
 def crashes(component: str) -> Literal:
-    """A component crashes again and again, for reasons of its own."""
+    """A component crashes, or ends though it is always to be there, again and again and for reasons of its own."""
     return Literal("crashes", (component,))
 
 

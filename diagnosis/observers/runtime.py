@@ -11,8 +11,8 @@ from typing import Any, Final
 
 from ...actors.control.orders_lane import OrderAsk
 from ...actors.errors import AskTimeout
-from ...actors.events import ActorCrashed, EventStream
-from ...actors.exit_reasons import Crash
+from ...actors.events import ActorCrashed, ChildTerminated, EventStream
+from ...actors.exit_reasons import Crash, Normal
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.envelope import Ask, chain_of
 from ...actors.kernel.message import Refusal
@@ -34,7 +34,7 @@ MOST: Final = 2_000
 SHARE: Final = 50.0
 """Times the length of a look that passes between two looks at least: looking takes a fiftieth of the time at most."""
 LOOP: Final = 3
-"""Crashes within `WITHIN` seconds that are a crash loop."""
+"""Ends within `WITHIN` seconds that are a crash loop: crashes, and those in good order of who is always to be there."""
 WITHIN: Final = 10.0
 USUAL: Final = 10
 """Looks of which the last ones say whom an actor waits for as a rule."""
@@ -70,7 +70,7 @@ class _Seen:
 
 
 class RuntimeObserver(Observer):
-    """Says who gets on, answers, keeps up, crashes again and again, whose mailbox is full, and who waits for whom.
+    """Says who gets on, answers, keeps up, ends again and again, whose mailbox is full, and who waits for whom.
 
     An actor is late if asks of it were not answered in time, or if others wait for it longer than the longest turn it
     was seen to need, four times over. Who is late because it waits for another one is not accused: the last one in that
@@ -101,7 +101,7 @@ class RuntimeObserver(Observer):
         self._failed: list[tuple[Ask, BaseException]] = []
         self._stream: EventStream | None = None
         self._rests_until = 0.0
-        self._loops: set[str] = set()  # who crashes again and again
+        self._loops: set[str] = set()  # who ends again and again
         self._let_down: dict[str, float] = {}  # when an ask of theirs has failed
         self._waiting: set[Literal] = set()
 
@@ -135,7 +135,7 @@ class RuntimeObserver(Observer):
             self._failed.append((ask, error))
 
     def spares(self, grace: Any, about: Literal) -> bool:
-        """How often it crashes is just what is to be known."""
+        """How often it ends is just what is to be known."""
         return self._loops.isdisjoint(about.args) and super().spares(grace, about)
 
     def afresh(self, names: Collection[str]) -> None:
@@ -210,14 +210,16 @@ class RuntimeObserver(Observer):
                     self._asked.setdefault(asker, set()).add(callee)
 
     def _take_crashes(self, names: Mapping[str, str]) -> None:
-        """Crashes by themselves; who could not bear that another one did not answer is not to blame."""
+        """Ends by themselves; who could not bear that another one did not answer is not to blame."""
         assert self._stream is not None
         for event in self._stream.take():
-            component = names.get(event.address) if isinstance(event, ActorCrashed) else None
-            if component is None or not isinstance(event, ActorCrashed) or not isinstance(event.reason, Crash):
-                continue
-            was_let_down = self.now - self._let_down.get(component, -math.inf) <= 2 * self.manner.every
-            if not (was_let_down or _is_anothers(event.reason)):
+            match event:
+                case ActorCrashed(reason=Crash() as reason) | ChildTerminated(reason=Normal() as reason):
+                    component = names.get(event.address)
+                case _:
+                    continue
+            was_let_down = self.now - self._let_down.get(component or "", -math.inf) <= 2 * self.manner.every
+            if component is not None and not (was_let_down or _is_anothers(reason)):
                 seen = self._seen(component)
                 seen.crashes = (*seen.crashes, self.now)
         for seen in self._known.values():
@@ -343,6 +345,7 @@ class RuntimeObserver(Observer):
         return usual if usual and 2 * count > len(seen.waited) and usual in self._actors else None
 
 
-def _is_anothers(reason: Crash) -> bool:
+def _is_anothers(reason: Crash | Normal) -> bool:
     """Whether an actor crashed because another one did not answer; of one in a process nothing else is known."""
-    return reason.type_name.rpartition(".")[2] in ("AskTimeout", "AskFailed", "RemoteCrash")
+    others = ("AskTimeout", "AskFailed", "RemoteCrash")
+    return isinstance(reason, Crash) and reason.type_name.rpartition(".")[2] in others

@@ -255,10 +255,17 @@ CHECKS = {
     ),
     "who crashes because of another one is not to blame": Check(
         "diagnosis/observers/runtime.py",
-        "if not (was_let_down or _is_anothers(event.reason)):",
-        "if True:",
+        "if component is not None and not (was_let_down or _is_anothers(reason)):",
+        "if component is not None:",
         RUNTIME,
         "who_crashes_because",
+    ),
+    "who is always to be there, and ends again and again, is faulty": Check(
+        "diagnosis/observers/runtime.py",
+        "case ActorCrashed(reason=Crash() as reason) | ChildTerminated(reason=Normal() as reason):",
+        "case ActorCrashed(reason=Crash() as reason):",
+        RUNTIME,
+        "a_crash_loop_is_certain",
     ),
     "a long turn that nobody waits for is no fault": Check(
         "diagnosis/observers/runtime.py",

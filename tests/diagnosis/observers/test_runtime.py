@@ -17,7 +17,7 @@ pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 
 
 class Go(hf.Message[int]):
-    """Do it; "ask ADDRESS", "freeze", "crash" or nothing."""
+    """Do it; "ask ADDRESS", "freeze", "crash", "stop" or nothing."""
 
     what: str = ""
     timeout: float = 60.0
@@ -45,6 +45,8 @@ class Worker(hf.Actor):
                 await asyncio.Event().wait()
             case ["crash"]:
                 raise RuntimeError("broken")
+            case ["stop"]:
+                self.ctx.stop()
             case ["refuse"]:
                 raise Sorry
             case ["refused", address]:
@@ -153,13 +155,14 @@ async def test_a_long_turn_that_nobody_waits_for_and_one_that_is_usual_are_no_fa
     assert await asking == 1
 
 
-async def test_a_crash_loop_is_certain_and_one_crash_is_none(system: hf.ActorSystem) -> None:
+@pytest.mark.parametrize("end", ["crash", "stop"])
+async def test_a_crash_loop_is_certain_and_one_crash_is_none(system: hf.ActorSystem, end: str) -> None:
     watching = await watched(system)
-    worker(system, "b").tell(Go("crash"))
+    worker(system, "b").tell(Go(end))
     await advance(1.5)
     assert (await watching.diagnosis()).state is State.HEALTHY
     for _ in range(2):
-        worker(system, "b").tell(Go("crash"))
+        worker(system, "b").tell(Go(end))
         await advance(1.0)
     assert (await watching.diagnosis()).certain == ("all/b",)
     assert crashes("all/b") in (await watching.observed()).positive
