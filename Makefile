@@ -56,6 +56,7 @@ campaign: $(VENV)/.dev
 	    tests/diagnosis/live/test_replicas.py
 	HOLDFAST_FOREIGN=20 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=0 tests/diagnosis/foreign
 	$(BIN)/python -m tests.diagnosis.foreign.days 24
+	$(BIN)/python -m tests.diagnosis.foreign.repairs 3
 	HOLDFAST_BUILDS=1 $(BIN)/python -m pytest -q -s tests/packaging
 	HOLDFAST_MUTANTS=100 $(BIN)/python -m pytest -q -s -o faulthandler_timeout=0 tests/test_mutants.py
 

@@ -135,7 +135,7 @@ class OffAndOn:
         return next((when for who, when in self.on.acted if who == self.case.fault[0]), None)
 
 
-def both(case: RepairTrial, haste: Haste) -> OffAndOn:
+def off_and_on(case: RepairTrial, haste: Haste = Haste()) -> OffAndOn:
     """Run a fault with repair off and with repair on."""
     stances: tuple[Stance, Stance] = ("off", "on")
     off, on = (in_its_own_loop(cost(case, stance, haste)) for stance in stances)
@@ -165,7 +165,7 @@ def main(arguments: list[str] | None = None) -> int:
     pairs: list[OffAndOn] = []
     with ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool:
         running = [
-            pool.submit(both, dataclasses.replace(case, seed=seed), haste)
+            pool.submit(off_and_on, dataclasses.replace(case, seed=seed), haste)
             for seed in range(options.rounds)
             for case in ALL_TRIALS[options.first :: options.every]
         ]

@@ -1,5 +1,6 @@
 """Systems that know nothing of diagnosis: the root cause of a fault is named first, and changed traffic is no fault."""
 
+import dataclasses
 import itertools
 import os
 import random
@@ -7,6 +8,7 @@ import statistics
 
 import pytest
 
+from tests.diagnosis.foreign.repairs import ALL_TRIALS, LONGER, off_and_on
 from tests.diagnosis.foreign.systems import SYSTEMS, Foreign
 from tests.diagnosis.foreign.trials import TRAFFICS, Outcome, run, trial
 
@@ -109,3 +111,12 @@ def test_of_many_faults_nearly_all_are_named() -> None:
     print(f"{len(outcomes)} trials, {len(wrong)} wrong, {alarms} with false alarms, named after {median:.1f} s")
     assert alarms == 0
     assert len(wrong) <= 0.05 * len(outcomes)
+
+
+@pytest.mark.parametrize("number", range(2))
+def test_repair_makes_no_outage_longer_and_restarts_nobody_else(number: int) -> None:
+    """Rounds over all of them: `python -m tests.diagnosis.foreign.repairs 3`."""
+    trial_of_repair = dataclasses.replace(random.Random(number).choice(ALL_TRIALS), seed=number)
+    pair = off_and_on(trial_of_repair)
+    assert (pair.wrong, pair.off.acted) == ([], ()), pair
+    assert pair.longer <= LONGER, pair
