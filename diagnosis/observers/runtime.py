@@ -13,6 +13,7 @@ from ...actors.control.orders_lane import OrderAsk
 from ...actors.errors import AskTimeout
 from ...actors.events import ActorCrashed, ChildTerminated, EventStream
 from ...actors.exit_reasons import Crash, Normal
+from ...actors.kernel.address_host import Work
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.envelope import Ask, chain_of
 from ...actors.kernel.message import Refusal
@@ -67,6 +68,22 @@ class _Seen:
     backlog: Backlog = dataclasses.field(default_factory=Backlog)
     waited: deque[str] = dataclasses.field(default_factory=lambda: deque(maxlen=USUAL))
     """Whom it waited for at the last looks."""
+
+    def take(self, work: Work, life: int, now: float, patience: float) -> bool:
+        """Learn from what it has in hand at a look. Returns whether it has got on since the last one."""
+        if self.life != life:
+            self.life, self.mark, self.since = life, work.mark, now
+            self.unanswered.clear()
+            self.backlog.clear()
+        has_got_on = work.mark is not self.mark
+        if has_got_on or (self.is_in_turn and not work.is_in_turn):  # A turn is over that was seen, or that was missed.
+            stood = now - max(self.since, self.idle)
+            self.longest = max(self.longest, stood if self.is_in_turn or stood > patience else 0.0)
+        self.is_in_turn = work.is_in_turn
+        if has_got_on:
+            self.mark, self.turns = work.mark, self.turns + 1
+            self.since = now if work.since is None else max(work.since, self.since)
+        return has_got_on
 
 
 class RuntimeObserver(Observer):
@@ -236,22 +253,10 @@ class RuntimeObserver(Observer):
         self, component: str, cell: Cell, asked_since: float | None, waits: Mapping[str, set[str]], now: float
     ) -> bool:
         seen = self._seen(component)
-        work = cell.host.work(cell)
-        if seen.life != cell.life:
-            seen.life, seen.mark, seen.since = cell.life, work.mark, now
-            seen.unanswered.clear()
-            seen.backlog.clear()
-        has_got_on = work.mark is not seen.mark
-        if has_got_on or (seen.is_in_turn and not work.is_in_turn):  # A turn is over that was seen, or that was missed.
-            stood = now - max(seen.since, seen.idle)
-            seen.longest = max(seen.longest, stood if seen.is_in_turn or stood > self._patience else 0.0)
-        seen.is_in_turn = work.is_in_turn
-        if has_got_on:
-            seen.mark, seen.turns = work.mark, seen.turns + 1
-            seen.since = now if work.since is None else max(work.since, seen.since)
+        work, backlog = cell.host.work(cell), cell.host.backlog(cell)
+        has_got_on = seen.take(work, cell.life, now, self._patience)
         waits_now = sorted(waits.get(component, ()))
         seen.waited.append(waits_now[0] if waits_now else "")
-        backlog = cell.host.backlog(cell)
         aside = len(cell.more.stash or ()) if cell.more is not None else 0  # It may never be taken up again.
         seen.backlog.take(backlog + aside, now)
         limit = max(self._patience, LONGER * seen.longest) if seen.turns >= LOOKS else float("inf")
@@ -259,30 +264,34 @@ class RuntimeObserver(Observer):
         if not is_busy:
             seen.idle = now
         is_wanted = asked_since is not None or backlog > 0
-        keeps = self.manner.time_to_live
-        while seen.unanswered and now - seen.unanswered[0][0] > keeps:
+        while seen.unanswered and now - seen.unanswered[0][0] > self.manner.time_to_live:
             seen.unanswered.popleft()
         stands = is_busy and is_wanted and now - max(seen.since, seen.idle) > limit
         # A turn that was under way when an ask of it ran out, and still is; or several asks that ran out.
         unanswered = [at for at, made in seen.unanswered if is_busy and seen.since <= max(made, at - self._patience)]
         is_late = stands or bool(unanswered) or len(seen.unanswered) > 1
-        bound = cell.host.mailbox(cell)
+        is_full = self._is_full(component, cell, now)
+        if not is_late and not is_full and component not in self._loops:
+            self._tell_good(component, has_got_on, has_got_on and work.has_answered and not seen.unanswered)
+        return is_late or is_full
+
+    def _is_full(self, component: str, cell: Cell, now: float) -> bool:
+        """Whether its mailbox has taken nothing for too long."""
+        seen, bound = self._seen(component), cell.host.mailbox(cell)
         turns_away = bound is not None and bound.overflow not in DROPS and bound.count >= bound.capacity
         seen.full = None if cell.has_room and not turns_away else now if seen.full is None else seen.full
         is_full = seen.full is not None and now - seen.full >= self._patience
         if bound is not None and not is_full:
             self.verdict(room(component), True)
-        if not is_late and not is_full and component not in self._loops:
-            answered = work.has_answered and not seen.unanswered
-            self.verdict(
-                progress(component),
-                True if has_got_on else None if now - seen.since > keeps else self.said(progress(component)),
-            )
-            if now - seen.refused <= keeps:
-                self.verdict(replies(component), None)
-            else:
-                self.verdict(replies(component), True if has_got_on and answered else self.said(replies(component)))
-        return is_late or is_full
+        return is_full
+
+    def _tell_good(self, component: str, has_got_on: bool, answers: bool) -> None:
+        """Say of who is not late what it was seen to do, and for a while what it was seen to do before."""
+        seen, now, keeps = self._known[component], self.now, self.manner.time_to_live
+        was = None if now - seen.since > keeps else self.said(progress(component))
+        self.verdict(progress(component), True if has_got_on else was)
+        has_refused = now - seen.refused <= keeps
+        self.verdict(replies(component), None if has_refused else True if answers else self.said(replies(component)))
 
     # -- blaming ----------------------------------------------------------------------------------------------------
 

@@ -276,8 +276,8 @@ CHECKS = {
     ),
     "a refusal is no evidence": Check(
         "diagnosis/observers/runtime.py",
-        "if now - seen.refused <= keeps:",
-        "if False:",
+        "has_refused = now - seen.refused <= keeps",
+        "has_refused = False",
         RUNTIME,
         "who_refuses",
     ),
