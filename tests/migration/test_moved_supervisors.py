@@ -394,7 +394,7 @@ async def test_whom_it_is_asked_to_start_meanwhile_is_there_if_it_says_so(system
             with contextlib.suppress(hf.ActorStopped, hf.AskFailed):
                 await supervisor.ask(hf.StartChild(hf.child(name, hf.start(Traveller))), IN_TIME)
                 started.append(name)
-            await asyncio.sleep(0.02)
+            await asyncio.sleep(0.1)
 
     starting = asyncio.create_task(start())
     for to in (new, old) * 3:
