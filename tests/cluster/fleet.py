@@ -24,6 +24,7 @@ class Programs:
         self.store, self.socket, self.isolation = store, folder / "bank.sock", isolation
         self.folder, self.command = folder, command
         self.processes: list[asyncio.subprocess.Process] = []
+        self._started = 0
 
     async def start(self, *before: str, environ: Mapping[str, str] | None = None) -> asyncio.subprocess.Process:
         """Start another program; it stands by, or leads.
@@ -34,8 +35,8 @@ class Programs:
         """
         bank = ("-m", "tests.cluster.bank", self.store, str(self.socket), self.isolation)
         command = [*before, sys.executable, *(self.command or bank)]
-        errors = (self.folder / f"program-{len(self.processes)}.err").open("wb")
-        with errors:
+        self._started += 1  # What those who have ended wrote is kept.
+        with (self.folder / f"program-{self._started:03}.err").open("wb") as errors:
             process = await asyncio.create_subprocess_exec(
                 *command, stdout=asyncio.subprocess.PIPE, stderr=errors, env={**os.environ, **(environ or {})}
             )
