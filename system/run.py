@@ -14,6 +14,7 @@ from time import monotonic
 from typing import Any, TypeVar
 
 from ..actors.errors import SpecError
+from ..actors.process.fork.launch import check_is_program
 from ..actors.seconds import check_seconds
 from ..cluster.leadership import LeadershipLost
 from .init_process import leave_init
@@ -98,11 +99,13 @@ def run(
 
     Raises:
         SpecError: an event loop runs in this thread already, as in a notebook; `again` was given a coroutine, which
-            can run only once; or `standstill` is no such number.
+            can run only once; `standstill` is no such number; or the program has no `if __name__ == "__main__":` and
+            is being imported for the classes of its actors.
         KeyboardInterrupt: it was ended by SIGINT.
         SystemExit: it was ended by SIGTERM (with code 143, as a shell reports it).
     """
     try:
+        check_is_program("hf.run")
         check_seconds("hf.run", "standstill", standstill)
     except SpecError:
         if not callable(main):

@@ -25,6 +25,7 @@ from ..actors.kernel.node import Node, Ports, cell_kind
 from ..actors.kernel.ref import ActorRef, current
 from ..actors.kernel.topics import publish
 from ..actors.loop_watchdog import LoopWatch
+from ..actors.process.fork.launch import check_is_program
 from ..actors.process.process_host import WorkerPlace, in_process, on_frame
 from ..actors.process.worker_pool import Workers
 from ..checkpoint.engine_calls import Called
@@ -214,6 +215,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
     async def __aenter__(self) -> ActorSystem:
         if self._running is not None:
             raise HoldfastError(f"system {self.name!r} was entered already; make a new one")
+        check_is_program("ActorSystem")
         options = self._options
         file = options.read_recovery_file()
         node = self._running = Node(self.name, asyncio.get_running_loop(), seed=options.seed)

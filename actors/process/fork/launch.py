@@ -10,7 +10,7 @@ import subprocess
 import sys
 import sysconfig
 
-from ...errors import ProcessUnavailable
+from ...errors import ProcessUnavailable, SpecError
 from . import boot
 from .boot import OWNER_VARIABLE, SERVER_VARIABLE, Config
 
@@ -56,14 +56,19 @@ def keep_large_memory() -> None:
 
 
 def check_can_start() -> None:
-    """Raise ProcessUnavailable where no fork server can or must be started."""
+    """Raise ProcessUnavailable where no fork server can be started."""
     if not sys.platform.startswith("linux"):
         raise ProcessUnavailable(f"actors in processes of their own need Linux (pidfd, memfd); this is {sys.platform}")
+
+
+def check_is_program(where: str) -> None:
+    """Raise SpecError in the fork server, which imports the program for its classes: nothing must run a second time."""
     if os.environ.get(SERVER_VARIABLE) == str(os.getpid()):
-        raise ProcessUnavailable(
-            "this program is being imported by the fork server and must not start a system then; "
-            'put what it does under `if __name__ == "__main__":`'
+        problem = (
+            "this program is being imported for the classes of its actors, by the process that processes are forked "
+            'from, and must not run a second time; put what it does under `if __name__ == "__main__":`'
         )
+        raise SpecError(where, problem)
 
 
 def server_command(control_fd: int) -> list[str]:

@@ -63,6 +63,16 @@ def test_a_script_without_a_guard_is_told_to_have_one(tmp_path: Path, how: str) 
     assert 'put what it does under `if __name__ == "__main__":`' in said
 
 
+@pytest.mark.parametrize("runner", ["hf.run", "__import__('asyncio').run"])
+def test_a_script_without_a_guard_does_nothing_twice(tmp_path: Path, runner: str) -> None:
+    """What it did before it wanted a process it had done again, in the process that imports the program."""
+    begins = "as system:\n        print('charges a customer')\n"
+    program = PROCESS.replace("as system:\n", begins) + f"{runner}(main())\n"
+    said = output(file(tmp_path, "program.py", program), folder=tmp_path)
+    assert said.count("charges a customer") == 1
+    assert 'put what it does under `if __name__ == "__main__":`' in said
+
+
 def test_a_script_that_cannot_be_imported_is_told_why(tmp_path: Path) -> None:
     program = "import sys\nif __name__ != '__main__':\n    raise OSError('no display')\n" + PROCESS + GUARD + RUN
     assert "OSError: no display" in output(file(tmp_path, "program.py", program), folder=tmp_path)
