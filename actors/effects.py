@@ -194,7 +194,7 @@ def effect_of(
     if not callable(function):
         raise SpecError("effect", f"takes a function and its arguments, not {function!r}")
     if timeout is not None:
-        check_seconds("effect", "timeout", timeout)
+        timeout = check_seconds("effect", "timeout", timeout)
     if retry is not None and not isinstance(retry, Retry):
         raise SpecError("effect", f"retry must be a Retry, or None, not {retry!r}")
     if at_most_once and retry is not None and retry.attempts > 1:

@@ -185,7 +185,7 @@ def recovery_hooks(
                 raise SpecError("recovery_hooks", f"{which} must name phases ({known}), not {phase!r}")
             if not callable(hook):
                 raise SpecError("recovery_hooks", f"{which}[{phase!r}] must be a function, not {hook!r}")
-    return RecoveryHooks(before or {}, after or {}, float(check_seconds("recovery_hooks", "timeout", timeout)))
+    return RecoveryHooks(before or {}, after or {}, check_seconds("recovery_hooks", "timeout", timeout))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -221,5 +221,5 @@ def meanwhile(
     if hooks is not None and not isinstance(hooks, RecoveryHooks):
         raise SpecError(where, f"hooks must come from recovery_hooks(...), not be {hooks!r}")
     for_all, by_topic = as_held(where, held)
-    timeout = float(check_seconds(where, "safe_state_timeout", safe_state_timeout))
+    timeout = check_seconds(where, "safe_state_timeout", safe_state_timeout)
     return Meanwhile(as_safe_state(where, safe_state), timeout, for_all, by_topic, hooks)

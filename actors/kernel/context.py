@@ -286,7 +286,8 @@ class ActorContext:
 
     def every(self, interval: float, message: Message[Any]) -> Timer:
         """Have a message come every `interval` seconds, > 0; ticks that fall due while one waits are left out."""
-        timer: Timer = self._timer(message, check_seconds(self.path, "interval", interval), interval)
+        interval = check_seconds(self.path, "interval", interval)
+        timer: Timer = self._timer(message, interval, interval)
         return timer
 
     def _timer(self, message: Message[Any], delay: float, interval: float | None) -> Any:
@@ -461,8 +462,7 @@ class ActorContext:
     def sleep(self, seconds: float) -> asyncio.Future[None]:
         """Have the turn in hand wait for so many seconds from this call on; see `sleep_until`."""
         self._alive()
-        check_seconds(self.path, "sleep", seconds, or_zero=True)
-        return self._slept(float(seconds), is_moment=False)
+        return self._slept(check_seconds(self.path, "sleep", seconds, or_zero=True), is_moment=False)
 
     def _slept(self, seconds: float, *, is_moment: bool) -> asyncio.Future[None]:
         """Wait until a moment, or for so many seconds: without recovery, in this life."""
@@ -494,7 +494,7 @@ class ActorContext:
         if answered := [kind.__name__ for kind in kinds if reply_type(kind) is not None]:
             raise SpecError("wait_for", f"takes messages whose reply is None, and {', '.join(answered)} has another")
         if timeout is not None:
-            check_seconds(self.path, "timeout of wait_for", timeout)
+            timeout = check_seconds(self.path, "timeout of wait_for", timeout)
         return cast("asyncio.Future[M]", self._signal(kinds, timeout))
 
     def _signal(self, kinds: tuple[type[Message[Any]], ...], timeout: float | None) -> asyncio.Future[Message[Any]]:

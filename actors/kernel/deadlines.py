@@ -30,7 +30,7 @@ class Deadlines:
         timeout = ask.timeout
         queue = self._queues.get(timeout) if type(timeout) is float else None
         if queue is None:
-            timeout = float(check_seconds(ask.to.path, "timeout", timeout))
+            timeout = check_seconds(ask.to.path, "timeout", timeout)
             queue = self._queues.get(timeout)
         if queue is None:
             queue = self._queues[timeout] = _Queue(self._loop, self._queues, timeout)

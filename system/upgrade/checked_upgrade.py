@@ -91,7 +91,7 @@ def check_upgrade(
     Raises:
         SpecError: the specs cannot be had. StoreError: the store cannot be read or copied.
     """
-    seconds = float(check_seconds("check_upgrade", "turn_timeout", turn_timeout))
+    seconds = check_seconds("check_upgrade", "turn_timeout", turn_timeout)
     where = os.path.realpath(store)
     with tempfile.TemporaryDirectory(prefix="holdfast-upgrade-") as folder:
         copy = os.path.join(folder, "copy.db")

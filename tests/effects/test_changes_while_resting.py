@@ -65,6 +65,36 @@ async def test_what_comes_while_it_is_moved_is_taken_once(tmp_path: Path, isolat
         assert len(await ref.ask(Look(), IN_TIME)) == 3
 
 
+class Whole(Patient):
+    """It counts in whole seconds: 600 is what 600.0 is, also where only the number is left."""
+
+    @hf.on(Go)
+    async def go(self, message: Go) -> str:
+        self.ctx.tell_after(600, Call("late"))
+        self.ctx.every(600, Call("each"))
+        await self.ctx.effect(note, message.file, "whole", timeout=600)
+        await self.ctx.sleep(0)
+        return (await self.ctx.wait_for(Call, timeout=600)).word
+
+
+@pytest.mark.parametrize("change", ["move", "protect"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_whole_seconds_are_the_same_behind_a_change(tmp_path: Path, isolation: Any, change: str) -> None:
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(
+            hf.child("patient", hf.start(Whole), isolation=isolation, recovery=hf.hybrid(interval=1000))
+        )
+        asked = ref.ask(Go([], str(tmp_path / "world")), IN_TIME)
+        await waits(system)
+        if change == "move":
+            await system.set_isolation(ref, OTHER[isolation])
+        else:
+            async with system.transaction(timeout=IN_TIME) as changes:
+                changes.protect(ref, PBR())
+        await ref.ask(Call("now"), IN_TIME)
+        assert await asked == "now"
+
+
 class Fussy(hf.Actor):
     """It goes on in one process only."""
 
