@@ -48,6 +48,8 @@ class Item:
     """The turns that wait for its turn."""
     is_ask: bool = False
     """Whether somebody waits for an answer to it."""
+    lapses: ClassVar[bool] = False
+    """Whether it means nothing to a life that leaves its turn in the middle, and need not be waited for then."""
     is_followed: ClassVar[bool] = False
     """Whether its turn is a span of a trace."""
     is_cancelled: bool = False

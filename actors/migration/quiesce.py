@@ -93,15 +93,15 @@ class PackLife(Item):
     def hurry(self, cell: Cell) -> None:
         """Do not wait for a turn that rests, which may be for days: it is left, and run again at the new place.
 
-        Not while other commands come first than orders, which the next life obeys, or something is out that would end
-        with this life.
+        Not while other commands come first than orders, which the next life obeys, and than what lapses with the turn,
+        or something is out that would end with this life.
         """
         ctx, more = cell.ctx, cell.extra()
         if ctx is None or not ctx._may_rest or self._stays or self.is_void or self.is_done:
             return
         if cell.state is not RUNNING:
             return
-        first = next((one for one in more.urgent or () if not isinstance(one, QueuedOrder)), None)
+        first = next((one for one in more.urgent or () if not (isinstance(one, QueuedOrder) or one.lapses)), None)
         stays_behind = any(name not in self._ignored for name in cell.children or ())
         if first is self and not stays_behind and not _busy(cell) and ctx._leaves_turn():
             return

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.checkpoint.home.recorded_home import switch_of
 from holdfast.ftm import LFR, PBR, TMR, TR
 from holdfast.ftm.group.steering import LOOK_AGAIN, past_resting_turns
 from tests.effects import test_glances
@@ -65,6 +66,18 @@ async def test_what_comes_while_it_is_moved_is_taken_once(tmp_path: Path, isolat
         assert len(await ref.ask(Look(), IN_TIME)) == 3
 
 
+async def change_to(system: hf.ActorSystem, ref: Any, change: str, isolation: Any) -> None:
+    match change:
+        case "move":
+            await system.set_isolation(ref, OTHER[isolation], timeout=IN_TIME)
+        case "protect":
+            async with system.transaction(timeout=IN_TIME) as changes:
+                changes.protect(ref, PBR())
+        case "suspend":
+            await system.suspend(ref, timeout=IN_TIME)
+            await system.resume(ref)
+
+
 class Whole(Patient):
     """It counts in whole seconds: 600 is what 600.0 is, also where only the number is left."""
 
@@ -86,13 +99,29 @@ async def test_whole_seconds_are_the_same_behind_a_change(tmp_path: Path, isolat
         )
         asked = ref.ask(Go([], str(tmp_path / "world")), IN_TIME)
         await waits(system)
-        if change == "move":
-            await system.set_isolation(ref, OTHER[isolation])
-        else:
-            async with system.transaction(timeout=IN_TIME) as changes:
-                changes.protect(ref, PBR())
+        await change_to(system, ref, change, isolation)
         await ref.ask(Call("now"), IN_TIME)
         assert await asked == "now"
+
+
+@pytest.mark.parametrize("change", ["move", "protect", "suspend"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_snapshot_that_is_due_keeps_no_change_waiting(tmp_path: Path, isolation: Any, change: str) -> None:
+    """It is to be taken before anything else, and after the turn that waits: it lapses with that."""
+    async with running(tmp_path, "os") as system:
+        ref = await system.start(patient(isolation, recovery=hf.hybrid(interval=0.02)))
+        assert await ref.ask(Count(), IN_TIME) == 1
+        asked = ref.ask(Go(["c"]), IN_TIME)
+        await waits(system)
+        home = switch_of(ref._cell)
+        assert home is not None
+        async with asyncio.timeout(IN_TIME):
+            while home.due.asked_at < 0:
+                await asyncio.sleep(0.001)
+        await change_to(system, ref, change, isolation)
+        await ref.ask(Call("now"), IN_TIME)
+        assert await asked == "call now"
+        assert await ref.ask(Count(), IN_TIME) == 2
 
 
 class Fussy(hf.Actor):
