@@ -16,6 +16,13 @@ HEALTH = "tests/console/test_health.py"
 EMBEDDED = "tests/examples/embedding/test_surroundings.py"
 
 CHECKS = {
+    "a state too large for a frame from its process is told as such": Check(
+        "actors/control/orders_lane.py",
+        "    if len(data) > MOST_TOLD:",
+        "    if False:",
+        "tests/console/test_operate.py",
+        "too_large_to_be_sent",
+    ),
     "what the next program cannot have is not kept": Check(
         "system/specification.py",
         "            _refuse_of_scripts(one)\n",
