@@ -697,6 +697,20 @@ CHECKS = {
         "tests/checkpoint/store_tools/test_verification.py",
         "test_a_closed_store_that_is_opened_under_a_look",
     ),
+    "who comes to a store that had no room looks whether there is some": Check(
+        "checkpoint/group_commit.py",
+        "self.stopped is None and self._loop.time() - self._tried_at >= RETRY_SECONDS:",
+        "False:",
+        "tests/checkpoint/test_commits.py",
+        "first_who_comes",
+    ),
+    "a store without room is tried by one timer": Check(
+        "checkpoint/group_commit.py",
+        "            self._retry.cancel()",
+        "            pass",
+        "tests/checkpoint/test_commits.py",
+        "tried_by_one_timer",
+    ),
     "a list of the root is no damage": Check(
         "checkpoint/store_tools/verification.py",
         "                if not is_of_actor(chain.path):",
