@@ -3,7 +3,7 @@
 import hashlib
 import os
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -150,18 +150,18 @@ async def test_what_the_next_program_could_not_have_is_refused_where_there_is_a_
     script = written(tmp_path / "own.py", OWN.format(step=STEPS[name], imported=imported))
     async with stored(tmp_path) as system:
         with pytest.raises(hf.TransactionRefused, match="into a module that the program can import") as refused:
-            await system.apply(script)
+            await system.apply(str(script))
         assert f"is defined in {os.path.realpath(defined if imported else script)}" in str(refused.value)
         if imported:
             monkeypatch.syspath_prepend(str(tmp_path))  # Where the next program looks, too.
-            await system.apply(script)
+            await system.apply(str(script))
     if imported:
         async with stored(tmp_path) as system:
             assert system._node.find("/app/left/x") is not None
 
 
 @asynccontextmanager
-async def stored(folder: Path) -> AsyncIterator[hf.ActorSystem]:
+async def stored(folder: Path) -> AsyncGenerator[hf.ActorSystem]:
     """A program with a store."""
     async with hf.ActorSystem("app", log=False, store=f"sqlite:{folder}/app.db") as system:
         await system.start(hf.supervisor("left", children=[counter("a")]))

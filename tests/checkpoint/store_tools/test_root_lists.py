@@ -21,6 +21,7 @@ from holdfast.checkpoint.store_tools import (
     store_stats,
     verify_store,
 )
+from holdfast.cluster.joining import open_store
 from holdfast.cluster.store_copy import copy_store
 from tests.checkpoint.sqlite.stores import A
 from tests.checkpoint.store_tools.writing import filled
@@ -72,14 +73,14 @@ def test_copies_have_them(path: Path, tmp_path: Path) -> None:
     back_up_store(path, tmp_path / "b.db")
     rekey_store(path, tmp_path / "c.db", new_key=KEY)
     compact_store(path)
-    with closing(SqliteJournal(path)) as one, closing(SqliteJournal(tmp_path / "d.db")) as other:
+    with closing(open_store(f"sqlite:{path}")) as one, closing(open_store(f"sqlite:{tmp_path / 'd.db'}")) as other:
         copy_store(one, other, names=("a", "d"))
     for name, key in (("a/app.db", None), ("b.db", None), ("c.db", KEY), ("d.db", None)):
         assert kept_in(tmp_path / name, key) == LISTS
 
 
 def test_a_snapshot_that_cannot_be_copied_is_told_with_its_address(path: Path, tmp_path: Path) -> None:
-    with closing(SqliteJournal(path)) as one, closing(SqliteJournal(tmp_path / "d.db")) as other:
+    with closing(open_store(f"sqlite:{path}")) as one, closing(open_store(f"sqlite:{tmp_path / 'd.db'}")) as other:
         one.cut(A, msgspec.msgpack.encode([1, 2, 3]), [], turn=9)
         with pytest.raises(HoldfastError, match=f"{A} cannot be copied: .* or restore the store from a backup"):
             copy_store(one, other, names=("a", "d"))
