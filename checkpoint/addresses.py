@@ -26,6 +26,17 @@ KEY = "recorded under "
 """How the note begins of an actor whose key is not its address; the address follows, and the note is the key."""
 
 
+def is_of_actor(key: str) -> bool:
+    """Whether a key of a store is that of an actor: those of the root's own lists (`quarantine`, `far`) have no slash.
+
+    Snapshots of actors are a `Meta` each. Those of a list are the list itself, and refer to nothing else.
+
+    >>> is_of_actor("/app/a"), is_of_actor("quarantine")
+    (True, False)
+    """
+    return key.startswith("/")
+
+
 class Addresses:
     """Where those live who were moved. An address that was left is forgotten when somebody else comes to live there."""
 

@@ -68,6 +68,8 @@ class Commits:
         self._thread: ThreadPoolExecutor | None = None
         self._syncing: asyncio.Future[None] | None = None
         self._delay = RETRY_SECONDS
+        self._retry: asyncio.TimerHandle | None = None
+        self._tried_at = 0.0  # on the clock of the loop; when the store was found to have no room
         self.blocked: HoldfastError | None = None  # why nothing is written at the moment
         self.stopped: HoldfastError | None = None  # why nothing is written any more
 
@@ -99,11 +101,13 @@ class Commits:
         self.submit(submission)
 
     def check(self) -> None:
-        """Raise what `admit` would raise now.
+        """Raise what `admit` would raise now; who comes to a store that had no room looks whether there is some.
 
         Raises:
             HoldfastError: the store does not take anything now.
         """
+        if self.blocked is not None and self.stopped is None and self._loop.time() - self._tried_at >= RETRY_SECONDS:
+            self._look_again()
         error = self.stopped or self.blocked
         if error is not None:
             raise type(error)(*error.args)
@@ -221,15 +225,23 @@ class Commits:
         self._lanes.refuse(error)
         if first:
             self._emit(JournalBlocked(self._where, str(error)))
-        self._loop.call_later(self._delay, self._try_again, context=self._context)
+        self._tried_at = self._loop.time()
+        if self._retry is not None:
+            self._retry.cancel()
+        self._retry = self._loop.call_later(self._delay, self._try_again, context=self._context)
         self._delay = min(2 * self._delay, MOST_RETRY_SECONDS)
 
     def _try_again(self) -> None:
-        if self.blocked is None or self.stopped is not None:
-            return
+        self._retry = None
+        if self.blocked is not None and self.stopped is None:
+            self._look_again()
+
+    def _look_again(self) -> None:
+        """See whether there is room now; what has waited for that takes effect later, in nobody's name."""
         if self._lanes.pending:
             self._write()
-            self._run()
+            if self._lanes.ready and not self._is_running and not self._is_awake:
+                self._wake()
         else:  # Nothing is left that could show whether there is room: the next admission does.
             self.blocked, self._delay = None, RETRY_SECONDS
             self._emit(JournalGoesOn(self._where))

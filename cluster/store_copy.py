@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from ..actors.errors import HoldfastError
+from ..checkpoint.addresses import is_of_actor
 from ..checkpoint.journal import DamagedStore, Entry, NotCopied, Saved, StoreEngine
 from ..checkpoint.snapshot.shared_blocks import by_segment
 from ..checkpoint.snapshot.snapshot_record import decode_meta
@@ -101,7 +103,7 @@ def kept_of(store: StoreEngine, address: str) -> KeptAddress:
     """All that a store keeps of an address.
 
     Raises:
-        DamagedStore: some of it is damaged.
+        DamagedStore: some of it is damaged. HoldfastError: a snapshot is of a format that this holdfast does not know.
     """
     saved = _saved(store, address)
     positions = [position for position, _ in saved[0].entries]
@@ -110,11 +112,12 @@ def kept_of(store: StoreEngine, address: str) -> KeptAddress:
     before = set(positions)
     for one in saved:
         if one.snapshot is not None:
+            if is_of_actor(address):
+                _read_blocks(store, address, one.snapshot, blocks)
             left = {position for position, _ in one.entries}
             gone = before - left
             snapshots.append((one.snapshot, one.turn, [n for n, position in enumerate(positions) if position in gone]))
             before = left
-            _read_blocks(store, address, one.snapshot, blocks)
     return KeptAddress(snapshots, [entry for _, entry in saved[0].entries], blocks)
 
 
@@ -137,8 +140,13 @@ def _saved(store: StoreEngine, address: str) -> list[Saved]:
 
 
 def _read_blocks(store: StoreEngine, address: str, snapshot: bytes, blocks: dict[int, dict[int, bytes]]) -> None:
-    """Add the blocks that a snapshot consists of, by pack and offset."""
-    for number, places in by_segment(decode_meta(snapshot).blocks).items():
+    """Add the blocks that a snapshot of an actor consists of, by pack and offset."""
+    try:
+        meta = decode_meta(snapshot)
+    except HoldfastError as error:
+        remedy = "copy with the release of holdfast that wrote the store, or restore the store from a backup"
+        raise HoldfastError(f"{address} cannot be copied: {error}; {remedy}") from error
+    for number, places in by_segment(meta.blocks).items():
         segment = store.read_blocks(address, number, places)
         try:
             own = blocks.setdefault(number, {})

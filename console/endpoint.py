@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 
+from ..actors.control.orders_lane import answer_bytes
 from ..actors.errors import HoldfastError
 from ..actors.ordered import Ordered
 from ..actors.process.wire.frame_buffer import LENGTH
@@ -26,6 +27,7 @@ from .wire import (
     REQUEST,
     AnyRequest,
     BadRequest,
+    ControlActor,
     ControlResponse,
     NotServed,
     body_size,
@@ -236,7 +238,10 @@ class Endpoint:
 
     async def _respond(self, session: ClientSession, request: AnyRequest) -> ControlResponse:
         try:
-            return ControlResponse(encode_value(await session.carry_out(request)))
+            value = await session.carry_out(request)
+            if isinstance(request, ControlActor):
+                return ControlResponse(answer_bytes(value, request.path, request.verb))
+            return ControlResponse(encode_value(value))
         except (asyncio.CancelledError, GeneratorExit):
             raise
         except BaseException as error:  # It is the client's to know: whatever a user's code raises ends nobody here.

@@ -11,7 +11,7 @@ import stat
 import sys
 import types
 from collections.abc import Awaitable, Callable, Generator, Sequence
-from importlib.machinery import ModuleSpec
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,12 @@ class UntrustedFile(HoldfastError, text="{path} is not used: {problem}"):
 
     path: str
     problem: str
+
+
+class ScriptFolder(str):
+    """An entry of `sys.path` that a script has brought: a program that is started again does not have it."""
+
+    __slots__ = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -120,7 +126,26 @@ def find_beside(source: ScriptSource) -> None:
     """Let modules be found in the folder of a script too, after all others, so that it can hide none of them."""
     folder = str(Path(source.path).parent)
     if folder not in sys.path:
-        sys.path.append(folder)
+        sys.path.append(ScriptFolder(folder))
+
+
+def find_only_here(kind: type) -> str:
+    """The file that defines a class which only processes with a script can have: the script, or a module beside it.
+
+    Returns:
+        Its path; "" if the class can be imported without any script.
+    """
+    module = sys.modules.get(kind.__module__)
+    file = str(getattr(module, "__file__", None) or "")
+    if kind.__module__.startswith(PREFIX):
+        return file or kind.__module__
+    top = sys.modules.get(kind.__module__.partition(".")[0])
+    origin = str(getattr(top, "__file__", None) or "")
+    brought = [folder for folder in sys.path if isinstance(folder, ScriptFolder)]
+    if not any(Path(origin).is_relative_to(folder) for folder in brought):
+        return ""
+    rest = [folder for folder in sys.path if not isinstance(folder, ScriptFolder)]
+    return "" if PathFinder.find_spec(kind.__module__.partition(".")[0], rest) is not None else file
 
 
 @contextlib.contextmanager

@@ -12,12 +12,12 @@ import asyncio
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import msgspec
 
-from ..actors.errors import HoldfastError, SpecError, UnsavableValue
+from ..actors.errors import HoldfastError, SpecError, UnsavableValue, type_name
 from ..actors.events import Event
 from ..actors.kernel.actor import Start
 from ..actors.process.wire.start_codec import pack_data, unpack_data
@@ -26,6 +26,7 @@ from ..supervision.respec import rebuilt
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor
 from ..supervision.supervisor_changes import everything
+from .script import find_only_here
 
 if TYPE_CHECKING:
     from ..checkpoint.home.homes import Homes
@@ -39,6 +40,12 @@ FEW = 100
 """Specs of children that may have ended, before it is looked which have."""
 TOGETHER = 50
 """So many specs are packed before others have their turn."""
+GONE = (
+    "put what is missing back where the program can import it, and nothing is lost; without it, change any option of "
+    "this child's spec in the program (say `shutdown`): its spec counts then, what transactions have changed at this "
+    "address and below is void, and all recorded states stay (`system.start(spec, fresh=True)` would erase those too)"
+)
+"""What to do when a kept spec cannot be had any more."""
 
 
 class SpecificationSuperseded(Event, frozen=True, eq=False):
@@ -155,8 +162,9 @@ class Specifications:
         try:
             return unpack(data)
         except HoldfastError as error:
-            why = f"what transactions have made of it cannot be had any more: {error}"
-            raise SpecError(address, f"{why}; start it with fresh=True to begin anew") from error
+            raise SpecError(
+                address, f"what transactions have made of it cannot be had any more: {error}; {GONE}"
+            ) from error
 
     def added(self) -> dict[str, ChildSpec]:
         """Those that transactions have added below the root, and that are not started yet, by address.
@@ -201,7 +209,8 @@ class Specifications:
         """Whether the next root could start the tree as it would be.
 
         Raises:
-            SpecError: somebody would be bound by its spec to one whom the next root starts later.
+            SpecError: somebody would be bound by its spec to one whom the next root starts later, or be of a class
+                that the next root does not find.
         """
         if not self._is_kept:
             return
@@ -209,6 +218,8 @@ class Specifications:
         added = [one for one in tops if one.is_planned or one.has_moved or one.path in self._added]
         by_path = {one.path: one for one in tops if one not in added}
         declared = [by_path[path] for path in self._declared if path in by_path]
+        for one in (*declared, *added):
+            _refuse_of_scripts(one)
         led = [one for top in (*declared, *added) for one in _led_outside(top) if one[2] in (*declared, *added)]
         order: list[DraftPlace] = []
         waiting = list(added)
@@ -309,6 +320,46 @@ class Specifications:
             del self._kept[address]
         else:
             self._kept[address] = value
+
+
+def _refuse_of_scripts(top: DraftPlace) -> None:
+    """Refuse a tree of which the store would keep what only a script can define: the next root runs none.
+
+    Raises:
+        SpecError: naming who would be of such a class, or be made from an instance of one.
+    """
+    found: dict[type, DraftPlace] = {}
+    for place in top.walk():
+        is_noted = place.parent is not None and place.parent.is_noted
+        if place.spec is not None and not place.is_leaving and (is_noted or place.comes_back_with(top)):
+            for kind in (place.kind, *_classes(place.spec.start if place.is_planned else ())):
+                if kind is not None:
+                    found.setdefault(kind, place)
+    for kind, place in found.items():
+        file = find_only_here(kind)
+        if file:
+            why = f"{type_name(kind)} is defined in {file}, which is there only while the script is"
+            what = "the store would keep a spec that the next start of the program cannot have"
+            raise SpecError(place.path, f"{why}: {what}; put the class into a module that the program can import")
+
+
+def _classes(value: Any) -> Iterator[type]:
+    """The classes in a recipe, except those of mechanisms, which are found by file; of the children in it too."""
+    if isinstance(value, Start):
+        yield value.kind
+        value = (value.args, value.kwargs, value.begins_with)
+    elif isinstance(value, ChildSpec):
+        value = value.start
+    if isinstance(value, (list, tuple)):
+        for one in value:
+            yield from _classes(one)
+    elif isinstance(value, dict):
+        for one in value.values():
+            yield from _classes(one)
+    elif isinstance(value, Start):
+        yield from _classes(value)
+    else:
+        yield type(value)
 
 
 def _led_outside(top: DraftPlace) -> list[tuple[DraftPlace, str, DraftPlace]]:

@@ -61,7 +61,7 @@ class SystemConnection:
         try:
             lines = self._lines = self._lines_of(self._within)
             call = self._call = LineCaller(lines, transport, to, self._system, self._subscribe_again)
-            await call.begin(self._seconds)
+            await transport.unless_denied(call.begin(self._seconds))
         except (TimeoutError, Unanswered) as error:
             await self.close()
             problem = f"no program that leads it has answered for {self._seconds:g} s"
@@ -214,6 +214,7 @@ def connect(
 
     Raises (when it is opened):
         Unreachable: nobody has answered. SpecError: the address cannot be read.
+        AccessRefused: the servers do not let this program in, or do not let it send to the system.
         LineTaken: there is a connection to a system of that name already.
     """
     if system is not None:

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 from ..errors import ControlFailed, HoldfastError, error_text, type_name
 from ..kernel import lifecycle
 from ..kernel.cell import Cell
+from ..kernel.codec import MAX_BYTES
 from ..kernel.envelope import NO_DEADLINE, Ask, Item
 from ..kernel.message import Message
 from ..process.wire import frames
 from ..process.wire.frames import BadFrame
 from ..process.wire.peer import Peer, RelayedAsk
 from ..values import SavedRef, decode_value, encode_value
-from .orders import ORDERS, Mark, Order, status_of
+from .orders import ORDERS, GetState, Mark, Order, status_of
 
 if TYPE_CHECKING:
     from ..process.worker_node import Guest
@@ -25,6 +26,8 @@ class OrderAsked(Message[bytes]):
 
 
 ORDERED = OrderAsked()
+MOST_TOLD = MAX_BYTES - 4096
+"""Bytes of what an order may give: with what stands around it, it fits into one message."""
 
 
 class OrderAsk(Ask, eq=False):
@@ -83,7 +86,7 @@ class QueuedOrder(Item):
             ask.give(value)
             return
         try:
-            ask.answer(encode_value(value))
+            ask.answer(answer_bytes(value, ask.to.path if ask.to is not None else "", self.order.verb))
         except HoldfastError as error:
             ask.fail(error)
 
@@ -94,6 +97,22 @@ class QueuedOrder(Item):
     def is_urgent(self) -> bool:
         """Whether it goes ahead of the messages."""
         return type(self.order) is not Mark
+
+
+def answer_bytes(value: object, path: str, verb: str) -> bytes:
+    """What an order gives, as bytes that fit into one frame.
+
+    Raises:
+        ControlFailed: it is too large to be passed on. UnsavableValue: it cannot be encoded.
+    """
+    data = encode_value(value)
+    if len(data) > MOST_TOLD:
+        done = "" if verb == GetState.verb else "it was carried out, but "
+        size = f"what it gives is too large to be passed on ({len(data)} bytes, the limit is {MOST_TOLD})"
+        outline = "`holdfast inspect PATH --state` without --json, or `system.outline`, shows a state in outline"
+        whole = "`holdfast store export` has all of what is recorded"
+        raise ControlFailed(path, verb, f"{done}{size}; {outline}; {whole}")
+    return data
 
 
 def order(cell: Cell, wanted: Order, timeout: float) -> asyncio.Future[Any]:

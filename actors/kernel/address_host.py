@@ -103,6 +103,10 @@ class Home:
         """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
         return True
 
+    def holds_back(self, cell: Cell) -> str:
+        """Why replies of turns that have ended do not leave now; "" if nothing keeps them."""
+        return ""
+
     def hangs(self, cell: Cell) -> None:
         """The life is told to end because it works badly: a turn that has to be cut off for that did not end."""
 
@@ -301,6 +305,9 @@ class AddressHost:
 
     def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
         return self.home.may_have_begun(cell, ask)
+
+    def holds_back(self, cell: Cell) -> str:
+        return self.home.holds_back(cell)
 
     # -- the place's ------------------------------------------------------------------------------------------------
 

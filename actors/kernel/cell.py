@@ -111,6 +111,10 @@ class Host(Protocol):
         """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
         ...
 
+    def holds_back(self, cell: Cell) -> str:
+        """Why replies of turns that have ended do not leave now; "" if nothing keeps them."""
+        ...
+
     def backlog(self, cell: Cell) -> int:
         """Messages that wait, as far as is known in this process."""
         ...

@@ -265,7 +265,8 @@ class Ask(Item, msgspec.Struct, eq=False):
         started = self.started
         is_sure = not started or (started is not True and not self.to.host.may_have_begun(self.to, self))
         self.deadline = 0.0
-        self.fail(AskTimeout(self.to.path, self.timeout, False if is_sure else None))
+        why = "" if is_sure else self.to.host.holds_back(self.to)
+        self.fail(AskTimeout(self.to.path, self.timeout, False if is_sure else None, why))
 
     def undelivered(self, cell: Cell, reason: str) -> None:
         self.fail(cell.stopped_error(reason))

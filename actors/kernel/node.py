@@ -231,13 +231,13 @@ class Node(RunLoop):
             known = "" if sender is None else sender.path
             self.events.emit(DeadLetter(cell.path, self.codec.opened(cell, message), why, known))
 
-    def not_taken(self, cell: Cell, message: object, error: HoldfastError) -> None:
-        """A subscriber could not take what was published.
+    def not_taken(self, cell: Cell, message: object, error: HoldfastError, sender: Cell | None = None) -> None:
+        """A subscriber could not take what was published, by `sender` if that was an actor.
 
         One that has ended meanwhile is no subscriber any more, and one that has no handler for it wants other messages.
         """
         if not isinstance(error, (ActorStopped, UnknownMessage)):
-            self.dead_letter(cell, message, str(error))
+            self.dead_letter(cell, message, str(error), sender)
 
     def refused(self, cell: Cell, item: Any, no: Refusal) -> None:
         """A tell was answered with a Refusal: there is nobody to hand it to."""

@@ -93,7 +93,7 @@ async def publish(
                     break
                 await room
         except NOT_TAKEN as error:
-            node.not_taken(cell, message, error)
+            node.not_taken(cell, message, error, publisher)
 
     waiting: list[asyncio.Task[None]] = []
     try:

@@ -232,6 +232,9 @@ class Transit:
     def is_up(self, cell: Cell) -> bool:
         return True
 
+    def holds_back(self, cell: Cell) -> str:
+        return ""  # It is at rest: no turn has an end.
+
     def backlog(self, cell: Cell) -> int:
         return sum(map(mailbox.counts, cell.queue or ()))
 

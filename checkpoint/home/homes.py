@@ -9,7 +9,7 @@ from ...actors.errors import ControlFailed, HoldfastError, StartFailed
 from ...actors.events import RecordsMapped, RecoveryFailed
 from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.persistence import child_key
-from ..addresses import Addresses, renamed
+from ..addresses import Addresses, is_of_actor, renamed
 from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
 from ..journal import Saved, StoreEngine
@@ -21,11 +21,11 @@ from ..snapshot.rollback import older_snapshot, roll_back
 from ..snapshot.snapshot_groups import Groups
 from ..snapshot.snapshot_record import take_over
 from ..snapshot.snapshot_schedule import nobody
-from .ask_recovery import FAR, FarMail, Rejoin
+from .ask_recovery import FarMail, Rejoin
 from .capacity import HomeBound
 from .disposal import drop_all, forget_home, put_into_quarantine
 from .held_messages import Holding, let_go
-from .quarantine import PLACE, Quarantine
+from .quarantine import Quarantine
 from .switch import Switch
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class Homes:
         self.planted: dict[str, Saved] = {}  # what the next life at an address begins with, whatever is recorded
         node.numbers.begin_tokens(_first_token(journal, node.clock.wall()))
         unfinished = journal.notes(ERASING).get(ERASING)
-        self._stored = set(journal.addresses()) - {PLACE, FAR}
+        self._stored = set(filter(is_of_actor, journal.addresses()))
         self.groups = Groups(self)
         self.rejoin = Rejoin(self)
         self.far = FarMail(self)

@@ -242,6 +242,11 @@ class JournalHome(RecordedHome):
         has_answered = ended is not None and bool(ended.reply) and ended.input.ask is None  # Else it is to come later.
         return Work(mark, source is not None, None if turn is None else turn.since, has_answered)
 
+    def holds_back(self, cell: Cell) -> str:
+        """A turn that has ended waits for a store without room: what it has done is kept, and its reply comes then."""
+        blocked = self.homes.journal.blocked
+        return "" if blocked is None else f"in time, for its store takes nothing: {blocked}"
+
     def mailbox(self, cell: Cell) -> Capacity | None:
         return None if self.switch is None else self.switch.intake.mailbox
 

@@ -201,7 +201,7 @@ class Outputs:
 
         def over(target: Cell, error: HoldfastError | None) -> None:
             if error is not None:
-                home.node.not_taken(target, Parcel(out.name, out.body), error)
+                home.node.not_taken(target, Parcel(out.name, out.body), error, home.cell)
             left.pop(target, None)
             if not left:
                 home.calls.sent(turn, out.k, None)

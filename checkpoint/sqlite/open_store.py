@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import sqlite3
 import threading
@@ -26,6 +27,8 @@ from .store_parts import Parts
 
 INSERT: Final = "INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)"
 _CHECKPOINT_BYTES: Final = 4 << 20
+_REFUSALS: Final = frozenset((errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT))
+_WRITABLE: Final = "have its folder there, and that and all files of the store writable to this user"
 LOOK_SECONDS: Final = 0.05
 """How long writes may be acknowledged after the store was deleted or replaced, before anybody looks."""
 _WAL_FRAMES: Final = 16384  # 64 MiB; beyond it a checkpoint may hold up the writers
@@ -425,11 +428,17 @@ class Store:
         if isinstance(error, NoRoom):
             return StoreFailed(self.path, f"{error}; nothing was written, make room and try again")
         if isinstance(error, OSError) or code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN):
-            translated = StoreFailed(self.path, f"{error}; open it again, which verifies it")
+            is_refused = code == sqlite3.SQLITE_CANTOPEN or (isinstance(error, OSError) and error.errno in _REFUSALS)
+            remedy = f"{_WRITABLE}, and start again" if is_refused else "open it again, which verifies it"
+            translated = StoreFailed(self.path, f"{error}; {remedy}")
         elif code in damaged:
             translated = DamagedStore(self.path, None, None, str(error))
         else:
-            hint = {sqlite3.SQLITE_BUSY: "try again", sqlite3.SQLITE_FULL: "make room and try again"}
+            hint = {
+                sqlite3.SQLITE_BUSY: "try again",
+                sqlite3.SQLITE_FULL: "make room and try again",
+                sqlite3.SQLITE_READONLY: f"{_WRITABLE}, and try again",
+            }
             return StoreFailed(self.path, f"{error}; nothing was written, {hint.get(code, 'it cannot be')}")
         self.failure = self.failure or translated
         return translated

@@ -19,7 +19,7 @@ import msgpack
 from ...actors.errors import DamagedValue, HoldfastError, type_name
 from ...actors.kernel.codec import ARRAY, PACKED, REF
 from ...actors.values import ValueDescription, describe_value
-from ..addresses import KEY
+from ..addresses import KEY, is_of_actor
 from ..encoding.compression import LibraryMissing
 from ..inputs import spread
 from ..journal import DamagedStore, Entry, StoreFailed
@@ -113,7 +113,11 @@ class _Export:
 
     def _snapshot(self, chain: Chain, number: int, address: str) -> Iterator[Record]:
         try:
-            meta = decode_meta(self._reader.read_snapshot(chain, number)[0])
+            snapshot, turn = self._reader.read_snapshot(chain, number)
+            if not is_of_actor(address):
+                yield {"record": "snapshot", "address": address, "turn": turn, "state": plain_message(snapshot, ())}
+                return
+            meta = decode_meta(snapshot)
             data = self._view.packs.state(chain.path or "", meta.blocks) if meta.blocks else meta.state
         except StoreFailed:
             raise

@@ -9,7 +9,7 @@ from typing import Final
 
 import msgspec
 
-from ..addresses import KEY
+from ..addresses import KEY, is_of_actor
 from ..home.input_ledger import InputLedger
 from ..journal import DamagedStore, Entry
 from ..protocol import START
@@ -154,11 +154,15 @@ def _count_address(view: StoreView, chain: Chain, address: str) -> AddressStats:
     contained: set[int] = set()
     for place, number in enumerate(chain.kept):
         try:
-            meta = msgspec.msgpack.decode(view.reader.read_snapshot(chain, number)[0], type=Meta)
+            data, turn = view.reader.read_snapshot(chain, number)
+            meta = msgspec.msgpack.decode(data, type=Meta) if is_of_actor(address) else None
             contained = view.reader.read_drops(chain, chain.kept[: place + 1])
         except (DamagedStore, msgspec.MsgspecError) as error:
             if view.is_kept(number):  # Else the running system has a newer one now.
                 found.damage = found.damage or (error.reason if isinstance(error, DamagedStore) else str(error))
+            continue
+        if meta is None:
+            found.snapshots.append(SnapshotStats(turn, len(data), 0.0))
             continue
         size = len(meta.state) + sum(length for _, _, length in meta.blocks)
         found.snapshots.append(SnapshotStats(meta.turn, size, meta.time))

@@ -10,6 +10,7 @@ from typing import Final
 import msgspec
 
 from ...actors.errors import HoldfastError
+from ..addresses import is_of_actor
 from ..journal import DamagedStore
 from ..snapshot.shared_blocks import by_segment
 from ..snapshot.snapshot_record import FORMAT, IMAGES, Meta
@@ -190,6 +191,8 @@ class StoreCheck:
             try:
                 data, _ = self._reader.read_snapshot(chain, number)
                 self._reader.read_drops(chain, [number])
+                if not is_of_actor(chain.path):
+                    continue
                 meta = msgspec.msgpack.decode(data, type=Meta)
                 if meta.format not in (FORMAT, IMAGES):
                     raise HoldfastError(f"its format is {meta.format}, which this holdfast does not know")

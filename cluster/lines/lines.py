@@ -6,8 +6,8 @@ import asyncio
 import itertools
 import secrets
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, Protocol
+from collections.abc import Callable, Coroutine
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 
 import msgspec
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
     from ...actors.kernel.node import Node
     from ...checkpoint.home.homes import Homes
+
+T = TypeVar("T")
 
 BEAT_SECONDS: Final = 1.0
 """How often each end says that it is there."""
@@ -83,6 +85,14 @@ class Transport(Protocol):
 
     def own_place(self) -> str:
         """A place at which this program alone may listen."""
+        ...
+
+    async def unless_denied(self, work: Coroutine[Any, Any, T]) -> T:
+        """Do what waits for an answer, and end it when the servers say that this program may not send there.
+
+        Raises:
+            AccessRefused: they say so.
+        """
         ...
 
     async def close(self) -> None:

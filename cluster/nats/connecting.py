@@ -156,7 +156,7 @@ class SystemClient(Client):
                 await one.unsubscribe()
         denied = [subject for subject in wanted if any(f'"{subject.lower()}"' in one for one in self._denied)]
         if denied:
-            system, key = self.access.system, self.access.nkey or self.access.creds or "the user that needs no key"
+            system, key = self.access.system, self._key
             whose = "an observer" if names.lease not in denied else "a client, or of another system"
             what = "run" if is_node else "look at"
             raise AccessRefused(
@@ -179,7 +179,24 @@ class SystemClient(Client):
                 return doing.result()
         finally:
             await end_tasks(doing, denied)
-        raise AccessRefused(self.access.name, self._denied[-1], "give the key of a node, or let its user do that")
+        raise self._refused_here(self._denied[-1])
+
+    def _refused_here(self, said: str) -> AccessRefused:
+        """The servers know this program, and do not let it do what its role needs."""
+        if self._role == "node":
+            return AccessRefused(self.access.name, said, "give the key of a node, or let its user do that")
+        system = self.access.system
+        return AccessRefused(
+            self.access.name,
+            f"{self._key} may not send to the system {system}: it is the key of an observer, or of another system "
+            f"({said})",
+            f"give the key of a client or a node, such as nkey={system}-client.nk from `holdfast nats config`",
+        )
+
+    @property
+    def _key(self) -> str:
+        """What this program is known by."""
+        return self.access.nkey or self.access.creds or "the user that needs no key"
 
     @property
     def denials(self) -> int:

@@ -5,17 +5,18 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import deque
-from collections.abc import Awaitable, Callable
-from typing import Final
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any, Final, TypeVar
 
 import nats.errors
-from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from ..engine_thread import end_tasks
 from .access import NatsAccess
 from .connecting import ANSWER_SECONDS, SystemClient, answering
 from .nats_engine import CONNECT_SECONDS
+
+T = TypeVar("T")
 
 INBOX: Final = "_INBOX."
 """How subjects begin at which programs get answers."""
@@ -29,7 +30,7 @@ class NatsTransport:
         name: what errors call the servers, without secrets.
     """
 
-    def __init__(self, client: Client, name: str) -> None:
+    def __init__(self, client: SystemClient, name: str) -> None:
         self._client, self._name = client, name
         self._out: deque[tuple[str, bytes, str]] = deque()
         self._has_some = asyncio.Event()
@@ -85,6 +86,10 @@ class NatsTransport:
     def own_place(self) -> str:
         """A subject of this client's own; see `Transport`."""
         return self._client.new_inbox()
+
+    async def unless_denied(self, work: Coroutine[Any, Any, T]) -> T:
+        """Do what the servers have to allow; see `Transport`."""
+        return await self._client.unless_denied(work)
 
     async def close(self) -> None:
         """Send what was posted, and disconnect; see `Transport`."""

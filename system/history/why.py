@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -85,7 +86,7 @@ def _crash_loop(evidence: Evidence) -> list[str]:
     if len(loop) == 1:
         return [_one_end(evidence, last)]
     said = f"{evidence.address} {_restarted(loop)} {_within(evidence, loop)}"
-    said += _common("handling", [life.handling for life in loop])
+    said += _in_hand([life.handling for life in loop])
     said += f"; {_fault(last)}" + ("" if len({life.reason for life in loop}) == 1 else " (the last time)")
     limit = _limit(evidence, last)
     return [f"{said}; {limit}." if limit else f"{said}."]
@@ -109,11 +110,24 @@ def _restarted(loop: list[PastLife]) -> str:
     return f"ended {ends} times and was restarted {restarts} times" if restarts else f"ended {ends} times"
 
 
-def _common(what: str, values: list[str]) -> str:
-    known = {value for value in values if value}
-    if len(known) != 1 or not all(values):
-        return f"; {what} {', '.join(sorted(known))}" if known else ""
-    return f"; each time {what} {known.pop()}"
+def _in_hand(messages: list[str]) -> str:
+    """What the lives had in hand when they ended, oldest first: each end is put down to its own message only.
+
+    >>> _in_hand(["shop.Pay", "shop.Pay"]), _in_hand(["shop.Pay", "shop.Buy", "shop.Pay"])
+    ('; each time handling shop.Pay', '; 2 times handling shop.Pay, once shop.Buy, the last time shop.Pay')
+    >>> _in_hand(["shop.Pay", "", ""]), _in_hand(["", "shop.Pay"]), _in_hand(["", ""])
+    ('; once handling shop.Pay, but not the last time', '; the last time handling shop.Pay', '')
+    """
+    known = Counter(message for message in messages if message)
+    if not known:
+        return ""
+    last = messages[-1]
+    if len(known) == 1 and last and known[last] in (1, len(messages)):
+        return f"; {'the last' if known[last] < len(messages) else 'each'} time handling {last}"
+    times = [f"{'once' if count == 1 else f'{count} times'} {message}" for message, count in known.most_common()]
+    first, said = times[0].rpartition(" ")[::2]
+    end = f"the last time {last}" if last else "but not the last time"
+    return f"; {', '.join([f'{first} handling {said}', *times[1:], end])}"
 
 
 def _one_end(evidence: Evidence, life: PastLife) -> str:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final, TypeVar
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +118,10 @@ class SimTransport:
 
         self._takes.append(taken)
         self._post.listen(at, taken)
+
+    async def unless_denied(self, work: Coroutine[Any, Any, T]) -> T:
+        """Here everybody may send everywhere."""
+        return await work
 
     def own_place(self) -> str:
         """The place of this program alone; see `Transport`."""

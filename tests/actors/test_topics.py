@@ -123,8 +123,10 @@ async def test_a_subscriber_that_cannot_take_it_does_not_keep_it_from_the_others
     ending = system.spawn(hf.start(Subscriber))
     system.spawn(hf.start(Deaf))
     last = system.spawn(hf.start(Subscriber))
+    events, publisher = system.events(), ""
     if inside:
         editor = system.spawn(hf.start(Reader))
+        publisher = editor.path
         published: Any = editor.ask(Do(lambda actor: actor.ctx.publish("/news", News(1))))
     else:
         published = asyncio.create_task(system.publish("/news", News(1)))
@@ -133,9 +135,13 @@ async def test_a_subscriber_that_cannot_take_it_does_not_keep_it_from_the_others
     await system.stop(ending)
     gate.set()
     await published
+    events.close()
+    letters = [one for one in events.take() if isinstance(one, hf.events.DeadLetter)]
     assert await last.ask(Seen()) == [1]
     assert await slow.ask(Seen()) == [0, 1]
-    assert await full.ask(Seen()) in ([0], [0, 1])
+    seen = await full.ask(Seen())
+    assert seen in ([0], [0, 1])
+    assert [one.sender for one in letters if one.address == full.path] == ([publisher] if seen == [0] else [])
 
 
 @pytest.mark.parametrize("inside", [False, True])

@@ -13,7 +13,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.checkpoint.engine_calls import Called
-from holdfast.checkpoint.group_commit import Commits
+from holdfast.checkpoint.group_commit import RETRY_SECONDS, Commits
 from holdfast.checkpoint.journal import Entry, StoreFailed
 from holdfast.checkpoint.protocol import SnapshotNow
 from holdfast.checkpoint.sqlite import SqliteJournal
@@ -330,6 +330,59 @@ async def test_a_full_disk_refuses_clearly_and_when_there_is_room_all_goes_on(en
                 except StoreFailed:
                     await asyncio.sleep(0.01)
         assert await doer.ask(Seen(), timeout=30.0) == ["a", "b", "e"]
+
+
+async def test_an_ask_that_has_met_a_full_disk_says_so_when_its_time_is_over(engine: Any, isolation: str) -> None:
+    engine.let_sync.set()
+    async with hf.ActorSystem("app", log=False, store=engine, intensity=1000) as system:
+        doer = await start(system, isolation, "doer", hf.start(Doer), recovery=hf.hybrid(interval=1000.0))
+        await doer.ask(Note("a"))
+        engine.full = True
+        with pytest.raises(hf.AskTimeout) as late:
+            await doer.ask(Note("b"), timeout=0.3)
+        assert "its store takes nothing: " in str(late.value)
+        assert "no room" in str(late.value)
+        assert str(late.value).endswith("it may have been handled")
+        engine.full = False
+        await until(lambda: system._homes.journal.blocked is None)
+
+
+async def test_the_first_who_comes_when_there_is_room_is_taken(engine: Any) -> None:
+    engine.let_sync.set()
+    async with hf.ActorSystem("app", log=False, store=engine, intensity=1000) as system:
+        doer = await start(system, "task", "doer", hf.start(Doer), recovery=hf.hybrid(interval=1000.0))
+        await doer.ask(Note("a"))
+        commits = system._homes.journal
+        engine.full = True
+        begun = doer.ask(Note("b"), timeout=30.0)
+        await until(lambda: commits._delay >= 0.4)  # So far apart are its own attempts by now.
+        clock = asyncio.get_running_loop()
+        await until(lambda: clock.time() - commits._tried_at >= RETRY_SECONDS)
+        engine.full = False
+        assert await doer.ask(Note("c"), timeout=30.0) == 3
+        assert await begun == 2
+
+
+async def test_a_store_without_room_is_tried_by_one_timer_however_many_come(engine: Any) -> None:
+    """Else each that comes leaves one behind."""
+    engine.let_sync.set()
+    async with hf.ActorSystem("app", log=False, store=engine, intensity=1000) as system:
+        doer = await start(system, "task", "doer", hf.start(Doer), recovery=hf.hybrid(interval=1000.0))
+        await doer.ask(Note("a"))
+        commits, timers = system._homes.journal, set[asyncio.TimerHandle]()
+        engine.full = True
+        begun = doer.ask(Note("b"), timeout=30.0)
+        await until(lambda: commits._retry is not None)
+        for _ in range(5):
+            with pytest.raises(StoreFailed, match="no room"):
+                await doer.ask(Note("c"), timeout=30.0)
+            await until(lambda: asyncio.get_running_loop().time() - commits._tried_at >= RETRY_SECONDS)
+            if commits._retry is not None:
+                timers.add(commits._retry)
+        now = asyncio.get_running_loop().time()
+        assert sum(not one.cancelled() and one.when() > now for one in timers) <= 1
+        engine.full = False
+        assert await begun == 2
 
 
 class Spread(hf.Message[None]):

@@ -190,6 +190,15 @@ async def test_a_client_without_a_key_is_told_of_the_key_of_a_client(nats1: Nats
             raise AssertionError("it is connected")
 
 
+async def test_a_client_with_the_key_of_an_observer_is_refused_and_does_not_wait(nats1: NatsServers) -> None:
+    name = nats1.new_system()
+    access = nats1.access(name, UserRole.OBSERVER)
+    at = f"{nats1.store(name).partition('?')[0]}?nkey={access.nkey}"
+    with pytest.raises(hf.errors.AccessRefused, match=f"it is the key of an observer.*nkey={name}-client.nk"):
+        async with asyncio.timeout(PATIENCE), hf.connect(at, timeout=10 * PATIENCE):
+            raise AssertionError("it is connected")
+
+
 async def test_who_waits_for_servers_says_so(tmp_path: Path) -> None:
     servers = NatsServers(tmp_path)
     await servers.start()

@@ -329,6 +329,13 @@ CHECKS = {
         "tests/cluster/test_simulated_fleet.py",
         "clients_see_one_ledger",
     ),
+    "a client that may not send does not wait": Check(
+        "system/system_connection.py",
+        "await transport.unless_denied(call.begin(self._seconds))",
+        "await call.begin(self._seconds)",
+        "tests/cluster/test_connecting.py",
+        "key_of_an_observer_is_refused",
+    ),
     "no system takes a copy that was not finished": Check(
         "checkpoint/store_opening.py",
         "if journal.noted(UNFINISHED) is not None:",

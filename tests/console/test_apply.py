@@ -3,15 +3,18 @@
 import hashlib
 import os
 import sys
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
 
 import holdfast as hf
+from holdfast.console.endpoint import control_endpoint
 from holdfast.system import script as script_module
 from holdfast.system.script import UntrustedFile, read_source
 from tests.console.commands import holdfast
-from tests.system.trees import Add, picture, ref
+from tests.system.trees import Add, counter, picture, ref
 
 DONE, FAILED, UNUSABLE = 0, 1, 2
 GROW = """
@@ -107,6 +110,72 @@ async def test_a_dry_run_says_what_would_be_done(system: hf.ActorSystem, path: P
     assert "+ /app/left/greeter: Greeter, permanent, task, named 'greeter'" in output
     assert output.endswith("nothing was done: this was a dry run\n")
     assert picture(system) == before
+
+
+OWN = """
+import holdfast as hf
+{imported}
+from tests.system.trees import Counter, Double
+
+
+class Own(Double): ...
+
+
+class Value(hf.Message):
+    n: int = 0
+
+
+async def reconfigure(system):
+    async with system.transaction() as change:
+        {step}
+"""
+STEPS = {
+    "a class of its own": "change.add('/app/left', hf.child('x', hf.start(Own)))",
+    "one below a supervisor": "change.add('/app/left', hf.supervisor('s', children=[hf.child('x', hf.start(Own))]))",
+    "one under a supervisor that keeps a journal": "change.add('/app/noted', hf.child('x', hf.start(Own)))",
+    "an instance of one": "change.add('/app/left', hf.child('x', hf.start(Counter, Value())))",
+    "other code": "change.replace_code('/app/left/a', Own)",
+    "a class from beside it": "change.add('/app/left', hf.child('x', hf.start(Beside)))",
+}
+
+
+@pytest.mark.parametrize("name", STEPS)
+async def test_what_the_next_program_could_not_have_is_refused_where_there_is_a_store(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    module = f"beside_{tmp_path.name}"  # No other test has imported it.
+    defined = written(tmp_path / f"{module}.py", "from tests.system.trees import Double\nclass Beside(Double): ...\n")
+    imported = f"from {module} import Beside" if "beside" in name else ""
+    script = written(tmp_path / "own.py", OWN.format(step=STEPS[name], imported=imported))
+    async with stored(tmp_path) as system:
+        with pytest.raises(hf.TransactionRefused, match="into a module that the program can import") as refused:
+            await system.apply(str(script))
+        assert f"is defined in {os.path.realpath(defined if imported else script)}" in str(refused.value)
+        if imported:
+            monkeypatch.syspath_prepend(str(tmp_path))  # Where the next program looks, too.
+            await system.apply(str(script))
+    if imported:
+        async with stored(tmp_path) as system:
+            assert system._node.find("/app/left/x") is not None
+
+
+@asynccontextmanager
+async def stored(folder: Path) -> AsyncGenerator[hf.ActorSystem]:
+    """A program with a store."""
+    async with hf.ActorSystem("app", log=False, store=f"sqlite:{folder}/app.db") as system:
+        await system.start(hf.supervisor("left", children=[counter("a")]))
+        await system.start(hf.dynamic("noted", journal=True))
+        yield system
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_such_a_script_is_refused_in_a_dry_run_too(tmp_path: Path) -> None:
+    script = written(tmp_path / "own.py", OWN.format(step=STEPS["a class of its own"], imported=""))
+    async with stored(tmp_path) as system, control_endpoint(system, tmp_path / "app.sock") as path:
+        for options in (("--dry-run",), ()):
+            status, _, errors = await holdfast("apply", script, "--socket", path, *options)
+            assert (status, "is defined in" in errors) == (FAILED, True), errors
 
 
 async def test_the_same_script_runs_in_process(system: hf.ActorSystem, grow: Path) -> None:

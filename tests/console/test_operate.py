@@ -18,6 +18,7 @@ import holdfast as hf
 from holdfast.console.endpoint import control_endpoint
 from holdfast.console.runtime_folder import runtime_folder
 from holdfast.console.wire import BadRequest, SettleQuarantined, frame
+from tests.cluster.shelves import Grow, Shelf
 from tests.console.commands import holdfast
 from tests.system.trees import Add, Counter, ref
 
@@ -176,6 +177,22 @@ async def test_a_pattern_with_conditions_selects(named: hf.ActorSystem) -> None:
     assert (status, errors) == (FAILED, "holdfast tree: there is no actor at /app/**[restarts>3]\n")
     status, _, errors = await holdfast("tree", "/app/**[colour=red]")
     assert (status, "there is no field 'colour'; there are kind, state" in errors) == (FAILED, True)
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_state_that_is_too_large_to_be_sent_is_told_with_what_to_do(
+    named: hf.ActorSystem, isolation: Any
+) -> None:
+    large = await named.start(hf.child("large", hf.start(Shelf), isolation=isolation))
+    await large.ask(Grow(20))
+    status, output, errors = await holdfast("inspect", "/app/large", "--state", "--json")
+    assert (status, output) == (FAILED, "")
+    assert errors.startswith("holdfast inspect: get_state of /app/large failed: what it gives is too large")
+    assert "--state` without --json" in errors
+    assert "holdfast store export" in errors
+    status, output, errors = await holdfast("inspect", "/app/large", "--state")
+    assert (status, "state bulk: bytes of 20971520" in output) == (DONE, True), errors
 
 
 async def test_inspect_tells_all_of_an_actor(named: hf.ActorSystem) -> None:

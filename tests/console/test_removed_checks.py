@@ -16,6 +16,27 @@ HEALTH = "tests/console/test_health.py"
 EMBEDDED = "tests/examples/embedding/test_surroundings.py"
 
 CHECKS = {
+    "a state too large for a frame from its process is told as such": Check(
+        "actors/control/orders_lane.py",
+        "    if len(data) > MOST_TOLD:",
+        "    if False:",
+        "tests/console/test_operate.py",
+        "too_large_to_be_sent",
+    ),
+    "what the next program cannot have is not kept": Check(
+        "system/specification.py",
+        "            _refuse_of_scripts(one)\n",
+        "            pass\n",
+        APPLY,
+        "test_what_the_next_program_could_not_have",
+    ),
+    "a module from beside a script is not one that the program finds": Check(
+        "system/script.py",
+        "        sys.path.append(ScriptFolder(folder))",
+        "        sys.path.append(folder)",
+        APPLY,
+        "test_what_the_next_program_could_not_have",
+    ),
     "a server ends when its tree fails": Check(
         "console/service/health.py",
         "        if self._ends_server and system.has_failed:",

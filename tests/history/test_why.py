@@ -85,8 +85,21 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     "different faults": (
         {"lives": [CRASHES[0], life(2, 995.0, "SIGSEGV", "Signal", handling="shop.Pay", pid=5)]},
         (
-            f"{AT} ended 2 times and was restarted 1 times in the last 9 s; handling shop.Pay; "
+            f"{AT} ended 2 times and was restarted 1 times in the last 9 s; the last time handling shop.Pay; "
             "its process was ended by SIGSEGV (the last time)."
+        ),
+    ),
+    "what was in hand once is not blamed for later ends": (
+        {
+            "lives": [
+                *(life(n, 990.0 + n, "hung for 1 s", "Hung", handling="shop.Pay", restarts=n, pid=n) for n in (1, 2)),
+                life(3, 998.0, "out of memory: 2 GB", "OutOfMemory", restarts=3, pid=3),
+                life(4),
+            ]
+        },
+        (
+            f"{AT} restarted 3 times in the last 9 s; 2 times handling shop.Pay, but not the last time; "
+            "its process was out of memory: 2 GB (the last time)."
         ),
     ),
     "killed": (

@@ -112,7 +112,7 @@ def server_config(entry: str, preload: list[str]) -> Config:
         parent=os.getpid(),
         entry=entry,
         preload=preload,
-        path=[directory or os.getcwd() for directory in sys.path],
+        path=[str(directory) or os.getcwd() for directory in sys.path],
         argv=sys.argv,
         server=f"{__package__}.zygote",
         package=package,

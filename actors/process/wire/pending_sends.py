@@ -74,6 +74,6 @@ class Offered:
                 self._peer.accepted(self._id, error)
                 self._left = -1  # Answered.
                 return
-            self._peer.node.not_taken(cell, self._parcel, error)
+            self._peer.node.not_taken(cell, self._parcel, error, self._sender)
         if self._left == 0 and self._peer.connection.is_open:
             self._peer.accepted(self._id, None)

@@ -383,3 +383,9 @@ def test_a_wal_that_was_away_is_put_back_and_nothing_is_lost(tmp_path: Path) -> 
         SqliteJournal(path)
     (tmp_path / "wal").rename(f"{path}-wal")
     assert numbers(reopened(path)) == numbers(reopened(copy / "app.db"))
+
+
+def test_a_folder_that_takes_no_store_is_told_with_what_to_do() -> None:
+    """Nobody may make files there, whoever they are."""
+    with pytest.raises(StoreFailed, match=r"have its folder there, .* writable to this user, and start again"):
+        SqliteJournal("/proc/app.db")
