@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import dataclasses
 import random
-from collections.abc import AsyncIterator, Collection, Coroutine
+from collections.abc import AsyncGenerator, Collection, Coroutine
 from typing import Any, TypeVar
 
 import holdfast as hf
@@ -128,7 +128,7 @@ async def trial(foreign: Foreign, struck: dict[str, str], kind: str, seed: int, 
 
 
 @contextlib.asynccontextmanager
-async def under_traffic(foreign: Foreign, faults: Faults, kind: str, seed: int) -> AsyncIterator[hf.ActorSystem]:
+async def under_traffic(foreign: Foreign, faults: Faults, kind: str, seed: int) -> AsyncGenerator[hf.ActorSystem]:
     """A system in which a foreign one runs, and is told what comes."""
     async with hf.ActorSystem("app", log=False, seed=seed) as system:
         await system.start(hf.supervisor("all", children=foreign.children(faults), intensity=1000, period=5.0))
