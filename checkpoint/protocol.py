@@ -77,10 +77,14 @@ class Answer(msgspec.Struct, array_like=True, gc=False):
     body: bytes = b""
 
 
+TOO_LATE, AT_ITS_END = -1, -2
+"""In place of the number of an outcome: its turn was over; it comes after all others, as nobody knows those here."""
+
+
 class Came(Answer, array_like=True, gc=False):
     """What came of an output, and when: the turn had heard `nth - 1` outcomes, and had let `after` outputs out.
 
-    A replay hears it there again. `nth` is 0 where that is not known, and -1 if the turn was over by then.
+    A replay hears it there again; where `nth` is 0, as soon as it asks for it.
     """
 
     nth: int = 0

@@ -18,6 +18,7 @@ from ..inputs import NO_DIGESTS, OVERHEAD, Contained, Input, RowPlace, Turn, spr
 from ..life.replay_guard import StateDiverged
 from ..long_waits import due_entry
 from ..protocol import (
+    AT_ITS_END,
     DROPPED,
     FAILED,
     MESSAGE,
@@ -27,6 +28,7 @@ from ..protocol import (
     STASHED,
     TICK,
     TIMED,
+    TOO_LATE,
     Answer,
     Came,
     EndWanted,
@@ -326,13 +328,13 @@ class InputLedger:
         if turn <= self.state_turn:
             return None
         before = self.outcomes.get((turn, k))
-        if before is not None:
-            kept = came(answer, before.nth, before.after)
-        else:
-            is_in_hand = turn > self.turn
-            kept = came(answer, self.heard + 1, len(self.released)) if is_in_hand else came(answer, -1)
+        kept = self._placed(turn, answer) if before is None else came(answer, before.nth, before.after)
         self._take_outcome(turn, k, kept)
         return kept
+
+    def _placed(self, turn: int, answer: Answer) -> Came:
+        """What comes now of an output of a turn, behind all that the turn has had."""
+        return came(answer, self.heard + 1, len(self.released)) if turn > self.turn else came(answer, TOO_LATE)
 
     def _take_outcome(self, turn: int, k: int, answer: Came) -> None:
         """A turn that gets further than before has not died of the same thing again: its deaths are counted anew."""
@@ -514,10 +516,10 @@ class InputLedger:
         """All of it behind the newest snapshot, as `read_entry` takes it."""
         inputs = {source.id: source for source in self.handled_and_open()}
         entries = [inputs[key].entry() for key in sorted(inputs)]
-        heard = [outcome_entry(turn, k, answer) for (turn, k), answer in sorted(self.outcomes.items())]
-        entries += [entry for entry in heard if entry[1] <= self.turn]
+        heard = sorted(self.outcomes.items())
+        entries += [outcome_entry(*place, answer) for place, answer in heard if place[0] <= self.turn]
         entries += [turn.entry(number) for number, turn in self.turns.items()]
-        entries += [entry for entry in heard if entry[1] > self.turn]
+        entries += [outcome_entry(*place, answer) for place, answer in heard if place[0] > self.turn]
         if self.released:
             entries.append(self.released_entry(self.turn + 1))
         entries += [due_entry(*place, when) for place, when in self.dues.items()]
@@ -559,7 +561,8 @@ class InputLedger:
                     self.dues[turn, k], self.lasts = when, True
             case ("got", turn, k, kind, name, body, *order):
                 self.positions_of(turn).append(position)
-                self._take_outcome(turn, k, Came(kind, name, body, *order))
+                answer = Came(kind, name, body, *order)
+                self._take_outcome(turn, k, self._placed(turn, answer) if answer.nth == AT_ITS_END else answer)
                 self.lasts = self.lasts or (turn > self.turn and kind.startswith(TIMED))
             case ("stop", *said):
                 self.end_with(EndWanted(*said) if said else None).append(position)
