@@ -97,7 +97,7 @@ class Pending(asyncio.Future[Any]):
     def __init__(self, life: Life) -> None:
         super().__init__(loop=life.cell.node.loop)
         self._life, self.when, self.is_out = life, 0.0, False
-        self.place = 0, 0  # its turn, and the number of its output
+        self.place: tuple[int, int] = (0, 0)  # its turn, and the number of its output
 
     def cancel(self, msg: Any = None) -> bool:
         """Nobody waits for it any more: nothing of it is done again in a replay, and no message is taken for it."""

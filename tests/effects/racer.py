@@ -94,7 +94,8 @@ class Racer(hf.Actor):
     async def race(self, message: Race) -> str:
         paid = self.ctx.effect(wait_in, message.world, "paid", key="x", at_most_once=message.at_most_once)
         cancel = self.ctx.wait_for(Cancel)
-        done, rest = await asyncio.wait([paid, cancel], return_when=asyncio.FIRST_COMPLETED)
+        both: list[asyncio.Future[Any]] = [paid, cancel]
+        done, rest = await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
         for one in rest:
             one.cancel()
         said = [str(one.result()) for one in (paid, cancel) if one in done]
@@ -127,9 +128,8 @@ class Racer(hf.Actor):
                     async with asyncio.timeout(0.05), asyncio.TaskGroup() as tasks:
                         tasks.create_task(awaited(self.ctx.wait_for(Cancel)))
                 case "first":
-                    done, rest = await asyncio.wait(
-                        [self.ctx.wait_for(Cancel), self.ctx.sleep(0.05)], return_when=asyncio.FIRST_COMPLETED
-                    )
+                    both: list[asyncio.Future[Any]] = [self.ctx.wait_for(Cancel), self.ctx.sleep(0.05)]
+                    done, rest = await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
                     assert len(done) == len(rest) == 1
                     rest.pop().cancel()
                 case _:

@@ -299,6 +299,7 @@ def test_outcomes_have_their_places_in_the_journal() -> None:
             ledger.compare_outputs(0, source.id, [Out(number, "effect", "x")], same)
         entries.append(ledger.released_entry(0))
         kept = ledger.note_outcome(0, k, Answer(REPLY))
+        assert kept is not None
         assert kept == Came(REPLY, "", b"", 3 - k, count)
         entries.append(outcome_entry(0, k, kept))
     entries.append(outcome_entry(0, 3, came(Answer(REPLY), AT_ITS_END)))  # By somebody who did not know the others.
