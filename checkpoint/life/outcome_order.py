@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from ..protocol import Feed
     from .recorded_life import Life
 
-STEPS: Final = 6
-"""Steps of the event loop in which a handler acts on an outcome. `asyncio.wait` and `asyncio.gather` take two, and each
-`asyncio.shield`, task or further `gather` around what was awaited takes one or two more."""
+STEPS: Final = 4
+"""Steps of the event loop in which a handler acts on an outcome. `asyncio.wait` and `asyncio.gather` take two, and an
+`asyncio.shield`, a task or a further `gather` around what was awaited takes one more, or two."""
 PATIENCE: Final = 5.0
 """Seconds after which an outcome is told all the same: the handler has gone another way, as a comparison will show."""
 
@@ -32,28 +32,25 @@ class OutcomeOrder:
 
     Attributes:
         due: outcomes that have come too early, by their place among those of the turn.
+        is_used: whether there may be something to forget of the turn.
     """
 
-    __slots__ = ("_given", "_handle", "_late", "_left", "_life", "due")
+    __slots__ = ("_given", "_handle", "_late", "_left", "_life", "due", "is_used")
 
     def __init__(self, life: Life) -> None:
         self._life = life
         self.due: dict[int, Outcome] = {}
+        self.is_used = False
         self._given = 0  # outcomes that the turn has heard
         self._late: list[Outcome] = []  # of which it had not heard at its end
         self._left = 0  # steps of the loop until the next one may be told
         self._handle: asyncio.Handle | None = None
 
-    @property
-    def is_used(self) -> bool:
-        """Whether there is anything to forget of an earlier turn."""
-        return bool(self._given or self.due)
-
     def begin(self) -> None:
         """A turn begins, which has heard nothing."""
         self.close()
         self.due.clear()
-        self._given = 0
+        self._given, self._late, self.is_used = 0, [], False
         outcomes = self._life.waits.outcomes
         for place in [place for place, (future, _) in outcomes.items() if future.done()]:
             del outcomes[place]  # Given up, and nothing comes of it.
@@ -74,10 +71,11 @@ class OutcomeOrder:
             life.hear(record)
         elif nth < 0:
             self._late.append(record)
+            self.is_used = True
         elif nth <= self._given:
-            life.waits.heard += 1  # Whoever led before has told it.
+            life.hear(record)  # Whoever led before has told it, perhaps before the turn had come so far.
         else:
-            self.due[nth] = record
+            self.due[nth], self.is_used = record, True
             self.go_on()
 
     def go_on(self) -> None:

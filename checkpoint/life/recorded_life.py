@@ -326,7 +326,7 @@ class Life:
         self.feed, self.last_k, self.stage.ending = feed, 0, None
         waits = self.waits
         waits.moment, waits.resting = 0.0, 0
-        if waits.order.is_used or waits.outcomes:
+        if waits.order.is_used:
             waits.order.begin()
         if self.outs:  # What a turn that was left in the middle has said does not count.
             self.outs = []

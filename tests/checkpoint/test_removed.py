@@ -87,14 +87,14 @@ CHECKS = {
         "            waits.order.ignored(record)\n",
         "",
         RACES,
-        "test_what_comes_at_once_is_heard",
+        "test_nor_if_its_home_did_not_hear",
     ),
     "a turn that is killed has given up nothing": Check(
         "checkpoint/life/outcome_order.py",
         "            self._give_up_soon(place, feed, suspended, STEPS)",
         "            self.give_up(place)",
-        RACES,
-        "test_a_killed_turn_has_given_up_nothing",
+        "tests/effects/test_long_waits.py",
+        "test_days_pass_and_crashes",
     ),
     "a turn that ends gives up what it waits for": Check(
         "checkpoint/life/recorded_life.py",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+from contextvars import Context
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 import holdfast as hf
 from holdfast.checkpoint.home.input_ledger import InputLedger, outcome_entry
 from holdfast.checkpoint.home.recorded_home import switch_of
-from holdfast.checkpoint.protocol import AT_ITS_END, MESSAGE, REPLY, Answer, Came, Out, came
+from holdfast.checkpoint.protocol import AT_ITS_END, MESSAGE, REPLY, Answer, Came, GivenUp, Out, came
 from holdfast.ftm import LFR, PBR, TR
 from tests.effects.clerk import IN_TIME, words
 from tests.effects.racer import Both, Cancel, GiveUp, Leave, Look, Other, Race, Tire, Two, let, racer
@@ -194,26 +195,26 @@ async def test_a_turn_that_goes_another_way_is_not_waited_for(tmp_path: Path, mo
 async def test_what_comes_at_once_is_heard_one_after_another(tmp_path: Path) -> None:
     """The handler has given up the other one when that comes: the message is not lost with it."""
     world = str(tmp_path)
-    async with running(tmp_path, "os") as system:
+    async with running(tmp_path) as system:
         ref = await system.start(racer())
         asked = ref.ask(Race(world), IN_TIME)
         await begun(tmp_path, "paid")
         await until(system, 1)
         home = switch_of(system._node.cell_at(PATH))
         assert home is not None
-        tell, told = home.calls._tell, list[int]()
+        tell, told = home.calls._tell, list[tuple[int, str]]()
 
         def together(turn: int, k: int, answer: Any) -> None:
             tell(turn, k, answer)
-            told.append(k)
-            if told == [1]:
-                ref.tell(Cancel("at once"))
+            told.append((k, answer.kind))
+            if len(told) == 1:
+                Context().run(ref.tell, Cancel("at once"))  # By nobody: this is called in a task of the actor.
 
         home.calls._tell = together  # type: ignore[method-assign]  # the moment cannot be met otherwise
         let(world, "paid")
         await begun(tmp_path, "then")
         home.calls._tell = tell  # type: ignore[method-assign]
-        assert told[:2] == [1, 2], "the message was taken for the wait"
+        assert told[:2] == [(1, "timed reply"), (2, "timed message")], "the message was taken for the wait"
         await end_of(system, "task", PATH)
         let(world, "then paid")
         let(world, "end")
@@ -253,6 +254,30 @@ async def test_nor_behind_a_mechanism(tmp_path: Path, stack: str, how: str) -> N
         asked = ref.ask(GiveUp(world, how), IN_TIME)
         await begun(tmp_path, "again")
         await until(system, 0)
+        await ref.send(Cancel("second"))
+        let(world, "again")
+        assert await asked == "had second"
+
+
+async def test_nor_if_its_home_did_not_hear_of_that(tmp_path: Path) -> None:
+    """As when the leader has died with it: whoever leads now has the wait begin, and gives it up again."""
+    world = str(tmp_path)
+    async with running(tmp_path) as system:
+        ref = await system.start(racer())
+        home = switch_of(system._node.cell_at(PATH))
+        assert home is not None
+        give_up, lost = home.calls.give_up, list[GivenUp]()
+
+        def lose_first(record: GivenUp) -> None:
+            if lost:
+                give_up(record)
+            else:
+                lost.append(record)
+
+        home.calls.give_up = lose_first  # type: ignore[method-assign]  # one process has nobody who could lose it
+        asked = ref.ask(GiveUp(world, "at once"), IN_TIME)
+        await begun(tmp_path, "again")
+        await until(system, 1)
         await ref.send(Cancel("second"))
         let(world, "again")
         assert await asked == "had second"
