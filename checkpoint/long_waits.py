@@ -38,7 +38,7 @@ class LongWaits:
     def __init__(self, home: Switch) -> None:
         self._home = home
         self._clocks: dict[Place, asyncio.TimerHandle] = {}
-        self.taken: dict[Place, int] = {}  # the messages that the turn in hand has waited for
+        self.taken: dict[Place, Input] = {}  # the messages that the turn in hand has waited for
         self.wanted: dict[Place, str] = {}  # "A|B": types of messages, "": a moment; in the order of the waits
 
     @property
@@ -86,8 +86,8 @@ class LongWaits:
     def _take(self, place: Place, source: Input) -> None:
         """The message is no input any more, but an outcome of the turn, in one append."""
         home, batch = self._home, Batch()
-        self._forget(place)
-        self.taken = {known: key for known, key in self.taken.items() if known[0] == place[0]} | {place: source.id}
+        self.withdraw(place)
+        self.taken = {known: one for known, one in self.taken.items() if known[0] == place[0]} | {place: source}
         home.end_without_turn(source, HAD if source.ask is not None else Answer(), batch)
         outcome = timed(Answer(MESSAGE, source.name, source.body), home.node.clock.wall())
         home.calls.outcome(*place, outcome, batch)
@@ -101,14 +101,15 @@ class LongWaits:
             self._clocks[place] = home.node.loop.call_later(min(when - now, LONGEST), self._look, place, when)
             return
         names = self.wanted[place]
-        self._forget(place)
+        self.withdraw(place)
         if not names:
             answer = Answer(MOMENT)
         else:
             answer = Answer(*home.node.codec.encode_error(WaitTimeout(home.path, names.replace("|", " or "))))
         home.calls.outcome(*place, timed(answer, now), None)
 
-    def _forget(self, place: Place) -> None:
+    def withdraw(self, place: Place) -> None:
+        """Wait no more for what this output of the turn waits for, if anything."""
         clock = self._clocks.pop(place, None)
         self.wanted.pop(place, None)
         if clock is not None:
@@ -117,7 +118,7 @@ class LongWaits:
     def abandon(self) -> None:
         """Wait for nothing any more, since the life is over."""
         for place in list(self.wanted):
-            self._forget(place)
+            self.withdraw(place)
 
     # -- asks that change nothing -----------------------------------------------------------------------------------
 

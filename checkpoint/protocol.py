@@ -30,6 +30,8 @@ REPLY, REFUSAL, ERROR, CRASH, LATER, NOTHING = "reply", "refusal", "error", "cra
 # What else a turn can wait for: a moment, or (MESSAGE) a message. If it may have waited for long, the kind of the
 # outcome begins with TIMED, and its body has the Unix time at which it came in front.
 MOMENT, TIMED = "moment", "timed "
+# The turn has cancelled what it waited for: nothing is taken for it or done any more.
+GIVEN_UP = "given up"
 # In place of a receiver, of a wait whose `seconds` begin with it; else they are Unix time.
 SINCE_THEN = "since then"
 
@@ -73,6 +75,25 @@ class Answer(msgspec.Struct, array_like=True, gc=False):
     kind: str = NOTHING
     name: str = ""
     body: bytes = b""
+
+
+TOO_LATE, AT_ITS_END = -1, -2
+"""In place of the number of an outcome: its turn was over; it comes after all others, as nobody knows those here."""
+
+
+class Came(Answer, array_like=True, gc=False):
+    """What came of an output, and when: the turn had heard `nth - 1` outcomes, and had let `after` outputs out.
+
+    A replay hears it there again; where `nth` is 0, as soon as it asks for it.
+    """
+
+    nth: int = 0
+    after: int = 0
+
+
+def came(answer: Answer, nth: int = 0, after: int = 0) -> Came:
+    """The same outcome, and its place among those of its turn."""
+    return Came(answer.kind, answer.name, answer.body, nth, after)
 
 
 NO_ANSWER = Answer()
@@ -157,7 +178,7 @@ class Outcome(msgspec.Struct, array_like=True, tag=2):
 
     turn: int
     k: int
-    answer: Answer
+    answer: Came
     taken: int = -1
     asked: int = 0
 
@@ -393,6 +414,13 @@ class Performed(msgspec.Struct, array_like=True, tag=23):
     answer: Answer
 
 
+class GivenUp(msgspec.Struct, array_like=True, tag=27):
+    """The turn does not wait any more for what comes of its output (turn, k), and has not got it."""
+
+    turn: int
+    k: int
+
+
 class Glanced(msgspec.Struct, array_like=True, tag=25):
     """The input `id`, an ask that changes nothing, has this answer, and is not handled in a turn."""
 
@@ -462,6 +490,7 @@ ToHome = (
     | Snapshot
     | PipeDone
     | Performed
+    | GivenUp
     | Glanced
     | Unsaved
     | Wanted

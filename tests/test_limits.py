@@ -200,7 +200,7 @@ async def test_state_and_code_of_a_protected_actor_are_not_replaced() -> None:
         ref = await system.start(hf.child("one", hf.start(Keeper), mechanism=PBR()))
         await system.suspend(ref, timeout=60.0)
         for refused in (system.replace_state(ref, with_more), system.replace_code(ref, Busy)):
-            with pytest.raises(hf.errors.ControlFailed, match=r"`protect` it by None, and again after"):
+            with pytest.raises(hf.errors.ControlFailed, match=r"`protect` it by None first, and again after"):
                 await refused
         await system.resume(ref, timeout=60.0)
         async with system.transaction(timeout=60.0) as change:

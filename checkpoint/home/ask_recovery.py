@@ -24,7 +24,7 @@ from ...actors.events import KeptForSystem
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask
 from ..inputs import Batch, Input
-from ..protocol import MESSAGE, Answer, Out
+from ..protocol import AT_ITS_END, MESSAGE, Answer, Out, came
 from ..schema import shape_entry
 from .input_ledger import outcome_entry
 from .pending_asks import MARK, OVER, SwitchAsk
@@ -84,7 +84,7 @@ class RejoinedAsk(SwitchAsk, eq=False):
                     return  # Its receiver has been stopped with the system: it asks whoever leads next.
                 homes.far.answered(FarId(self.asker, self.turn, self.k), answer, own)
             else:
-                own.add(self.asker, outcome_entry(self.turn, self.k, answer), [])
+                own.add(self.asker, outcome_entry(self.turn, self.k, came(answer, AT_ITS_END)), [])
             if batch is None:
                 own.commit(homes.journal)
 

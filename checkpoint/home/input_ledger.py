@@ -18,6 +18,7 @@ from ..inputs import NO_DIGESTS, OVERHEAD, Contained, Input, RowPlace, Turn, spr
 from ..life.replay_guard import StateDiverged
 from ..long_waits import due_entry
 from ..protocol import (
+    AT_ITS_END,
     DROPPED,
     FAILED,
     MESSAGE,
@@ -27,10 +28,13 @@ from ..protocol import (
     STASHED,
     TICK,
     TIMED,
+    TOO_LATE,
     Answer,
+    Came,
     EndWanted,
     Out,
     TurnEnd,
+    came,
 )
 
 if TYPE_CHECKING:
@@ -83,6 +87,7 @@ class InputLedger:
         begun: the input of the turn after `turn`, if it has released outputs.
         released: digests of those outputs.
         outcomes: of the asks that these turns have made, by (turn, output).
+        heard: how many outcomes the turn in hand has.
         lasts: whether that turn has had effects or long waits: it goes on in the next life at its address.
         dues: until when outputs of the turn in hand wait, in Unix time.
         pipes_done: the background work of these turns that has its result, by turn.
@@ -104,7 +109,8 @@ class InputLedger:
     turns: dict[int, Turn] = dataclasses.field(default_factory=dict)
     begun: int = -1
     released: list[int] = dataclasses.field(default_factory=list)
-    outcomes: dict[tuple[int, int], Answer] = dataclasses.field(default_factory=dict)
+    outcomes: dict[tuple[int, int], Came] = dataclasses.field(default_factory=dict)
+    heard: int = 0
     lasts: bool = False
     dues: dict[tuple[int, int], float] = dataclasses.field(default_factory=dict)
     pipes_done: dict[int, set[int]] = dataclasses.field(default_factory=dict)
@@ -252,7 +258,7 @@ class InputLedger:
         if self.released:
             digests, self.released = self.released, []
         turn = self.turns[number] = Turn(source, status, digests, state, reply)
-        self.begun, self.lasts = -1, False
+        self.begun, self.lasts, self.heard = -1, False, 0
         if self.dues:
             self.dues.clear()
         self.turn = number
@@ -314,17 +320,28 @@ class InputLedger:
         digests = self.released if turn > self.turn else past.digests if past is not None else []
         return digests[k - 1] if k <= len(digests) else 0
 
-    def note_outcome(self, turn: int, k: int, answer: Answer) -> bool:
-        """Keep the outcome of the ask that was output (turn, k); False if no replay will want it."""
-        if turn <= self.state_turn:
-            return False
-        self._take_outcome(turn, k, answer)
-        return True
+    def note_outcome(self, turn: int, k: int, answer: Answer) -> Came | None:
+        """Keep the outcome of what was output (turn, k), with its place among others; None if no replay will want it.
 
-    def _take_outcome(self, turn: int, k: int, answer: Answer) -> None:
+        What takes the place of an outcome (the turn has given it up) has the place of that.
+        """
+        if turn <= self.state_turn:
+            return None
+        before = self.outcomes.get((turn, k))
+        kept = self._placed(turn, answer) if before is None else came(answer, before.nth, before.after)
+        self._take_outcome(turn, k, kept)
+        return kept
+
+    def _placed(self, turn: int, answer: Answer) -> Came:
+        """What comes now of an output of a turn, behind all that the turn has had."""
+        return came(answer, self.heard + 1, len(self.released)) if turn > self.turn else came(answer, TOO_LATE)
+
+    def _take_outcome(self, turn: int, k: int, answer: Came) -> None:
         """A turn that gets further than before has not died of the same thing again: its deaths are counted anew."""
         if turn > self.turn and (turn, k) not in self.outcomes and self.begun in self.open:
             self.open[self.begun].deliveries = 0
+        if turn > self.turn:
+            self.heard = max(self.heard, answer.nth)
         self.outcomes[turn, k] = answer
 
     def end_with(self, wanted: EndWanted | None) -> list[int]:
@@ -366,7 +383,7 @@ class InputLedger:
         """Let the turn in hand begin anew, unless it has released something: then its input is returned."""
         source = self.open.get(self.begun)
         if source is None or not self.released:
-            self.released, self.begun, self.lasts = [], -1, False
+            self.released, self.begun, self.lasts, self.heard = [], -1, False, 0
             self.dues.clear()
             return None
         return source
@@ -499,8 +516,10 @@ class InputLedger:
         """All of it behind the newest snapshot, as `read_entry` takes it."""
         inputs = {source.id: source for source in self.handled_and_open()}
         entries = [inputs[key].entry() for key in sorted(inputs)]
-        entries += [outcome_entry(turn, k, answer) for (turn, k), answer in sorted(self.outcomes.items())]
+        heard = sorted(self.outcomes.items())
+        entries += [outcome_entry(*place, answer) for place, answer in heard if place[0] <= self.turn]
         entries += [turn.entry(number) for number, turn in self.turns.items()]
+        entries += [outcome_entry(*place, answer) for place, answer in heard if place[0] > self.turn]
         if self.released:
             entries.append(self.released_entry(self.turn + 1))
         entries += [due_entry(*place, when) for place, when in self.dues.items()]
@@ -540,9 +559,10 @@ class InputLedger:
                 self.positions_of(turn).append(position)
                 if turn > self.turn:
                     self.dues[turn, k], self.lasts = when, True
-            case ("got", turn, k, kind, name, body):
+            case ("got", turn, k, kind, name, body, *order):
                 self.positions_of(turn).append(position)
-                self._take_outcome(turn, k, Answer(kind, name, body))
+                answer = Came(kind, name, body, *order)
+                self._take_outcome(turn, k, self._placed(turn, answer) if answer.nth == AT_ITS_END else answer)
                 self.lasts = self.lasts or (turn > self.turn and kind.startswith(TIMED))
             case ("stop", *said):
                 self.end_with(EndWanted(*said) if said else None).append(position)
@@ -603,6 +623,6 @@ def stop_entry(ends: EndWanted | None) -> Entry:
     return ("stop",) if ends is None else ("stop", *msgspec.structs.astuple(ends))
 
 
-def outcome_entry(turn: int, k: int, answer: Answer) -> Entry:
-    """What the journal has of the outcome of an ask."""
-    return "got", turn, k, answer.kind, answer.name, answer.body
+def outcome_entry(turn: int, k: int, answer: Came) -> Entry:
+    """What the journal has of what came of an output."""
+    return "got", turn, k, answer.kind, answer.name, answer.body, answer.nth, answer.after

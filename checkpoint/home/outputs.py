@@ -106,6 +106,8 @@ class Outputs:
         home = self._home
         if home.life.port is not port or (turn, out.k) in home.ledger.outcomes:
             return
+        if turn <= home.ledger.turn:
+            return  # It left with the end of its turn, which has not waited for it.
         if out.verb == "effect":
             home.calls.order(turn, out.k)
         else:

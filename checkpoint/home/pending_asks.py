@@ -15,7 +15,21 @@ from ...actors.kernel.envelope import NO_DEADLINE, Ask, ReplyHandle
 from ...actors.process.wire.peer import RelayedAsk, asked
 from ..inputs import Batch, Input
 from ..long_waits import LongWaits
-from ..protocol import REPLY, Answer, Out, Outcome, Perform, Performed, timed
+from ..protocol import (
+    GIVEN_UP,
+    MESSAGE,
+    REPLY,
+    Answer,
+    Came,
+    GivenUp,
+    Out,
+    Outcome,
+    Perform,
+    Performed,
+    came,
+    timed,
+    untimed,
+)
 from ..schema import shape_name
 from .input_ledger import outcome_entry
 
@@ -24,7 +38,7 @@ if TYPE_CHECKING:
     from .switch import Switch
 
 
-ACCEPTED = Answer(REPLY, "", msgspec.msgpack.encode(None))
+ACCEPTED = Came(REPLY, "", msgspec.msgpack.encode(None))
 
 
 MARK = "ask "
@@ -188,7 +202,7 @@ class PendingCalls:
         elif answer is None and (turn, k) not in self.asks and not home.homes.rejoin.joins(home, turn, key, out):
             # The root itself was restarted meanwhile, and whoever was asked keeps no journal.
             why = "the program was started again since, and what it had in hand was not recorded"
-            answer = Answer(*home.node.codec.encode_error(AskTimeout(out.to, out.seconds, None, why)))
+            answer = came(Answer(*home.node.codec.encode_error(AskTimeout(out.to, out.seconds, None, why))))
         if answer is not None:
             self._tell(turn, k, answer)
 
@@ -217,15 +231,39 @@ class PendingCalls:
         if is_out and place not in self.asks:
             self.outcome(*place, timed(record.answer, self._home.node.clock.wall()), None)
 
+    def give_up(self, record: GivenUp) -> None:
+        """The turn in hand does not want any more what it waits for: no later life of it gets that either.
+
+        A message that had been taken for it by then waits again, behind the others.
+        """
+        home, place = self._home, (record.turn, record.k)
+        if record.turn <= home.ledger.turn or not home.ledger.digest_of(*place):
+            return  # It was handled again, and says so again; or it has not let that out.
+        known = home.ledger.outcomes.get(place)
+        self.rests.withdraw(place)
+        if known is None:
+            self.outcome(*place, Answer(GIVEN_UP), None)
+            return
+        taken, _ = untimed(known)
+        if taken.kind == MESSAGE:
+            batch, source = Batch(), self.rests.taken.pop(place, None)
+            self.outcome(*place, Answer(GIVEN_UP), batch)
+            again = home.record(MESSAGE, taken.name, taken.body, None if source is None else source.sender, batch)
+            again.chain = () if source is None else source.chain
+            batch.after.append(lambda: home.admitted(again))
+            batch.commit(home.journal)
+
     def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None) -> None:
-        """An ask of ours has its outcome: journal it, then tell the turn that waits."""
+        """An output of ours has an outcome: journal it, then tell the turn that waits."""
         own = batch if batch is not None else Batch()
         ask = self.asks.pop((turn, k), None)
-        if self._home.ledger.note_outcome(turn, k, answer):
+        kept = self._home.ledger.note_outcome(turn, k, answer)
+        if kept is not None:
             if self._home.journal.durable:
                 self._home.note_shape(shape_name(answer), own)
-            self._home.note(turn, outcome_entry(turn, k, answer), own)
-        own.after.append(lambda: self._tell(turn, k, answer))
+            self._home.note(turn, outcome_entry(turn, k, kept), own)
+        told = came(answer) if kept is None else kept
+        own.after.append(lambda: self._tell(turn, k, told))
         if ask is not None and ask.settled is not None:
             own.after.append(ask.settled)
         if batch is None:
@@ -250,8 +288,9 @@ class PendingCalls:
         else:
             self.outcome(turn, k, Answer(*self._home.node.codec.encode_error(error)), None)
 
-    def _tell(self, turn: int, k: int, answer: Answer) -> None:
+    def _tell(self, turn: int, k: int, answer: Came) -> None:
         if self._home.life.port is not None:
             self._home.life.told += 1
-            taken = self.rests.taken.get((turn, k), -1)  # Whoever leads now may have been given that by the last one.
+            source = self.rests.taken.get((turn, k))  # Whoever leads now may have been given that by the last one.
+            taken = -1 if source is None else source.id
             self._home.life.port.to_life(Outcome(turn, k, answer, taken, self._home.ledger.digest_of(turn, k)))

@@ -41,6 +41,7 @@ from ..protocol import (
     Answer,
     Closed,
     EndWanted,
+    GivenUp,
     Glanced,
     Go,
     Hooked,
@@ -442,6 +443,8 @@ class Switch:
                     self.outputs.work_done(record)
                 case Performed():
                     self.calls.performed(record)
+                case GivenUp():
+                    self.calls.give_up(record)
                 case Glanced():
                     self.calls.rests.glanced(record)
                 case Hooked():

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from ...actors.kernel.envelope import Item
     from ...actors.kernel.message import Message
     from ..protocol import Clock, EndWanted, Go, Lent, Restore
+    from .outcome_order import OutcomeOrder
 
 
 class Asked(NamedTuple):
@@ -131,8 +132,10 @@ class TurnWaits:
         moment: until when the handler of the turn in hand has waited, in Unix time.
         resting: how many moments and messages the turn in hand waits for.
         heard: how many outcomes the home has told.
+        order: tells the turn in hand its outcomes, one after another.
     """
 
+    order: OutcomeOrder
     outcomes: dict[tuple[int, int], tuple[asyncio.Future[Any], Awaited]] = dataclasses.field(default_factory=dict)
     moment: float = 0.0
     resting: int = 0

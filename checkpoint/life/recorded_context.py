@@ -92,11 +92,19 @@ class Pending(asyncio.Future[Any]):
     Not when it has come: in a replay all comes at once, and `now()` has to say again what it said.
     """
 
-    __slots__ = ("_life", "is_out", "when")
+    __slots__ = ("_life", "is_out", "place", "when")
 
     def __init__(self, life: Life) -> None:
         super().__init__(loop=life.cell.node.loop)
         self._life, self.when, self.is_out = life, 0.0, False
+        self.place: tuple[int, int] = (0, 0)  # its turn, and the number of its output
+
+    def cancel(self, msg: Any = None) -> bool:
+        """Nobody waits for it any more: nothing of it is done again in a replay, and no message is taken for it."""
+        is_news = super().cancel(msg)
+        if is_news:
+            self._life.waits.order.cancelled(self.place)
+        return is_news
 
     # It is its own iterator, so that nothing else is kept while it is awaited, perhaps for days.
 
@@ -349,7 +357,8 @@ class RecordedContext(ActorContext):
         """An output of the turn in hand, and a future of what comes of it; the turn need not wait for that."""
         life = self.recorded
         k = life.put(verb, to, name, seconds=until)
-        life.waits.outcomes[life.turn, k] = outcome, kind
+        outcome.place = life.turn, k
+        life.waits.outcomes[outcome.place] = outcome, kind
         life.release()
         return outcome
 

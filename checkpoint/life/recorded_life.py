@@ -73,6 +73,7 @@ from ..snapshot.key_variables import check_keys, restore_state, save_state, vari
 from .determinism_guard import DeterminismGuard
 from .glances import answer_beside
 from .life_state import Asked, Awaited, HookTimers, LifeStage, RestoredState, SnapshotState, TurnWaits
+from .outcome_order import OutcomeOrder, is_given_up
 from .readonly_guard import check_readonly
 from .recorded_context import Pending, RecordedContext
 from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
@@ -115,7 +116,7 @@ class Life:
         self.feed: Feed | None = None
         self.outs: list[Out] = []
         self.last_k = 0
-        self.waits = TurnWaits()
+        self.waits = TurnWaits(OutcomeOrder(self))
         self.pipes = 0
         self.stash: list[Fed] = []
         self.returned: dict[int, Fed] = {}
@@ -205,9 +206,9 @@ class Life:
             case Feed():
                 self._take(record)
             case Outcome():
-                self._outcome(record)
-                if self.stage.begun >= 0:
-                    self.cell.node.loop.call_soon(self.say_it_waits)  # Behind the turn, if that has waited for this.
+                if record.taken >= 0:
+                    self.drop_queued(record.taken)
+                self.waits.order.take(record)
             case Perform():
                 self._perform(record)
             case Glance():  # Not here and now: this may be called in a turn of the very actor.
@@ -257,16 +258,19 @@ class Life:
         if not cell.scheduled:
             cell.schedule()
 
-    def _outcome(self, record: Outcome) -> None:
-        self.waits.heard += 1
-        if record.taken >= 0:
-            self.drop_queued(record.taken)
-        waiting = self.waits.outcomes.pop((record.turn, record.k), None)
-        if waiting is None:
-            return
-        future, awaited = waiting
+    def hear(self, record: Outcome) -> bool:
+        """Tell a turn the outcome of one of its outputs; False if it does not wait for that."""
+        waits = self.waits
+        waits.heard += 1
+        if self.stage.begun >= 0:
+            self.cell.node.loop.call_soon(self.say_it_waits)  # Behind the turn, if that has waited for this.
+        future, awaited = waits.outcomes.get((record.turn, record.k), (None, None))
+        if future is None or (is_given_up(record) and not future.done()):
+            return False
+        del waits.outcomes[record.turn, record.k]
         if future.done():
-            return
+            waits.order.ignored(record)
+            return False
         try:
             answer, when = untimed(record.answer)
             if when:
@@ -278,6 +282,7 @@ class Life:
                 future.set_exception(error)
         except Exception as error:
             future.set_exception(BadReply(*self._asked(awaited), str(error)))
+        return True
 
     def _asked(self, awaited: Awaited) -> tuple[str, str]:
         """Who was to do what, as errors name it."""
@@ -301,6 +306,8 @@ class Life:
         outcome, effect = self.waits.outcomes.get((order.turn, order.k), (None, None))
         ctx = self.cell.ctx
         if isinstance(outcome, Pending) and isinstance(effect, EffectCall) and isinstance(ctx, RecordedContext):
+            if outcome.done():
+                return  # It was given up meanwhile.
             ctx.perform(order, effect, outcome)
 
     # -- turns ------------------------------------------------------------------------------------------------------
@@ -317,7 +324,10 @@ class Life:
         if self.returned:
             self.returned.pop(feed.id, None)  # It has come again: its feed may have been here before it was put back.
         self.feed, self.last_k, self.stage.ending = feed, 0, None
-        self.waits.moment, self.waits.resting = 0.0, 0
+        waits = self.waits
+        waits.moment, waits.resting = 0.0, 0
+        if waits.order.is_used:
+            waits.order.begin()
         if self.outs:  # What a turn that was left in the middle has said does not count.
             self.outs = []
         if self.page is not None:
@@ -346,6 +356,8 @@ class Life:
             if self.method.check_replay and self.cell.actor and status in (OK, STASHED)
             else 0
         )
+        if self.waits.outcomes:
+            self.waits.order.end_turn()
         outs, self.feed, self.outs = self.outs, None, []
         ends = None if status == FAILED else self.stage.ending
         self.port.to_home(TurnEnd(self.turn, feed.id, status, outs, answer, state, ends))
@@ -426,6 +438,8 @@ class Life:
             self.port.to_home(Hooked(self.hook, out))
         else:
             self.outs.append(out)
+            if self.waits.order.due:
+                self.cell.node.loop.call_soon(self.waits.order.go_on)
         return k
 
     def enter(self, hook: str) -> None:
@@ -651,6 +665,7 @@ class Life:
         """End what the life has out, for it is over."""
         self.stage.is_over = True
         self.images.close()
+        self.waits.order.close()
         for future, _ in self.waits.outcomes.values():
             future.cancel()
         self.waits.outcomes.clear()

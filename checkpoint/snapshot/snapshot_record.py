@@ -16,7 +16,7 @@ from ..encoding.compression import PLAIN, compressor, decompress
 from ..inputs import Contained, spread
 from ..journal import DamagedStore, Entry
 from ..journal import Saved as Journaled
-from ..protocol import DOWN, EXIT, OK, STASHED, TICK, TIMED, Answer, Clock, Snapshot, timed, untimed
+from ..protocol import DOWN, EXIT, OK, STASHED, TICK, TIMED, Answer, Came, Clock, Snapshot, came, timed, untimed
 from ..schema import as_shape, first_of, kind_in, shape_name
 from ..upgrade.mapping import BodyMapper, NotMapped
 from ..upgrade.old_records import OldRecords
@@ -384,7 +384,7 @@ def _note_old(old: OldRecords, entry: Entry) -> None:
         case ("in", key, _, name, *_):
             if name and (mapper := old.mapper(name)) is not None:
                 old.inputs[key] = mapper
-        case ("got", turn, k, kind, name, _):
+        case ("got", turn, k, kind, name, _, *_):
             name = shape_name(Answer(kind, name))
             if name and (mapper := old.mapper(name)) is not None:
                 old.outcomes[turn, k] = mapper
@@ -416,10 +416,10 @@ def _taken_over(home: Switch, old: OldRecords) -> list[str]:
         counts[mapper] += 1
         return mapper.mapped(body)
 
-    def outcome(mapper: BodyMapper, answer: Answer) -> Answer:
+    def outcome(mapper: BodyMapper, answer: Came) -> Came:
         own, when = untimed(answer)
         own = Answer(own.kind, mapper.name.rpartition(" ")[2], mapped(mapper, own.body))
-        return timed(own, when) if answer.kind.startswith(TIMED) else own
+        return came(timed(own, when) if answer.kind.startswith(TIMED) else own, answer.nth, answer.after)
 
     inputs = {key: mapped(one, sources[key].body) for key, one in old.inputs.items() if key in sources}
     outcomes = {key: outcome(one, ledger.outcomes[key]) for key, one in old.outcomes.items() if key in ledger.outcomes}

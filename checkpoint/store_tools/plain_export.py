@@ -37,7 +37,7 @@ _NAMES: Final[dict[str, tuple[str, ...]]] = {
     "out": ("turn", "input", "outputs", "since"),
     "end": ("turn", "input", "status", "outputs", "state", "reply"),
     "ends": ("turn", "inputs"),
-    "got": ("turn", "output", "outcome", "type", "value"),
+    "got": ("turn", "output", "outcome", "type", "value", "order", "after"),
     "due": ("turn", "output", "time"),
     "kept": ("origin", "type", "value", "sender"),
     "drop": ("input",),
@@ -190,7 +190,7 @@ class _Export:
             case ("shape", str() as name, shape):
                 self._shapes.setdefault(key, {})[name] = as_shape(shape)
                 return _named_values("shape", entry[1:])
-            case ("got", _, _, str() as kind, str() as name, bytes() as body):
+            case ("got", _, _, str() as kind, str() as name, bytes() as body, *_):
                 answer, when = untimed(Answer(kind, name, body))
                 value = self._message(key, shape_name(answer), answer.body) if answer.body else None
                 if when and answer.kind == REPLY:

@@ -8,6 +8,7 @@ from ...actors.kernel.message import Message, Refusal
 from ...checkpoint.protocol import (
     Closed,
     Feed,
+    GivenUp,
     Go,
     Hooked,
     Ignored,
@@ -197,7 +198,7 @@ class Outward(Message):
     and what its effects have come to."""
 
     epoch: int
-    records: list[Released | Performed]
+    records: list[Released | Performed | GivenUp]
 
 
 class PartEnded(Message):

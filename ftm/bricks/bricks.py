@@ -25,6 +25,7 @@ from ...checkpoint.protocol import (
     MESSAGE,
     REPLY,
     Answer,
+    GivenUp,
     Live,
     Outcome,
     Performed,
@@ -403,7 +404,7 @@ class Proceed(Brick):
                 await self.heard(record)
             self._standing.server.inward(record)
 
-    def tell_outward(self, record: Released | Performed) -> None:
+    def tell_outward(self, record: Released | Performed | GivenUp) -> None:
         """Tell a message that the protected actor has let out, if this replica leads and is not fenced."""
         standing = self._standing
         if standing.leads and not standing.is_fenced:

@@ -35,7 +35,7 @@ def give_order(group: Group | None, cell: Cell, call: QueuedOrder) -> None:
     """
     ask = call.ask
     if isinstance(call.order, (ReplaceState, ReplaceCode, Prepare, Conclude)):
-        why = "it is protected, and all replicas have to be alike: `protect` it by None, and again after"
+        why = "it is protected, and all replicas have to be alike: `protect` it by None first, and again after that"
         ask.fail(ControlFailed(cell.path, call.order.verb, why))
         return
     primary = None if group is None else group.membership.primary

@@ -32,6 +32,7 @@ from ...checkpoint.protocol import (
     Answer,
     Closed,
     Feed,
+    GivenUp,
     Go,
     Hooked,
     Ignored,
@@ -112,7 +113,7 @@ class Driver(Protocol):
         """See to it that what waits to go home is taken."""
         ...
 
-    def tell_outward(self, record: Released | Performed) -> None:
+    def tell_outward(self, record: Released | Performed | GivenUp) -> None:
         """Something leaves in the middle of a turn."""
         ...
 
@@ -1014,7 +1015,7 @@ class Server(lifecycle.HerePlace):
                     if record.status == FAILED:
                         self.attempts.failed = record.id
                 self.part.ends.append(record)
-            case Released() | Performed():
+            case Released() | Performed() | GivenUp():
                 if self._driver is not None:
                     self._driver.tell_outward(record)
             case Live():

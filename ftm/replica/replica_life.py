@@ -137,7 +137,8 @@ class ServerLife(Life):
     def only_rests(self) -> bool:
         """Whether the turn in hand waits for moments or messages, and nothing that would end with this life is out."""
         waits = self.waits
-        return 0 < waits.resting == len(waits.outcomes) and not (self.pipes or self.has_begun_tasks)
+        out = sum(not future.done() for future, _ in waits.outcomes.values())
+        return 0 < waits.resting == out and not (self.pipes or self.has_begun_tasks)
 
     def rewind(self, turn: int, stash: list[Fed], returned: dict[int, Fed]) -> None:
         """Go on from after an earlier turn: what was run since is run again, or something else is."""

@@ -8,7 +8,7 @@ from ...actors.control.orders import Change, ReplaceCode, ReplaceState, next_sta
 from ...actors.errors import SpecError, type_name
 from ...actors.kernel.actor import Actor, Start
 from .draft import Draft, DraftPlace, Target, is_elsewhere
-from .operation import Operation, StagedWork, wrong
+from .operation import PROTECTED, Operation, StagedWork, wrong
 from .rework import Rework
 
 if TYPE_CHECKING:
@@ -140,7 +140,10 @@ class ReplaceActorCode(OnRework):
 def check_unprotected(place: DraftPlace) -> None:
     """Refuse what would change one replica of a protected actor, and not the others. Raises SpecError."""
     if place.spec is not None and place.spec.mechanism is not None:
-        raise wrong(place.path, "it is protected by a mechanism: `protect` it by None, and again after")
+        raise wrong(
+            place.path,
+            PROTECTED,
+        )
 
 
 def _is_actor(kind: object) -> bool:

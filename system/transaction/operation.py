@@ -109,6 +109,13 @@ def text_of(target: Target) -> str:
     return target if isinstance(target, str) else target.path
 
 
+PROTECTED = (
+    "it is protected by a mechanism: `protect` it by None, and again after that, each in a transaction of its own; "
+    "meanwhile it is unprotected"
+)
+"""Why what would change one replica alone is refused."""
+
+
 def wrong(where: str, problem: str) -> SpecError:
     """The error of a check."""
     return SpecError(where, problem)

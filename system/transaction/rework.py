@@ -24,7 +24,7 @@ from ...checkpoint.protocol import Snapshot
 from ...supervision.respec import respec
 from ..live_moves import ended_too_often
 from .arrangement import busy
-from .operation import StagedWork, wrong
+from .operation import PROTECTED, StagedWork, wrong
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
@@ -66,7 +66,10 @@ class Rework(StagedWork):
         if place.is_supervisor:
             raise wrong(place.path, "a supervisor is changed by its own operations: add, remove, strategy ...")
         if place.is_protected:
-            raise wrong(place.path, "it is protected by a mechanism: `protect` it by None, and again after")
+            raise wrong(
+                place.path,
+                PROTECTED,
+            )
         if place.cell is not None and not lives_here(place.cell) and not place.cell.is_dead:
             wanted.pack(place.path)
         self._wanted.append(wanted)

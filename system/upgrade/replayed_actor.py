@@ -22,7 +22,7 @@ from ...actors.values.classes import find_class
 from ...checkpoint.home.homes import Homes
 from ...checkpoint.inputs import Turn
 from ...checkpoint.method import hybrid
-from ...checkpoint.protocol import LATER, NOTHING, REPLY, START, Answer, Out, untimed
+from ...checkpoint.protocol import GIVEN_UP, LATER, NOTHING, REPLY, START, Answer, Out, untimed
 from ...checkpoint.recovery_file import load_recovery
 from ...checkpoint.schema import Shape, shape_of
 from ...checkpoint.snapshot.key_variables import save_state
@@ -281,9 +281,9 @@ def _output(rerun: Rerun, turn: int, out: Out) -> dict[str, Any]:
         said["message"] = plain_message(out.body, _shape(out.name.rpartition("|")[2]))
     if out.seconds:
         said["seconds"] = out.seconds
-    answer = rerun.ledger.outcomes.get((turn, out.k))
-    if answer is not None:
-        answer, _ = untimed(answer)
+    outcome = rerun.ledger.outcomes.get((turn, out.k))
+    if outcome is not None:
+        answer, _ = untimed(outcome)
         is_result = out.verb == "effect" and answer.kind == REPLY
         said["got"] = plain_result(answer.body) if is_result else _outcome(rerun, answer, out.name)
     return said
@@ -295,8 +295,8 @@ def _outcome(rerun: Rerun, answer: Answer, asked: str) -> Any:
         return None
     if answer.kind == REPLY:
         return plain_message(answer.body, _reply_shape(asked))
-    if answer.kind == LATER:
-        return {"later": True}
+    if answer.kind in (LATER, GIVEN_UP):
+        return {answer.kind: True}
     return {"error": rerun.said(answer)}
 
 

@@ -25,6 +25,7 @@ from holdfast.checkpoint.protocol import (
     START,
     STASHED,
     Answer,
+    Came,
     Out,
     TurnEnd,
     answer_digest,
@@ -199,9 +200,10 @@ class Ledgers(RuleBasedStateMachine):
         source = self.next_input()
         if source is not None and self.left.get(ledger.turn + 1) and back == 0 and (turn, k) not in ledger.outcomes:
             self.deaths.pop(source.id, None)  # The turn in hand has come further.
-        assert ledger.note_outcome(turn, k, answer) == is_wanted, "only what will be replayed is kept"
-        if is_wanted:
-            self.write(outcome_entry(turn, k, answer), ledger.positions_of(turn))
+        kept = ledger.note_outcome(turn, k, answer)
+        assert (kept is not None) == is_wanted, "only what will be replayed is kept"
+        if kept is not None:
+            self.write(outcome_entry(turn, k, kept), ledger.positions_of(turn))
 
     # -- deaths and cuts --------------------------------------------------------------------------------------------
 
@@ -342,7 +344,7 @@ def test_a_turn_that_comes_further_has_not_died_of_the_same() -> None:
     ledger, read = InputLedger("/app/doer"), InputLedger("/app/doer")
     source = ledger.admit(MESSAGE, "m:Do", b"", 0.0, None)
     ledger.compare_outputs(0, source.id, outs_of(0, 1), same)
-    got = outcome_entry(0, 1, Answer(REPLY, "m:Done", b""))
+    got = outcome_entry(0, 1, Came(REPLY, "m:Done", b"", 1, 1))
     for entry in (source.entry(), ledger.released_entry(0), ("tried", source.id, 2), got, ("tried", source.id, 1)):
         assert read.read_entry(0, entry)
     assert ledger.count_death(source.id, is_ordered=False, most=2) is None

@@ -14,10 +14,102 @@ CHUNKS_KEPT = "tests/checkpoint/test_chunks_kept.py"
 
 KILLS = "tests/checkpoint/test_kill_counts.py"
 
+RACES = "tests/effects/test_races.py"
 TIMERS = "tests/effects/test_timers_while_resting.py"
 IN_HAND = "tests/checkpoint/test_diverging_in_hand.py"
 
 CHECKS = {
+    "outcomes of a turn have their places in its order": Check(
+        "checkpoint/home/input_ledger.py",
+        "came(answer, self.heard + 1, len(self.released))",
+        "came(answer)",
+        RACES,
+        "test_asks_that_race_come_in_the_same_order",
+    ),
+    "an outcome waits for what the turn did before it came": Check(
+        "checkpoint/life/outcome_order.py",
+        "if record is None or record.answer.after > life.last_k:",
+        "if record is None:",
+        RACES,
+        "test_what_a_turn_did_before_something_came",
+    ),
+    "what comes when a turn is over is no outcome in it": Check(
+        "checkpoint/home/input_ledger.py",
+        "else came(answer, TOO_LATE)",
+        "else came(answer)",
+        RACES,
+        "test_an_ask_whose_answer_comes_behind_its_turn",
+    ),
+    "what nobody knew the place of is behind all others": Check(
+        "checkpoint/home/input_ledger.py",
+        "self._placed(turn, answer) if answer.nth == AT_ITS_END else answer",
+        "answer",
+        RACES,
+        "test_outcomes_have_their_places_in_the_journal",
+    ),
+    "a handler acts on an outcome before it hears the next one": Check(
+        "checkpoint/life/outcome_order.py",
+        "if life.hear(record) and life.waits.outcomes:",
+        "if life.hear(record) and False:",
+        RACES,
+        "test_what_comes_at_once_is_heard",
+    ),
+    "an outcome that is never due is told all the same": Check(
+        "checkpoint/life/outcome_order.py",
+        "self._handle = life.cell.node.loop.call_later(PATIENCE, self._hurry)",
+        "pass",
+        RACES,
+        "test_a_turn_that_goes_another_way",
+    ),
+    "a wait that was given up is withdrawn": Check(
+        "checkpoint/life/outcome_order.py",
+        "        self._life.port.to_home(GivenUp(*place))",
+        "        pass",
+        RACES,
+        "test_a_wait_that_was_given_up_takes_nothing",
+    ),
+    "a wait that was given up is so in each later life": Check(
+        "checkpoint/home/pending_asks.py",
+        "            self.outcome(*place, Answer(GIVEN_UP), None)\n",
+        "            pass\n",
+        RACES,
+        "test_a_wait_that_was_given_up_takes_nothing",
+    ),
+    "a message that was taken for what is given up waits again": Check(
+        "checkpoint/home/pending_asks.py",
+        "        if taken.kind == MESSAGE:\n",
+        "        if False:\n",
+        RACES,
+        "test_what_comes_at_once_is_heard",
+    ),
+    "whoever gives up a wait hears of what was taken for it": Check(
+        "checkpoint/life/recorded_life.py",
+        "            waits.order.ignored(record)\n",
+        "",
+        RACES,
+        "test_nor_if_its_home_did_not_hear",
+    ),
+    "a turn that is killed has given up nothing": Check(
+        "checkpoint/life/outcome_order.py",
+        "            self._give_up_soon(place, feed, suspended, STEPS)",
+        "            self.give_up(place)",
+        "tests/effects/test_long_waits.py",
+        "test_days_pass_and_crashes",
+    ),
+    "a turn that ends gives up what it waits for": Check(
+        "checkpoint/life/recorded_life.py",
+        "            self.waits.order.end_turn()\n",
+        "            pass\n",
+        RACES,
+        "test_a_turn_that_ends_waits_for_nothing",
+    ),
+    "what leaves with the end of its turn is not waited for": Check(
+        "checkpoint/home/outputs.py",
+        "        if turn <= home.ledger.turn:\n            return  # It left",
+        "        if False:\n            return  # It left",
+        RACES,
+        "test_a_turn_that_ends_waits_for_nothing",
+    ),
     "what was submitted is written at the end, whether the message handler comes or not": Check(
         "checkpoint/group_commit.py",
         "                self.flush()  # The message handler may have ended",

@@ -23,6 +23,7 @@ from holdfast.checkpoint.protocol import (
     Released,
     SnapshotNow,
     TurnEnd,
+    came,
 )
 from holdfast.ftm.bricks.brick_messages import Done, Follow, Inward, Lead, Outward, PartEnded, Request, Strayed, Work
 from holdfast.ftm.bricks.replica_orders import Install, Join, ReplicaBeat, SetPeer, Setting
@@ -249,7 +250,7 @@ class Driver:
                 if answer is None:
                     return
                 self.answers[turn, out.k] = answer
-            self.inward(Outcome(turn, out.k, self.answers[turn, out.k]))
+            self.inward(Outcome(turn, out.k, came(self.answers[turn, out.k])))
 
     def inward(self, *records: Outcome | SnapshotNow) -> None:
         self.protocol(self.primary).tell(Inward(self.epoch, list(records)))

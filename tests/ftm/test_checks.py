@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.protocol import DROPPED, OK, REPLY, Answer, Outcome, TurnEnd
+from holdfast.checkpoint.protocol import DROPPED, OK, REPLY, Answer, Outcome, TurnEnd, came
 from holdfast.ftm.bricks.brick_messages import Done, NotFollowing, ReplyEvicted, Request, ServerState, StateDelta, Work
 from holdfast.ftm.bricks.letters import Letter
 from holdfast.ftm.bricks.replica_orders import Broken
@@ -141,7 +141,7 @@ async def test_what_a_follower_hears_before_it_has_the_state_does_not_keep_the_s
         while driver.standing("r1").other.state != "joining":
             await asyncio.sleep(0.001)
     for (turn, k), out in driver.released.items():
-        driver.inward(Outcome(turn, k, answer(out)))
+        driver.inward(Outcome(turn, k, came(answer(out))))
     async with asyncio.timeout(10):
         await joining
     assert await driver.reply(key) == 2

@@ -13,7 +13,19 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 import holdfast as hf
 from holdfast.actors.errors import AskTimeout, NoSuchActor
-from holdfast.checkpoint.protocol import DROPPED, MESSAGE, OK, Answer, Feed, Go, Outcome, PipeDone, SnapshotNow, TurnEnd
+from holdfast.checkpoint.protocol import (
+    DROPPED,
+    MESSAGE,
+    OK,
+    Answer,
+    Came,
+    Feed,
+    Go,
+    Outcome,
+    PipeDone,
+    SnapshotNow,
+    TurnEnd,
+)
 from holdfast.ftm.bricks.behind import Behind
 from holdfast.ftm.bricks.brick_messages import MOST_REQUESTS, Request, Strayed, Work
 from holdfast.ftm.bricks.replica_orders import Stand
@@ -387,7 +399,7 @@ class Delivering(RuleBasedStateMachine):
     def bring_inward(self) -> None:
         """A snapshot waits until the home knows all that a replica does; an outcome does not."""
         delivery = self.delivery
-        for record in (Outcome(1, 1, Answer()), SnapshotNow()):
+        for record in (Outcome(1, 1, Came()), SnapshotNow()):
             assert delivery.put(record)
         kinds = [type(one) for one in delivery.next_inward()]
         assert Outcome in kinds

@@ -39,7 +39,7 @@ CHECKS = {
     ),
     "whoever leads next hears which message its turn has waited for": Check(
         "checkpoint/home/pending_asks.py",
-        "taken = self.rests.taken.get((turn, k), -1)",
+        "taken = -1 if source is None else source.id",
         "taken = -1",
         "tests/effects/test_effects_protected.py",
         "test_what_was_taken_is_handled_by_nobody",

@@ -421,6 +421,14 @@ async def what_was_put_aside_outlives_a_crash(system: hf.ActorSystem) -> None:
     assert await ref.ask(Told()) == ["aside"]
 
 
+@entry("selective `receive`, and priorities")
+async def a_mailbox_is_handled_in_order(system: hf.ActorSystem) -> None:
+    ref = await scribe(system)
+    for text in ("first", "urgent"):
+        ref.tell(Word(text))
+    assert await ref.ask(Told()) == ["first", "urgent"]
+
+
 REAL = ["specs_from_processes_stay_packed"]
 """Those that start a process, and so cannot live in virtual time."""
 
