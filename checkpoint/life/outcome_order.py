@@ -2,7 +2,8 @@
 
 A handler may race what it waits for (`asyncio.wait`), and goes on with what comes first. A later life of its turn gets
 all that is known as soon as it asks for it; so each outcome has its place in the journal, and is held until the handler
-has had those before it, has had the time to act on them, and has let out what it had let out by then.
+has had those before it, has had the time to act on them, and has let out what it had let out by then. A turn that only
+asks gets what has come at once: on a busy loop the steps between two outcomes take long, and many are asked together.
 """
 
 from __future__ import annotations
@@ -33,14 +34,15 @@ class OutcomeOrder:
     Attributes:
         due: outcomes that have come too early, by their place among those of the turn.
         is_used: whether there may be something to forget of the turn.
+        has_rested: whether the turn has had an effect, or has waited for a moment or a message.
     """
 
-    __slots__ = ("_given", "_handle", "_late", "_left", "_life", "due", "is_used")
+    __slots__ = ("_given", "_handle", "_late", "_left", "_life", "due", "has_rested", "is_used")
 
     def __init__(self, life: Life) -> None:
         self._life = life
         self.due: dict[int, Outcome] = {}
-        self.is_used = False
+        self.is_used = self.has_rested = False
         self._given = 0  # outcomes that the turn has heard
         self._late: list[Outcome] = []  # of which it had not heard at its end
         self._left = 0  # steps of the loop until the next one may be told
@@ -50,7 +52,7 @@ class OutcomeOrder:
         """A turn begins, which has heard nothing."""
         self.close()
         self.due.clear()
-        self._given, self._late, self.is_used = 0, [], False
+        self._given, self._late, self.is_used, self.has_rested = 0, [], False, False
         outcomes = self._life.waits.outcomes
         for place in [place for place, (future, _) in outcomes.items() if future.done()]:
             del outcomes[place]  # Given up, and nothing comes of it.
@@ -61,6 +63,10 @@ class OutcomeOrder:
         if self._handle is not None:
             self._handle.cancel()
             self._handle = None
+
+    def rests(self) -> None:
+        """The turn has an effect from here on, or waits for a moment or a message: perhaps in a race."""
+        self.has_rested = self.is_used = True
 
     # -- hearing ----------------------------------------------------------------------------------------------------
 
@@ -93,8 +99,8 @@ class OutcomeOrder:
         life, record = self._life, self.due.pop(nth)
         self.close()
         self._given = nth
-        if life.hear(record) and life.waits.outcomes:  # Another one could come before the handler has acted on this.
-            self._left = STEPS
+        if life.hear(record) and self.has_rested and life.waits.outcomes:
+            self._left = STEPS  # Another one could come before the handler has acted on this.
             self._handle = life.cell.node.loop.call_soon(self._step)
 
     def _step(self) -> None:

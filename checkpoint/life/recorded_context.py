@@ -359,6 +359,7 @@ class RecordedContext(ActorContext):
         k = life.put(verb, to, name, seconds=until)
         outcome.place = life.turn, k
         life.waits.outcomes[outcome.place] = outcome, kind
+        life.waits.order.rests()
         life.release()
         return outcome
 

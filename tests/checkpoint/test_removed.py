@@ -49,7 +49,7 @@ CHECKS = {
     ),
     "a handler acts on an outcome before it hears the next one": Check(
         "checkpoint/life/outcome_order.py",
-        "if life.hear(record) and life.waits.outcomes:",
+        "if life.hear(record) and self.has_rested and life.waits.outcomes:",
         "if life.hear(record) and False:",
         RACES,
         "test_what_comes_at_once_is_heard",
