@@ -15,7 +15,7 @@ from ...actors.kernel.envelope import NO_DEADLINE, Ask, ReplyHandle
 from ...actors.process.wire.peer import RelayedAsk, asked
 from ..inputs import Batch, Input
 from ..long_waits import LongWaits
-from ..protocol import REPLY, Answer, Out, Outcome, Perform, Performed, timed
+from ..protocol import LEADS_NOWHERE, REPLY, Answer, Out, Outcome, Perform, Performed, timed
 from ..schema import shape_name
 from .input_ledger import outcome_entry
 
@@ -204,6 +204,17 @@ class PendingCalls:
         source = home.ledger.open.get(key)
         home.node.emit(EffectRepeated(home.path, out.to, "" if source is None else source.name))
         self.order(turn, out.k)
+
+    def said(self) -> str:
+        """What the turn in hand waits for, in words; "" if that is not known."""
+        ledger = self._home.ledger
+        turn, effects = ledger.turn + 1, 0
+        for k, digest in enumerate(ledger.released, 1):
+            is_over = (turn, k) in ledger.outcomes or (turn, k) in self.rests.wanted
+            effects += digest >= LEADS_NOWHERE and not is_over
+        asked = [f"waits for an answer of {ask.to.path}" for ask in self.asks.values() if ask.to is not None]
+        said = [self.rests.said(), "waits for an effect that is out" if effects else "", *asked]
+        return " and ".join(filter(None, said))
 
     def order(self, turn: int, k: int) -> None:
         """Have the present life perform an effect: all that precedes it is safe."""
