@@ -48,6 +48,8 @@ class Item:
     """The turns that wait for its turn."""
     is_ask: bool = False
     """Whether somebody waits for an answer to it."""
+    comes_again: ClassVar[bool] = False
+    """Whether the life at another place is told of it, too: a move does not wait until it was obeyed."""
     is_followed: ClassVar[bool] = False
     """Whether its turn is a span of a trace."""
     is_cancelled: bool = False

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from .draft import DraftPlace
 
 MOVED_WITHIN = 60.0
-"""Seconds that a life may take to move; the transaction's own time limit is shorter."""
+"""Seconds that a life may take to move at least; the transaction gives up first, at its own time limit."""
 
 
 class Gated:
@@ -111,8 +111,8 @@ class Gated:
 class Relocation(StagedWork):
     """One actor that is to live elsewhere, or behind other mechanisms: the way from its spec to that of the draft."""
 
-    def __init__(self, place: DraftPlace, text: str) -> None:
-        self._place, self._text = place, text
+    def __init__(self, place: DraftPlace, text: str, timeout: float) -> None:
+        self._place, self._text, self._within = place, text, max(MOVED_WITHIN, timeout)
         assert place.spec is not None
         self.before: ChildSpec = place.spec
         """What its spec says before the transaction."""
@@ -167,12 +167,12 @@ class Relocation(StagedWork):
         cell, moves = self._place.living(system._node), system._moves
         wanted, before = self._after.mechanism, self.before.mechanism
         if not self._adapts:
-            return moves.move(cell, self._after.isolation, self._after.limits, MOVED_WITHIN, gate)
+            return moves.move(cell, self._after.isolation, self._after.limits, self._within, gate)
         if wanted is None:
-            return moves.unprotect(cell, MOVED_WITHIN, gate)
+            return moves.unprotect(cell, self._within, gate)
         if before is None:
-            return moves.protect(cell, system._homes, wanted, MOVED_WITHIN, gate, self._begun)
-        return moves.adapt(cell, wanted, MOVED_WITHIN, gate, self._begun)
+            return moves.protect(cell, system._homes, wanted, self._within, gate, self._begun)
+        return moves.adapt(cell, wanted, self._within, gate, self._begun)
 
     def _begun(self, probation: Probation) -> None:
         self.probation = probation
@@ -216,7 +216,7 @@ class Relocation(StagedWork):
             await asyncio.shield(self._move.task)
             if self._adapts and self._moves:
                 cell = self._place.living(system._node)
-                await system._moves.move(cell, self._after.isolation, self._after.limits, MOVED_WITHIN)
+                await system._moves.move(cell, self._after.isolation, self._after.limits, self._within)
         finally:
             self._settle(system)
 

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
 PATIENCE = 0.25
 """Seconds for which some stand still at first while others have not come to rest; it is doubled each time."""
-LOOK_AGAIN = 0.02
-"""Seconds between two looks at who has come to rest."""
 
 
 class Reparent(OnSharedWork):
@@ -165,18 +163,19 @@ class Regrouping(StagedWork):
         What a turn waits for goes on reaching it. It may be the answer, or a message, of somebody who is at rest already:
         nobody stands still for long while another one's turn has not ended.
         """
-        loop, end = system._node.loop, math.inf
+        loop, end, longest = system._node.loop, math.inf, max(MOVED_WITHIN, self._draft.timeout)
         while late := [(one, rest) for one, rest in self._resting(system) if not rest.is_waiting]:
             waiting = [(one, rest) for one, rest in late if said_of_turn(one.living(system._node))]
             for one, rest in waiting or late:
-                rest.aim(system, functools.partial(system._moves.pause, one.living(system._node), MOVED_WITHIN))
-            stirs = [future for _, rest in late for future in rest.stirs]
-            await asyncio.wait(stirs, timeout=LOOK_AGAIN, return_when=asyncio.FIRST_COMPLETED)
-            if not any(rest.is_waiting for rest in self._rests.values()):
-                end = math.inf
-            elif loop.time() > (end := min(end, loop.time() + self._patience)):
+                rest.aim(system, functools.partial(system._moves.pause, one.living(system._node), longest))
+            stands_still = any(rest.is_waiting for rest in self._rests.values())
+            end = min(end, loop.time() + self._patience) if stands_still else math.inf
+            if loop.time() >= end:
                 await self._try_again_later(system)
                 return
+            stirs = [future for _, rest in late for future in rest.stirs]
+            within = max(0.0, end - loop.time()) if stands_still else None
+            await asyncio.wait(stirs, timeout=within, return_when=asyncio.FIRST_COMPLETED)
         if any(has_begun(one.living(system._node)) for one, _ in self._resting(system)):
             await self._try_again_later(system)
 
@@ -301,8 +300,10 @@ class Regrouping(StagedWork):
         for resting, rest in self._resting(system):
             cell = resting.living(system._node)
             switch = switch_of(cell)
-            if not rest.is_waiting or has_begun(cell):
-                return said_of_turn(cell) or f"{cell.path} is not at rest"
+            if not rest.is_waiting:
+                return f"{cell.path} is not at rest"
+            if has_begun(cell):
+                return f"{cell.path} is at rest before a turn that it has begun"
             if switch is not None and switch.method.replays and not is_saved(switch):
                 return f"{cell.path} is at rest, and the snapshot that it takes there is not complete yet"
         return next((why for one in self._successions if (why := one.ready(system))), "")
