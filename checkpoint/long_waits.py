@@ -122,7 +122,9 @@ class LongWaits:
         now = self._home.node.clock.wall()
         waits = ((names, now - self._since[place]) for place, names in self.wanted.items())
         return " and ".join(
-            f"has waited for {seconds:.1f} s for {names.replace('|', ' or ')}" if names else f"has slept for {seconds:.1f} s"
+            f"has waited for {seconds:.1f} s for {names.replace('|', ' or ')}"
+            if names
+            else f"has slept for {seconds:.1f} s"
             for names, seconds in waits
         )
 

@@ -93,7 +93,7 @@ class PackLife(Item):
     def hurry(self, cell: Cell) -> None:
         """Do not wait for a turn that rests, which may be for days: it is left, and run again at the new place.
 
-        Not while commands come first that the next life would not obey, or something is out that would end with this one.
+        Not while commands come first that the next life would not obey, or something is out that ends with this one.
         """
         ctx, more = cell.ctx, cell.extra()
         if ctx is None or not ctx._may_rest or self._stays or self.is_void or self.is_done:

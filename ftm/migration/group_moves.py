@@ -237,7 +237,7 @@ class FromRecordedGroup(Leaving):
         self.detach()
 
     async def quiet(self) -> None:
-        """Wait until nothing is inside; a turn that rests, perhaps for days, is left, and run again where the life goes."""
+        """Wait until nothing is inside; a turn that rests, perhaps for days, is left, and run again elsewhere."""
         await past_resting_turns(self._group, self._group.quiet())
 
     async def _has_died(self, epoch: int) -> bool:

@@ -160,8 +160,8 @@ class Regrouping(StagedWork):
     async def _rest(self, system: ActorSystem) -> None:
         """Have all of them come to rest: first those whose turn waits for something, while the others go on.
 
-        What a turn waits for goes on reaching it. It may be the answer, or a message, of somebody who is at rest already:
-        nobody stands still for long while another one's turn has not ended.
+        What a turn waits for goes on reaching it. It may be the answer, or a message, of somebody who is at rest
+        already: nobody stands still for long while another one's turn has not ended.
         """
         loop, end, longest = system._node.loop, math.inf, max(MOVED_WITHIN, self._draft.timeout)
         while late := [(one, rest) for one, rest in self._resting(system) if not rest.is_waiting]:
@@ -282,7 +282,8 @@ class Regrouping(StagedWork):
         if late is None:
             return ""
         said = "" if late.cell is None else said_of_turn(late.cell)
-        return f"{late.path} may have to repeat what it has sent, so its next snapshot is waited for{said and f'; {said}'}"
+        why = f"{late.path} may have to repeat what it has sent, so its next snapshot is waited for"
+        return f"{why}; {said}" if said else why
 
     @property
     def waits_for(self) -> str:

@@ -10,6 +10,9 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.checkpoint.home.recorded_home import switch_of
+from holdfast.checkpoint.home.replay import is_as_before
+from holdfast.checkpoint.protocol import LEADS_NOWHERE, Out
 from holdfast.ftm import LFR, PBR, TMR, TR
 from holdfast.testing import advance
 from tests.effects.patient import IN_TIME, Call, Count, Look, Patient
@@ -114,7 +117,7 @@ CHANGES: dict[str, Callable[[hf.ActorSystem, hf.ActorRef[Any]], Awaitable[None]]
     one.__name__: one for one in (moved, moved_from_above, suspended, replaced, changed, saved, cut)
 }
 WAIT = ("moved", "moved_from_above", "saved")
-"""They wait for the end of a turn that rests. The others leave it, and it is run again behind them, or do not mind it."""
+"""They wait for the end of a turn that rests. The others leave it, and it is run again, or pay it no heed."""
 
 
 @VIRTUAL
@@ -210,6 +213,35 @@ async def test_who_is_at_rest_lets_another_turn_have_what_that_waits_for(order: 
         async with system.transaction(timeout=60.0) as change:
             change.move("/app/s/x", "/app/o")
         assert await asked == ("1" if how == "ask" else "called")
+
+
+@VIRTUAL
+async def test_the_others_answer_until_the_turn_that_rests_is_over() -> None:
+    async with hf.ActorSystem("app", log=False, intensity=99) as system:
+        children = [hf.child(name, hf.start(Resting), recovery=hf.hybrid()) for name in ("other", "patient", "last")]
+        ref = await grown(system, hf.supervisor("x", intensity=99, children=children))
+        asked = asyncio.ensure_future(ref.ask(Rest("sleep"), 9 * LONG))
+        await rests(system, "sleep")
+        change = asyncio.ensure_future(moved_from_above(system, ref))
+        for step in range(1, 4):
+            await advance(1.0)
+            now = asyncio.get_running_loop().time()
+            for name in ("other", "last"):
+                assert await system.ref(f"/app/s/x/{name}", Resting).ask(Count(), IN_TIME) == step
+            assert asyncio.get_running_loop().time() - now < 0.01, "they stand still"
+        await change
+        assert await asked == AT
+
+
+async def test_an_output_that_leads_nowhere_is_known_by_the_digest_that_a_store_of_before_has() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("patient", hf.start(Patient), recovery=hf.hybrid()))
+        home = switch_of(ref._cell)
+        assert home is not None
+        out = Out(1, "sleep", "since then", seconds=3.0)
+        assert out.digest() > LEADS_NOWHERE
+        assert is_as_before(home, out, out.digest() - LEADS_NOWHERE)
+        assert not is_as_before(home, Out(1, "sleep", "since then", seconds=4.0), out.digest())
 
 
 # -- mechanisms --------------------------------------------------------------------------------------------------------
