@@ -149,22 +149,23 @@ class Regrouping(StagedWork):
         waits = bool(self._others_settle(system)) or bool(self._unsteady(system))
         if waits:  # Perhaps for what those here have to answer.
             await self._go_on(system)
-        else:
-            await self._rest(system)
-        if waits or self._why_not_moved(system):
+        if waits or not await self._rest(system) or self._why_not_moved(system):
             await self._let_go(system)
             return
         for succession in self._successions:
             await succession.hold(system)
 
-    async def _rest(self, system: ActorSystem) -> None:
+    async def _rest(self, system: ActorSystem) -> bool:
         """Have all of them come to rest: first those whose turn waits for something, while the others go on.
+
+        Returns whether they are at rest.
 
         What a turn waits for goes on reaching it. It may be the answer, or a message, of somebody who is at rest
         already: nobody stands still for long while another one's turn has not ended.
         """
         loop, end, longest = system._node.loop, math.inf, max(MOVED_WITHIN, self._draft.timeout)
         while late := [(one, rest) for one, rest in self._resting(system) if not rest.is_waiting]:
+            await self._let_go(system)  # This may take long.
             waiting = [(one, rest) for one, rest in late if said_of_turn(one.living(system._node))]
             for one, rest in waiting or late:
                 rest.aim(system, functools.partial(system._moves.pause, one.living(system._node), longest))
@@ -172,12 +173,14 @@ class Regrouping(StagedWork):
             end = min(end, loop.time() + self._patience) if stands_still else math.inf
             if loop.time() >= end:
                 await self._try_again_later(system)
-                return
+                return False
             stirs = [future for _, rest in late for future in rest.stirs]
             within = max(0.0, end - loop.time()) if stands_still else None
             await asyncio.wait(stirs, timeout=within, return_when=asyncio.FIRST_COMPLETED)
         if any(has_begun(one.living(system._node)) for one, _ in self._resting(system)):
             await self._try_again_later(system)
+            return False
+        return True
 
     async def _try_again_later(self, system: ActorSystem) -> None:
         """Let all of them go on, for as long as some have stood still."""

@@ -19,6 +19,7 @@ from tests.effects.patient import IN_TIME, Call, Count, Look, Patient
 from tests.effects.test_effects_protected import whole
 from tests.effects.test_long_waits import VIRTUAL, waits
 
+OTHER: dict[str, Any] = {"task": "process", "process": "task"}
 LONG = 200.0  # seconds
 AT = "/app/s/x/patient"
 
@@ -287,8 +288,8 @@ async def test_a_supervisor_is_given_a_process_while_a_turn_below_it_rests(tmp_p
         asked = asyncio.ensure_future(ref.ask(Rest(how, 1.0), IN_TIME))
         await waits(system, path)
         beside = asyncio.ensure_future(ref.ask(Count(), IN_TIME))
-        for place in ("process", "task"):
-            await system.set_isolation(system.ref(top, hf.Supervisor), place, timeout=IN_TIME)  # type: ignore[arg-type]
+        for place in OTHER.values():
+            await system.set_isolation(system.ref(top, hf.Supervisor), place, timeout=IN_TIME)
         if how == "wait":
             await waits(system, path)
             assert not asked.done()
@@ -325,8 +326,7 @@ async def test_a_move_that_is_given_up_says_what_it_has_waited_for_and_is_in_nob
         with pytest.raises(hf.errors.TransactionFailed, match=rf"a turn of {AT} has waited for 0.\d s for \S+Call"):
             async with system.transaction(timeout=0.3) as change:
                 change.move(ref, "/app/o")
-        other = "process" if isolation == "task" else "task"
-        await system.set_isolation(ref, other, timeout=IN_TIME)
+        await system.set_isolation(ref, OTHER[isolation], timeout=IN_TIME)
         assert not asked.done()
         await waits(system, AT)
         ref.tell(Call())

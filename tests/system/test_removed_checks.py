@@ -211,7 +211,7 @@ CHECKS = {
     ),
     "a turn that rests is left though an order comes first": Check(
         "actors/migration/quiesce.py",
-        "(one for one in more.urgent or () if not isinstance(one, QueuedOrder))",
+        "(one for one in more.urgent or () if not one.comes_again)",
         "iter(more.urgent or ())",
         ORDERS,
         "test_an_actor_gets_another_state and task",
@@ -561,8 +561,8 @@ CHECKS = {
     ),
     "who rests is let go of when others have to be waited for": Check(
         "system/transaction/reparenting.py",
-        "            if waits:  # Perhaps for what those here have to answer.\n",
-        "            if False:\n",
+        "        if waits:  # Perhaps for what those here have to answer.\n",
+        "        if False:\n",
         MOVED,
         "test_it_waits_for_nobody",
     ),
