@@ -15,6 +15,7 @@ from holdfast.checkpoint.home.replay import is_as_before
 from holdfast.checkpoint.protocol import LEADS_NOWHERE, Out
 from holdfast.ftm import LFR, PBR, TMR, TR
 from holdfast.testing import advance
+from tests.effects.clerk import lines, note
 from tests.effects.patient import IN_TIME, Call, Count, Look, Patient
 from tests.effects.test_effects_protected import whole
 from tests.effects.test_long_waits import VIRTUAL, waits
@@ -29,6 +30,7 @@ class Rest(hf.Message[str]):
 
     how: str
     seconds: float = LONG
+    file: str = ""  # where each run of the handler is noted
 
 
 class Newer(Patient): ...
@@ -37,6 +39,8 @@ class Newer(Patient): ...
 class Resting(Newer):
     @hf.on(Rest)
     async def rest(self, message: Rest) -> str:
+        if message.file:
+            note(message.file, "begun")
         match message.how:
             case "sleep":
                 await self.ctx.sleep(message.seconds)
@@ -253,11 +257,12 @@ STACKS: dict[str, Any] = {"tr": TR(detection=None), "pbr": PBR(), "lfr": LFR(), 
 @pytest.mark.parametrize(
     ("stack", "how"), [("tr", "sleep"), ("tr", "wait"), ("pbr", "sleep"), ("lfr", "wait"), ("tmr", "effect")]
 )
-async def test_who_is_protected_is_moved_when_its_turn_is_over(stack: str, how: str) -> None:
+async def test_who_is_protected_is_moved_when_its_turn_is_over(tmp_path: Path, stack: str, how: str) -> None:
+    world = str(tmp_path / "world")
     async with hf.ActorSystem("app", log=False, intensity=99) as system:
         ref = await grown(system, family(mechanism=STACKS[stack]))
         await whole(system, ref)
-        asked = asyncio.ensure_future(ref.ask(Rest(how, 0.4), IN_TIME))
+        asked = asyncio.ensure_future(ref.ask(Rest(how, 0.4, world), IN_TIME))
         await rests(system, how)
         beside = asyncio.ensure_future(ref.ask(Count(), IN_TIME))
         change = asyncio.ensure_future(moved(system, ref))
@@ -268,6 +273,8 @@ async def test_who_is_protected_is_moved_when_its_turn_is_over(stack: str, how: 
         await asyncio.wait_for(change, IN_TIME)
         assert ref.path == "/app/o/patient"
         assert await beside == 1
+        if stack == "pbr":  # Elsewhere others run it, too.
+            assert lines(world) == ["begun"], "it was left, and run again"
         assert [line for line in await ref.ask(Look(), IN_TIME) if not line.startswith("no turn")] == [how]
 
 

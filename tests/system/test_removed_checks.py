@@ -39,7 +39,7 @@ CHECKS = {
         "        await self._group.quiet()\n",
         "        await super().quiet()\n",
         RESTING,
-        "who_is_protected_is_moved and tr-sleep",
+        "who_is_protected_is_moved and pbr-sleep",
     ),
     "who keeps its address need not come to rest": Check(
         "system/transaction/reparenting.py",
