@@ -189,7 +189,7 @@ class Pair(Patient):
 
     @hf.on(Need)
     async def need(self, message: Need) -> str:
-        await self.ctx.sleep(5.0)
+        await asyncio.sleep(5.0)  # A turn that nobody knows to wait: all others are at rest when it goes on.
         if message.how == "ask":
             return f"{await message.peer.ask(Count(), 9 * LONG)}"
         message.peer.tell(Answer())
