@@ -262,7 +262,7 @@ async def test_who_is_protected_is_moved_when_its_turn_is_over(tmp_path: Path, s
     async with hf.ActorSystem("app", log=False, intensity=99) as system:
         ref = await grown(system, family(mechanism=STACKS[stack]))
         await whole(system, ref)
-        asked = asyncio.ensure_future(ref.ask(Rest(how, 0.4, world), IN_TIME))
+        asked = asyncio.ensure_future(ref.ask(Rest(how, 1.0, world), IN_TIME))
         await rests(system, how)
         beside = asyncio.ensure_future(ref.ask(Count(), IN_TIME))
         change = asyncio.ensure_future(moved(system, ref))
