@@ -33,11 +33,12 @@ def due_entry(turn: int, k: int, when: float) -> Entry:
 class LongWaits:
     """What the turn in hand at one home waits for. It ends with the life; the next one's turn waits again."""
 
-    __slots__ = ("_clocks", "_home", "taken", "wanted")
+    __slots__ = ("_clocks", "_home", "_since", "taken", "wanted")
 
     def __init__(self, home: Switch) -> None:
         self._home = home
         self._clocks: dict[Place, asyncio.TimerHandle] = {}
+        self._since: dict[Place, float] = {}  # when the turn in hand first came there, in whichever life
         self.taken: dict[Place, Input] = {}  # the messages that the turn in hand has waited for
         self.wanted: dict[Place, str] = {}  # "A|B": types of messages, "": a moment; in the order of the waits
 
@@ -65,6 +66,8 @@ class LongWaits:
                 self._take(place, source)
                 return
         self.wanted[place] = names
+        self._since = {known: when for known, when in self._since.items() if known[0] == turn}
+        self._since.setdefault(place, self._home.node.clock.wall())
         if not names or out.seconds:
             self._look(place, self._home.ledger.dues.get(place, out.seconds))
         if self.wanted:
@@ -114,6 +117,17 @@ class LongWaits:
         self.wanted.pop(place, None)
         if clock is not None:
             clock.cancel()
+
+    def said(self) -> str:
+        """What the turn in hand waits for, and for how long it has, in words; "" if it does not."""
+        now = self._home.node.clock.wall()
+        waits = ((names, now - self._since[place]) for place, names in self.wanted.items())
+        return " and ".join(
+            f"has waited for {seconds:.1f} s for {names.replace('|', ' or ')}"
+            if names
+            else f"has slept for {seconds:.1f} s"
+            for names, seconds in waits
+        )
 
     def abandon(self) -> None:
         """Wait for nothing any more, since the life is over."""

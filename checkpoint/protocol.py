@@ -23,6 +23,10 @@ from .method import Method
 MESSAGE, START, TICK, EXIT, DOWN, PIPE = "message", "start", "tick", "exit", "down", "pipe"
 # Outputs whose turn waits for what becomes of them.
 AWAITED = ("ask", "send", "publish", "effect", "sleep", "wait")
+# Outputs that lead to no address: where somebody lives is nothing to a replay of them.
+NOWHERE = ("effect", "sleep", "wait")
+LEADS_NOWHERE = 1 << 32
+"""Marks digests of such outputs. The rest of a digest is a checksum of 32 bits; stores of before have only that."""
 # How a turn can end.
 OK, FAILED, DROPPED, STASHED = "ok", "failed", "dropped", "stashed"
 # How an ask can be answered; LATER keeps it open, NOTHING means that nobody asked.
@@ -51,7 +55,8 @@ class Out(msgspec.Struct, array_like=True, gc=False):
     def digest(self) -> int:
         """A checksum by which a replayed output is compared with the one released before."""
         head = f"{self.verb}|{self.to}|{self.name}|{self.seconds}|{self.interval}".encode()
-        return zlib.crc32(self.body, zlib.crc32(head))
+        checksum = zlib.crc32(self.body, zlib.crc32(head))
+        return checksum | LEADS_NOWHERE if self.verb in NOWHERE else checksum
 
 
 def shortened(body: bytes) -> Iterator[bytes]:

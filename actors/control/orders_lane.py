@@ -56,6 +56,7 @@ class QueuedOrder(Item):
 
     __slots__ = ("ask", "order")
     of_life = False
+    comes_again = True
 
     def __init__(self, ask: Ask, order: Order) -> None:
         self.ask, self.order = ask, order

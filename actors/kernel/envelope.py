@@ -48,8 +48,8 @@ class Item:
     """The turns that wait for its turn."""
     is_ask: bool = False
     """Whether somebody waits for an answer to it."""
-    lapses: ClassVar[bool] = False
-    """Whether it means nothing to a life that leaves its turn in the middle, and need not be waited for then."""
+    comes_again: ClassVar[bool] = False
+    """Whether the life at another place is told of it, too: a move does not wait until it was obeyed."""
     is_followed: ClassVar[bool] = False
     """Whether its turn is a span of a trace."""
     is_cancelled: bool = False

@@ -92,7 +92,7 @@ class FromHere(Leaving):
 
     def resume(self) -> None:
         if self._take is not None:
-            self._take.is_void = True
+            self._take.withdraw(self.cell)
         cell, transit = self.cell, self.move.transit
         if transit is None:
             return

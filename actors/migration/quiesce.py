@@ -93,19 +93,25 @@ class PackLife(Item):
     def hurry(self, cell: Cell) -> None:
         """Do not wait for a turn that rests, which may be for days: it is left, and run again at the new place.
 
-        Not while other commands come first than orders, which the next life obeys, and than what lapses with the turn,
-        or something is out that would end with this life.
+        Not while commands come first that the next life would not obey, or something is out that ends with this one.
         """
         ctx, more = cell.ctx, cell.extra()
         if ctx is None or not ctx._may_rest or self._stays or self.is_void or self.is_done:
             return
         if cell.state is not RUNNING:
             return
-        first = next((one for one in more.urgent or () if not (isinstance(one, QueuedOrder) or one.lapses)), None)
+        first = next((one for one in more.urgent or () if not one.comes_again), None)
         stays_behind = any(name not in self._ignored for name in cell.children or ())
         if first is self and not stays_behind and not _busy(cell) and ctx._leaves_turn():
             return
         cell.node.loop.call_later(LOOK_AGAIN, self.hurry, cell)
+
+    def withdraw(self, cell: Cell) -> None:
+        """It is not wanted any more; if a turn is before it, the next such command is not behind it."""
+        self.is_void = True
+        urgent = cell.extra().urgent
+        if urgent is not None and self in urgent:
+            urgent.remove(self)
 
     def _again(self, cell: Cell, life: int) -> None:
         if not self.is_void and cell.state is RUNNING and cell.life == life:

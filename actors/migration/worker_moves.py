@@ -226,7 +226,7 @@ class GuestMove:
         take, self._take, self._state = self._take, None, b""
         if take is None:
             return
-        take.is_void = True
+        take.withdraw(cell)
         if take.is_done and cell.state is RUNNING:
             resume(cell)
 

@@ -21,6 +21,7 @@ from ..protocol import (
     AT_ITS_END,
     DROPPED,
     FAILED,
+    LEADS_NOWHERE,
     MESSAGE,
     OK,
     PIPE,
@@ -143,8 +144,13 @@ class InputLedger:
 
     @property
     def has_sent(self) -> bool:
-        """Whether a turn since the newest snapshot has sent anything."""
-        return bool(self.released) or any(turn.digests for turn in self.turns.values())
+        """Whether a turn since the newest snapshot has let out anything that leads to an address."""
+        return self.is_sending or any(map(leads_somewhere, (turn.digests for turn in self.turns.values())))
+
+    @property
+    def is_sending(self) -> bool:
+        """Whether the turn in hand has."""
+        return leads_somewhere(self.released)
 
     def stashed(self) -> set[int]:
         """The inputs that the actor has put aside."""
@@ -602,6 +608,11 @@ class InputLedger:
     def _read_end(self, source: Input, number: int, status: str, digests: Iterable[int], *more: int) -> None:
         self.released = list(digests)
         self.end_turn(source, number, status, *more)
+
+
+def leads_somewhere(digests: Iterable[int]) -> bool:
+    """Whether one of these outputs leads to an address, or may do so."""
+    return any(digest < LEADS_NOWHERE for digest in digests)
 
 
 def said_of(out: Out) -> str:

@@ -17,6 +17,7 @@ from ..inputs import Batch, Input
 from ..long_waits import LongWaits
 from ..protocol import (
     GIVEN_UP,
+    LEADS_NOWHERE,
     MESSAGE,
     REPLY,
     Answer,
@@ -218,6 +219,17 @@ class PendingCalls:
         source = home.ledger.open.get(key)
         home.node.emit(EffectRepeated(home.path, out.to, "" if source is None else source.name))
         self.order(turn, out.k)
+
+    def said(self) -> str:
+        """What the turn in hand waits for, in words; "" if that is not known."""
+        ledger = self._home.ledger
+        turn, effects = ledger.turn + 1, 0
+        for k, digest in enumerate(ledger.released, 1):
+            is_over = (turn, k) in ledger.outcomes or (turn, k) in self.rests.wanted
+            effects += digest >= LEADS_NOWHERE and not is_over
+        asked = [f"waits for an answer of {ask.to.path}" for ask in self.asks.values() if ask.to is not None]
+        said = [self.rests.said(), "waits for an effect that is out" if effects else "", *asked]
+        return " and ".join(filter(None, said))
 
     def order(self, turn: int, k: int) -> None:
         """Have the present life perform an effect: all that precedes it is safe."""

@@ -23,6 +23,13 @@ class RecordedHome(WorkerHome):
         raise NotImplementedError
 
 
+def said_of_turn(cell: Cell) -> str:
+    """What the turn in hand of a recorded actor waits for, as words behind its address; "" if that is not known."""
+    switch = switch_of(cell)
+    said = "" if switch is None else switch.calls.said()
+    return f"a turn of {cell.path} {said}" if said else ""
+
+
 def switch_of(cell: Cell) -> Switch | None:
     """The switch of a recorded actor's cell."""
     home = cell.host.home

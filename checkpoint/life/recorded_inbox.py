@@ -228,7 +228,7 @@ class TakeSnapshot(Item):
     """A command: save the state now, between two turns."""
 
     __slots__ = ("life",)
-    lapses = True
+    comes_again = True
 
     def __init__(self, life: Life) -> None:
         self.life = life

@@ -65,7 +65,7 @@ def digest(end: TurnEnd) -> int:
     head = f"{end.turn}|{end.status}|{answer.kind}|{answer.name}".encode()
     found = zlib.crc32(compared_body(answer), zlib.crc32(head))
     for sent in (out.digest() for out in end.outs):
-        found = zlib.crc32(sent.to_bytes(4, "little"), found)
+        found = zlib.crc32(sent.to_bytes(8, "little"), found)
     return found
 
 

@@ -211,7 +211,7 @@ class FromRecordedGroup(Leaving):
         move.rest_at = now()
         end = move.rest_at + move.timeout
         while True:
-            quiet = asyncio.ensure_future(past_resting_turns(group, group.quiet()))
+            quiet = asyncio.ensure_future(self.quiet())
             try:
                 await move.within(quiet, end - now(), lambda: "a turn of it has not ended")
             finally:
@@ -235,6 +235,10 @@ class FromRecordedGroup(Leaving):
         move.at_rest()
         group.hand_to(self)
         self.detach()
+
+    async def quiet(self) -> None:
+        """Wait until nothing is inside; a turn that rests, perhaps for days, is left, and run again elsewhere."""
+        await past_resting_turns(self._group, self._group.quiet())
 
     async def _has_died(self, epoch: int) -> bool:
         """Whether it was for a failover that no state came: it shows within a second."""
@@ -309,6 +313,10 @@ class AtRest(FromRecordedGroup):
 
     def __init__(self, cell: Cell) -> None:
         super().__init__(cell, is_below=False)
+
+    async def quiet(self) -> None:
+        """Wait until nothing is inside: a turn that rests comes to its end here, for it belongs to this address."""
+        await self._group.quiet()
 
     async def collect(self, epoch: int, end: float) -> None:
         group = self._group

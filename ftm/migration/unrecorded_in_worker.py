@@ -115,7 +115,7 @@ class PlainChild:
         take, self._take, cell = self._take, None, self._cell
         if take is None or cell is None:
             return
-        take.is_void = True
+        take.withdraw(cell)
         for key in self._expected:
             self._guest.pending.pop(key, None)
         self._owed, self._expected = {}, []

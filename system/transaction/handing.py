@@ -130,7 +130,8 @@ class Handing:
             raise wrong(place.path, "it goes to another process's supervisor: change it in a transaction of its own")
         cell = place.living(system._node)
         if not place.is_protected and place_of(cell) != "process":
-            work = functools.partial(system._moves.move, cell, "process", None, MOVED_WITHIN, known=place.spec)
+            within = max(MOVED_WITHIN, self._timeout)
+            work = functools.partial(system._moves.move, cell, "process", None, within, known=place.spec)
             self._is_lodged |= await self._lodging.done(system, work)
         above = self._above.living(system._node)
         if not is_elsewhere(above) or (

@@ -40,7 +40,7 @@ class OnPlace(OnSharedWork):
         if place.spec is None:
             raise wrong(self.target, self.unsupervised)
         if place.relocation is None:
-            place.relocation = self._work = Relocation(place, self.text)
+            place.relocation = self._work = Relocation(place, self.text, draft.timeout)
 
 
 class Isolate(OnPlace):

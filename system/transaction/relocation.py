@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.kernel.cell import Cell
 from ...actors.migration.move import CommitGate
+from ...checkpoint.home.recorded_home import said_of_turn
 from ...supervision.arbiter import Grant, Hand, arbiter_of
 from ...supervision.respec import recipe_spec, replace_mechanism, replace_place
 from ...supervision.spec import ChildSpec
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from .draft import DraftPlace
 
 MOVED_WITHIN = 60.0
-"""Seconds that a life may take to move; the transaction's own time limit is shorter."""
+"""Seconds that a life may take to move at least; the transaction gives up first, at its own time limit."""
 
 
 class Gated:
@@ -35,19 +36,22 @@ class Gated:
     def __init__(self, place: DraftPlace, text: str) -> None:
         self._place, self._text = place, text
         self.task: asyncio.Task[Any] | None = None
-        self._path = ""  # of the actor, as it is while this is done
+        self._cell: Cell | None = None  # of the actor, as it is while this is done
         self._gate: CommitGate | None = None
 
     @property
     def waits_for(self) -> str:
         """Why it takes so long, in words; "" if nothing is known."""
-        lives = 0 if self._gate is None else self._gate.lives_ended
-        return f"{self._path}: {ended_too_often(lives)}" if lives else ""
+        cell, gate, task = self._cell, self._gate, self.task
+        if cell is None or gate is None:
+            return ""
+        if gate.lives_ended:
+            return f"{cell.path}: {ended_too_often(gate.lives_ended)}"
+        return "" if gate.is_waiting or task is None or task.done() else said_of_turn(cell.living)
 
     def begin(self, system: ActorSystem, work: Coroutine[Any, Any, object]) -> None:
         """Have it done; with a gate that `work` was given it waits there."""
-        cell = self._place.living(system._node)
-        self._path = cell.path
+        cell = self._cell = self._place.living(system._node)
         self.task = system._node.loop.create_task(
             to_its_end(cell.path, asyncio.ensure_future(work)),
             name=self._text,
@@ -57,16 +61,20 @@ class Gated:
 
     async def reach(self, system: ActorSystem, work: Callable[[CommitGate], Coroutine[Any, Any, object]]) -> None:
         """Have it begun, if it is not, and wait until it is ready."""
+        self.aim(system, work)
+        while not self.is_waiting:
+            await asyncio.wait(self.stirs, return_when=asyncio.FIRST_COMPLETED)
+
+    def aim(self, system: ActorSystem, work: Callable[[CommitGate], Coroutine[Any, Any, object]]) -> None:
+        """Have it begun, if it is not; it waits at the gate when it is ready."""
         if self.task is None:
             self._gate = CommitGate(system._node.loop)
             self.begin(system, work(self._gate))
-        gate, task = self._gate, self.task
-        assert gate is not None
-        assert task is not None
-        while not gate.is_waiting and not task.done():
-            await asyncio.wait((gate.reached, task), return_when=asyncio.FIRST_COMPLETED)
-        if task.done():
-            task.result()
+
+    @property
+    def stirs(self) -> tuple[asyncio.Future[Any], ...]:
+        """What ends when it may be ready, or has failed; nothing if it is not begun."""
+        return (self._gate.reached, self.task) if self._gate is not None and self.task is not None else ()
 
     async def done(self, system: ActorSystem, work: Callable[[CommitGate], Coroutine[Any, Any, bool]]) -> bool:
         """Have it done at once, at an open gate. Whoever waits no more has to give it up."""
@@ -103,8 +111,8 @@ class Gated:
 class Relocation(StagedWork):
     """One actor that is to live elsewhere, or behind other mechanisms: the way from its spec to that of the draft."""
 
-    def __init__(self, place: DraftPlace, text: str) -> None:
-        self._place, self._text = place, text
+    def __init__(self, place: DraftPlace, text: str, timeout: float) -> None:
+        self._place, self._text, self._within = place, text, max(MOVED_WITHIN, timeout)
         assert place.spec is not None
         self.before: ChildSpec = place.spec
         """What its spec says before the transaction."""
@@ -159,12 +167,12 @@ class Relocation(StagedWork):
         cell, moves = self._place.living(system._node), system._moves
         wanted, before = self._after.mechanism, self.before.mechanism
         if not self._adapts:
-            return moves.move(cell, self._after.isolation, self._after.limits, MOVED_WITHIN, gate)
+            return moves.move(cell, self._after.isolation, self._after.limits, self._within, gate)
         if wanted is None:
-            return moves.unprotect(cell, MOVED_WITHIN, gate)
+            return moves.unprotect(cell, self._within, gate)
         if before is None:
-            return moves.protect(cell, system._homes, wanted, MOVED_WITHIN, gate, self._begun)
-        return moves.adapt(cell, wanted, MOVED_WITHIN, gate, self._begun)
+            return moves.protect(cell, system._homes, wanted, self._within, gate, self._begun)
+        return moves.adapt(cell, wanted, self._within, gate, self._begun)
 
     def _begun(self, probation: Probation) -> None:
         self.probation = probation
@@ -208,7 +216,7 @@ class Relocation(StagedWork):
             await asyncio.shield(self._move.task)
             if self._adapts and self._moves:
                 cell = self._place.living(system._node)
-                await system._moves.move(cell, self._after.isolation, self._after.limits, MOVED_WITHIN)
+                await system._moves.move(cell, self._after.isolation, self._after.limits, self._within)
         finally:
             self._settle(system)
 

@@ -10,11 +10,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import math
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.errors import ControlFailed, HoldfastError
-from ...checkpoint.home.recorded_home import switch_of
+from ...checkpoint.home.recorded_home import said_of_turn, switch_of
 from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import SnapshotNow
 from ...supervision.children import STOPPED, UP
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
     from ...ftm.bricks.sealed_frames import MovedCertificates
     from ..system import ActorSystem
+
+PATIENCE = 0.25
+"""Seconds for which some stand still at first while others have not come to rest; it is doubled each time."""
 
 
 class Reparent(OnSharedWork):
@@ -107,6 +111,7 @@ class Regrouping(StagedWork):
         self._handings: list[tuple[DraftPlace, Handing]] = []
         self._successions: list[Succession] = []  # from above
         self._candidate: NewSupervisor | None = None  # the uppermost supervisor that begins anew
+        self._patience = PATIENCE  # seconds for which some stand still, while others have not come to rest yet
 
     def hand(self, place: DraftPlace) -> None:
         """Have this actor be given to the supervisor that it has in the draft in the end."""
@@ -142,16 +147,50 @@ class Regrouping(StagedWork):
             await handing.prepare(system)
         await self._certify(system)
         waits = bool(self._others_settle(system)) or bool(self._unsteady(system))
-        for one, rest in self._resting(system):
-            if waits:  # Perhaps for what those here have to answer.
-                await rest.give_up()
-            else:
-                await rest.reach(system, functools.partial(system._moves.pause, one.living(system._node), MOVED_WITHIN))
-        if waits or self._why_not_moved(system):
+        if waits:  # Perhaps for what those here have to answer.
+            await self._go_on(system)
+        if waits or not await self._rest(system) or self._why_not_moved(system):
             await self._let_go(system)
             return
         for succession in self._successions:
             await succession.hold(system)
+
+    async def _rest(self, system: ActorSystem) -> bool:
+        """Have all of them come to rest: first those whose turn waits for something, while the others go on.
+
+        Returns whether they are at rest.
+
+        What a turn waits for goes on reaching it. It may be the answer, or a message, of somebody who is at rest
+        already: nobody stands still for long while another one's turn has not ended.
+        """
+        loop, end, longest = system._node.loop, math.inf, max(MOVED_WITHIN, self._draft.timeout)
+        while late := [(one, rest) for one, rest in self._resting(system) if not rest.is_waiting]:
+            await self._let_go(system)  # This may take long.
+            waiting = [(one, rest) for one, rest in late if said_of_turn(one.living(system._node))]
+            for one, rest in waiting or late:
+                rest.aim(system, functools.partial(system._moves.pause, one.living(system._node), longest))
+            stands_still = any(rest.is_waiting for rest in self._rests.values())
+            end = min(end, loop.time() + self._patience) if stands_still else math.inf
+            if loop.time() >= end:
+                await self._try_again_later(system)
+                return False
+            stirs = [future for _, rest in late for future in rest.stirs]
+            within = max(0.0, end - loop.time()) if stands_still else None
+            await asyncio.wait(stirs, timeout=within, return_when=asyncio.FIRST_COMPLETED)
+        if any(has_begun(one.living(system._node)) for one, _ in self._resting(system)):
+            await self._try_again_later(system)
+            return False
+        return True
+
+    async def _try_again_later(self, system: ActorSystem) -> None:
+        """Let all of them go on, for as long as some have stood still."""
+        await self._go_on(system)
+        await asyncio.sleep(self._patience)
+        self._patience *= 2
+
+    async def _go_on(self, system: ActorSystem) -> None:
+        """Those at rest go on, and those that were to come to rest need not."""
+        await asyncio.gather(*(rest.give_up() for _, rest in self._resting(system)))
 
     async def _let_go(self, system: ActorSystem) -> None:
         """Supervisors that have stood down go on."""
@@ -206,9 +245,17 @@ class Regrouping(StagedWork):
             why = "certificates under the addresses where its replicas are not could not be revoked"
             raise ControlFailed(self._top.path, "move", f"{why}: {'; '.join(failed)}")
 
+    def _is_readdressed(self, system: ActorSystem) -> bool:
+        """Whether the actor, and so all below it, has another address from the commit on."""
+        above = self._top.was.below
+        return above is not None and f"{above.living(system._node).path}/{self._top.name}" != self._top.path
+
     def _resting(self, system: ActorSystem) -> list[tuple[DraftPlace, Gated]]:
-        """Those that run turns again, of the actor and all below it, and how each comes to rest."""
-        for one in addressed(self._top):
+        """Those that run turns again, of the actor and all below it, and how each comes to rest.
+
+        Who keeps its address goes on meanwhile: a turn of it, which may wait for days, is repeated where it began.
+        """
+        for one in addressed(self._top) if self._is_readdressed(system) else ():
             # Who is reworked rests for that, and is saved; replicas are only told.
             rests = not one.is_planned and (one.rework is None or one.is_protected)
             cell = one.now(system._node) if rests else None
@@ -226,13 +273,20 @@ class Regrouping(StagedWork):
 
     def _others_settle(self, system: ActorSystem) -> str:
         """Why the others are not so far that addresses can change; they are asked for what is missing."""
+        if not self._is_readdressed(system):
+            return ""
         # Those that are reworked are saved at the commit.
         reworked = [place for place in self._draft.places() if place.rework is not None]
         own = [place.now(system._node) for place in (*reworked, *(one for one, _ in self._resting(system)))]
         settled = {switch_of(cell) for cell in own if cell is not None}
         others = [switch for switch in system._homes if switch not in settled]
         settle_senders(others, self._asked)
-        return WAITING if any(map(is_unsettled, others)) else ""
+        late = next(filter(is_unsettled, others), None)
+        if late is None:
+            return ""
+        said = "" if late.cell is None else said_of_turn(late.cell)
+        why = f"{late.path} may have to repeat what it has sent, so its next snapshot is waited for"
+        return f"{why}; {said}" if said else why
 
     @property
     def waits_for(self) -> str:
@@ -248,11 +302,14 @@ class Regrouping(StagedWork):
         if why := self._others_settle(system) or self._unsteady(system):
             return why
         for resting, rest in self._resting(system):
-            switch = switch_of(resting.living(system._node))
+            cell = resting.living(system._node)
+            switch = switch_of(cell)
             if not rest.is_waiting:
-                return f"{resting.path} is not at rest"
+                return f"{cell.path} is not at rest"
+            if has_begun(cell):
+                return f"{cell.path} is at rest before a turn that it has begun"
             if switch is not None and switch.method.replays and not is_saved(switch):
-                return f"the last snapshot of {resting.path} is not in the store yet"
+                return f"{cell.path} is at rest, and the snapshot that it takes there is not complete yet"
         return next((why for one in self._successions if (why := one.ready(system))), "")
 
     def _is_busy(self, old: Cell, place: DraftPlace) -> str:
@@ -361,14 +418,11 @@ async def successors(draft: Draft, place: DraftPlace, new: DraftPlace, *, is_giv
     return found
 
 
-WAITING = "recorded actors may have to repeat what they sent to it: their snapshots are waited for"
-
-
 def is_unsettled(switch: Switch) -> bool:
     """Whether what it has sent may be sent again, to be compared."""
     ledger, method = switch.ledger, switch.method
     if not (method.replays or method.snapshots):  # Protected, without recovery: only the turn in hand is made again.
-        return bool(ledger.released)
+        return ledger.is_sending
     return ledger.has_sent
 
 
@@ -376,6 +430,15 @@ def is_saved(switch: Switch) -> bool:
     """Whether a replay would compare nothing: all that it has done is in its snapshot."""
     compared = any(turn.digests or turn.reply or turn.state for turn in switch.turns.values())
     return not (compared or switch.ledger.released or switch.images.is_saving)
+
+
+def has_begun(cell: Cell) -> bool:
+    """Whether an actor has a turn in hand that has let something out: one that rests may stand before it.
+
+    Its last life had begun with it, and the turn was to be run again when the actor came to rest.
+    """
+    switch = switch_of(cell)
+    return switch is not None and bool(switch.ledger.released)
 
 
 def settle_senders(homes: Iterable[Switch], asked: dict[Switch, int]) -> None:

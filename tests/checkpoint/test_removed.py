@@ -663,13 +663,6 @@ CHECKS = {
         "tests/effects/test_glances.py",
         "test_one_that_ends_the_process",
     ),
-    "a snapshot that is due lapses with a turn that is left": Check(
-        "checkpoint/life/recorded_inbox.py",
-        "    lapses = True\n",
-        "",
-        "tests/effects/test_changes_while_resting.py",
-        "due_keeps_no_change and suspend and task",
-    ),
     "a whole number of seconds is written down as a float": Check(
         "actors/seconds.py",
         "    return float(value)\n",

@@ -28,11 +28,82 @@ SLOW = "tests/supervision/test_slow_restarts.py"
 UPGRADE = "tests/system/upgrade/test_check_upgrade.py"
 COLLECTIONS = "tests/system/test_full_collections.py"
 ORDERS = "tests/effects/test_orders_while_resting.py"
+RESTING = "tests/effects/test_moves_while_resting.py"
 LINKS = "tests/actors/test_links.py"
 TURNS = "tests/supervision/test_turn_timeout.py"
 EFFECTS = "tests/effects/test_effect_processes.py"
 
 CHECKS = {
+    "a turn that rests behind mechanisms ends before its address changes": Check(
+        "ftm/migration/group_moves.py",
+        "        await self._group.quiet()\n",
+        "        await super().quiet()\n",
+        RESTING,
+        "who_is_protected_is_moved and pbr-sleep",
+    ),
+    "who keeps its address need not come to rest": Check(
+        "system/transaction/reparenting.py",
+        "addressed(self._top) if self._is_readdressed(system) else ():",
+        "addressed(self._top):",
+        RESTING,
+        "a_supervisor_is_given_a_process and list",
+    ),
+    "a snapshot that is wanted keeps no turn from being left": Check(
+        "checkpoint/life/recorded_inbox.py",
+        "    comes_again = True\n",
+        "",
+        RESTING,
+        "a_supervisor_is_given_a_process and list",
+    ),
+    "a move that was given up is in no later one's way": Check(
+        "actors/migration/quiesce.py",
+        "            urgent.remove(self)\n",
+        "            pass\n",
+        RESTING,
+        "given_up_says",
+    ),
+    "a wait leads to no address": Check(
+        "checkpoint/protocol.py",
+        "        return checksum | LEADS_NOWHERE if self.verb in NOWHERE else checksum\n",
+        "        return checksum\n",
+        RESTING,
+        "rests_elsewhere_keeps_nobody",
+    ),
+    "what a store of before has is compared by its checksum": Check(
+        "checkpoint/home/replay.py",
+        "(one ^ digest) & ~LEADS_NOWHERE == 0",
+        "one == digest",
+        RESTING,
+        "leads_nowhere_is_known",
+    ),
+    "nobody stands still for long while another one's turn has not ended": Check(
+        "system/transaction/reparenting.py",
+        "            if loop.time() >= end:\n",
+        "            if False:\n",
+        RESTING,
+        "lets_another_turn_have",
+    ),
+    "those whose turn waits come to rest first": Check(
+        "system/transaction/reparenting.py",
+        "            for one, rest in waiting or late:\n",
+        "            for one, rest in late:\n",
+        RESTING,
+        "the_others_answer",
+    ),
+    "who is at rest before a turn that it has begun goes on": Check(
+        "system/transaction/reparenting.py",
+        "        if any(has_begun(one.living(system._node)) for one, _ in self._resting(system)):\n",
+        "        if False:\n",
+        RESTING,
+        "while_its_supervisor_leaves",
+    ),
+    "a pause may take as long as its transaction": Check(
+        "system/transaction/reparenting.py",
+        "math.inf, max(MOVED_WITHIN, self._draft.timeout)\n",
+        "math.inf, MOVED_WITHIN\n",
+        RESTING,
+        "both_end and moved-sleep",
+    ),
     "a recovery that fails is logged once": Check(
         "system/logs.py",
         "            if event.reason in crash.reason:\n                return\n",
@@ -140,7 +211,7 @@ CHECKS = {
     ),
     "a turn that rests is left though an order comes first": Check(
         "actors/migration/quiesce.py",
-        "(one for one in more.urgent or () if not isinstance(one, QueuedOrder))",
+        "(one for one in more.urgent or () if not one.comes_again)",
         "iter(more.urgent or ())",
         ORDERS,
         "test_an_actor_gets_another_state and task",
@@ -490,8 +561,8 @@ CHECKS = {
     ),
     "who rests is let go of when others have to be waited for": Check(
         "system/transaction/reparenting.py",
-        "            if waits:  # Perhaps for what those here have to answer.\n",
-        "            if False:\n",
+        "        if waits:  # Perhaps for what those here have to answer.\n",
+        "        if False:\n",
         MOVED,
         "test_it_waits_for_nobody",
     ),
