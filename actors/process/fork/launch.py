@@ -56,7 +56,8 @@ def keep_large_memory() -> None:
 
 
 def check_can_start() -> None:
-    """Raise ProcessUnavailable where no fork server can be started."""
+    """Raise ProcessUnavailable or SpecError where no fork server can or must be started."""
+    check_is_program("fork server")  # Each would start the next one.
     if not sys.platform.startswith("linux"):
         raise ProcessUnavailable(f"actors in processes of their own need Linux (pidfd, memfd); this is {sys.platform}")
 
