@@ -180,7 +180,10 @@ async def test_a_move_waits_for_recorded_actors_that_may_have_to_repeat_what_the
     poked = sender.ask(Poke(plain))  # Its turn is not over: a replay would ask again, at the address of before.
     while not (await system.get_status(sender)).turn:
         await asyncio.sleep(0)
-    with pytest.raises(hf.TransactionFailed, match="its next snapshot is waited for; a turn of /app/near/sender waits for an answer of /app/near/plain"):
+    with pytest.raises(
+        hf.TransactionFailed,
+        match="its next snapshot is waited for; a turn of /app/near/sender waits for an answer of /app/near/plain",
+    ):
         async with system.transaction(timeout=0.2) as change:
             change.move(plain, "/app/other")
     assert plain.path == "/app/near/plain"
