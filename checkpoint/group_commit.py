@@ -13,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import contextvars
+import dataclasses
 import functools
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -34,6 +35,21 @@ MOST = 250
 """Messages written and let out in one go, or their ends: about 2 ms of the loop's time."""
 PATIENCE_SECONDS = 0.05
 """How long the message handler may take to come, before the homes do its work themselves."""
+
+
+@dataclasses.dataclass(slots=True)
+class _Retry:
+    """When a store that had no room is tried again.
+
+    Attributes:
+        delay: seconds until the next attempt.
+        timer: of that, if one is set.
+        tried_at: when the last one was made, on the clock of the loop.
+    """
+
+    delay: float = RETRY_SECONDS
+    timer: asyncio.TimerHandle | None = None
+    tried_at: float = 0.0
 
 
 class Commits:
@@ -67,9 +83,7 @@ class Commits:
         self._overdue: asyncio.TimerHandle | None = None
         self._thread: ThreadPoolExecutor | None = None
         self._syncing: asyncio.Future[None] | None = None
-        self._delay = RETRY_SECONDS
-        self._retry: asyncio.TimerHandle | None = None
-        self._tried_at = 0.0  # on the clock of the loop; when the store was found to have no room
+        self._retry = _Retry()
         self.blocked: HoldfastError | None = None  # why nothing is written at the moment
         self.stopped: HoldfastError | None = None  # why nothing is written any more
 
@@ -106,7 +120,11 @@ class Commits:
         Raises:
             HoldfastError: the store does not take anything now.
         """
-        if self.blocked is not None and self.stopped is None and self._loop.time() - self._tried_at >= RETRY_SECONDS:
+        if (
+            self.blocked is not None
+            and self.stopped is None
+            and self._loop.time() - self._retry.tried_at >= RETRY_SECONDS
+        ):
             self._look_again()
         error = self.stopped or self.blocked
         if error is not None:
@@ -195,7 +213,7 @@ class Commits:
         if self._lanes.unsynced and self._syncing is None:
             self._sync()
         if self.blocked is not None:
-            self.blocked, self._delay = None, RETRY_SECONDS
+            self.blocked, self._retry.delay = None, RETRY_SECONDS
             self._emit(JournalGoesOn(self._where))
 
     def _run(self) -> None:
@@ -225,14 +243,14 @@ class Commits:
         self._lanes.refuse(error)
         if first:
             self._emit(JournalBlocked(self._where, str(error)))
-        self._tried_at = self._loop.time()
-        if self._retry is not None:
-            self._retry.cancel()
-        self._retry = self._loop.call_later(self._delay, self._try_again, context=self._context)
-        self._delay = min(2 * self._delay, MOST_RETRY_SECONDS)
+        self._retry.tried_at = self._loop.time()
+        if self._retry.timer is not None:
+            self._retry.timer.cancel()
+        self._retry.timer = self._loop.call_later(self._retry.delay, self._try_again, context=self._context)
+        self._retry.delay = min(2 * self._retry.delay, MOST_RETRY_SECONDS)
 
     def _try_again(self) -> None:
-        self._retry = None
+        self._retry.timer = None
         if self.blocked is not None and self.stopped is None:
             self._look_again()
 
@@ -243,7 +261,7 @@ class Commits:
             if self._lanes.ready and not self._is_running and not self._is_awake:
                 self._wake()
         else:  # Nothing is left that could show whether there is room: the next admission does.
-            self.blocked, self._delay = None, RETRY_SECONDS
+            self.blocked, self._retry.delay = None, RETRY_SECONDS
             self._emit(JournalGoesOn(self._where))
 
     def _stop(self, error: HoldfastError) -> None:

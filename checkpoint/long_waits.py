@@ -51,7 +51,7 @@ class LongWaits:
         """Until when a turn waits is fixed when it first wants to, for all of its lives."""
         if (out.verb == "sleep" and out.to == SINCE_THEN) or (out.verb == "wait" and out.seconds):
             home = self._home
-            when = home.ledger.dues[turn, out.k] = home.node.clock.wall() + out.seconds
+            when = home.ledger.waits.dues[turn, out.k] = home.node.clock.wall() + out.seconds
             home.note(turn, due_entry(turn, out.k, when), batch)
 
     def begin(self, turn: int, key: int, out: Out) -> None:
@@ -69,7 +69,7 @@ class LongWaits:
         self._since = {known: when for known, when in self._since.items() if known[0] == turn}
         self._since.setdefault(place, self._home.node.clock.wall())
         if not names or out.seconds:
-            self._look(place, self._home.ledger.dues.get(place, out.seconds))
+            self._look(place, self._home.ledger.waits.dues.get(place, out.seconds))
         if self.wanted:
             self.show(self._home.ledger.open.values())
 

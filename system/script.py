@@ -135,17 +135,21 @@ def find_only_here(kind: type) -> str:
     Returns:
         Its path; "" if the class can be imported without any script.
     """
-    module = sys.modules.get(kind.__module__)
-    file = str(getattr(module, "__file__", None) or "")
+    package = kind.__module__.partition(".")[0]
+    file, origin = _file_of(kind.__module__), _file_of(package)
     if kind.__module__.startswith(PREFIX):
         return file or kind.__module__
-    top = sys.modules.get(kind.__module__.partition(".")[0])
-    origin = str(getattr(top, "__file__", None) or "")
     brought = [folder for folder in sys.path if isinstance(folder, ScriptFolder)]
     if not any(Path(origin).is_relative_to(folder) for folder in brought):
         return ""
     rest = [folder for folder in sys.path if not isinstance(folder, ScriptFolder)]
-    return "" if PathFinder.find_spec(kind.__module__.partition(".")[0], rest) is not None else file
+    return "" if PathFinder.find_spec(package, rest) is not None else file
+
+
+def _file_of(module: str) -> str:
+    """The file that a module was imported from; "" if it has none."""
+    found = sys.modules.get(module)
+    return "" if found is None else str(vars(found).get("__file__") or "")
 
 
 @contextlib.contextmanager

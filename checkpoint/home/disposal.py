@@ -74,7 +74,7 @@ def drop_all(home: Switch, why: str, *, keep_tells: bool = False, keep_ticks: bo
             continue
         if source.ask is None and source.kind == MESSAGE:
             lose(home, source, why)
-        if source.id == ledger.begun and ledger.released and ledger.lasts and keep_tells:
+        if source.id == ledger.begun and ledger.released and ledger.waits.lasts and keep_tells:
             ask, source.ask = source.ask, None  # It goes on in the next life: what it has done is not left half done.
             if ask is not None:
                 ask.fail(ended)

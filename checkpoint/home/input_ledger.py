@@ -76,6 +76,27 @@ class SharedRows:
 
 
 @dataclasses.dataclass(slots=True)
+class TurnWaits:
+    """What the turn in hand at one address has waited for.
+
+    Attributes:
+        heard: how many outcomes it has.
+        lasts: whether it has had effects or long waits: it goes on in the next life at its address.
+        dues: until when outputs of it wait, in Unix time.
+    """
+
+    heard: int = 0
+    lasts: bool = False
+    dues: dict[tuple[int, int], float] = dataclasses.field(default_factory=dict)
+
+    def end(self) -> None:
+        """The turn in hand is over, or is to begin anew with nothing known of it."""
+        self.heard, self.lasts = 0, False
+        if self.dues:
+            self.dues.clear()
+
+
+@dataclasses.dataclass(slots=True)
 class InputLedger:
     """The inputs of one address, its turns, and where they stand in the journal.
 
@@ -88,9 +109,7 @@ class InputLedger:
         begun: the input of the turn after `turn`, if it has released outputs.
         released: digests of those outputs.
         outcomes: of the asks that these turns have made, by (turn, output).
-        heard: how many outcomes the turn in hand has.
-        lasts: whether that turn has had effects or long waits: it goes on in the next life at its address.
-        dues: until when outputs of the turn in hand wait, in Unix time.
+        waits: what the turn in hand has waited for.
         pipes_done: the background work of these turns that has its result, by turn.
         journal_bytes: what is counted against the journal's limit.
         newest: the snapshot that the next life begins with.
@@ -111,9 +130,7 @@ class InputLedger:
     begun: int = -1
     released: list[int] = dataclasses.field(default_factory=list)
     outcomes: dict[tuple[int, int], Came] = dataclasses.field(default_factory=dict)
-    heard: int = 0
-    lasts: bool = False
-    dues: dict[tuple[int, int], float] = dataclasses.field(default_factory=dict)
+    waits: TurnWaits = dataclasses.field(default_factory=lambda: TurnWaits())
     pipes_done: dict[int, set[int]] = dataclasses.field(default_factory=dict)
     journal_bytes: int = 0
     newest: Meta | None = None
@@ -264,9 +281,8 @@ class InputLedger:
         if self.released:
             digests, self.released = self.released, []
         turn = self.turns[number] = Turn(source, status, digests, state, reply)
-        self.begun, self.lasts, self.heard = -1, False, 0
-        if self.dues:
-            self.dues.clear()
+        self.begun = -1
+        self.waits.end()
         self.turn = number
         if source.deliveries:
             source.deliveries = 0
@@ -340,14 +356,14 @@ class InputLedger:
 
     def _placed(self, turn: int, answer: Answer) -> Came:
         """What comes now of an output of a turn, behind all that the turn has had."""
-        return came(answer, self.heard + 1, len(self.released)) if turn > self.turn else came(answer, TOO_LATE)
+        return came(answer, self.waits.heard + 1, len(self.released)) if turn > self.turn else came(answer, TOO_LATE)
 
     def _take_outcome(self, turn: int, k: int, answer: Came) -> None:
         """A turn that gets further than before has not died of the same thing again: its deaths are counted anew."""
         if turn > self.turn and (turn, k) not in self.outcomes and self.begun in self.open:
             self.open[self.begun].deliveries = 0
         if turn > self.turn:
-            self.heard = max(self.heard, answer.nth)
+            self.waits.heard = max(self.waits.heard, answer.nth)
         self.outcomes[turn, k] = answer
 
     def end_with(self, wanted: EndWanted | None) -> list[int]:
@@ -389,8 +405,8 @@ class InputLedger:
         """Let the turn in hand begin anew, unless it has released something: then its input is returned."""
         source = self.open.get(self.begun)
         if source is None or not self.released:
-            self.released, self.begun, self.lasts, self.heard = [], -1, False, 0
-            self.dues.clear()
+            self.released, self.begun = [], -1
+            self.waits.end()
             return None
         return source
 
@@ -528,7 +544,7 @@ class InputLedger:
         entries += [outcome_entry(*place, answer) for place, answer in heard if place[0] > self.turn]
         if self.released:
             entries.append(self.released_entry(self.turn + 1))
-        entries += [due_entry(*place, when) for place, when in self.dues.items()]
+        entries += [due_entry(*place, when) for place, when in self.waits.dues.items()]
         # What was put aside once may have ended in a turn that was given up.
         ended = {turn.input.id for turn in self.turns.values() if turn.status != STASHED}
         entries += [("drop", key) for key in dict.fromkeys(self.ended_in_the_stash()) if key not in ended]
@@ -564,12 +580,12 @@ class InputLedger:
             case ("due", turn, k, when):
                 self.positions_of(turn).append(position)
                 if turn > self.turn:
-                    self.dues[turn, k], self.lasts = when, True
+                    self.waits.dues[turn, k], self.waits.lasts = when, True
             case ("got", turn, k, kind, name, body, *order):
                 self.positions_of(turn).append(position)
                 answer = Came(kind, name, body, *order)
                 self._take_outcome(turn, k, self._placed(turn, answer) if answer.nth == AT_ITS_END else answer)
-                self.lasts = self.lasts or (turn > self.turn and kind.startswith(TIMED))
+                self.waits.lasts |= turn > self.turn and kind.startswith(TIMED)
             case ("stop", *said):
                 self.end_with(EndWanted(*said) if said else None).append(position)
             case ("drop", key):

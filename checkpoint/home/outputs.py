@@ -64,7 +64,7 @@ class Outputs:
             case "ask":
                 self._ask(turn, key, out, batch)
             case "effect" | "sleep" | "wait":
-                home.ledger.lasts = True
+                home.ledger.waits.lasts = True
                 home.calls.rests.fix(turn, out, batch)
                 port = home.life.port
                 batch.after.append(lambda: self._begin(turn, key, out, port))

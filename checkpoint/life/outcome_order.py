@@ -58,7 +58,7 @@ class OutcomeOrder:
             del outcomes[place]  # Given up, and nothing comes of it.
 
     def close(self) -> None:
-        """Tell nothing more."""
+        """Tell no further outcome: the turn in hand, or the life, is over."""
         self._left = 0
         if self._handle is not None:
             self._handle.cancel()

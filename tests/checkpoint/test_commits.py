@@ -355,9 +355,9 @@ async def test_the_first_who_comes_when_there_is_room_is_taken(engine: Any) -> N
         commits = system._homes.journal
         engine.full = True
         begun = doer.ask(Note("b"), timeout=30.0)
-        await until(lambda: commits._delay >= 0.4)  # So far apart are its own attempts by now.
+        await until(lambda: commits._retry.delay >= 0.4)  # So far apart are its own attempts by now.
         clock = asyncio.get_running_loop()
-        await until(lambda: clock.time() - commits._tried_at >= RETRY_SECONDS)
+        await until(lambda: clock.time() - commits._retry.tried_at >= RETRY_SECONDS)
         engine.full = False
         assert await doer.ask(Note("c"), timeout=30.0) == 3
         assert await begun == 2
@@ -372,13 +372,13 @@ async def test_a_store_without_room_is_tried_by_one_timer_however_many_come(engi
         commits, timers = system._homes.journal, set[asyncio.TimerHandle]()
         engine.full = True
         begun = doer.ask(Note("b"), timeout=30.0)
-        await until(lambda: commits._retry is not None)
+        await until(lambda: commits._retry.timer is not None)
         for _ in range(5):
             with pytest.raises(StoreFailed, match="no room"):
                 await doer.ask(Note("c"), timeout=30.0)
-            await until(lambda: asyncio.get_running_loop().time() - commits._tried_at >= RETRY_SECONDS)
-            if commits._retry is not None:
-                timers.add(commits._retry)
+            await until(lambda: asyncio.get_running_loop().time() - commits._retry.tried_at >= RETRY_SECONDS)
+            if commits._retry.timer is not None:
+                timers.add(commits._retry.timer)
         now = asyncio.get_running_loop().time()
         assert sum(not one.cancelled() and one.when() > now for one in timers) <= 1
         engine.full = False

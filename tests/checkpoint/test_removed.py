@@ -21,7 +21,7 @@ IN_HAND = "tests/checkpoint/test_diverging_in_hand.py"
 CHECKS = {
     "outcomes of a turn have their places in its order": Check(
         "checkpoint/home/input_ledger.py",
-        "came(answer, self.heard + 1, len(self.released))",
+        "came(answer, self.waits.heard + 1, len(self.released))",
         "came(answer)",
         RACES,
         "test_asks_that_race_come_in_the_same_order",
@@ -504,7 +504,7 @@ CHECKS = {
     ),
     "a workflow that was asked outlives the program": Check(
         "checkpoint/home/disposal.py",
-        "ledger.released and ledger.lasts and keep_tells",
+        "ledger.released and ledger.waits.lasts and keep_tells",
         "False",
         "tests/effects/test_long_waits.py",
         "test_a_turn_that_was_asked_goes_on_too",
@@ -798,14 +798,14 @@ CHECKS = {
     ),
     "who comes to a store that had no room looks whether there is some": Check(
         "checkpoint/group_commit.py",
-        "self.stopped is None and self._loop.time() - self._tried_at >= RETRY_SECONDS:",
-        "False:",
+        "and self._loop.time() - self._retry.tried_at >= RETRY_SECONDS",
+        "and False",
         "tests/checkpoint/test_commits.py",
         "first_who_comes",
     ),
     "a store without room is tried by one timer": Check(
         "checkpoint/group_commit.py",
-        "            self._retry.cancel()",
+        "            self._retry.timer.cancel()",
         "            pass",
         "tests/checkpoint/test_commits.py",
         "tried_by_one_timer",

@@ -45,6 +45,21 @@ async def until(system: hf.ActorSystem, count: int) -> None:
             await asyncio.sleep(0.001)
 
 
+async def decided(
+    system: hf.ActorSystem, ref: hf.ActorRef[Any], world: Path, race: Race, first: str
+) -> asyncio.Future[str]:
+    """Have a race be won by the effect ("paid") or by the message, and wait until its handler has gone on."""
+    asked = ref.ask(race, IN_TIME)
+    await begun(world, "paid")
+    await until(system, 1)
+    if first == "paid":
+        let(str(world), "paid")
+    else:
+        await ref.send(Cancel("now"))
+    await begun(world, "then")
+    return asked
+
+
 # -- races -----------------------------------------------------------------------------------------------------------
 
 
@@ -57,14 +72,7 @@ async def test_a_race_is_won_by_the_same_one_again(
     world = str(tmp_path)
     async with running(tmp_path, "os") as system:
         ref = await system.start(racer(isolation))
-        asked = ref.ask(Race(world, at_most_once), IN_TIME)
-        await begun(tmp_path, "paid")
-        await until(system, 1)
-        if first == "paid":
-            let(world, "paid")
-        else:
-            await ref.send(Cancel("now"))
-        await begun(tmp_path, "then")
+        asked = await decided(system, ref, tmp_path, Race(world, at_most_once), first)
         assert wanted(system) == 0
         await ref.send(Cancel("late"))
         let(world, "paid")
@@ -93,14 +101,7 @@ async def test_behind_a_mechanism_too(tmp_path: Path, stack: str, first: str) ->
     world = str(tmp_path)
     async with running(tmp_path, "os") as system:
         ref = await system.start(racer(mechanism=STACKS[stack]))
-        asked = ref.ask(Race(world), IN_TIME)
-        await begun(tmp_path, "paid")
-        await until(system, 1)
-        if first == "paid":
-            let(world, "paid")
-        else:
-            await ref.send(Cancel("now"))
-        await begun(tmp_path, "then")
+        asked = await decided(system, ref, tmp_path, Race(world), first)
         let(world, "paid")
         await ref.send(Cancel("late"))
         os.kill(pid_of(system, ref, "r1"), signal.SIGKILL)

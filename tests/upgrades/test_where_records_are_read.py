@@ -102,7 +102,7 @@ async def test_a_message_that_a_turn_has_waited_for(store: Generations, isolatio
         actor.tell(old.Wait())
         actor.tell(old.Tick(5, "came"))
         async with asyncio.timeout(LONG):
-            while not any(out for out in system._homes.at("/app/a").ledger.dues):
+            while not any(out for out in system._homes.at("/app/a").ledger.waits.dues):
                 await asyncio.sleep(0.01)
         actor.tell(old.Add(6, "behind"))
         await asyncio.sleep(0.05)
