@@ -245,11 +245,21 @@ class DraftPlace:
             raise NoSuchActor(self.path)
         return cell
 
+    def check_up(self, path: str) -> None:
+        """Whether this is no supervisor that was stopped before: then nobody is below it, of whom a step could be.
+
+        Raises:
+            SpecError: it is; `path` is what the step is about.
+        """
+        if self.is_supervisor and not self.is_planned and (self.cell is None or self.cell.is_dead):
+            whose = "it" if path == self.path else f"its supervisor {self.path}"
+            raise wrong(path, f"{whose} is stopped: start that in a transaction of its own first")
+
     def check_lived_in(self, node: Node, *, before_commit: bool = True) -> None:
         """Whether somebody lives here at this point, and also before the transaction is in force.
 
         Raises:
-            NoSuchActor: nobody does. SpecError: a step before stops it, or it is started only when all is in force.
+            SpecError: nobody does: it was stopped, or a step before stops it, or it starts when all is in force.
         """
         if self.comes_last and before_commit:
             raise wrong(
@@ -257,7 +267,8 @@ class DraftPlace:
             )
         if not self.is_stopped:
             return
-        self.living(node)
+        if self.now(node) is None:
+            raise wrong(self.path, "it is stopped: start it first")
         raise wrong(self.path, "it is stopped by this very transaction")
 
     def line(self) -> str:
@@ -391,6 +402,7 @@ class Draft:
                 if moved is not None and moved in self.by_cell:
                     return self.by_cell[moved]
                 self._check_no_part(path, place)
+                place.check_up(path)
                 raise NoSuchActor(path)
             place = place.children[name]
         return place
@@ -407,6 +419,7 @@ class Draft:
         cell = place.cell
         if place.is_planned:
             return place  # It will have what its spec says.
+        place.check_up(place.path)
         if cell is None:
             raise NoSuchActor(place.path)
         if place.actor is None:

@@ -580,6 +580,13 @@ CHECKS = {
         COMMIT,
         "test_a_tree_that_could_not_be_started_again",
     ),
+    "a step below a supervisor that was stopped says so": Check(
+        "system/transaction/draft.py",
+        "                place.check_up(path)\n",
+        "                pass\n",
+        "tests/system/test_transaction.py",
+        "test_a_supervisor_that_was_stopped_has_nobody",
+    ),
     "what came back with its supervisor is not stopped again": Check(
         "system/transaction/running.py",
         "            return  # It was stopped by a message alone: it has come back with its supervisor.\n",

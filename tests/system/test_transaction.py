@@ -233,7 +233,7 @@ async def test_an_address_that_was_left_is_free_for_another(system: hf.ActorSyst
         (lambda change: change.unregister("nobody"), "no actor has the name 'nobody'"),
         (lambda change: change.isolation("/app/left/a", "thread"), "isolation must be one of"),
         (lambda change: change.remove("/app"), "leave the system"),
-        (lambda change: change.suspend("/app/right/e"), "no actor at /app/right/e"),
+        (lambda change: change.suspend("/app/right/e"), "/app/right/e: it is stopped: start it first"),
         (lambda change: change.move("/app/right/e", "/app/pool"), "keeps nobody who does not run"),
     ],
 )
@@ -243,6 +243,33 @@ async def test_what_cannot_be_is_refused(system: hf.ActorSystem, step: Steps, wh
         async with system.transaction() as change:
             step(change)
     assert picture(system) == before
+
+
+BELOW_STOPPED: dict[str, Steps] = {
+    "remove": lambda change: change.remove("/app/left/a"),
+    "suspend": lambda change: change.suspend("/app/left/a"),
+    "move": lambda change: change.move("/app/left/a", "/app/right"),
+    "add": lambda change: change.add("/app/left", counter("g")),
+    "start": lambda change: change.start("/app/left", "a"),
+}
+
+
+@pytest.mark.parametrize("steps", BELOW_STOPPED.values(), ids=BELOW_STOPPED.keys())
+@pytest.mark.parametrize("is_started", [False, True], ids=["stopped before", "started by it"])
+async def test_a_supervisor_that_was_stopped_has_nobody_whom_a_step_could_be_about(
+    system: hf.ActorSystem, steps: Steps, is_started: bool
+) -> None:
+    async with system.transaction() as change:
+        change.unbind("/app/right/client", "peer")
+        change.stop("/app/left")
+    with pytest.raises(hf.TransactionRefused, match=r"/app/left is stopped|/app/left: it is stopped"):
+        async with system.transaction() as change:
+            if is_started:
+                change.start("/app", "left")
+            steps(change)
+    async with system.transaction() as change:  # In one of its own it is started, and then has them.
+        change.start("/app", "left")
+    assert await ref(system, "/app/left/a").ask(Add()) == 1
 
 
 async def test_a_child_that_does_not_start_undoes_what_came_before(system: hf.ActorSystem) -> None:

@@ -81,6 +81,10 @@ class Spec:
         """Whose state an earlier step of it has replaced."""
         self.relocated: set[int] = set()
         """Who is to live elsewhere by an earlier step of it."""
+        self.halted: set[int] = set()
+        """Who is stopped by an earlier step of it."""
+        self.roused: set[int] = set()
+        """Who is started by an earlier step of it: nobody is below it before that."""
 
     def copy(self) -> Spec:
         """The same specification, to be changed."""
@@ -195,6 +199,8 @@ class Spec:
         self.late.clear()
         self.reworked.clear()
         self.relocated.clear()
+        self.halted.clear()
+        self.roused.clear()
 
     def _forget(self, who: int) -> None:
         if who not in self.nodes:
@@ -209,6 +215,9 @@ class Spec:
     def _existing(self, who: int) -> Node:
         if who not in self.nodes or self.is_leaving(who):
             raise Cannot(f"{who} is not there")
+        for above in self.upwards(self.nodes[who].above):
+            if above.who in self.roused or (above.is_stopped and above.who not in self.halted):
+                raise Cannot(f"{above.who} was stopped before, and nobody is below it")
         return self.nodes[who]
 
     def _living(self, who: int) -> Node:
@@ -275,6 +284,7 @@ class Spec:
         if any(one.who in self.reworked for one in self.walk(who)):
             raise Cannot(f"{who} has its new state until it is stopped, and then no more")
         node.is_stopped = True
+        self.halted.add(who)
         self.lose(who)
 
     def _start(self, who: int) -> None:
@@ -283,6 +293,7 @@ class Spec:
         if not node.is_stopped:
             raise Cannot(f"{who} runs")
         node.is_stopped = False
+        self.roused.add(who)
 
     def lose(self, who: int) -> None:
         """What ends with a life. Where a binding leads when another one begins is found out then."""
