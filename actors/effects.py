@@ -10,6 +10,8 @@ from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
 from typing import Any, Literal, TypeAlias
 
+import msgspec
+
 from .backoff import Backoff
 from .errors import EffectFailed, EffectInDoubt, HoldfastError, SpecError, error_text, type_name
 from .seconds import check_seconds
@@ -90,8 +92,7 @@ def fencing_token() -> int:
     return token
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class EffectCall:
+class EffectCall(msgspec.Struct, frozen=True, eq=False):
     """One effect of a turn: the function, and how it is attempted.
 
     Attributes:
@@ -132,10 +133,10 @@ class EffectCall:
         attempt = 0
         while True:
             attempt += 1
-            limit = asyncio.timeout(self.timeout)
+            limit = None if self.timeout is None else asyncio.timeout(self.timeout)
             try:
                 work = self.function(*self.args) if self.is_async else run(self.function, *self.args)
-                if self.timeout is None:
+                if limit is None:
                     return await work
                 async with limit:
                     return await work
@@ -149,7 +150,7 @@ class EffectCall:
                 kind, text = type_name(type(error)), error_text(error)
                 if isinstance(error, FunctionRaised):
                     kind, text = error.kind, error.text
-                elif self.timeout is not None and limit.expired() and isinstance(error, TimeoutError):
+                elif limit is not None and limit.expired() and isinstance(error, TimeoutError):
                     text = f"it took longer than {self.timeout:g} s"
                 if attempt >= self.retry.attempts or not is_one_of(error, self.retry.on):
                     raise EffectFailed(self.key, attempt, kind, text) from error

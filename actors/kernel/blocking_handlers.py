@@ -20,6 +20,7 @@ import queue
 import threading
 from collections.abc import Callable
 from time import monotonic
+from types import FunctionType
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from ..errors import HoldfastError
@@ -207,4 +208,6 @@ def is_async(function: Callable[..., Any]) -> bool:
     """Whether calling it gives a coroutine; anything else may block."""
     while isinstance(function, functools.partial):
         function = function.func
+    if isinstance(function, FunctionType) and function.__code__.co_flags & inspect.CO_COROUTINE:
+        return True  # As `inspect` would find out, in a tenth of the time: there is one for each effect.
     return inspect.iscoroutinefunction(function) or inspect.iscoroutinefunction(getattr(function, "__call__", None))  # noqa: B004

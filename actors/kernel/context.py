@@ -690,8 +690,12 @@ class ActorContext:
         context.run(begun_in.set, self._item)
         task = self._cell.node.loop.create_task(contained(work), name=f"{what} of {self.path}", context=context)
         tasks.add(task)
-        task.add_done_callback(tasks.discard)
-        task.add_done_callback(lambda _: work.close())  # If it was cancelled before its first step, it never began.
+
+        def over(_: asyncio.Task[T]) -> None:
+            tasks.discard(task)
+            work.close()  # If it was cancelled before its first step, it never began.
+
+        task.add_done_callback(over)
         return task
 
     def _task_done(self, task: asyncio.Task[Any]) -> None:

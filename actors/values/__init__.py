@@ -24,7 +24,7 @@ from .forms import FORMAT, LENGTH
 from .saved_refs import SavedRef
 from .value_describer import Describer, ValueDescription
 from .value_reader import Decoder, unpack
-from .value_writer import ALONE, Links, pieces, walked_pieces
+from .value_writer import ALONE, HEAD_ALONE, Links, pieces, scalar_bytes, walked_pieces
 
 __all__ = [
     "ALONE",
@@ -67,7 +67,8 @@ def encode_value(value: object, *, where: str = "value", refs: bool = True) -> b
     Traceback (most recent call last):
     holdfast.actors.errors.UnsavableValue: balance['x'][1]: a value of type object cannot be saved; make it ...
     """
-    return b"".join(pieces(value, where, canonical=False, refs=refs))
+    simple = scalar_bytes(value)
+    return b"".join(pieces(value, where, canonical=False, refs=refs)) if simple is None else simple
 
 
 def state_digest(value: object) -> bytes:
@@ -150,14 +151,8 @@ def describe_value(data: bytes | memoryview, *, shared: dict[int, object] | None
 
 
 def _read(data: bytes | memoryview | ByteParts, decoder: Callable[[ByteParts], Decoder], *, is_checked: bool) -> object:
-    left = data if isinstance(data, ByteParts) else ByteParts((memoryview(data).cast("B"),))
-    if len(left) < 2:
-        raise DamagedValue("it is cut short")
-    version, flag = in_one(left.take(2))
-    if version != FORMAT or flag > 1:
-        raise DamagedValue(f"it has format {version}.{flag}, and only format {FORMAT} is known")
     try:
-        tree = in_one(left.take(len(left) if flag == 0 else LENGTH.unpack(in_one(left.take(LENGTH.size)))[0]))
+        flag, tree, left = _opened(data)
         if is_checked:
             check_containers(tree)
         if flag == 0:
@@ -169,3 +164,20 @@ def _read(data: bytes | memoryview | ByteParts, decoder: Callable[[ByteParts], D
         raise
     except Exception as error:
         raise DamagedValue(f"{type(error).__name__}: {error}") from error
+
+
+def _opened(data: bytes | memoryview | ByteParts) -> tuple[int, memoryview, ByteParts]:
+    """The flag of a value, its tree, and the buffers behind that."""
+    if isinstance(data, bytes) and data.startswith(HEAD_ALONE):  # Most are so, and small.
+        return 0, memoryview(data)[len(HEAD_ALONE) :], _NOTHING
+    left = data if isinstance(data, ByteParts) else ByteParts((memoryview(data).cast("B"),))
+    if len(left) < len(HEAD_ALONE):
+        raise DamagedValue("it is cut short")
+    version, flag = in_one(left.take(len(HEAD_ALONE)))
+    if version != FORMAT or flag > 1:
+        raise DamagedValue(f"it has format {version}.{flag}, and only format {FORMAT} is known")
+    size = len(left) if flag == 0 else LENGTH.unpack(in_one(left.take(LENGTH.size)))[0]
+    return flag, in_one(left.take(size)), left
+
+
+_NOTHING = ByteParts(())

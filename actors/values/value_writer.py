@@ -43,6 +43,7 @@ TUPLE: Final = KNOWN[tuple][0]
 MANY: Final = 8
 """Entries from which on a list of arrays or tuples that are alike is written as a whole."""
 _PLAIN: Final = msgspec.msgpack.Encoder()
+_SIMPLE: Final = SCALARS - {Blob}
 
 
 class Links(NamedTuple):
@@ -61,6 +62,16 @@ ALONE: Final = Links()
 def pieces(value: object, where: str, *, canonical: bool, refs: bool = True) -> list[Any]:
     """The bytes of a value, in parts to be joined; `canonical` and `refs` as in `_Encoder`."""
     return walked_pieces(value, where, canonical=canonical, refs=refs)[0]
+
+
+def scalar_bytes(value: object) -> bytes | None:
+    """The bytes of a scalar, which needs no walk; None: it is none, or one for which msgpack has no type."""
+    if type(value) not in _SIMPLE:
+        return None
+    try:
+        return HEAD_ALONE + _PLAIN.encode(value)
+    except (OverflowError, UnicodeEncodeError):
+        return None
 
 
 def walked_pieces(
