@@ -169,11 +169,11 @@ class NatsReader:
         """The next records; see `LogReader`."""
         try:
             messages = await self._consumer.fetch(BATCH, timeout=seconds)
+            return [LogRecord(message.metadata.sequence.stream, message.data) for message in messages]
         except TimeoutError:
             return []
         except (nats.errors.Error, JetStreamError, OSError) as error:
             raise Unanswered(self._name, str(error) or type(error).__name__) from error
-        return [LogRecord(message.metadata.sequence.stream, message.data) for message in messages]
 
     async def close(self) -> None:
         """Have the server forget the consumer; see `LogReader`."""
