@@ -140,8 +140,10 @@ class GuardedSystem(ActorSystem):
         before.look_away()
         self.crashes, before.crashes = before.crashes, []
         self.letters, before.letters = before.letters, []
-        self._expected_crashes, before._expected_crashes = before._expected_crashes, Expected()
-        self._expected_letters, before._expected_letters = before._expected_letters, Expected()
+        of_the_killed = Expected()
+        of_the_killed.expect(None)  # What is still told there is only how it is taken apart.
+        self._expected_crashes, before._expected_crashes = before._expected_crashes, of_the_killed
+        self._expected_letters, before._expected_letters = before._expected_letters, of_the_killed
         self.are_exceptions_expected = before.are_exceptions_expected
         if self._checks is not None and before._checks is not None:
             self._checks.expect_as(before._checks)

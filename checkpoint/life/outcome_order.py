@@ -11,12 +11,12 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Final
 
+from ...actors.kernel.loop import TurnRemains
 from ..protocol import GIVEN_UP, MESSAGE, GivenUp, Outcome, untimed
 from .recorded_context import Resting
 
 if TYPE_CHECKING:
-    from ...actors.kernel.loop import Suspended
-    from ..protocol import Feed
+    from ...actors.kernel.cell import Cell
     from .recorded_life import Life
 
 STEPS: Final = 4
@@ -122,29 +122,19 @@ class OutcomeOrder:
     # -- giving up --------------------------------------------------------------------------------------------------
 
     def cancelled(self, place: Place) -> None:
-        """What comes of an output is not awaited any more: by the turn itself, unless that is cancelled as a whole."""
+        """What comes of an output is not awaited any more."""
         life = self._life
-        feed, more = life.feed, life.cell.more
-        if feed is None or life.stage.is_over or place[0] != life.turn or place not in life.waits.outcomes:
-            return  # The life is over, or the turn was left: the next life waits on.
-        suspended = None if more is None else more.turn
-        if suspended is None or suspended.runner.task is _current_task():
-            self.give_up(place)
-        else:  # By a time limit, perhaps, or the turn is killed: that is known when it has gone on.
-            self._give_up_soon(place, feed, suspended, STEPS)
-
-    def _give_up_soon(self, place: Place, feed: Feed, suspended: Suspended, left: int) -> None:
-        more = self._life.cell.more
-        if self._life.feed is not feed or more is None or more.turn is not suspended or suspended.killed:
-            return
-        if left:
-            self._life.cell.node.loop.call_soon(self._give_up_soon, place, feed, suspended, left - 1)
-        else:
-            self.give_up(place)
+        if life.feed is not None and not life.stage.is_over and place[0] == life.turn and place in life.waits.outcomes:
+            self.give_up(place)  # Else the life is over, or the turn was left: the next life waits on.
 
     def give_up(self, place: Place) -> None:
-        """Tell the home that the turn in hand waits no more for what comes of its output."""
-        self._life.port.to_home(GivenUp(*place))
+        """Tell the home that the turn in hand waits no more for what comes of its output, if the handler says so.
+
+        What is cancelled because the turn is killed is wanted by the next life: a `TaskGroup` cancels its tasks then,
+        and what comes meanwhile finds nobody.
+        """
+        if not is_killed(self._life.cell):
+            self._life.port.to_home(GivenUp(*place))
 
     def ignored(self, record: Outcome) -> None:
         """An outcome has come that its turn had given up: a message that was taken for it is somebody else's."""
@@ -164,13 +154,15 @@ class OutcomeOrder:
             life.hear(record)
 
 
+def is_killed(cell: Cell) -> bool:
+    """Whether the turn in hand is killed: it is being cancelled, or has just ended so."""
+    more, queue = cell.more, cell.queue
+    turn = None if more is None else more.turn
+    if turn is None and queue and isinstance(queue[0], TurnRemains):
+        turn = queue[0].turn
+    return turn is not None and turn.killed
+
+
 def is_given_up(record: Outcome) -> bool:
     """Whether nothing has come of an output, as an earlier life of its turn has given it up: so will this one."""
     return record.answer.kind == GIVEN_UP
-
-
-def _current_task() -> asyncio.Task[object] | None:
-    try:
-        return asyncio.current_task()
-    except RuntimeError:
-        return None

@@ -86,18 +86,30 @@ class RecordedTimer:
         _own_life("cancels its timers").cancel_timer(self.id)
 
 
-class Pending(asyncio.Future[Any]):
+class OutcomeFuture(asyncio.Future[T]):
+    """What comes of an output of a turn. In a set (`asyncio.wait` returns two) it has the same place in each life."""
+
+    __slots__ = ("place",)
+
+    def __init__(self, life: Life, k: int) -> None:
+        super().__init__(loop=life.cell.node.loop)
+        self.place: tuple[int, int] = (life.turn, k)  # its turn, and the number of the output
+
+    def __hash__(self) -> int:
+        return self.place[1]
+
+
+class Pending(OutcomeFuture[Any]):
     """What a turn waits for. The clock of the turn moves on when its handler has awaited it.
 
     Not when it has come: in a replay all comes at once, and `now()` has to say again what it said.
     """
 
-    __slots__ = ("_life", "is_out", "place", "when")
+    __slots__ = ("_life", "is_out", "when")
 
-    def __init__(self, life: Life) -> None:
-        super().__init__(loop=life.cell.node.loop)
+    def __init__(self, life: Life, k: int) -> None:
+        super().__init__(life, k)
         self._life, self.when, self.is_out = life, 0.0, False
-        self.place: tuple[int, int] = (0, 0)  # its turn, and the number of its output
 
     def cancel(self, msg: Any = None) -> bool:
         """Nobody waits for it any more: nothing of it is done again in a replay, and no message is taken for it."""
@@ -241,8 +253,8 @@ class RecordedContext(ActorContext):
     async def _accepted(self, k: int) -> None:
         """Have output `k` leave, and wait until it is accepted."""
         life = self.recorded
-        accepted: asyncio.Future[None] = self._cell.node.loop.create_future()
-        life.waits.outcomes[life.turn, k] = accepted, None
+        accepted: OutcomeFuture[None] = OutcomeFuture(life, k)
+        life.waits.outcomes[accepted.place] = accepted, None
         life.release()
         await accepted
 
@@ -258,8 +270,8 @@ class RecordedContext(ActorContext):
             return super()._ask(cell, message, timeout)
         life = self.recorded
         k = self._put("ask", cell, message, seconds=check_seconds(cell.path, "timeout", timeout))
-        future: asyncio.Future[R] = self._cell.node.loop.create_future()
-        life.waits.outcomes[life.turn, k] = future, Asked(cell.path, type(message))
+        future: OutcomeFuture[R] = OutcomeFuture(life, k)
+        life.waits.outcomes[future.place] = future, Asked(cell.path, type(message))
         life.release()
         return future
 
@@ -349,15 +361,14 @@ class RecordedContext(ActorContext):
             self._outside()
             return super()._performed(effect)
         name = "at most once" if effect.at_most_once else ""
-        return self._awaited(Pending(self.recorded), "effect", effect.key, name, 0.0, effect)
+        return self._awaited(Pending, "effect", effect.key, name, 0.0, effect)
 
     def _awaited(
-        self, outcome: Pending, verb: str, to: str, name: str, until: float, kind: Awaited
+        self, made: type[Pending], verb: str, to: str, name: str, until: float, kind: Awaited
     ) -> asyncio.Future[Any]:
         """An output of the turn in hand, and a future of what comes of it; the turn need not wait for that."""
         life = self.recorded
-        k = life.put(verb, to, name, seconds=until)
-        outcome.place = life.turn, k
+        outcome = made(life, life.put(verb, to, name, seconds=until))
         life.waits.outcomes[outcome.place] = outcome, kind
         life.waits.order.rests()
         life.release()
@@ -367,7 +378,7 @@ class RecordedContext(ActorContext):
         self, verb: str, name: str, seconds: float, kinds: tuple[type[Message[Any]], ...], since: str = SINCE_THEN
     ) -> asyncio.Future[Any]:
         """Wait for what the home waits for: nothing of it is out."""
-        outcome = self._awaited(Resting(self.recorded), verb, since, name, seconds, kinds)
+        outcome = self._awaited(Resting, verb, since, name, seconds, kinds)
         self.recorded.waits.resting += 1
         return outcome
 

@@ -109,10 +109,10 @@ class StartAgain(OnChild):
             raise NoSuchActor(self.target)
         if not place.is_stopped:
             raise wrong(self.target, "it runs")
+        if place.is_switched or (place.cell is not None and not place.cell.is_dead):
+            raise wrong(self.target, "it is stopped by this very transaction")
         self._is_automatic = place.spec.autostart
         self._take(draft, place, starts=True)
-        if place.cell is not None and not place.cell.is_dead:
-            raise wrong(self.target, "it is stopped by this very transaction")
 
     def _supervisor(self, system: ActorSystem) -> Cell:
         """Who has it until the transaction is in force: there it is started, and goes from there if it is moved."""

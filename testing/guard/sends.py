@@ -167,7 +167,7 @@ class SendChecks(TurnWatcher):
     @property
     def asks(self) -> dict[asyncio.Future[Any], tuple[str, object]]:
         """What was asked, and of whom, by the futures that somebody still holds."""
-        held = [(ref(), *asked) for ref, asked in list(self._asks.items())]
+        held = [(ref(), *asked) for ref, asked in self._asks.copy().items()]  # A collection may take some out.
         return {future: (cell.path, message) for future, cell, message in held if future is not None}
 
     def replied(self, ask: Ask, reply: object) -> None:

@@ -2,15 +2,18 @@
 
 What asyncio promises is kept. Callbacks that are no steps of tasks are called in the order in which they were
 scheduled, and before the steps of tasks that were scheduled after them; a task's steps are in order among themselves.
+A turn that hears one outcome after another has as much time between two as in production: who tells it of them comes
+behind all steps that were scheduled before.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Hashable, Iterator
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from ...actors.kernel.node import Node
+from ...checkpoint.life.outcome_order import OutcomeOrder
 from .places import is_dead, lane_of
 
 Option = tuple[Hashable, asyncio.Handle, bool]
@@ -18,6 +21,12 @@ Option = tuple[Hashable, asyncio.Handle, bool]
 among the others matters."""
 STEPS = (None, "task_wakeup", "__step", "__wakeup")
 """How the methods of a task are named that go on with it, in C and in Python."""
+
+
+class Behind(NamedTuple):
+    """Whose step it is that comes behind all that was scheduled before it: a lane."""
+
+    lane: Hashable
 
 
 class TellingHandle(asyncio.Handle):
@@ -77,7 +86,8 @@ class DueQueue:
         elif type(handle) is asyncio.TimerHandle:
             key, has_place = handle, False
         else:
-            key, has_place = lane_of(handle), True
+            lane = lane_of(handle)
+            key, has_place = Behind(lane) if type(owner) is OutcomeOrder else lane, True
         self._ordered += has_place
         if type(handle) is not TellingHandle:
             self._silent += 1
@@ -128,6 +138,10 @@ class DueQueue:
                 tasks.add(id(key))
             elif not has_place:
                 found.append(option)
+            elif type(key) is Behind:
+                if not (tasks or lanes):
+                    found.append(option)
+                lanes.add(key.lane)
             elif key not in lanes:
                 lanes.add(key)
                 found.append(option)

@@ -15,10 +15,25 @@ CHUNKS_KEPT = "tests/checkpoint/test_chunks_kept.py"
 KILLS = "tests/checkpoint/test_kill_counts.py"
 
 RACES = "tests/effects/test_races.py"
+RACE_PROGRAMS = "tests/effects/test_race_programs.py"
 TIMERS = "tests/effects/test_timers_while_resting.py"
 IN_HAND = "tests/checkpoint/test_diverging_in_hand.py"
 
 CHECKS = {
+    "a turn that is killed has given up nothing": Check(
+        "checkpoint/life/outcome_order.py",
+        "        if not is_killed(self._life.cell):\n",
+        "        if True:\n",
+        RACE_PROGRAMS,
+        "test_every_life_goes_the_same_way and task",
+    ),
+    "nor has one that was killed and has just ended": Check(
+        "checkpoint/life/outcome_order.py",
+        "    if turn is None and queue and isinstance(queue[0], TurnRemains):\n",
+        "    if False:\n",
+        RACE_PROGRAMS,
+        "test_every_life_goes_the_same_way and task",
+    ),
     "outcomes of a turn have their places in its order": Check(
         "checkpoint/home/input_ledger.py",
         "came(answer, self.waits.heard + 1, len(self.released))",
@@ -88,13 +103,6 @@ CHECKS = {
         "",
         RACES,
         "test_nor_if_its_home_did_not_hear",
-    ),
-    "a turn that is killed has given up nothing": Check(
-        "checkpoint/life/outcome_order.py",
-        "            self._give_up_soon(place, feed, suspended, STEPS)",
-        "            self.give_up(place)",
-        "tests/effects/test_long_waits.py",
-        "test_days_pass_and_crashes",
     ),
     "a turn that ends gives up what it waits for": Check(
         "checkpoint/life/recorded_life.py",

@@ -235,6 +235,14 @@ async def test_an_address_that_was_left_is_free_for_another(system: hf.ActorSyst
         (lambda change: change.remove("/app"), "leave the system"),
         (lambda change: change.suspend("/app/right/e"), "/app/right/e: it is stopped: start it first"),
         (lambda change: change.move("/app/right/e", "/app/pool"), "keeps nobody who does not run"),
+        (
+            lambda change: (
+                change.start("/app/right", "e"),
+                change.stop("/app/right/e"),
+                change.start("/app/right", "e"),
+            ),
+            "start /app/right/e .*it is stopped by this very transaction",
+        ),
     ],
 )
 async def test_what_cannot_be_is_refused(system: hf.ActorSystem, step: Steps, why: str) -> None:

@@ -66,11 +66,12 @@ class Found(AssertionError):
 class Machine:
     """One system, its specification, and who asks it things."""
 
-    def __init__(self, system: hf.ActorSystem, rng: random.Random, *, checks_order: bool) -> None:
-        self.system, self._rng = system, rng
+    def __init__(self, system: hf.ActorSystem, run: Run) -> None:
+        self.system, self._rng = system, random.Random(run.seed)
+        self._is_alone = "concurrency" not in run.hazards  # no other transaction is under way with one
         self.spec = Spec()
         self.trace: list[str] = []
-        self.judge = Judge(self.note, checks_order=checks_order)
+        self.judge = Judge(self.note, checks_order=run.checks_order)
         self._last = 0
         self._number = 0
         self._busy: set[int] = set()
@@ -224,11 +225,15 @@ class Machine:
         return after.starts_alone()
 
     def _target(self, draft: Spec, draw: Draw) -> Callable[[int], Any]:
-        """How a step names an actor: by its address at that point, or by a ref."""
+        """How a step names an actor: by its address at that point, or by a ref.
+
+        Beside another transaction it is a ref: that may give the address to somebody else.
+        """
+        is_named = draw.numbers[2] % 2 == 0 and self._is_alone
 
         def target(who: int) -> Any:
             path = draft.path(who)
-            if draw.numbers[2] % 2 and who in self.spec.nodes:
+            if not is_named and who in self.spec.nodes:
                 try:
                     return self.system.ref(self.spec.path(who), hf.Actor)
                 except hf.HoldfastError:
@@ -329,7 +334,7 @@ def collect(change: hf.system.Change, step: Step, draft: Spec, target: Callable[
             node = draft.nodes[args[0]]
             change.start(target(node.above), node.name)
         case "stop":
-            change.stop(draft.path(args[0]))
+            change.stop(target(args[0]))
         case "reorder":
             change.reorder(target(args[0]), [draft.nodes[one].name for one in args[1]])
         case "bind":
@@ -409,7 +414,7 @@ async def carry_out(run: Run, plan: Plan, *, end: float = 15.0) -> None:
     faults, trace, leaving = list[str](), list[str](), 0.0
     try:
         async with hf.ActorSystem("app", log=False, intensity=1000, seed=run.seed) as system:
-            machine = Machine(system, random.Random(run.seed), checks_order=run.checks_order)
+            machine = Machine(system, run)
             faults, trace = machine.judge.faults, machine.trace
             try:
                 await machine.plant(processes=run.processes, stops="stop" in run.verbs)

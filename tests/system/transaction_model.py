@@ -344,7 +344,10 @@ class Spec:
         if owner == target:
             raise Cannot("nobody is bound to itself")
         self._leaf(target)
-        self._leaf(owner).peer = target
+        node = self._leaf(owner)
+        node.peer = target
+        if owner in self.planned and node.spec_peer is not None:
+            node.spec_peer = target  # It is added so.
 
     def _unbind(self, owner: int) -> None:
         node = self._leaf_before(owner)

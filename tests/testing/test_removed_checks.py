@@ -13,6 +13,20 @@ PLUGIN = "tests/testing/test_plugin.py"
 LOOPS = "tests/testing/test_loop_methods.py"
 
 CHECKS = {
+    "a turn has time between two outcomes": Check(
+        "testing/schedules/due.py",
+        "Behind(lane) if type(owner) is OutcomeOrder else lane",
+        "lane",
+        "tests/effects/test_race_programs.py",
+        "test_so_it_does_in_any_order_of_steps and task",
+    ),
+    "nobody looks at what a killed root still tells": Check(
+        "testing/guarded.py",
+        "        of_the_killed.expect(None)",
+        "        of_the_killed.expect(0)",
+        "tests/effects/test_race_programs.py",
+        "test_every_life_goes_the_same_way and task",
+    ),
     "faults strike no turn that has ended before": Check(
         "testing/injectors.py",
         "        if isinstance(item, Fed) and item.feed.turn >= 0 and not self._strikes.replays:\n",
