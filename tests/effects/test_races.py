@@ -17,7 +17,7 @@ from holdfast.checkpoint.home.recorded_home import switch_of
 from holdfast.checkpoint.protocol import AT_ITS_END, MESSAGE, REPLY, Answer, Came, GivenUp, Out, came
 from holdfast.ftm import LFR, PBR, TR
 from tests.effects.clerk import IN_TIME, words
-from tests.effects.racer import Both, Cancel, GiveUp, Leave, Look, Other, Race, Tire, Two, let, racer
+from tests.effects.racer import Both, Cancel, GiveUp, Leave, Look, Other, Race, Tire, Two, awaited, let, racer
 from tests.effects.test_long_waits import end_of, running
 from tests.ftm.test_failover import pid_of
 
@@ -307,6 +307,50 @@ async def test_a_killed_turn_has_given_up_nothing(tmp_path: Path) -> None:
         let(world, "then Cancel(word='now')")
         let(world, "end")
         assert await asked == "Cancel(word='now'), then Cancel(word='now')"
+
+
+class Wait(hf.Message[str]):
+    """Wait for a Cancel, a moment and an effect, in one of several ways."""
+
+    how: str
+
+
+class Waiter(hf.Actor):
+    @hf.on(Cancel)
+    def cancel(self, message: Cancel) -> None: ...
+
+    @hf.on(Wait)
+    async def wait(self, message: Wait) -> str:
+        match message.how:
+            case "effect":
+                return await self.ctx.effect(quickly)
+            case "message":
+                return (await self.ctx.wait_for(Cancel)).word
+            case "group":
+                async with asyncio.TaskGroup() as group:
+                    tasks = [group.create_task(awaited(one)) for one in (self.ctx.effect(quickly), self.ctx.sleep(0.1))]
+                return str(tasks[0].result())
+            case _:
+                return str((await asyncio.gather(self.ctx.effect(quickly), self.ctx.sleep(0.1)))[0])
+
+
+async def quickly() -> str:
+    return "done"
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+@pytest.mark.parametrize("how", ["effect", "message", "group", "gather"])
+async def test_a_turn_is_killed_at_any_step_of_the_loop_and_goes_on(tmp_path: Path, how: str) -> None:
+    async with running(tmp_path) as system:
+        for steps in range(12):
+            ref = await system.start(hf.child(f"w{steps}", hf.start(Waiter), recovery=hf.hybrid(interval=1000.0)))
+            asked = ref.ask(Wait(how), IN_TIME)
+            for _ in range(steps):
+                await asyncio.sleep(0)
+            ref.kill()
+            if how == "message":
+                await ref.send(Cancel("done"))
+            assert await asked == "done", f"killed after {steps} steps"
 
 
 # -- the record ------------------------------------------------------------------------------------------------------
