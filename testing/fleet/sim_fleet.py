@@ -178,7 +178,7 @@ class SimFleet:
         programs: all that were started and not killed.
 
     Args:
-        seed: decides all that is drawn.
+        seed: decides all that is drawn, by the global generator of `random`, too: the context seeds that meanwhile.
         faults: how often what goes wrong with the servers of each system.
         post_faults: the same of what programs send each other.
     """
@@ -233,12 +233,17 @@ class SimFleet:
             program.check()
 
     async def __aenter__(self) -> SimFleet:
+        self._random = random.getstate()
+        random.seed(f"random {self.seed}")
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        await self.close()
+        try:
+            await self.close()
+        finally:
+            random.setstate(self._random)
 
     async def close(self) -> None:
         """End all programs; with servers that are well, whatever was wrong with them before.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import os
 import random
 from typing import Any
@@ -232,6 +233,31 @@ async def test_the_fixture_has_a_fleet(sim_fleet: SimFleet) -> None:
     sim_fleet.start(bank, "bank")
     async with hf.connect(sim_fleet.servers("bank"), timeout=60.0) as connection:
         assert await connection.ref("/bank/ledger", Ledger).ask(Put("a", 1), timeout=60.0) == 0
+
+
+def test_a_seed_decides_when_whatever_happens() -> None:
+    """Also what programs draw by themselves: how soon one that stands by looks again."""
+
+    async def moments(told: list[float]) -> None:
+        random.seed(len(runs))  # Whatever was drawn before.
+        async with SimFleet(seed=1) as fleet:
+            fleet.start(bank)
+            fleet.start(bank)
+            async with hf.connect(fleet.servers("app"), timeout=60.0) as connection:
+                ledger = connection.ref("/app/ledger", Ledger)
+                for number in range(6):
+                    leader = fleet.leader()
+                    if number in (2, 4) and leader is not None:
+                        fleet.kill(leader)
+                        fleet.start(bank)
+                    await ledger.ask(Put("a", number), timeout=60.0)
+                    told.append(asyncio.get_running_loop().time())
+
+    runs: list[list[float]] = []
+    for _ in range(2):
+        runs.append([])
+        simulate(functools.partial(moments, runs[-1]), seed=1)
+    assert runs[0] == runs[1]
 
 
 def test_what_a_program_raises_is_told() -> None:
