@@ -87,13 +87,14 @@ class RecordedTimer:
 
 
 class OutcomeFuture(asyncio.Future[T]):
-    """What comes of an output of a turn. In a set (`asyncio.wait` returns two) it has the same place in each life."""
+    """What comes of an output of a turn. In a set (`asyncio.wait` returns two) it has the same place in each life.
+
+    There is one for each ask, so nothing is done when it is made but what a future does.
+    """
 
     __slots__ = ("place",)
 
-    def __init__(self, life: Life, k: int) -> None:
-        super().__init__(loop=life.cell.node.loop)
-        self.place: tuple[int, int] = (life.turn, k)  # its turn, and the number of the output
+    place: tuple[int, int]  # its turn, and the number of the output
 
     def __hash__(self) -> int:
         return self.place[1]
@@ -108,7 +109,8 @@ class Pending(OutcomeFuture[Any]):
     __slots__ = ("_life", "is_out", "when")
 
     def __init__(self, life: Life, k: int) -> None:
-        super().__init__(life, k)
+        super().__init__(loop=life.cell.node.loop)
+        self.place = life.turn, k
         self._life, self.when, self.is_out = life, 0.0, False
 
     def cancel(self, msg: Any = None) -> bool:
@@ -253,7 +255,8 @@ class RecordedContext(ActorContext):
     async def _accepted(self, k: int) -> None:
         """Have output `k` leave, and wait until it is accepted."""
         life = self.recorded
-        accepted: OutcomeFuture[None] = OutcomeFuture(life, k)
+        accepted: OutcomeFuture[None] = OutcomeFuture(loop=self._cell.node.loop)
+        accepted.place = life.turn, k
         life.waits.outcomes[accepted.place] = accepted, None
         life.release()
         await accepted
@@ -270,8 +273,9 @@ class RecordedContext(ActorContext):
             return super()._ask(cell, message, timeout)
         life = self.recorded
         k = self._put("ask", cell, message, seconds=check_seconds(cell.path, "timeout", timeout))
-        future: OutcomeFuture[R] = OutcomeFuture(life, k)
-        life.waits.outcomes[future.place] = future, Asked(cell.path, type(message))
+        future: OutcomeFuture[R] = OutcomeFuture(loop=self._cell.node.loop)
+        future.place = place = life.turn, k
+        life.waits.outcomes[place] = future, Asked(cell.path, type(message))
         life.release()
         return future
 
