@@ -215,6 +215,7 @@ class ControlledLoop(VirtualClockLoop):
         timers: Any = self._scheduled
         for handle in [*self.due, *timers, *self._sent]:
             if is_dead(handle):
+                _close_unbegun(handle)
                 handle.cancel()
         node = place.node
         tasks: list[Any] = [*place.tasks, *(runner.task for runner in node._runners)]
@@ -250,6 +251,17 @@ def _close(coroutine: Any) -> None:
         pass
     for one in given:
         _close(one)
+
+
+def _close_unbegun(handle: Any) -> None:
+    """Close the coroutines that a callback has which is never called, and that have not begun: nobody awaits them."""
+    for cell in getattr(handle._callback, "__closure__", None) or ():
+        try:
+            held = cell.cell_contents
+        except ValueError:  # It is empty.
+            continue
+        if inspect.iscoroutine(held) and inspect.getcoroutinestate(held) == inspect.CORO_CREATED:
+            held.close()
 
 
 def _given(args: Any) -> int:

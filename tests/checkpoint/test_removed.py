@@ -31,8 +31,8 @@ CHECKS = {
         "checkpoint/life/outcome_order.py",
         "    if turn is None and queue and isinstance(queue[0], TurnRemains):\n",
         "    if False:\n",
-        RACE_PROGRAMS,
-        "test_every_life_goes_the_same_way and task",
+        RACES,
+        "test_what_comes_while_a_turn_is_being_killed",
     ),
     "outcomes of a turn have their places in its order": Check(
         "checkpoint/home/input_ledger.py",

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import random
 import re
@@ -20,8 +21,7 @@ from tests.effects.race_player import WORLD, Helper, Play, Player, Ring, Told
 
 FIRST = int(os.environ.get("HOLDFAST_SEED", "1"))
 RACES = int(os.environ.get("HOLDFAST_RACES", "8"))
-SEEDS = [*range(FIRST, FIRST + RACES), 313]
-"""With the last one a message comes to a wait in the very moment in which the turn that was killed has ended."""
+SEEDS = range(FIRST, FIRST + RACES)
 NUMBERS = 6
 STRIKES = 8
 PAUSES = (0.0, 0.01, 0.02, 0.05, 0.3)
@@ -81,16 +81,28 @@ class Show:
             await asyncio.sleep(self.draw.choice(PAUSES))
 
     async def strike(self) -> None:
-        """Kill the player, and now and then the program."""
+        """Kill the player, restart it in good order or have it live elsewhere, and now and then kill the program."""
         for _ in range(STRIKES):
             await asyncio.sleep(self.draw.choice(PAUSES))
             if self.is_over:
                 return
-            if self.draw.random() < 0.7:
+            how = self.draw.choice(("kill", "kill", "crash") if self.seed % 2 else ("kill", "restart", "move", "crash"))
+            if how == "kill":
                 self.player.kill()
-            else:
+            elif how == "crash":
                 self.system = await self.simulation.crash_root()
                 await self.plant()
+            else:
+                with contextlib.suppress(hf.HoldfastError):  # It is being restarted, or the turn does not end in time.
+                    await self.change(how)
+
+    async def change(self, how: str) -> None:
+        """Restart the player in good order, or have it live in a process or as a task."""
+        if how == "restart":
+            await self.system.ref("/app", hf.Supervisor).ask(hf.RestartChild("player", running=True), timeout=5.0)
+        else:
+            place: Any = self.draw.choice(("task", "process"))
+            await self.system.set_isolation(self.player, place, timeout=2.0)
 
     async def judge(self) -> None:
         """Compare what was said to everybody, and to whom which ring went."""

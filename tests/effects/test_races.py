@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import os
 import signal
 from contextvars import Context
@@ -351,6 +352,50 @@ async def test_a_turn_is_killed_at_any_step_of_the_loop_and_goes_on(tmp_path: Pa
             if how == "message":
                 await ref.send(Cancel("done"))
             assert await asked == "done", f"killed after {steps} steps"
+
+
+class Gate(hf.Actor):
+    """Waits for an effect and a message at once; they come at once, too."""
+
+    may_go = asyncio.Event()
+
+    @hf.on(Cancel)
+    def cancel(self, message: Cancel) -> None: ...
+
+    @hf.on(Wait)
+    async def wait(self, message: Wait) -> str:
+        both: list[asyncio.Future[Any]] = [self.ctx.effect(self.pass_by), self.ctx.wait_for(Cancel)]
+        if message.how == "gather":
+            return str(await asyncio.gather(*both))
+        async with asyncio.TaskGroup() as group:
+            for one in both:
+                group.create_task(awaited(one))
+        return str([one.result() for one in both])
+
+    @classmethod
+    async def pass_by(cls) -> str:
+        await cls.may_go.wait()
+        return "passed"
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+@pytest.mark.parametrize("how", ["group", "gather"])
+async def test_what_comes_while_a_turn_is_being_killed_comes_again(tmp_path: Path, how: str) -> None:
+    async with running(tmp_path) as system:
+        for between, steps in itertools.product(range(4), range(9)):
+            Gate.may_go = asyncio.Event()
+            spec = hf.child(f"g{between}{steps}", hf.start(Gate), recovery=hf.hybrid(interval=1000.0))
+            ref = await system.start(spec)
+            asked = ref.ask(Wait(how), IN_TIME)
+            await asyncio.sleep(1.0)
+            Gate.may_go.set()
+            for _ in range(between):
+                await asyncio.sleep(0)
+            ref.tell(Cancel("now"))
+            for _ in range(steps):
+                await asyncio.sleep(0)
+            ref.kill()
+            assert await asked == "['passed', Cancel(word='now')]", f"{steps} steps behind {between}"
 
 
 # -- the record ------------------------------------------------------------------------------------------------------
