@@ -19,7 +19,38 @@ RACE_PROGRAMS = "tests/effects/test_race_programs.py"
 TIMERS = "tests/effects/test_timers_while_resting.py"
 IN_HAND = "tests/checkpoint/test_diverging_in_hand.py"
 
+SMALL_DISK = "tests/checkpoint/sqlite/test_small_disk.py"
+LONG_WAITS = "tests/effects/test_long_waits.py"
+
 CHECKS = {
+    "the WAL of a small store is begun anew before it is long": Check(
+        "checkpoint/sqlite/wal.py",
+        "        is_long = os.fstat(self._file()).st_size > self._most\n",
+        "        is_long = False\n",
+        SMALL_DISK,
+        "test_the_wal_of_a_small_store_stays_small",
+    ),
+    "a store that has filled its disk has the room of its WAL": Check(
+        "checkpoint/sqlite/open_store.py",
+        "            self._wal.make_room()\n",
+        "            pass\n",
+        SMALL_DISK,
+        "test_a_store_that_has_filled_its_disk and goes",
+    ),
+    "a long WAL goes into the database before the first write": Check(
+        "checkpoint/sqlite/ownership.py",
+        "                shorten(self._db, self.path)\n",
+        "",
+        SMALL_DISK,
+        "test_a_store_that_has_filled_its_disk and opened",
+    ),
+    "an opening without room says how much it needs": Check(
+        "checkpoint/sqlite/open_store.py",
+        "        if full is None:\n",
+        "        if True:\n",
+        SMALL_DISK,
+        "test_a_store_that_has_filled_its_disk and needs",
+    ),
     "a turn that is killed has given up nothing": Check(
         "checkpoint/life/outcome_order.py",
         "        if not is_killed(self._life.cell):\n",
