@@ -20,9 +20,23 @@ TIMERS = "tests/effects/test_timers_while_resting.py"
 IN_HAND = "tests/checkpoint/test_diverging_in_hand.py"
 
 SMALL_DISK = "tests/checkpoint/sqlite/test_small_disk.py"
-LONG_WAITS = "tests/effects/test_long_waits.py"
+CLOCKS_SET = "tests/effects/test_clocks_set.py"
 
 CHECKS = {
+    "a wait of so many seconds goes by a clock that nobody sets": Check(
+        "checkpoint/long_waits.py",
+        "left = when - (clock.wall() if is_moment else clock.passed())",
+        "left = (when if is_moment else home.ledger.waits.dues[place]) - clock.wall()",
+        CLOCKS_SET,
+        "test_so_many_seconds_last_as_long",
+    ),
+    "the next program waits no longer than was asked for": Check(
+        "checkpoint/long_waits.py",
+        "clock.passed() + min(left, out.seconds)",
+        "clock.passed() + left",
+        CLOCKS_SET,
+        "test_the_next_program_waits_no_longer",
+    ),
     "the WAL of a small store is begun anew before it is long": Check(
         "checkpoint/sqlite/wal.py",
         "        is_long = os.fstat(self._file()).st_size > self._most\n",
