@@ -1,7 +1,7 @@
 """Errands: the waiting work of a supervisor, as coroutines stepped in its turns; no turn ever waits.
 
 An errand is written as a coroutine. It is stepped in turns of the actor; where it waits, that turn ends, and when what
-it waits for has come, the rest is another item in the actor's mailbox. So the actor answers, and can be stopped, while
+it waits for has come, the rest is a turn ahead of the messages that wait. So the actor answers, and can be stopped, while
 children start and stop; and what an errand finds after a wait may be different from what it left.
 """
 
@@ -47,7 +47,9 @@ class Errand(Item):
     def _woken(self, awaited: asyncio.Future[Any]) -> None:
         cell = self._ctx._cell
         if not self._ctx._closed:
-            (cell.urge if self.is_urgent else cell.push)(self)
+            # Ahead of the orders that wait: who is among thousands is answered when it is done, and not behind all.
+            is_ahead = self.is_urgent or cell.more is None or not cell.more.suspended
+            (cell.urge if is_ahead else cell.push)(self)
         cell.node.errand_goes_on()
 
     @staticmethod

@@ -33,7 +33,16 @@ LINKS = "tests/actors/test_links.py"
 TURNS = "tests/supervision/test_turn_timeout.py"
 EFFECTS = "tests/effects/test_effect_processes.py"
 
+DYNAMIC = "tests/supervision/test_dynamic.py"
+
 CHECKS = {
+    "what an order waits for goes ahead of the orders that came later": Check(
+        "supervision/errands.py",
+        "            (cell.urge if is_ahead else cell.push)(self)\n",
+        "            (cell.urge if self.is_urgent else cell.push)(self)\n",
+        DYNAMIC,
+        "test_of_hundreds_that_start_at_once",
+    ),
     "a turn that rests behind mechanisms ends before its address changes": Check(
         "ftm/migration/group_moves.py",
         "        await self._group.quiet()\n",
