@@ -1,8 +1,8 @@
 """Errands: the waiting work of a supervisor, as coroutines stepped in its turns; no turn ever waits.
 
 An errand is written as a coroutine. It is stepped in turns of the actor; where it waits, that turn ends, and when what
-it waits for has come, the rest is a turn ahead of the messages that wait. So the actor answers, and can be stopped, while
-children start and stop; and what an errand finds after a wait may be different from what it left.
+it waits for has come, the rest is a turn ahead of the messages that wait. So the actor answers, and can be stopped,
+while children start and stop; and what an errand finds after a wait may be different from what it left.
 """
 
 from __future__ import annotations
