@@ -49,6 +49,8 @@ def shorten(db: sqlite3.Connection, path: str) -> None:
 
 def room_wanted(db: sqlite3.Connection, path: str) -> int:
     """Bytes with which the WAL can be brought into the database, and the store goes on, with the room of the WAL."""
+    pages: int
+    page_bytes: int
     (pages,) = db.execute("PRAGMA page_count").fetchone()
     (page_bytes,) = db.execute("PRAGMA page_size").fetchone()
     return max(0, pages * page_bytes - os.path.getsize(path)) + _BESIDE_BYTES

@@ -955,8 +955,8 @@ CHECKS = {
         "test_each_has_its_own_lane",
     ),
     "fsync: the journal is on the disk": Check(
-        "checkpoint/sqlite/open_store.py",
-        "        os.fdatasync(self._fd)\n",
+        "checkpoint/sqlite/wal.py",
+        "        os.fdatasync(self._file())\n",
         "        pass\n",
         "tests/checkpoint/sqlite/test_power.py",
         "test_a_power_loss and fsync",

@@ -36,12 +36,19 @@ EFFECTS = "tests/effects/test_effect_processes.py"
 DYNAMIC = "tests/supervision/test_dynamic.py"
 
 CHECKS = {
-    "what an order waits for goes ahead of the orders that came later": Check(
+    "who is up is answered ahead of those that are still to be started": Check(
         "supervision/errands.py",
-        "            (cell.urge if is_ahead else cell.push)(self)\n",
-        "            (cell.urge if self.is_urgent else cell.push)(self)\n",
+        "            if starts:",
+        "            if False:",
         DYNAMIC,
         "test_of_hundreds_that_start_at_once",
+    ),
+    "an order that came before a start was over is carried out before": Check(
+        "supervision/errands.py",
+        "            starts = 0 if self.is_urgent else _starts_behind(queue)\n",
+        "            starts = len(queue)\n",
+        "tests/control/test_stop.py",
+        "test_an_actor_may_stop_itself_in_on_start and uvloop-True",
     ),
     "a turn that rests behind mechanisms ends before its address changes": Check(
         "ftm/migration/group_moves.py",
