@@ -409,7 +409,7 @@ BEGUN: list[int] = []
 
 
 class Numbered(hf.Actor):
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int = 0) -> None:
         BEGUN.append(number)
 
 
