@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable
+from functools import partial
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import msgspec
@@ -17,12 +18,17 @@ if TYPE_CHECKING:
     from .journal import Entry
 
 LONGEST: Final = 3600.0
-"""Seconds after which a longer wait looks at the wall clock again: that may have been set, or the machine has slept."""
+"""Seconds after which a longer wait looks at its clock again: that may have been set, or the machine has slept."""
 HAD: Final = Answer(REPLY, "", msgspec.msgpack.encode(None))
 """What the sender of a message gets that a turn has waited for."""
 
 Place: TypeAlias = tuple[int, int]
 """A turn, and the number of its output."""
+
+
+def is_span(out: Out) -> bool:
+    """Whether a wait is over after so many seconds, and not at a moment, or never."""
+    return (out.verb == "sleep" and out.to == SINCE_THEN) or (out.verb == "wait" and out.seconds > 0)
 
 
 def due_entry(turn: int, k: int, when: float) -> Entry:
@@ -31,14 +37,19 @@ def due_entry(turn: int, k: int, when: float) -> Entry:
 
 
 class LongWaits:
-    """What the turn in hand at one home waits for. It ends with the life; the next one's turn waits again."""
+    """What the turn in hand at one home waits for. It ends with the life; the next one's turn waits again.
 
-    __slots__ = ("_clocks", "_home", "_since", "taken", "wanted")
+    A wait of so many seconds goes by a clock that nobody sets, over all lives of this program. What is left of it in
+    the next program only the wall clock tells; it is never more than those seconds.
+    """
+
+    __slots__ = ("_clocks", "_ends", "_home", "_since", "taken", "wanted")
 
     def __init__(self, home: Switch) -> None:
         self._home = home
         self._clocks: dict[Place, asyncio.TimerHandle] = {}
         self._since: dict[Place, float] = {}  # when the turn in hand first came there, in whichever life
+        self._ends: dict[Place, float] = {}  # when so many seconds are over, on the clock that nobody sets
         self.taken: dict[Place, Input] = {}  # the messages that the turn in hand has waited for
         self.wanted: dict[Place, str] = {}  # "A|B": types of messages, "": a moment; in the order of the waits
 
@@ -49,8 +60,9 @@ class LongWaits:
 
     def fix(self, turn: int, out: Out, batch: Batch) -> None:
         """Until when a turn waits is fixed when it first wants to, for all of its lives."""
-        if (out.verb == "sleep" and out.to == SINCE_THEN) or (out.verb == "wait" and out.seconds):
+        if is_span(out):
             home = self._home
+            self._ends[turn, out.k] = home.node.clock.passed() + out.seconds
             when = home.ledger.waits.dues[turn, out.k] = home.node.clock.wall() + out.seconds
             home.note(turn, due_entry(turn, out.k, when), batch)
 
@@ -67,9 +79,16 @@ class LongWaits:
                 return
         self.wanted[place] = names
         self._since = {known: when for known, when in self._since.items() if known[0] == turn}
-        self._since.setdefault(place, self._home.node.clock.wall())
-        if not names or out.seconds:
-            self._look(place, self._home.ledger.waits.dues.get(place, out.seconds))
+        self._ends = {known: when for known, when in self._ends.items() if known[0] == turn}
+        clock = self._home.node.clock
+        self._since.setdefault(place, clock.passed())
+        if is_span(out):
+            if place not in self._ends:  # Another program has begun to wait.
+                left = self._home.ledger.waits.dues.get(place, 0.0) - clock.wall()
+                self._ends[place] = clock.passed() + min(left, out.seconds)
+            self._look(place, self._ends[place], is_moment=False)
+        elif not names:
+            self._look(place, out.seconds, is_moment=True)
         if self.wanted:
             self.show(self._home.ledger.open.values())
 
@@ -96,12 +115,14 @@ class LongWaits:
         home.calls.outcome(*place, outcome, batch)
         batch.commit(home.journal)
 
-    def _look(self, place: Place, when: float) -> None:
+    def _look(self, place: Place, when: float, *, is_moment: bool) -> None:
         """End the wait of this place, if it is time; else look again later."""
         home = self._home
-        now = home.node.clock.wall()
-        if now < when:
-            self._clocks[place] = home.node.loop.call_later(min(when - now, LONGEST), self._look, place, when)
+        clock = home.node.clock
+        left = when - (clock.wall() if is_moment else clock.passed())
+        if left > 0:
+            again = partial(self._look, place, when, is_moment=is_moment)
+            self._clocks[place] = home.node.loop.call_later(min(left, LONGEST), again)
             return
         names = self.wanted[place]
         self.withdraw(place)
@@ -109,7 +130,7 @@ class LongWaits:
             answer = Answer(MOMENT)
         else:
             answer = Answer(*home.node.codec.encode_error(WaitTimeout(home.path, names.replace("|", " or "))))
-        home.calls.outcome(*place, timed(answer, now), None)
+        home.calls.outcome(*place, timed(answer, clock.wall()), None)
 
     def withdraw(self, place: Place) -> None:
         """Wait no more for what this output of the turn waits for, if anything."""
@@ -120,7 +141,7 @@ class LongWaits:
 
     def said(self) -> str:
         """What the turn in hand waits for, and for how long it has, in words; "" if it does not."""
-        now = self._home.node.clock.wall()
+        now = self._home.node.clock.passed()
         waits = ((names, now - self._since[place]) for place, names in self.wanted.items())
         return " and ".join(
             f"has waited for {seconds:.1f} s for {names.replace('|', ' or ')}"

@@ -113,9 +113,8 @@ def replay(
 
 
 def _show_turn(one: ReplayedTurn) -> None:
-    when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(one.time))
     sender = f" from {one.sender}" if one.sender else ""
-    typer.echo(f"turn {one.turn}: {one.type or one.kind} {_text(one.message)}{sender}, {when}")
+    typer.echo(f"turn {one.turn}: {one.type or one.kind} {_text(one.message)}{sender}, {_moment(one.time)}")
     if one.status != "ok":
         typer.echo(f"    {one.status}")
     if one.reply is not None:
@@ -123,10 +122,16 @@ def _show_turn(one: ReplayedTurn) -> None:
     for out in one.outputs:
         more = [_text(out["message"])] if "message" in out else []
         more += [f"after {out['seconds']:g} s"] if out.get("seconds") else []
+        more += [f"until {_moment(out['until'])}"] if "until" in out else []
         more += [f"and got {_text(out['got'])}"] if "got" in out else []
+        more += ["and waits for it"] if "waits" in out else []
         typer.echo(" ".join(filter(None, (f"    output {out['output']}:", out["verb"], out["to"], out["type"], *more))))
     for name, (before, after) in one.changes.items():
         typer.echo(f"    {name}: {_text(before)} -> {_text(after)}")
+
+
+def _moment(when: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(when))
 
 
 def _show_state(ended: ReplayedState) -> None:

@@ -1,21 +1,23 @@
 """Errands: the waiting work of a supervisor, as coroutines stepped in its turns; no turn ever waits.
 
 An errand is written as a coroutine. It is stepped in turns of the actor; where it waits, that turn ends, and when what
-it waits for has come, the rest is another item in the actor's mailbox. So the actor answers, and can be stopped, while
-children start and stop; and what an errand finds after a wait may be different from what it left.
+it waits for has come, the rest is another item in the actor's mailbox: behind all that is there, except for children
+that are still to be started. So the actor answers, and can be stopped, while children start and stop; and what an
+errand finds after a wait may be different from what it left.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Sequence
 from typing import Any
 
 from ..actors.errors import HoldfastError
-from ..actors.kernel import lifecycle
+from ..actors.kernel import lifecycle, mailbox
 from ..actors.kernel.context import ActorContext
-from ..actors.kernel.envelope import LEAVE, Item, ReplyHandle
+from ..actors.kernel.envelope import LEAVE, Ask, Envelope, Item, ReplyHandle
 from ..actors.kernel.message import Refusal
+from .admin import StartChild
 
 
 class Errand(Item):
@@ -47,7 +49,13 @@ class Errand(Item):
     def _woken(self, awaited: asyncio.Future[Any]) -> None:
         cell = self._ctx._cell
         if not self._ctx._closed:
-            (cell.urge if self.is_urgent else cell.push)(self)
+            queue = cell.queue or ()
+            starts = 0 if self.is_urgent else _starts_behind(queue)
+            if starts:  # Who is among thousands that start is answered when it is up, and not behind the last of them.
+                mailbox.queue_of(cell).insert(len(queue) - starts, self)
+                cell.schedule()
+            else:
+                (cell.urge if self.is_urgent else cell.push)(self)
         cell.node.errand_goes_on()
 
     @staticmethod
@@ -62,6 +70,19 @@ class Errand(Item):
         if item.is_over and item._first is not None:
             lifecycle.came_up(item._ctx._cell)
         return None
+
+
+def _starts_behind(queue: Sequence[Any]) -> int:
+    """How many orders to start a child there are behind everything else. (There may be thousands, at each call.)"""
+    count = 0
+    for item in reversed(queue):
+        kind = type(item)
+        if kind is Ask or kind is Envelope:
+            kind = type(item.message)
+        if kind is not StartChild:
+            break
+        count += 1
+    return count
 
 
 async def answered(ctx: ActorContext, handle: ReplyHandle[Any], work: Coroutine[Any, Any, Any]) -> None:

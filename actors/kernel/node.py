@@ -93,6 +93,11 @@ class Ports:
     """Runs a function with its arguments in a process of its own."""
 
 
+def _since_boot() -> float:
+    """Seconds since the machine was started, also those in which it has slept, where the system counts them."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME) if sys.platform == "linux" else monotonic()
+
+
 class Clock:
     """The times that a node goes by."""
 
@@ -101,6 +106,8 @@ class Clock:
         self.is_monotonic = abs(monotonic() - loop.time()) < SAME_CLOCK  # whether the loop has the machine's clock
         begin = time.time() - loop.time()  # On a virtual clock Unix time passes with the loop's, too.
         self.wall: Callable[[], float] = time.time if self.is_monotonic else lambda: begin + loop.time()
+        self.passed: Callable[[], float] = _since_boot if self.is_monotonic else loop.time
+        """Seconds that have passed since some moment: nobody sets this clock."""
 
     def is_past(self, deadline: float) -> bool:
         """Whether a deadline is over that was set in this process or another one of the system.

@@ -387,6 +387,7 @@ class SqliteJournal:
             with store.transaction(note=True):
                 pass
             try:
+                store.db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()  # Its room may be all that there is.
                 store.db.execute("VACUUM")
                 store.db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
             except sqlite3.Error as error:

@@ -24,14 +24,13 @@ from .position_mark import PositionMark
 from .sealing import format_of, may_have_log
 from .snapshot_files import SnapshotFiles, sync
 from .store_parts import Parts
+from .wal import Wal, room_wanted
 
 INSERT: Final = "INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)"
-_CHECKPOINT_BYTES: Final = 4 << 20
 _REFUSALS: Final = frozenset((errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT))
 _WRITABLE: Final = "have its folder there, and that and all files of the store writable to this user"
 LOOK_SECONDS: Final = 0.05
 """How long writes may be acknowledged after the store was deleted or replaced, before anybody looks."""
-_WAL_FRAMES: Final = 16384  # 64 MiB; beyond it a checkpoint may hold up the writers
 
 
 class Joint(NamedTuple):
@@ -41,30 +40,11 @@ class Joint(NamedTuple):
     doomed: list[str]
 
 
-class WalSync:
-    """The syncs of the WAL: one at a time, and only when something was committed since the last one."""
-
-    def __init__(self, path: str) -> None:
-        self._path, self._fd = path, -1
-        self.is_unsynced = True
-        self.lock = threading.Lock()
-
-    def begin(self) -> bool:
-        """Whether there is anything to sync; from now on what is committed is for the next one."""
-        if self._fd < 0:  # It has no locks: to close it later drops none.
-            self._fd = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC)
-        is_unsynced, self.is_unsynced = self.is_unsynced, False
-        return is_unsynced
-
-    def sync(self) -> None:
-        """Bring it to the disk. Raises OSError."""
-        os.fdatasync(self._fd)
-
-    def close(self) -> None:
-        """Close it, if it was ever synced."""
-        if self._fd >= 0:
-            fd, self._fd = self._fd, -1
-            os.close(fd)
+def is_full(error: BaseException | None) -> bool:
+    """Whether this is the operating system's, or SQLite's, word for a disk that is full."""
+    if isinstance(error, OSError):
+        return error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return isinstance(error, sqlite3.Error) and result_code(error) == sqlite3.SQLITE_FULL
 
 
 class Store:
@@ -94,9 +74,7 @@ class Store:
         self._mark = PositionMark(path)
         self.hands = InputsInHand(path)
         self.in_doubt = False
-        self._wal = WalSync(f"{path}-wal")
-        self._unsaved_bytes = 0  # written to the WAL since the last checkpoint, roughly
-        self._checkpointer: threading.Thread | None = None
+        self._wal = Wal(path, self.lock, self.translate)
 
     # ---- opening and closing
 
@@ -122,13 +100,28 @@ class Store:
                     with contextlib.suppress(sqlite3.Error):
                         self.claim.release()
                     raise
-            except BaseException:
+            except BaseException as error:
+                refusal = self._without_room(error)
                 self._disconnect()
+                if refusal is not None:
+                    raise refusal from error
                 raise
         except (sqlite3.Error, OSError) as error:
             raise self.translate(error) from error
         except UnicodeDecodeError as error:  # SQLite quotes a damaged schema, and Python cannot read the quotation.
             raise DamagedStore(self.path, None, None, "its tables are not as they were created") from error
+
+    def _without_room(self, error: BaseException) -> StoreFailed | None:
+        """What to say of an opening that has failed because the disk is full; None if that is not why."""
+        full = next((one for one in (error, error.__cause__) if is_full(one)), None)
+        if full is None:
+            return None
+        room = f"{room_wanted(self.db, self.path) / 1e6:.1f} MB"
+        return StoreFailed(
+            self.path,
+            f"{full}; nothing was written, make room for {room} and open it again; or have `holdfast store backup` "
+            "copy it to another disk",
+        )
 
     def _connect(self) -> None:
         is_there = self.parts.inspect()
@@ -146,7 +139,6 @@ class Store:
 
     def _configure(self) -> None:
         self.db.execute(f"PRAGMA synchronous = {'FULL' if self._fsync else 'NORMAL'}")
-        self.db.execute(f"PRAGMA journal_size_limit = {_WAL_FRAMES * 4096}")
 
     def _scan(self) -> None:
         """Take into memory what is in the file."""
@@ -201,9 +193,7 @@ class Store:
             clean = self.failure is None and not self.in_doubt
             self.failure = self.failure or StoreFailed(self.path, "it is closed")
             self._mark.close()
-            checkpointer = self._checkpointer
-        if checkpointer is not None:
-            checkpointer.join()  # not under the lock, which it may need
+        self._wal.join()
         with self.lock, self.read_lock:
             try:
                 with contextlib.suppress(sqlite3.Error):
@@ -236,6 +226,7 @@ class Store:
         self.log.close(remove=False)
         self.hands.close(remove=False)
         self.parts.close()
+        self._wal.join()
         self._wal.close()
         for db in (self.reader, self.db):
             with contextlib.suppress(sqlite3.Error):
@@ -271,8 +262,8 @@ class Store:
                     self.claim.write(self.contents.last, self.contents.live)
                 db.execute("COMMIT")
                 self._wal.is_unsynced = True
+                size += log.size + 8192
                 if log.is_due:
-                    self._unsaved_bytes += log.size
                     log.restart()
                 self.in_doubt = False
                 self._mark.set(self.contents.last)
@@ -281,11 +272,9 @@ class Store:
                     with contextlib.suppress(sqlite3.Error):
                         db.execute("ROLLBACK")
                 if isinstance(error, sqlite3.Error | OSError):
-                    raise self.translate(error) from error
+                    raise self._refused(error) from error
                 raise
-            self._unsaved_bytes += size + 8192
-            if self._unsaved_bytes > _CHECKPOINT_BYTES:
-                self._start_checkpoint()
+            self._wal.committed(db, size)
 
     @contextlib.contextmanager
     def together(self) -> Generator[None, None, None]:
@@ -325,7 +314,7 @@ class Store:
             (current,) = self.db.execute("SELECT epoch FROM store").fetchone()
             raise StaleEpoch(self.path, epoch=self.claim.epoch, current=current) from error
         except OSError as error:
-            raise self.translate(error) from error
+            raise self._refused(error) from error
         self.in_doubt = False
         self._mark.set(self.contents.last)
 
@@ -335,10 +324,10 @@ class Store:
         Without the lock while the disk works: the WAL only grows, or begins again when all of it is in the synced
         database; and its file stays the same for as long as somebody has it open.
         """
-        with self._wal.lock:
+        with self._wal.syncing:
             with self.lock:
                 self.refuse_failed()
-                last, is_unsynced = self.contents.last, self._wal.begin()
+                last, is_unsynced = self.contents.last, self._wal.begin_sync()
                 files, kept = self.log.promise(), self.log.kept()
             try:
                 if is_unsynced:
@@ -419,6 +408,12 @@ class Store:
         problem = self.parts.lost() or self.log.lost()
         return problem and f"{problem}: nothing is acknowledged any more; put the store back, and start again"
 
+    def _refused(self, error: sqlite3.Error | OSError) -> HoldfastError:
+        """Our error for a write that failed; if the disk is full, the room that the WAL takes may be had."""
+        if is_full(error):
+            self._wal.make_room()
+        return self.translate(error)
+
     def translate(self, error: sqlite3.Error | OSError) -> HoldfastError:
         """Our error for theirs; after damage or an I/O error the journal stops for good."""
         code = result_code(error)
@@ -477,25 +472,3 @@ class Store:
             yield view
         finally:
             db.execute("ROLLBACK")
-
-    # ---- checkpoints
-
-    def _start_checkpoint(self) -> None:
-        if self._checkpointer is None or not self._checkpointer.is_alive():
-            self._unsaved_bytes = 0
-            self._checkpointer = threading.Thread(target=self._checkpoint, name="holdfast-store", daemon=True)
-            self._checkpointer.start()
-
-    def _checkpoint(self) -> None:
-        """Bring the WAL into the database: in a thread, for it syncs twice, which takes milliseconds.
-
-        Writers go on meanwhile, so it seldom finds an end; only a WAL grown too long makes them wait for one.
-        """
-        try:
-            with contextlib.closing(connect(self.path)) as db:
-                _, frames, _ = db.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
-                if frames > _WAL_FRAMES:
-                    with self.lock:
-                        db.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
-        except sqlite3.Error as error:
-            self.translate(error)  # A failed sync stops the journal; a lock in the way does not.

@@ -17,6 +17,7 @@ from ..journal import DamagedStore, StoreInUse
 from .database import refuse_broken, refuse_foreign, result_code
 from .row_codec import crc_of
 from .store_parts import Parts, identity_of, lock_holder
+from .wal import shorten
 
 _KILL_SECONDS: Final = 10.0
 
@@ -96,6 +97,7 @@ class StoreClaim:
                 refuse_broken(self._db, self.path)
                 self._parts.compare(identity_of(self._db, self.path))
                 self._parts.lock()
+                shorten(self._db, self.path)
                 if self._write_in(seen):
                     return
             except sqlite3.OperationalError as error:

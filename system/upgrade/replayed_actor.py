@@ -10,7 +10,7 @@ import pdb  # noqa: T100  # it is what the user has asked for
 import sys
 import tempfile
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any, Final, cast
 
 from ...actors.errors import DamagedValue, ReplayDiverged, SpecError
@@ -20,9 +20,22 @@ from ...actors.kernel.node import Node
 from ...actors.process.wire.start_codec import loaded
 from ...actors.values.classes import find_class
 from ...checkpoint.home.homes import Homes
-from ...checkpoint.inputs import Turn
+from ...checkpoint.inputs import Input, Turn
 from ...checkpoint.method import hybrid
-from ...checkpoint.protocol import GIVEN_UP, LATER, NOTHING, REPLY, START, Answer, Out, untimed
+from ...checkpoint.protocol import (
+    AWAITED,
+    GIVEN_UP,
+    LATER,
+    MESSAGE,
+    MOMENT,
+    NOTHING,
+    REPLY,
+    SINCE_THEN,
+    START,
+    Answer,
+    Out,
+    untimed,
+)
 from ...checkpoint.recovery_file import load_recovery
 from ...checkpoint.schema import Shape, shape_of
 from ...checkpoint.snapshot.key_variables import save_state
@@ -36,6 +49,8 @@ from .new_program import NewProgram, load_specs
 
 TURN_TIMEOUT: Final = 30.0
 """Seconds that a turn may wait, unless a debugger is at work."""
+IN_HAND: Final = "in hand"
+"""The status of a turn that has begun and has not ended."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -49,9 +64,9 @@ class ReplayedTurn:
         message: its fields.
         sender: who has sent it; None: nobody, or somebody outside.
         time: when it was accepted, Unix time in seconds.
-        status: how it had ended: "ok", "stashed", or, not lived again, "failed" or "dropped".
+        status: how it had ended: "ok", "stashed", or, not lived again, "failed" or "dropped"; "in hand": it has not.
         reply: what was replied; None if nobody had asked.
-        outputs: what it has sent, in program order, with what it got for that.
+        outputs: what it has sent, in program order, with what it got for that. "waits": it waits for that still.
         changes: of the state: by variable what it was before, and what it is.
     """
 
@@ -104,7 +119,7 @@ def replay_actor(
     Args:
         store: the database.
         address: of the actor.
-        until: the last turn that is lived; all of them if left out.
+        until: the last turn that is lived; all of them if left out, and that in hand as far as it had come.
         since: the first turn that is told of; all that are kept if left out.
         target: the specs of the program (see `load_specs`). Left out, the recorded class is started without arguments.
         recovery: the recovery file of the program, if it has one.
@@ -201,6 +216,7 @@ class _Replay:
         first = kept[0] if since is None else max((turn for turn in kept if turn < since), default=kept[0])
         rerun = Rerun(self._homes, self._address, self._recipe, lives[kept.index(first)].saved)
         last = rerun.ledger.turn
+        in_hand = rerun.ledger.open.get(rerun.ledger.begun) if until is None and rerun.ledger.released else None
         until = last if until is None else until
         if not kept[0] <= until <= last:
             gone = f"turns up to {kept[0]} are only in a snapshot, and " if kept[0] >= 0 else ""
@@ -208,12 +224,12 @@ class _Replay:
         try:
             rerun.begin()
             self._turn, self._state = first, _state(rerun)
-            problem = await self._live(rerun, first + 1 if since is None else since, until)
+            problem = await self._live(rerun, first + 1 if since is None else since, until, in_hand)
         finally:
             await rerun.close()
         return ReplayedState(self._address, kept[0], last, self._turn, self._state, problem)
 
-    async def _live(self, rerun: Rerun, since: int, until: int) -> str:
+    async def _live(self, rerun: Rerun, since: int, until: int, in_hand: Input | None) -> str:
         """Why it has ended early; "" if it has not."""
         again = dict(rerun.turns)
         before = [one for one in rerun.turns if one[0] < since]
@@ -223,26 +239,37 @@ class _Replay:
             self._turn, self._state = min(since - 1, until), _state(rerun)
             for number, turn in wanted:
                 if number in again:
-                    await self._step(rerun, number, turn, breaks=self._breaks and number == until)
+                    breaks = self._breaks and number == until and in_hand is None
+                    self._told(
+                        await self._step(rerun, _input(number, turn), rerun.live([(number, turn)]), breaks=breaks)
+                    )
                 else:
                     self._told(_input(number, turn))
                 self._turn = number
+            if in_hand is not None:
+                ended = self._state
+                seen = _input(until + 1, Turn(in_hand, IN_HAND, []))
+                self._told(await self._step(rerun, seen, rerun.live_begun(), breaks=self._breaks))
+                self._state = ended  # What it has changed so far counts when it has ended.
         except (ReplayDiverged, LifeEnded) as error:
             return "the debugger was left" if self._debugger.quitting else str(error)
         except TimeoutError:
             return f"turn {rerun.turn} has not come to its end within {TURN_TIMEOUT:g} s"
         return ""
 
-    async def _step(self, rerun: Rerun, number: int, turn: Turn, *, breaks: bool) -> None:
+    async def _step(
+        self, rerun: Rerun, seen: ReplayedTurn, lived: Coroutine[Any, Any, object], *, breaks: bool
+    ) -> ReplayedTurn:
+        """Have a turn lived, in front of the debugger if `breaks`; what is to be told of it."""
         if breaks:
-            self._debugger.stop_in(_code(rerun.actor, turn))
+            self._debugger.stop_in(_code(rerun.actor, seen))
             try:
-                await rerun.live([(number, turn)])
+                await lived
             finally:
                 sys.settrace(None)
         else:
             async with asyncio.timeout(TURN_TIMEOUT):
-                await rerun.live([(number, turn)])
+                await lived
         before, after = self._state, _state(rerun)
         self._state = after
         changes = {
@@ -250,9 +277,9 @@ class _Replay:
             for name in {**before, **after}
             if before.get(name) != after.get(name)
         }
-        reply = None if rerun.end is None else _outcome(rerun, rerun.end.answer, turn.input.name)
-        outputs = [_output(rerun, number, out) for out in rerun.outs]
-        self._told(dataclasses.replace(_input(number, turn), reply=reply, outputs=outputs, changes=changes))
+        reply = None if rerun.end is None else _outcome(rerun, rerun.end.answer, seen.type)
+        outputs = [_output(rerun, seen.turn, out, is_over=seen.status != IN_HAND) for out in rerun.outs]
+        return dataclasses.replace(seen, reply=reply, outputs=outputs, changes=changes)
 
 
 def _state(rerun: Rerun) -> dict[str, Any]:
@@ -262,10 +289,10 @@ def _state(rerun: Rerun) -> dict[str, Any]:
     return variables if isinstance(variables, dict) else {"state": plain.get("state")}
 
 
-def _code(actor: Actor, turn: Turn) -> types.CodeType:
+def _code(actor: Actor, seen: ReplayedTurn) -> types.CodeType:
     """The code of the handler, or of the hook, that handles an input."""
-    name, kind = turn.input.name, type(actor)
-    handler: Any = kind._table[kind._table.kind_named(name)] if name else getattr(kind, f"on_{turn.input.kind}")
+    name, kind = seen.type, type(actor)
+    handler: Any = kind._table[kind._table.kind_named(name)] if name else getattr(kind, f"on_{seen.kind}")
     return cast("types.CodeType", inspect.unwrap(handler).__code__)
 
 
@@ -275,17 +302,20 @@ def _input(number: int, turn: Turn) -> ReplayedTurn:
     return ReplayedTurn(number, source.kind, source.name, message, source.sender, source.time, turn.status)
 
 
-def _output(rerun: Rerun, turn: int, out: Out) -> dict[str, Any]:
-    said: dict[str, Any] = {"output": out.k, "verb": out.verb, "to": out.to, "type": out.name}
+def _output(rerun: Rerun, turn: int, out: Out, *, is_over: bool) -> dict[str, Any]:
+    to = "" if out.to == SINCE_THEN else out.to
+    said: dict[str, Any] = {"output": out.k, "verb": out.verb, "to": to, "type": out.name}
     if out.body:
         said["message"] = plain_message(out.body, _shape(out.name.rpartition("|")[2]))
     if out.seconds:
-        said["seconds"] = out.seconds
+        said["until" if out.verb == "sleep" and not out.to else "seconds"] = out.seconds
     outcome = rerun.ledger.outcomes.get((turn, out.k))
     if outcome is not None:
         answer, _ = untimed(outcome)
         is_result = out.verb == "effect" and answer.kind == REPLY
         said["got"] = plain_result(answer.body) if is_result else _outcome(rerun, answer, out.name)
+    elif not is_over and out.verb in AWAITED and out.verb not in ("send", "publish"):
+        said["waits"] = True
     return said
 
 
@@ -295,6 +325,10 @@ def _outcome(rerun: Rerun, answer: Answer, asked: str) -> Any:
         return None
     if answer.kind == REPLY:
         return plain_message(answer.body, _reply_shape(asked))
+    if answer.kind == MOMENT:
+        return {"moment": True}
+    if answer.kind == MESSAGE:
+        return {"message": answer.name, "fields": plain_message(answer.body, _shape(answer.name))}
     if answer.kind in (LATER, GIVEN_UP):
         return {answer.kind: True}
     return {"error": rerun.said(answer)}

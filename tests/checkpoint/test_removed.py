@@ -19,7 +19,52 @@ RACE_PROGRAMS = "tests/effects/test_race_programs.py"
 TIMERS = "tests/effects/test_timers_while_resting.py"
 IN_HAND = "tests/checkpoint/test_diverging_in_hand.py"
 
+SMALL_DISK = "tests/checkpoint/sqlite/test_small_disk.py"
+CLOCKS_SET = "tests/effects/test_clocks_set.py"
+
 CHECKS = {
+    "a wait of so many seconds goes by a clock that nobody sets": Check(
+        "checkpoint/long_waits.py",
+        "left = when - (clock.wall() if is_moment else clock.passed())",
+        "left = (when if is_moment else home.ledger.waits.dues[place]) - clock.wall()",
+        CLOCKS_SET,
+        "test_so_many_seconds_last_as_long",
+    ),
+    "the next program waits no longer than was asked for": Check(
+        "checkpoint/long_waits.py",
+        "clock.passed() + min(left, out.seconds)",
+        "clock.passed() + left",
+        CLOCKS_SET,
+        "test_the_next_program_waits_no_longer",
+    ),
+    "the WAL of a small store is begun anew before it is long": Check(
+        "checkpoint/sqlite/wal.py",
+        "        is_long = os.fstat(self._file()).st_size > self._most\n",
+        "        is_long = False\n",
+        SMALL_DISK,
+        "test_the_wal_of_a_small_store_stays_small",
+    ),
+    "a store that has filled its disk has the room of its WAL": Check(
+        "checkpoint/sqlite/open_store.py",
+        "            self._wal.make_room()\n",
+        "            pass\n",
+        SMALL_DISK,
+        "test_a_store_that_has_filled_its_disk and goes",
+    ),
+    "a long WAL goes into the database before the first write": Check(
+        "checkpoint/sqlite/ownership.py",
+        "                shorten(self._db, self.path)\n",
+        "",
+        SMALL_DISK,
+        "test_a_store_that_has_filled_its_disk and opened",
+    ),
+    "an opening without room says how much it needs": Check(
+        "checkpoint/sqlite/open_store.py",
+        "        if full is None:\n",
+        "        if True:\n",
+        SMALL_DISK,
+        "test_a_store_that_has_filled_its_disk and needs",
+    ),
     "a turn that is killed has given up nothing": Check(
         "checkpoint/life/outcome_order.py",
         "        if not is_killed(self._life.cell):\n",
@@ -910,8 +955,8 @@ CHECKS = {
         "test_each_has_its_own_lane",
     ),
     "fsync: the journal is on the disk": Check(
-        "checkpoint/sqlite/open_store.py",
-        "        os.fdatasync(self._fd)\n",
+        "checkpoint/sqlite/wal.py",
+        "        os.fdatasync(self._file())\n",
         "        pass\n",
         "tests/checkpoint/sqlite/test_power.py",
         "test_a_power_loss and fsync",

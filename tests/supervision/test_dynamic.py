@@ -403,3 +403,26 @@ async def test_an_actor_in_a_process_starts_from_a_template_but_sends_no_code() 
         pool = await system.start(hf.dynamic("pool", template=hf.child(None, hf.start(Adder))))
         system.bind(boss, "pool", pool)
         assert await boss.ask(Hire(pool, "args")) == "/app/pool/w 3"
+
+
+BEGUN: list[int] = []
+
+
+class Numbered(hf.Actor):
+    def __init__(self, number: int = 0) -> None:
+        BEGUN.append(number)
+
+
+async def test_of_hundreds_that_start_at_once_each_is_answered_when_it_is_up() -> None:
+    BEGUN.clear()
+    count, begun_before = 300, list[int]()
+    async with hf.ActorSystem(log=False) as system:
+        top = await begin(system, template=hf.child(None, hf.start(Numbered), recovery=hf.hybrid()))
+
+        async def start(number: int) -> None:
+            await top.ask(hf.StartChild(args=(number,), id=f"n{number}"), timeout=60.0)
+            begun_before.append(len(BEGUN))
+
+        await asyncio.gather(*map(start, range(count)))
+    assert begun_before[0] < count / 2, f"the first was answered when {begun_before[0]} of {count} had begun"
+    assert begun_before[count // 2] < count

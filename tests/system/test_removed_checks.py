@@ -33,7 +33,23 @@ LINKS = "tests/actors/test_links.py"
 TURNS = "tests/supervision/test_turn_timeout.py"
 EFFECTS = "tests/effects/test_effect_processes.py"
 
+DYNAMIC = "tests/supervision/test_dynamic.py"
+
 CHECKS = {
+    "who is up is answered ahead of those that are still to be started": Check(
+        "supervision/errands.py",
+        "            if starts:",
+        "            if False:",
+        DYNAMIC,
+        "test_of_hundreds_that_start_at_once",
+    ),
+    "an order that came before a start was over is carried out before": Check(
+        "supervision/errands.py",
+        "            starts = 0 if self.is_urgent else _starts_behind(queue)\n",
+        "            starts = len(queue)\n",
+        "tests/control/test_stop.py",
+        "test_an_actor_may_stop_itself_in_on_start and uvloop-True",
+    ),
     "a turn that rests behind mechanisms ends before its address changes": Check(
         "ftm/migration/group_moves.py",
         "        await self._group.quiet()\n",

@@ -18,8 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from holdfast.checkpoint.journal import DamagedStore, Entry, StoreFailed
-from holdfast.checkpoint.sqlite import SqliteJournal
-from holdfast.checkpoint.sqlite import open_store as sqlite_store
+from holdfast.checkpoint.sqlite import SqliteJournal, wal
 from holdfast.checkpoint.sqlite.entry_chains import Chain
 from holdfast.checkpoint.sqlite.ownership import StoreClaim
 from tests.checkpoint.sqlite.stores import A, B, disown, edit, inputs, made, numbers, reopened
@@ -234,8 +233,8 @@ def test_appends_go_on_while_other_threads_cut_and_load(store: SqliteJournal) ->
 
 
 def test_the_wal_is_brought_into_the_database_meanwhile(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sqlite_store, "_CHECKPOINT_BYTES", 1 << 16)
-    monkeypatch.setattr(sqlite_store, "_WAL_FRAMES", 64)
+    monkeypatch.setattr(wal, "LEAST_BYTES", 1 << 16)
+    monkeypatch.setattr(wal, "MOST_BYTES", 64 * 4096)
     with closing(SqliteJournal(path)) as journal:
         sizes, count = [-1, 0], 0
         while sizes[-1] != sizes[-2]:  # The file does not shrink, but once it is written over it does not grow either.
@@ -243,8 +242,7 @@ def test_the_wal_is_brought_into_the_database_meanwhile(path: Path, monkeypatch:
             for number in range(count, count + 500):
                 journal.append(inputs(1, start=number))
             count += 500
-            if journal._store._checkpointer is not None:  # On a slow disk each round would end on another size.
-                journal._store._checkpointer.join()
+            journal._store._wal.join()  # On a slow disk each round would end on another size.
             sizes.append(os.path.getsize(f"{path}-wal"))
     assert numbers(reopened(path)) == list(range(count))
 
@@ -258,8 +256,8 @@ def wal_number(path: Path) -> int:
 def test_a_wal_that_has_grown_long_begins_anew_although_writers_never_rest(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sqlite_store, "_CHECKPOINT_BYTES", 1 << 16)
-    monkeypatch.setattr(sqlite_store, "_WAL_FRAMES", 64)
+    monkeypatch.setattr(wal, "LEAST_BYTES", 1 << 16)
+    monkeypatch.setattr(wal, "MOST_BYTES", 64 * 4096)
 
     with closing(SqliteJournal(path)) as journal:
         journal.append(inputs(1))
@@ -276,8 +274,8 @@ def test_a_checkpoint_that_leaves_a_long_wal_is_done_again_while_no_writer_goes_
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Somebody reads an old state during the first attempt, and has gone when the writers are held up."""
-    monkeypatch.setattr(sqlite_store, "_CHECKPOINT_BYTES", 1 << 19)
-    monkeypatch.setattr(sqlite_store, "_WAL_FRAMES", 64)
+    monkeypatch.setattr(wal, "LEAST_BYTES", 1 << 19)
+    monkeypatch.setattr(wal, "MOST_BYTES", 64 * 4096)
     with (
         closing(SqliteJournal(path)) as journal,
         closing(sqlite3.connect(path, isolation_level=None, check_same_thread=False)) as reader,
@@ -297,12 +295,12 @@ def test_a_checkpoint_that_leaves_a_long_wal_is_done_again_while_no_writer_goes_
         journal.append(inputs(1))
         reader.execute("BEGIN")
         reader.execute("SELECT count(*) FROM sqlite_master").fetchall()
-        monkeypatch.setattr(journal._store, "lock", Held())
+        monkeypatch.setattr(journal._store._wal, "_writers", Held())
         count = 1
-        while journal._store._checkpointer is None:
+        while os.path.getsize(f"{path}-wal") <= 1 << 19:
             journal.append(inputs(100, start=count))
             count += 100
-        journal._store._checkpointer.join()
+        journal._store._wal.join()
         assert checkpoints == ["again"]
         with open(f"{path}-shm", "rb") as index:
             words = struct.unpack("=25I", index.read(100))

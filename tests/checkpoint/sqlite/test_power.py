@@ -23,9 +23,9 @@ CUTS = int(os.environ.get("HOLDFAST_CUTS", "80"))
 
 WRITER = """
 import os, random, sys
-from holdfast.checkpoint.sqlite import SqliteJournal, append_log, open_store
+from holdfast.checkpoint.sqlite import SqliteJournal, append_log, wal
 from holdfast.checkpoint.journal import StoreFailed
-open_store._CHECKPOINT_BYTES, open_store._WAL_FRAMES, append_log.MOST_ROWS = 1 << 16, 32, 12
+wal.LEAST_BYTES, wal.MOST_BYTES, append_log.MOST_ROWS = 1 << 16, 32 * 4096, 12
 folder, seed, syncs, key = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "fsync", bytes.fromhex(sys.argv[4]) or None
 draw = random.Random(seed)
 journal = SqliteJournal(folder + "/app.db", takeover=True, key=key)

@@ -29,9 +29,9 @@ WRITER = """
 import os, random, sys
 import msgspec
 from holdfast.checkpoint.snapshot.snapshot_record import IMAGES, ClassRecord, Meta
-from holdfast.checkpoint.sqlite import SqliteJournal, append_log, open_store
+from holdfast.checkpoint.sqlite import SqliteJournal, append_log, wal
 path, seed, steps, key = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), bytes.fromhex(sys.argv[4]) or None
-append_log.MOST_ROWS, open_store._CHECKPOINT_BYTES = 12, 1 << 20
+append_log.MOST_ROWS, wal.LEAST_BYTES = 12, 1 << 20
 draw = random.Random(seed)
 journal = SqliteJournal(path, synchronous="fsync" if seed % 3 == 2 else "os", key=key)
 number, live, packs = 0, {0: [], 1: []}, {0: [], 1: []}

@@ -47,6 +47,25 @@ def test_each_turn_is_shown_and_the_state_after_the_last_one(store: Path) -> Non
     assert everything(store.parent) == before
 
 
+def test_a_turn_that_waits_is_shown_as_far_as_it_has_come(store: Path) -> None:
+    status, said, errors = replay(store, store.parent, "/app/trip", *SPEC)
+    assert (status, errors) == (0, "")
+    lines = re.sub(r", \d{4}-\d\d-\d\d \d\d:\d\d:\d\d", "", said).splitlines()
+    assert lines[2:] == [
+        "turn 1: shop:Book {}",
+        "    in hand",
+        '    output 1: effect done and got "seat"',
+        "    output 2: pipe",
+        "    output 3: timer 1.3 shop:Go {} after 3600 s",
+        "    output 4: wait shop:Go and waits for it",
+        '    seen: [] -> ["seat"]',
+        "/app/trip after turn 0 of 0:",
+        "    seen = []",
+    ]
+    _, said, _ = replay(store, store.parent, "/app/trip", *SPEC, "--until", "0")
+    assert "turn 1" not in said
+
+
 def test_the_state_after_each_kept_turn_can_be_had(store: Path) -> None:
     balances = []
     for turn in range(3, 9):
