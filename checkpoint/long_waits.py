@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 import msgspec
 
 from ..actors.errors import WaitTimeout
+from ..actors.kernel.cell import Rest
 from .inputs import Batch, Input
 from .protocol import MESSAGE, MOMENT, REPLY, SINCE_THEN, Answer, Glance, Glanced, Out, timed
 
@@ -33,12 +34,13 @@ def due_entry(turn: int, k: int, when: float) -> Entry:
 class LongWaits:
     """What the turn in hand at one home waits for. It ends with the life; the next one's turn waits again."""
 
-    __slots__ = ("_clocks", "_home", "_since", "taken", "wanted")
+    __slots__ = ("_clocks", "_home", "_since", "_until", "taken", "wanted")
 
     def __init__(self, home: Switch) -> None:
         self._home = home
         self._clocks: dict[Place, asyncio.TimerHandle] = {}
         self._since: dict[Place, float] = {}  # when the turn in hand first came there, in whichever life
+        self._until: dict[Place, float] = {}  # when the wait is over, in Unix time, if there is a limit
         self.taken: dict[Place, Input] = {}  # the messages that the turn in hand has waited for
         self.wanted: dict[Place, str] = {}  # "A|B": types of messages, "": a moment; in the order of the waits
 
@@ -101,6 +103,7 @@ class LongWaits:
         home = self._home
         now = home.node.clock.wall()
         if now < when:
+            self._until[place] = when
             self._clocks[place] = home.node.loop.call_later(min(when - now, LONGEST), self._look, place, when)
             return
         names = self.wanted[place]
@@ -114,20 +117,17 @@ class LongWaits:
     def withdraw(self, place: Place) -> None:
         """Wait no more for what this output of the turn waits for, if anything."""
         clock = self._clocks.pop(place, None)
+        self._until.pop(place, None)
         self.wanted.pop(place, None)
         if clock is not None:
             clock.cancel()
 
-    def said(self) -> str:
-        """What the turn in hand waits for, and for how long it has, in words; "" if it does not."""
-        now = self._home.node.clock.wall()
-        waits = ((names, now - self._since[place]) for place, names in self.wanted.items())
-        return " and ".join(
-            f"has waited for {seconds:.1f} s for {names.replace('|', ' or ')}"
-            if names
-            else f"has slept for {seconds:.1f} s"
-            for names, seconds in waits
-        )
+    def rests(self) -> list[Rest]:
+        """What the turn in hand waits for, since when and until when."""
+        return [
+            Rest("wait" if names else "sleep", names.replace("|", " or "), self._since[place], self._until.get(place))
+            for place, names in self.wanted.items()
+        ]
 
     def abandon(self) -> None:
         """Wait for nothing any more, since the life is over."""
