@@ -58,11 +58,11 @@ def _line(script: Path, error: Exception) -> str:
     return f"{script}:{lines[-1]}" if lines else str(script)
 
 
-def _missing(of: RemoteChange | RemoteRef | RemoteSystem, name: str) -> str:
+def _missing(of: RemoteChange | RemoteRef | RemoteSystem, name: str | None) -> str:
     """What a script has called that there is not, and what there is."""
     what = {RemoteChange: "a transaction", RemoteRef: "an actor", RemoteSystem: "the system"}[type(of)]
     there = sorted(one for one in dir(of) if not one.startswith("_"))
-    close = difflib.get_close_matches(name, there, 1)
+    close = difflib.get_close_matches(name or "", there, 1)
     meant = f"; did you mean {close[0]}?" if close else "."
     return f"{what} has no {name!r} in a script{meant} There are {', '.join(there)}"
 
