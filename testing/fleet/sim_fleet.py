@@ -224,12 +224,8 @@ class SimFleet:
             HoldfastError: it is none: nobody leads, if this is what `leader` has said; or it is not of this fleet.
         """
         if program not in self.programs or program is None:
-            why = (
-                "it runs none, or another fleet's"
-                if program is not None
-                else "nobody leads: wait until `leader()` is not None"
-            )
-            raise HoldfastError(f"SimFleet.kill takes a program that runs: {why}")
+            why = "this one does not" if program is not None else "nobody leads; wait until `leader()` is not None"
+            raise HoldfastError(f"SimFleet.kill takes a program that runs in this fleet: {why}")
         self.programs.remove(program)
         self._ending.append(program)
         program.kill()
