@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable
-from functools import partial
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 import msgspec
 
 from ..actors.errors import WaitTimeout
+from ..actors.kernel.cell import Rest
 from .inputs import Batch, Input
 from .protocol import MESSAGE, MOMENT, REPLY, SINCE_THEN, Answer, Glance, Glanced, Out, timed
 
@@ -49,7 +49,7 @@ class LongWaits:
         self._home = home
         self._clocks: dict[Place, asyncio.TimerHandle] = {}
         self._since: dict[Place, float] = {}  # when the turn in hand first came there, in whichever life
-        self._ends: dict[Place, float] = {}  # when so many seconds are over, on the clock that nobody sets
+        self._ends: dict[Place, tuple[float, bool]] = {}  # until when, on that clock; True: on the wall clock
         self.taken: dict[Place, Input] = {}  # the messages that the turn in hand has waited for
         self.wanted: dict[Place, str] = {}  # "A|B": types of messages, "": a moment; in the order of the waits
 
@@ -62,7 +62,7 @@ class LongWaits:
         """Until when a turn waits is fixed when it first wants to, for all of its lives."""
         if is_span(out):
             home = self._home
-            self._ends[turn, out.k] = home.node.clock.passed() + out.seconds
+            self._ends[turn, out.k] = home.node.clock.passed() + out.seconds, False
             when = home.ledger.waits.dues[turn, out.k] = home.node.clock.wall() + out.seconds
             home.note(turn, due_entry(turn, out.k, when), batch)
 
@@ -85,10 +85,11 @@ class LongWaits:
         if is_span(out):
             if place not in self._ends:  # Another program has begun to wait.
                 left = self._home.ledger.waits.dues.get(place, 0.0) - clock.wall()
-                self._ends[place] = clock.passed() + min(left, out.seconds)
-            self._look(place, self._ends[place], is_moment=False)
+                self._ends[place] = clock.passed() + min(left, out.seconds), False
+            self._look(place)
         elif not names:
-            self._look(place, out.seconds, is_moment=True)
+            self._ends[place] = out.seconds, True
+            self._look(place)
         if self.wanted:
             self.show(self._home.ledger.open.values())
 
@@ -115,14 +116,14 @@ class LongWaits:
         home.calls.outcome(*place, outcome, batch)
         batch.commit(home.journal)
 
-    def _look(self, place: Place, when: float, *, is_moment: bool) -> None:
+    def _look(self, place: Place) -> None:
         """End the wait of this place, if it is time; else look again later."""
         home = self._home
+        when, is_moment = self._ends[place]
         clock = home.node.clock
         left = when - (clock.wall() if is_moment else clock.passed())
         if left > 0:
-            again = partial(self._look, place, when, is_moment=is_moment)
-            self._clocks[place] = home.node.loop.call_later(min(left, LONGEST), again)
+            self._clocks[place] = home.node.loop.call_later(min(left, LONGEST), self._look, place)
             return
         names = self.wanted[place]
         self.withdraw(place)
@@ -139,16 +140,17 @@ class LongWaits:
         if clock is not None:
             clock.cancel()
 
-    def said(self) -> str:
-        """What the turn in hand waits for, and for how long it has, in words; "" if it does not."""
-        now = self._home.node.clock.passed()
-        waits = ((names, now - self._since[place]) for place, names in self.wanted.items())
-        return " and ".join(
-            f"has waited for {seconds:.1f} s for {names.replace('|', ' or ')}"
-            if names
-            else f"has slept for {seconds:.1f} s"
-            for names, seconds in waits
-        )
+    def rests(self) -> list[Rest]:
+        """What the turn in hand waits for, since when and until when."""
+        clock = self._home.node.clock
+        ago = clock.wall() - clock.passed()  # Unix time at the beginning of the other clock
+        found: list[Rest] = []
+        for place, names in self.wanted.items():
+            when, is_moment = self._ends.get(place, (None, True))
+            until = when if when is None or is_moment else when + ago
+            kind: Literal["wait", "sleep"] = "wait" if names else "sleep"
+            found.append(Rest(kind, names.replace("|", " or "), self._since[place] + ago, until))
+        return found
 
     def abandon(self) -> None:
         """Wait for nothing any more, since the life is over."""

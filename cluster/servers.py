@@ -69,8 +69,12 @@ class NatsServers:
     """
 
     def __init__(self, at: str, settings: Mapping[str, str | bool | int]) -> None:
+        kind, is_address, _ = at.partition("://")
+        if not is_address or kind not in ("nats", "tls"):
+            raise SpecError(
+                "servers", f"{kind.partition(':')[0]}: names no servers: nats://HOST,HOST/NAME or tls://... does"
+            )
         if find_spec("nats") is None:
-            kind = at.partition(":")[0]
             raise SpecError("store", f"{kind}:// needs the library nats-py: pip install 'holdfast[nats]'")
         from .nats.access import access_of  # only now: it imports that library
 

@@ -67,7 +67,7 @@ OPENED_TOGETHER = 32
 """Operations of a transaction that are opened in one step of the loop."""
 LONGEST_MESSAGE = 1000
 """Characters that are shown of a message that is followed."""
-_TREE = {"add", "remove", "move", "reorder", "strategy", "intensity", "isolation", "stop", "start"}
+_TREE = {"add", "remove", "move", "reorder", "strategy", "intensity", "isolation", "respecify", "stop", "start"}
 _LIVING = {"bind", "unbind", "register", "unregister", "suspend", "resume", "replace_state", "replace_code"}
 OPERATIONS = frozenset(_TREE | _LIVING | {"protect", "update"})
 NAMED = {"update": ("mechanism", "role")}
@@ -230,6 +230,9 @@ class ClientSession:
             for verb, args in operations:
                 if verb not in OPERATIONS:
                     raise BadRequest(f"there is no operation {verb!r}")
+                if verb == "respecify":
+                    change.respecify(args[0], **_options(args))
+                    continue
                 named = NAMED.get(verb, ())
                 at = len(args) - len(named)
                 if at < 0:
@@ -300,6 +303,15 @@ def _why_not_here(system: ActorSystem) -> str:
             return "it is being started, or waits for the servers of its store"
         case "leader" | "alone":
             return ""
+
+
+def _options(args: list[Any]) -> dict[str, Any]:
+    """The options of a child that came behind it. Raises BadRequest if these are none."""
+    match args:
+        case [_, dict() as options] if all(isinstance(name, str) for name in options):
+            return options
+        case _:
+            raise BadRequest("respecify takes a child and its options")
 
 
 def as_told(change: Change) -> dict[str, Any]:

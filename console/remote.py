@@ -604,6 +604,10 @@ class RemoteChange:
         """Have an actor live in a process of its own, or as a task."""
         self._put("isolation", target, isolation)
 
+    def respecify(self, target: RemoteTarget, **options: Any) -> None:
+        """Have a child restarted and stopped by other options from now on: those that `Change.respecify` takes."""
+        self._put("respecify", target, options)
+
     def bind(self, owner: RemoteTarget, port: str, target: RemoteTarget) -> None:
         """Have a binding lead to another actor."""
         self._put("bind", owner, port, text_of(target))

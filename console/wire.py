@@ -107,7 +107,7 @@ class PlainArg(Arg, tag="plain", array_like=True, frozen=True):
 
 
 class PackedArg(Arg, tag="packed", array_like=True, frozen=True):
-    """What has to be rebuilt: a child spec or recipe, a function, the recipe of a class, or mechanisms."""
+    """What has to be rebuilt: a child spec, recipe or options, a function, the recipe of a class, or mechanisms."""
 
     of: Literal["spec", "function", "code", "mechanism"]
     data: bytes
@@ -122,7 +122,7 @@ def pack_arg(value: Any, where: str) -> AnyArg:
     Raises:
         SpecError, UnsavableValue: it cannot be sent.
     """
-    if isinstance(value, (ChildSpec, Start)):
+    if isinstance(value, (ChildSpec, Start, dict)):
         return PackedArg("spec", pack_data(value, where))
     if isinstance(value, type) and issubclass(value, Actor):
         return PackedArg("code", pack_recipe(Start(value), where))

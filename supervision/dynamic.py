@@ -23,7 +23,7 @@ from ..actors.persistence import child_key
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.start_codec import pack_data, unpack_data
 from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
-from .children import STARTING, Child, StartRow, complete, tell_stopped
+from .children import STARTING, Child, StartRow, complete, tell_ended_with
 from .rules import Rule
 from .spec import NAMELESS, ChildSpec, Flags, Isolation, Plan, Restart, Shutdown, check_spec, child
 from .supervisor import Supervisor
@@ -287,7 +287,7 @@ async def stop_together(cells: list[Cell]) -> None:
             if cell.spec is not None:
                 cell.spec.judge(cell, SHUTDOWN, ended)
             if above is not None:
-                tell_stopped(cell, above.path, "its supervisor has ended")
+                tell_ended_with(cell, above.path)
             lifecycle.retire(cell, "its parent has stopped")
     finally:
         for timer in timers:

@@ -47,6 +47,7 @@ from .children import (
     begin_start,
     complete,
     new_cell,
+    tell_ended_with,
     tell_stopped,
 )
 from .decisions import affected, decide, is_reported
@@ -609,7 +610,7 @@ class Supervisor(Inquiries):
                 is_living = child.state not in (DOWN, GONE)
                 await child.node.stop_child(child)
                 if is_living and child.parent is self.ctx._cell:
-                    tell_stopped(child, self.ctx.path, "its supervisor has ended")
+                    tell_ended_with(child, self.ctx.path)
 
     def _is_parked(self, name: str) -> bool:
         """Whether this child was stopped by order, and not started since; also if it is forgotten by now."""

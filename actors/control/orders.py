@@ -444,6 +444,8 @@ class Status:
     """Who is bound to its ports: port to address."""
     turn_at: str = ""
     """The line of the user's code at which that turn waits, `shop.py:41, await reader.readline()`; "" if none does."""
+    turn_rests: str = ""
+    """What that turn waits for that is no other actor's work: a sleep, an effect that is out; "" if none is known."""
 
 
 def status_of(cell: Cell) -> Status:
@@ -467,7 +469,14 @@ def status_of(cell: Cell) -> Status:
         os.getpid(),
         {} if more is None else {port: target.path for port, target in more.bindings.items()},
         "" if turn is None else waits_at(turn.coroutine),
+        "" if turn is None else rests_said(cell),
     )
+
+
+def rests_said(cell: Cell) -> str:
+    """What the turn in hand waits for that is no other actor's work, in words; "" if none is known here."""
+    now = cell.node.clock.wall()
+    return " and ".join(rest.said(now) for rest in cell.host.rests(cell))
 
 
 def _state(cell: Cell) -> str:

@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from ..events import ActorKilled
-from .cell import RUNNING
+from .cell import RUNNING, Rest
 from .envelope import Ask, Item
 
 if TYPE_CHECKING:
@@ -82,6 +82,13 @@ class Home:
         turn, item = cell.more.turn if cell.more is not None else None, cell.item
         has_answered = isinstance(item, Ask) and item.is_done
         return Work(item, turn is not None, None if turn is None else turn.since, has_answered)
+
+    def rests(self, cell: Cell) -> list[Rest]:
+        """What the turn in hand waits for that is no other actor's work; empty if that is not known in this process."""
+        more = cell.more
+        if more is None or more.turn is None or not (begun := more.belongings.rests):
+            return []
+        return [rest for item, rest in begun.values() if item is more.turn.item]
 
     def mailbox(self, cell: Cell) -> Capacity | None:
         """How full the mailbox is; None if it takes any number of messages."""
@@ -293,6 +300,9 @@ class AddressHost:
 
     def work(self, cell: Cell) -> Work:
         return self.home.work(cell, self.place.running(cell))
+
+    def rests(self, cell: Cell) -> list[Rest]:
+        return self.home.rests(cell)
 
     def mailbox(self, cell: Cell) -> Capacity | None:
         return self.home.mailbox(cell)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextvars
 import dataclasses
+import time
 from collections import deque
 from collections.abc import Awaitable, Callable
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeAlias, cast
 
 from ..errors import ActorStopped, UnknownMessage, type_name
 from ..exit_reasons import KILLED, SHUTDOWN, ExitReason
@@ -127,6 +128,10 @@ class Host(Protocol):
         """What the actor is at, as far as is known in this process."""
         ...
 
+    def rests(self, cell: Cell) -> list[Rest]:
+        """What the turn in hand waits for that is no other actor's work, as far as is known in this process."""
+        ...
+
     def mailbox(self, cell: Cell) -> Capacity | None:
         """How full the mailbox is; None if it takes any number of messages."""
         ...
@@ -148,14 +153,52 @@ class GivenName:
     scope: Scope = "system"
 
 
+class Rest(NamedTuple):
+    """What a turn waits for that is no other actor's work: a moment, an effect that is out, or a message.
+
+    Attributes:
+        kind: "sleep", "effect" or "wait", as the methods of `ctx` are called.
+        name: of an effect its key, of a wait the classes of messages; "" for a sleep.
+        since: when it began, in Unix time.
+        until: when it ends at the latest, in Unix time; None: that is not known.
+    """
+
+    kind: Literal["sleep", "effect", "wait"]
+    name: str
+    since: float
+    until: float | None = None
+
+    def said(self, now: float) -> str:
+        """It in words, behind whoever waits; `now` is Unix time.
+
+        >>> Rest("effect", "charge", 10.0).said(12.0), Rest("wait", "shop:Call", 10.0).said(12.0)
+        ('waits for the effect charge, which has been out for 2.0 s', 'has waited for 2.0 s for shop:Call')
+        """
+        seconds = now - self.since
+        if self.kind == "effect":
+            return f"waits for the effect {self.name}, which has been out for {seconds:.1f} s"
+        if self.kind == "wait":
+            said = f"has waited for {seconds:.1f} s for {self.name}"
+            return said if self.until is None else f"{said}, until {_moment(self.until, now)} at the latest"
+        said = f"has slept for {seconds:.1f} s"
+        return said if self.until is None else f"{said}, and sleeps until {_moment(self.until, now)}"
+
+
+def _moment(at: float, now: float) -> str:
+    """A moment as people say it: with the day, if that is not within the next hours."""
+    form = "%H:%M:%S" if abs(at - now) < 12 * 3600.0 else "%Y-%m-%d %H:%M:%S"
+    return f"{time.strftime(form, time.localtime(at))} ({max(0.0, at - now):.1f} s from now)"
+
+
 class Belongings:
     """What a life has taken, and gives back at its end: background tasks, timers, subscriptions, names."""
 
-    __slots__ = ("names", "tasks", "timers", "topics")
+    __slots__ = ("names", "rests", "tasks", "timers", "topics")
 
     def __init__(self) -> None:
         self.names: dict[str, Scope] = {}
         self.tasks = Ordered[asyncio.Task[Any]]()
+        self.rests: dict[asyncio.Task[Any], tuple[Any, Rest]] | None = None  # with the item in hand when it began
         self.timers = Ordered[Any]()
         self.topics = Ordered[str]()
 

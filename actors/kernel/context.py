@@ -9,7 +9,7 @@ import uuid
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
 from contextvars import ContextVar, copy_context
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, TypeVarTuple, cast, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, TypeVarTuple, cast, overload
 
 from ..effects import EffectCall, Isolation, Retry, effect_of
 from ..errors import ActorStopped, AskDeadlock, HoldfastError, SpecError, remote_crash
@@ -17,6 +17,7 @@ from ..exit_reasons import NORMAL, ExitReason
 from ..seconds import check_seconds
 from . import links, mailbox
 from .blocking_handlers import is_async
+from .cell import Rest
 from .envelope import (
     NO_DEADLINE,
     Ask,
@@ -431,7 +432,7 @@ class ActorContext:
     def _performed(self, effect: EffectCall) -> asyncio.Future[object]:
         """The outcome of an effect: without recovery, whatever it comes to now."""
         self._token = self._token or self._cell.node.numbers.next_token()
-        return self._beside(self._perform(effect), "effect")
+        return self._resting(self._perform(effect), "effect", effect.key, None)
 
     def _perform(self, effect: EffectCall) -> Coroutine[Any, Any, object]:
         """Perform it here and now."""
@@ -466,8 +467,19 @@ class ActorContext:
 
     def _slept(self, seconds: float, *, is_moment: bool) -> asyncio.Future[None]:
         """Wait until a moment, or for so many seconds: without recovery, in this life."""
-        left = seconds - self._cell.node.clock.wall() if is_moment else seconds
-        return self._beside(asyncio.sleep(left), "sleep")
+        now = self._cell.node.clock.wall()
+        left = seconds - now if is_moment else seconds
+        return self._resting(asyncio.sleep(left), "sleep", "", now + max(0.0, left))
+
+    def _resting(
+        self, work: Coroutine[Any, Any, T], kind: Literal["sleep", "effect"], name: str, until: float | None
+    ) -> asyncio.Task[T]:
+        """A task of this life, of which those who look see that the turn in hand rests in it."""
+        task, belongings = self._beside(work, kind), self._cell.extra().belongings
+        rests = belongings.rests = {} if belongings.rests is None else belongings.rests
+        rests[task] = self._item, Rest(kind, name, self._cell.node.clock.wall(), until)
+        task.add_done_callback(rests.pop)
+        return task
 
     def wait_for(self, *kinds: type[M], timeout: float | None = None) -> asyncio.Future[M]:
         """Have the turn in hand wait for a message of one of these classes: a signal. It needs recovery.

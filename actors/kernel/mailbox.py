@@ -65,9 +65,18 @@ def admit_gone(cell: Cell, item: Any) -> None:
     if successor is not None:
         successor.admit(successor, item)
     elif isinstance(item, Item):
-        item.undelivered(cell, "nobody lives at its address now")
+        item.undelivered(cell, _gone_at(cell))
     else:
         cell.node.dead_letter(cell, item, "the actor has stopped")
+
+
+def _gone_at(cell: Cell) -> str:
+    """Why nobody is at an address."""
+    root = cell.node.root
+    if root is None or cell.parent is not None or cell.path.split("/")[1:2] == root.path.split("/")[1:2]:
+        return "nobody lives at its address now"
+    name = root.path.split("/")[1]
+    return f"it is of another system than {name}, and a ref that was sent does not lead there: `hf.connect` does"
 
 
 def queue_of(cell: Cell) -> deque[Any]:

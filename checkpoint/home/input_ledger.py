@@ -638,10 +638,17 @@ def said_of(out: Out) -> str:
     ('tell of shop:Sold to /app/cart', 'effect charge')
     >>> said_of(Out(1, "timer", "0.1", "shop:Expire", seconds=1800.0))
     'timer of shop:Expire after 1800.0 s'
+    >>> said_of(Out(1, "wait", "since then", "shop:Paid|shop:Cancel", seconds=60.0))
+    'wait for shop:Paid or shop:Cancel, for 60 s at most'
     """
     if out.verb == "timer":  # `to` is the number by which its home knows it.
         again = f" and then every {out.interval} s" if out.interval else ""
         return f"timer of {out.name} after {out.seconds} s{again}"
+    if out.verb == "sleep":  # `to` says from when on its seconds count, if that is no moment.
+        return f"sleep for {out.seconds:g} s" if out.to else "sleep until a moment"
+    if out.verb == "wait":
+        limit = f", for {out.seconds:g} s at most" if out.seconds else ""
+        return f"wait for {out.name.replace('|', ' or ')}{limit}"
     return f"{out.verb} of {out.name} to {out.to}" if ":" in out.name else f"{out.verb} {out.to}".strip()
 
 

@@ -109,7 +109,7 @@ class Outputs:
         if turn <= home.ledger.turn:
             return  # It left with the end of its turn, which has not waited for it.
         if out.verb == "effect":
-            home.calls.order(turn, out.k)
+            home.calls.order(turn, out)
         else:
             home.calls.rests.begin(turn, key, out)
 

@@ -9,7 +9,7 @@ import msgspec
 
 from ...actors.errors import AskTimeout, BadMessage, BadReply, EffectInDoubt, HoldfastError, type_name
 from ...actors.events import EffectRepeated
-from ...actors.kernel.cell import Cell
+from ...actors.kernel.cell import Cell, Rest
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import NO_DEADLINE, Ask, ReplyHandle
 from ...actors.process.wire.peer import RelayedAsk, asked
@@ -17,7 +17,6 @@ from ..inputs import Batch, Input
 from ..long_waits import LongWaits
 from ..protocol import (
     GIVEN_UP,
-    LEADS_NOWHERE,
     MESSAGE,
     REPLY,
     Answer,
@@ -152,6 +151,7 @@ class PendingCalls:
         asks: asks of its own turns, by (turn, output).
         sends: sends and publications of its own turns whose receivers have no room yet.
         rests: moments and messages that its own turns wait for.
+        effects: effects of its turn in hand that are out.
         later: asks of others that are to be answered later, by input.
         owed: the same as read back from the store: asker and origin.
     """
@@ -161,6 +161,7 @@ class PendingCalls:
         self.asks: dict[tuple[int, int], SwitchAsk] = {}
         self.sends: set[tuple[int, int]] = set()
         self.rests = LongWaits(home)
+        self.effects: dict[tuple[int, int], Rest] = {}
         self.later: dict[int, Ask] = {}
         self.owed: dict[int, tuple[str, str]] = {}
 
@@ -218,23 +219,29 @@ class PendingCalls:
             return
         source = home.ledger.open.get(key)
         home.node.emit(EffectRepeated(home.path, out.to, "" if source is None else source.name))
-        self.order(turn, out.k)
+        self.order(turn, out)
+
+    def resting(self) -> list[Rest]:
+        """What the turn in hand waits for that is no other actor's work."""
+        ledger = self._home.ledger
+        effects = [one for place, one in self.effects.items() if place[0] > ledger.turn]
+        return [*self.rests.rests(), *effects]
 
     def said(self) -> str:
         """What the turn in hand waits for, in words; "" if that is not known."""
-        ledger = self._home.ledger
-        turn, effects = ledger.turn + 1, 0
-        for k, digest in enumerate(ledger.released, 1):
-            is_over = (turn, k) in ledger.outcomes or (turn, k) in self.rests.wanted
-            effects += digest >= LEADS_NOWHERE and not is_over
+        now = self._home.node.clock.wall()
         asked = [f"waits for an answer of {ask.to.path}" for ask in self.asks.values() if ask.to is not None]
-        said = [self.rests.said(), "waits for an effect that is out" if effects else "", *asked]
-        return " and ".join(filter(None, said))
+        return " and ".join([*(rest.said(now) for rest in self.resting()), *asked])
 
-    def order(self, turn: int, k: int) -> None:
+    def order(self, turn: int, out: Out) -> None:
         """Have the present life perform an effect: all that precedes it is safe."""
+        place = turn, out.k
+        if place not in self.effects:  # Else it is done again by a later life.
+            if self.effects and next(iter(self.effects))[0] != turn:
+                self.effects.clear()  # An earlier turn has ended without waiting for them.
+            self.effects[place] = Rest("effect", out.to, self._home.node.clock.wall())
         if self._home.life.port is not None:
-            self._home.life.port.to_life(Perform(turn, k, self._home.life.token))
+            self._home.life.port.to_life(Perform(turn, out.k, self._home.life.token))
 
     def performed(self, record: Performed) -> None:
         """An effect of the turn in hand has come to something; what it comes to later, or once more, is of no use."""
@@ -269,6 +276,7 @@ class PendingCalls:
         """An output of ours has an outcome: journal it, then tell the turn that waits."""
         own = batch if batch is not None else Batch()
         ask = self.asks.pop((turn, k), None)
+        self.effects.pop((turn, k), None)
         kept = self._home.ledger.note_outcome(turn, k, answer)
         if kept is not None:
             if self._home.journal.durable:
@@ -286,6 +294,7 @@ class PendingCalls:
         for ask in self.asks.values():
             ask.is_over, ask.future = True, OVER
         self.asks.clear()
+        self.effects.clear()
         self.sends.clear()
         self.rests.abandon()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import difflib
 import traceback
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import typer
 
 from ...actors.errors import HoldfastError, SpecError
 from ...system.script import load_script
-from ..remote import RemoteChange, RemoteSystem
+from ..remote import RemoteChange, RemoteRef, RemoteSystem
 from .reaching import FAILED, GREETING_SECONDS, UNUSABLE, chosen, ended, told
 
 
@@ -25,11 +26,11 @@ def run_script(script: Path, system: str | None, socket: Path | None, *, dry_run
         path = chosen(system, socket)
         with RemoteSystem(path, dry_run=dry_run, timeout=timeout, script=source, told=_show) as remote:
             remote.greet(GREETING_SECONDS)
-            _run(loaded.reconfigure, remote)
+            _run(loaded.reconfigure, remote, script)
     typer.echo("nothing was done: this was a dry run" if dry_run else "done")
 
 
-def _run(reconfigure: object, system: RemoteSystem) -> None:
+def _run(reconfigure: object, system: RemoteSystem, script: Path) -> None:
     async def main() -> None:
         await reconfigure(system)  # type: ignore[operator]  # it was looked at when it was loaded
 
@@ -37,9 +38,33 @@ def _run(reconfigure: object, system: RemoteSystem) -> None:
         asyncio.run(main())
     except HoldfastError:
         raise
-    except Exception as error:  # The script's own: its user wants to see where.
-        typer.echo(traceback.format_exc(), err=True)
-        raise typer.Exit(FAILED) from error
+    except AttributeError as error:
+        if not isinstance(error.obj, (RemoteChange, RemoteRef, RemoteSystem)):
+            raise _own(error) from error
+        raise SpecError(_line(script, error), _missing(error.obj, error.name)) from error
+    except Exception as error:
+        raise _own(error) from error
+
+
+def _own(error: Exception) -> typer.Exit:
+    """What ends a script by an error of its own: its user wants to see where."""
+    typer.echo("".join(traceback.format_exception(error)), err=True)
+    return typer.Exit(FAILED)
+
+
+def _line(script: Path, error: Exception) -> str:
+    """The line of the script in which an error was raised."""
+    lines = [one.lineno for one in traceback.extract_tb(error.__traceback__) if Path(one.filename).name == script.name]
+    return f"{script}:{lines[-1]}" if lines else str(script)
+
+
+def _missing(of: RemoteChange | RemoteRef | RemoteSystem, name: str | None) -> str:
+    """What a script has called that there is not, and what there is."""
+    what = {RemoteChange: "a transaction", RemoteRef: "an actor", RemoteSystem: "the system"}[type(of)]
+    there = sorted(one for one in dir(of) if not one.startswith("_"))
+    close = difflib.get_close_matches(name or "", there, 1)
+    meant = f"; did you mean {close[0]}?" if close else "."
+    return f"{what} has no {name!r} in a script{meant} There are {', '.join(there)}"
 
 
 def _show(change: RemoteChange) -> None:

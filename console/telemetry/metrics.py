@@ -68,6 +68,9 @@ class Metrics(Collector):
     the event loop then reads what there is, a millisecond at a time, and is not held up. On the loop's own thread,
     where nothing can be waited for, a scrape gets what the one before has asked for; `asgi` has no such delay.
 
+    Each system needs a registry of its own: `register` raises ValueError for a second `Metrics`, whose families have
+    the same names.
+
     Args:
         system: that runs.
         addresses: whose mailboxes are told one by one; the others are added up by class.

@@ -82,7 +82,7 @@ class Backlog:
 
     def clear(self) -> None:
         """Forget what waits, such as after a restart; what was usual is kept."""
-        self.since, self.has_grown = None, False
+        self.since, self.has_grown, self.is_empty = None, False, False
 
     def _begin(self, waiting: int, now: float) -> None:
         self.trough = self.peak = self.least = waiting

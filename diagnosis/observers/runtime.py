@@ -7,7 +7,7 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Mapping
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from ...actors.control.orders_lane import OrderAsk
 from ...actors.errors import AskTimeout
@@ -52,6 +52,8 @@ class _Seen:
     """When it was seen to get on for the last time."""
     idle: float = 0.0
     """When it was seen with nothing to do for the last time: who has nothing to do does not stand still."""
+    rested: float = -math.inf
+    """When it was seen for the last time to rest in its turn, as that has said: in a sleep, or an effect."""
     is_in_turn: bool = False
     """Whether it had something in hand at the last look."""
     turns: int = 0
@@ -68,6 +70,8 @@ class _Seen:
     backlog: Backlog = dataclasses.field(default_factory=Backlog)
     waited: deque[str] = dataclasses.field(default_factory=lambda: deque(maxlen=USUAL))
     """Whom it waited for at the last looks."""
+    denied: dict[Literal, float] = dataclasses.field(default_factory=dict[Literal, float])
+    """When there was a reason for the last time to say that something does not hold."""
 
     def take(self, work: Work, life: int, now: float, patience: float) -> bool:
         """Learn from what it has in hand at a look. Returns whether it has got on since the last one."""
@@ -86,13 +90,29 @@ class _Seen:
         return has_got_on
 
 
+class _Shown(NamedTuple):
+    """What one look shows of an actor that is up."""
+
+    is_late: bool
+    """Others wait for it too long, or messages do, while it does not rest as it has said."""
+    is_asked: bool
+    """An ask of it waits, or has run out lately."""
+    is_full: bool
+    """Its mailbox has taken nothing for too long."""
+    is_bounded: bool
+    has_got_on: bool
+    has_answered: bool
+
+
 class RuntimeObserver(Observer):
     """Says who gets on, answers, keeps up, ends again and again, whose mailbox is full, and who waits for whom.
 
     An actor is late if asks of it were not answered in time, or if others wait for it longer than the longest turn it
-    was seen to need, four times over. Who is late because it waits for another one is not accused: the last one in that
-    row is, also if a mailbox only grows because each turn waits for it. If the row leads back to its beginning, all in
-    the circle are. Of an actor that nobody has asked anything nothing is said.
+    was seen to need, four times over. So it is if messages wait that it was only told; but then it may rest, in a sleep
+    or an effect of its own (`ctx.sleep`, `ctx.effect`). Who is late because it waits for another one is not accused:
+    the last one in that row is, also if a mailbox only grows because each turn waits for it. If the row leads back to
+    its beginning, all in the circle are. Whether an actor answers is said only if it was asked. What is said against
+    one is taken back when it is true again, and else is unknown `time_to_live` seconds after the last reason for it.
 
     Args:
         actors: component to address; it may change, and what is in it at a look is looked at.
@@ -177,11 +197,11 @@ class RuntimeObserver(Observer):
         self._take_failures(names)
         self._take_crashes(names)
         waits, asked_since = self._waits(names, now)
-        late: dict[str, bool] = {}
+        shown: dict[str, _Shown] = {}
         for component, path in self._actors.items():
             cell = self._node.find(path)
             if cell is not None and cell.state is RUNNING and cell.host.is_up(cell):
-                late[component] = self._is_late(component, cell, asked_since.get(component), waits, now)
+                shown[component] = self._look_at(component, cell, asked_since.get(component), waits, now)
             else:
                 seen = self._seen(component)
                 seen.full = None
@@ -189,7 +209,7 @@ class RuntimeObserver(Observer):
                 for atom in (progress(component), replies(component), room(component), keeps_up(component)):
                     if component not in self._loops:
                         self.verdict(atom, None)
-        self._tell(late, waits, now)
+        self._tell(shown, waits)
         if self._node.clock.is_monotonic:
             self._rests_until = now + (time.thread_time() - began) * SHARE
 
@@ -199,7 +219,7 @@ class RuntimeObserver(Observer):
         since: dict[str, float] = {}
         for to, ask in open_asks(self._node, MOST):
             callee = names.get(to.path)
-            if callee is None:
+            if callee is None or isinstance(ask, OrderAsk):
                 continue
             since[callee] = min(since.get(callee, now), ask.deadline - ask.timeout)
             asker = names.get(ask.sender.path) if ask.sender is not None else None
@@ -249,70 +269,77 @@ class RuntimeObserver(Observer):
             seen = self._known[component] = _Seen(since=self.now)
         return seen
 
-    def _is_late(
+    def _look_at(
         self, component: str, cell: Cell, asked_since: float | None, waits: Mapping[str, set[str]], now: float
-    ) -> bool:
+    ) -> _Shown:
         seen = self._seen(component)
         work, backlog = cell.host.work(cell), cell.host.backlog(cell)
         has_got_on = seen.take(work, cell.life, now, self._patience)
         waits_now = sorted(waits.get(component, ()))
         seen.waited.append(waits_now[0] if waits_now else "")
-        aside = len(cell.more.stash or ()) if cell.more is not None else 0  # It may never be taken up again.
-        seen.backlog.take(backlog + aside, now)
-        limit = max(self._patience, LONGER * seen.longest) if seen.turns >= LOOKS else float("inf")
+        usual = max(self._patience, LONGER * seen.longest)
+        limit = usual if seen.turns >= LOOKS else float("inf")
         is_busy = work.is_in_turn or backlog > 0
         if not is_busy:
             seen.idle = now
-        is_wanted = asked_since is not None or backlog > 0
         while seen.unanswered and now - seen.unanswered[0][0] > self.manner.time_to_live:
             seen.unanswered.popleft()
-        stands = is_busy and is_wanted and now - max(seen.since, seen.idle) > limit
+        stood = now - max(seen.since, seen.idle)
+        keeps_waiting = asked_since is not None and min(stood, now - asked_since) > limit
+        # Who tells it something does not wait for that: it may rest in its turn, now and then for a moment in no wait.
+        if is_busy and backlog > 0 and 2 * stood > self._patience and cell.host.rests(cell):
+            seen.rested = now
+        is_at_rest = is_busy and stood > usual and now - seen.rested <= usual
+        stands = is_busy and backlog > 0 and stood > limit and not is_at_rest
+        if is_at_rest:  # What waits does so because of the outside: that is no leak.
+            seen.backlog.clear()
+            self.verdict(keeps_up(component), None)
+        else:
+            aside = len(cell.more.stash or ()) if cell.more is not None else 0  # It may never be taken up again.
+            seen.backlog.take(backlog + aside, now)
         # A turn that was under way when an ask of it ran out, and still is; or several asks that ran out.
         unanswered = [at for at, made in seen.unanswered if is_busy and seen.since <= max(made, at - self._patience)]
-        is_late = stands or bool(unanswered) or len(seen.unanswered) > 1
-        is_full = self._is_full(component, cell, now)
-        if not is_late and not is_full and component not in self._loops:
-            self._tell_good(component, has_got_on, has_got_on and work.has_answered and not seen.unanswered)
-        return is_late or is_full
+        is_late = keeps_waiting or stands or bool(unanswered) or len(seen.unanswered) > 1
+        return _Shown(
+            is_late,
+            asked_since is not None or bool(seen.unanswered),
+            self._is_full(component, cell, now),
+            cell.host.mailbox(cell) is not None,
+            has_got_on,
+            has_got_on and work.has_answered and not seen.unanswered,
+        )
 
     def _is_full(self, component: str, cell: Cell, now: float) -> bool:
         """Whether its mailbox has taken nothing for too long."""
         seen, bound = self._seen(component), cell.host.mailbox(cell)
         turns_away = bound is not None and bound.overflow not in DROPS and bound.count >= bound.capacity
         seen.full = None if cell.has_room and not turns_away else now if seen.full is None else seen.full
-        is_full = seen.full is not None and now - seen.full >= self._patience
-        if bound is not None and not is_full:
-            self.verdict(room(component), True)
-        return is_full
-
-    def _tell_good(self, component: str, has_got_on: bool, answers: bool) -> None:
-        """Say of who is not late what it was seen to do, and for a while what it was seen to do before."""
-        seen, now, keeps = self._known[component], self.now, self.manner.time_to_live
-        was = None if now - seen.since > keeps else self.said(progress(component))
-        self.verdict(progress(component), True if has_got_on else was)
-        has_refused = now - seen.refused <= keeps
-        self.verdict(replies(component), None if has_refused else True if answers else self.said(replies(component)))
+        return seen.full is not None and now - seen.full >= self._patience
 
     # -- blaming ----------------------------------------------------------------------------------------------------
 
-    def _tell(self, late: Mapping[str, bool], waits: Mapping[str, set[str]], now: float) -> None:
-        """Accuse whoever those who are late wait for in the end."""
+    def _tell(self, shown: Mapping[str, _Shown], waits: Mapping[str, set[str]]) -> None:
+        """Accuse whoever those who are late wait for in the end, and say of the others what they were seen to do."""
         waiting: set[Literal] = set()
-        accused = self._ends((one for one, is_late in late.items() if is_late), waits, waiting)
-        growing = [one for one in late if self._known[one].backlog.has_grown]
+        accused = self._ends((one for one, of_it in shown.items() if of_it.is_late or of_it.is_full), waits, waiting)
+        awaited = {literal.args[1] for literal in waiting}
+        growing = [one for one in shown if self._known[one].backlog.has_grown]
         # What they wait for at just this moment says little: they get on.
         overrun = self._ends(growing, {}, waiting)
-        for component, is_late in late.items():
-            if component in accused:
-                full = self._seen(component).full
-                if full is not None and now - full >= self._patience:
-                    self.verdict(room(component), False)
-                self.verdict(progress(component), False)
-                self.verdict(replies(component), False)
-            elif is_late:
-                for atom in (progress(component), replies(component), room(component)):
-                    self.verdict(atom, None)
-        for component in late:
+        for component, of_it in shown.items():
+            is_blamed, is_awaited = component in accused, component in awaited
+            self._tell_room(component, of_it, is_blamed=is_blamed)
+            if is_blamed and (of_it.is_late or is_awaited):
+                self._deny(progress(component))
+                if of_it.is_asked or is_awaited:
+                    self._deny(replies(component))
+                else:
+                    self.verdict(replies(component), self._kept(replies(component)))
+            elif of_it.is_late or (of_it.is_full and not is_blamed):
+                self.verdict(progress(component), None)
+                self.verdict(replies(component), None)
+            elif component not in self._loops:
+                self._tell_good(component, of_it)
             backlog, was = self._known[component].backlog, self.said(keeps_up(component))
             is_known = None if was is False or component in growing else was
             is_empty = backlog.is_empty and self._known[component].turns > 0
@@ -325,7 +352,31 @@ class RuntimeObserver(Observer):
         for component in self._known:
             self.verdict(crashes(component), True if component in self._loops else None)
             if component in self._loops:
-                self.verdict(progress(component), False)
+                self._deny(progress(component))
+
+    def _tell_room(self, component: str, of_it: _Shown, *, is_blamed: bool) -> None:
+        is_known = of_it.is_bounded and (is_blamed or not of_it.is_late)
+        self.verdict(room(component), (False if is_blamed else None) if of_it.is_full else True if is_known else None)
+
+    def _tell_good(self, component: str, of_it: _Shown) -> None:
+        """Say of who is not late what it was seen to do, and for a while what it was seen to do before."""
+        seen, now, keeps = self._known[component], self.now, self.manner.time_to_live
+        was = None if now - seen.since > keeps else self._kept(progress(component))
+        self.verdict(progress(component), True if of_it.has_got_on else was)
+        has_refused = now - seen.refused <= keeps
+        was = self._kept(replies(component))
+        self.verdict(replies(component), None if has_refused else True if of_it.has_answered else was)
+
+    def _deny(self, atom: Literal) -> None:
+        """There is a reason to say that it does not hold."""
+        self._seen(atom.args[0]).denied[atom] = self.now
+        self.verdict(atom, False)
+
+    def _kept(self, atom: Literal) -> bool | None:
+        """What was said of it before: that it does not hold only as long as the last reason for that is fresh."""
+        said = self.said(atom)
+        last = self._seen(atom.args[0]).denied.get(atom, -math.inf)
+        return None if said is False and self.now - last > self.manner.time_to_live else said
 
     def _ends(self, late: Iterable[str], waits: Mapping[str, Iterable[str]], waiting: set[Literal]) -> set[str]:
         """Who is at the end of the rows that begin with these; who waits for whom in them is noted in `waiting`."""

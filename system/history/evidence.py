@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ...actors.control.orders import Status, status_of
+from ...actors.control.orders import Status, rests_said, status_of
 from ...actors.kernel.cell import GONE
 from ...actors.kernel.envelope import Item, message_in
 from ...actors.process.open_asks import items_at, open_asks
@@ -175,6 +175,7 @@ class Evidence(msgspec.Struct, frozen=True):
         memory: of its own process, if its limits bound that.
         waiting: what waits most in its mailbox.
         silence: that its process has not answered.
+        rests: what its turn waits for that is no other actor's work, in words; "" if nothing is known.
     """
 
     address: str
@@ -197,6 +198,7 @@ class Evidence(msgspec.Struct, frozen=True):
     memory: ProcessMemory | None = None
     waiting: Waiting | None = None
     silence: Silence | None = None
+    rests: str = ""
 
     def ago(self, at: float) -> str:
         """A moment as people say it: how long ago, or the time of day if that is long."""
@@ -272,6 +274,8 @@ def collect(
         None if cell is None else _memory(cell),
         None if cell is None else _waiting(cell),
         told.silence,
+        # The home of a recorded actor knows more than the process that it lives in.
+        ("" if cell is None else rests_said(cell)) or ("" if told.status is None else told.status.turn_rests),
     )
 
 

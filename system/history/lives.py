@@ -8,6 +8,7 @@ from typing import TypeAlias
 
 import msgspec
 
+from ...supervision.children import WITH_THE_SYSTEM
 from .past_event import PastEvent, Plain
 
 MOST_LIVES = 16
@@ -238,6 +239,8 @@ def _stopped(lives: Lives, event: PastEvent) -> None:
     if life.is_over and number is not None and number > life.number:
         lives.append(life := PastLife(number))
     _end(life, event)
+    if _text(event, "because") == WITH_THE_SYSTEM and life.reason_kind == "Shutdown":
+        life.reason_kind, life.by = "SystemStopped", "the program"
     _blame(life, event)
 
 

@@ -79,10 +79,11 @@ def check_upgrade(
     """Check whether a new program goes on with what a store has recorded as the old one would; it is not changed.
 
     A system may have the store open. A copy of it is made in a temporary folder, and the recorded turns of each address
-    are handled again by the new code, in a process of its own. What they send goes nowhere.
+    are handled again by the new code, in a process of its own. What they send goes nowhere. It blocks until that is
+    done: call it in a thread, or in another process.
 
     Args:
-        store: the database.
+        store: the path of the SQLite database.
         target: the specs of the new program, as "module:name" or "program.py:name" (see `load_specs`). Nothing of it
             is imported in this process.
         recovery: the recovery file of the new program, if it has one.

@@ -116,8 +116,10 @@ def replay_actor(
 ) -> ReplayedState:
     """Live the recorded turns of one actor again, in this process; the store is not changed, and may be open.
 
+    It blocks for as long as the turns take, and runs the actor's code: call it in a thread, or in another process.
+
     Args:
-        store: the database.
+        store: the path of the SQLite database.
         address: of the actor.
         until: the last turn that is lived; all of them if left out, and that in hand as far as it had come.
         since: the first turn that is told of; all that are kept if left out.

@@ -217,8 +217,15 @@ class SimFleet:
         self.programs.append(program)
         return program
 
-    def kill(self, program: SimProgram) -> None:
-        """End a program as SIGKILL does."""
+    def kill(self, program: SimProgram | None) -> None:
+        """End a program as SIGKILL does.
+
+        Raises:
+            HoldfastError: it is none: nobody leads, if this is what `leader` has said; or it is not of this fleet.
+        """
+        if program not in self.programs or program is None:
+            why = "this one does not" if program is not None else "nobody leads; wait until `leader()` is not None"
+            raise HoldfastError(f"SimFleet.kill takes a program that runs in this fleet: {why}")
         self.programs.remove(program)
         self._ending.append(program)
         program.kill()

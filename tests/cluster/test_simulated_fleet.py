@@ -348,3 +348,21 @@ def test_a_program_that_begins_to_lead_waits_for_its_large_snapshots(monkeypatch
         assert len(asked) > 1
 
     simulate(run, 0)
+
+
+async def idle(program: SimProgram) -> None:
+    """Do nothing until the end."""
+    await asyncio.Event().wait()
+
+
+def test_who_does_not_run_is_not_killed() -> None:
+    async def run() -> None:
+        async with SimFleet() as fleet:
+            with pytest.raises(hf.HoldfastError, match="nobody leads; wait until"):
+                fleet.kill(fleet.leader())
+            program = fleet.start(idle)
+            fleet.kill(program)
+            with pytest.raises(hf.HoldfastError, match="this one does not"):
+                fleet.kill(program)
+
+    simulate(run, 0)

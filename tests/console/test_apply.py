@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 import sys
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
@@ -10,12 +11,17 @@ from pathlib import Path
 import pytest
 
 import holdfast as hf
+from holdfast.actors.kernel.cell import GivenName
+from holdfast.console.client_session import OPERATIONS
 from holdfast.console.endpoint import control_endpoint
+from holdfast.console.remote import RemoteChange
 from holdfast.system import script as script_module
 from holdfast.system.script import UntrustedFile, read_source
+from holdfast.system.transaction.change import Change
 from tests.console.commands import holdfast
 from tests.system.trees import Add, counter, picture, ref
 
+ROOT = Path(__file__).parents[2]
 DONE, FAILED, UNUSABLE = 0, 1, 2
 GROW = """
 import holdfast as hf
@@ -42,6 +48,26 @@ async def reconfigure(system):
         change.move("/app/left/b", "/app/right")
         change.replace_state("/app/left/a", hundred)
         change.remove("/app/left/c")
+"""
+
+RESPECIFY = """
+import holdfast as hf
+
+
+async def reconfigure(system):
+    async with system.transaction() as change:
+        change.respecify("/app/left/a", restart="transient", backoff=hf.Backoff(initial=0.5), register="first")
+"""
+
+NO_STEP = """
+async def reconfigure(system):
+    async with system.transaction() as change:
+        change.respecifi("/app/left/a", restart="transient")
+"""
+
+OF_ITS_OWN = """
+async def reconfigure(system):
+    "text".respecify()
 """
 
 CHANGED_MIND = """
@@ -200,6 +226,8 @@ async def test_the_same_script_runs_in_process(system: hf.ActorSystem, grow: Pat
             FAILED,
             "changed my mind",
         ),
+        (NO_STEP, FAILED, "script.py:4: a transaction has no 'respecifi' in a script; did you mean respecify?"),
+        (OF_ITS_OWN, FAILED, "AttributeError: 'str' object has no attribute 'respecify'"),
     ],
 )
 async def test_what_goes_wrong_is_said_and_changes_nothing(
@@ -210,6 +238,25 @@ async def test_what_goes_wrong_is_said_and_changes_nothing(
     assert done[0] == status
     assert error in done[2]
     assert picture(system) == before
+
+
+async def test_a_script_respecifies_a_child(system: hf.ActorSystem, path: Path, tmp_path: Path) -> None:
+    done = await holdfast("apply", written(tmp_path / "script.py", RESPECIFY), "--socket", path)
+    assert done[0] == DONE, done
+    spec = system.ref("/app/left/a")._cell.spec
+    assert isinstance(spec, hf.ChildSpec)
+    assert (spec.restart, spec.backoff, spec.register) == ("transient", hf.Backoff(initial=0.5), GivenName("first"))
+
+
+def test_scripts_have_every_step_that_the_page_lists() -> None:
+    """What a program can do in a transaction a script can do, too: the page, the program and the wire have one list."""
+    page = (ROOT / "docs" / "transactions.md").read_text().partition("\n## The steps\n")[2].partition("\n**")[0]
+    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
+    listed = {name for row in rows for name in re.findall(r"`(\w+)", row)}
+    assert len(listed) > 15
+    assert listed == OPERATIONS
+    for kind in (Change, RemoteChange):
+        assert listed <= {name for name, value in vars(kind).items() if callable(value)}, kind
 
 
 async def test_a_script_that_others_may_write_is_not_loaded(

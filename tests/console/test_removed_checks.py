@@ -290,6 +290,13 @@ CHECKS = {
         SERVICE,
         "test_a_manager_that_does_not_listen_holds_nothing_up",
     ),
+    "a script that calls what there is not is told the line": Check(
+        "console/operate/scripts.py",
+        "if not isinstance(error.obj, (RemoteChange, RemoteRef, RemoteSystem)):",
+        "if True:",
+        APPLY,
+        "goes_wrong",
+    ),
     "imports for a request are told of": Check(
         "system/script.py",
         "            tell(path, sha256)\n",

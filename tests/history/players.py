@@ -51,6 +51,23 @@ class Worker(hf.Actor):
         return self.done
 
 
+async def upload() -> int:
+    """Do something that takes a minute."""
+    await asyncio.sleep(60.0)
+    return 1
+
+
+class Sleeper(hf.Actor):
+    """Rests in its turns, as it says by its context."""
+
+    @hf.on(Do)
+    async def do(self, message: Do) -> int:
+        if message.what == "sleep":
+            await self.ctx.sleep(20.0)
+            return 0
+        return await self.ctx.effect(upload, key="upload")
+
+
 class Pass(hf.Message[int]):
     """Ask another one to do this, and wait for its answer."""
 

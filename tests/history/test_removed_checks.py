@@ -261,6 +261,27 @@ CHECKS = {
         WHY,
         "test_of_many_children_some_are_named",
     ),
+    "who ends with the whole system is not ended by its supervisor": Check(
+        "supervision/children.py",
+        "if root is not None and root.state is not RUNNING:",
+        "if False:",
+        KILLED,
+        "orderly_restart",
+    ),
+    "a turn that rests says so": Check(
+        "actors/kernel/context.py",
+        "        task.add_done_callback(rests.pop)\n",
+        "        rests.clear()\n",
+        LIVE,
+        "rests_as_it_has_said and none and task",
+    ),
+    "an effect that is out is known to the home": Check(
+        "checkpoint/home/pending_asks.py",
+        'self.effects[place] = Rest("effect", out.to, self._home.node.clock.wall())',
+        "pass",
+        LIVE,
+        "rests_as_it_has_said and hybrid",
+    ),
     "a turn that hangs is killed for KILLED": Check(
         "system/controls.py",
         "        if reason == KILLED:\n",

@@ -54,6 +54,30 @@ async def test_the_next_root_knows_what_was_before_the_kill(tmp_path: Path) -> N
         assert system.lives("/app/worker")[-1].reason_kind in ("Shutdown", "SystemStopped")
 
 
+async def test_after_an_orderly_restart_of_the_program_an_actor_is_well(tmp_path: Path) -> None:
+    """What has ended with the program is not told as an end that its supervisor has called for."""
+    path = tmp_path / "app.db"
+    template = hf.child(None, hf.start(Worker), recovery=hf.hybrid())
+    for life in (1, 2):
+        async with hf.ActorSystem("app", store=f"sqlite:{path}", log=False) as system:
+            worker = hf.child("worker", hf.start(Worker), recovery=hf.hybrid())
+            north = await system.start(hf.supervisor("north", children=[worker, hf.child("other", hf.start(Worker))]))
+            many = await system.start(hf.dynamic("many", template=template, journal=True))
+            if life == 1:
+                await many.ask(hf.StartChild(id="one"))
+            addresses = ("/app/north/worker", "/app/north/other", "/app/many/one", north.path, many.path)
+            for at in addresses[:3]:
+                assert await system.ref(at, Worker).ask(Do("well")) == (1 if at == "/app/north/other" else life)
+            for at in addresses:
+                (said,) = await system.why(at)
+                assert said.startswith(f"{at} is running, in life "), said
+            if life == 1:
+                continue
+            assert [one.reason_kind for one in system.lives("/app/north/worker")] == ["SystemStopped", ""]
+            await system.stop(north)
+            assert system.lives("/app/north/worker")[-1].because == "its supervisor has ended"
+
+
 def test_an_event_that_was_written_twice_is_there_once() -> None:
     """A store that has failed in the middle of a write is given the same events again."""
     notes: dict[str, bytes] = {}

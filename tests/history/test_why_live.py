@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import re
 import signal
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -19,6 +20,7 @@ from tests.history.players import (
     Fickle,
     Killer,
     Pass,
+    Sleeper,
     SlowStarter,
     Strike,
     Stubborn,
@@ -371,6 +373,27 @@ async def test_a_turn_that_waits_wherever_both_live(
     await system.stop(caller)
     with pytest.raises(hf.HoldfastError):
         await asked
+
+
+@pytest.mark.parametrize(
+    ("what", "says"),
+    [
+        ("sleep", r"; it has slept for 1\.\d s, and sleeps until \d\d:\d\d:\d\d \(\d\d?\.\d s from now\)\."),
+        ("effect", r"; it waits for the effect upload, which has been out for 1\.\d s\."),
+    ],
+    ids=["sleep", "effect"],
+)
+@pytest.mark.parametrize("place", ["task", "process"])
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["none", "hybrid"])
+async def test_a_turn_that_rests_as_it_has_said(
+    system: hf.ActorSystem, place: Any, recovery: hf.Method | None, what: str, says: str
+) -> None:
+    spec = hf.child("sleeper", hf.start(Sleeper), isolation=place, recovery=recovery, shutdown="brutal_kill")
+    sleeper = await system.start(spec)
+    sleeper.tell(Do(what))
+    await asyncio.sleep(1.3)
+    text = await said(system, sleeper)
+    assert re.search(rf"/app/sleeper has been in the turn of tests.history.players.Do for 1\.\d s.*{says}", text), text
 
 
 async def test_suspended_and_full(system: hf.ActorSystem) -> None:

@@ -1222,6 +1222,20 @@ CHECKS = {
         SLOW,
         "test_attempts_that_each_outlast and one_for_one",
     ),
+    "a ref of another system that was sent is told from one of nobody": Check(
+        "actors/kernel/mailbox.py",
+        'cell.path.split("/")[1:2] == root.path.split("/")[1:2]',
+        "True",
+        "tests/system/test_two_systems.py",
+        "test_a_ref_of_another_system",
+    ),
+    "a connection is refused before a library is missed": Check(
+        "cluster/servers.py",
+        'if not is_address or kind not in ("nats", "tls"):',
+        "if False:",
+        "tests/system/test_two_systems.py",
+        "test_a_connection_takes_servers_alone",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)

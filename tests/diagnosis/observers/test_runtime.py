@@ -1,6 +1,7 @@
 """What the runtime knows, as literals: no actor here says a word about itself."""
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -9,7 +10,7 @@ import pytest
 import holdfast as hf
 from holdfast import diagnosis
 from holdfast.diagnosis.engine import State
-from holdfast.diagnosis.literals import crashes, progress, replies, room, waits_for
+from holdfast.diagnosis.literals import Literal, crashes, keeps_up, progress, replies, room, waits_for
 from holdfast.diagnosis.observers import RuntimeObserver
 from holdfast.testing import advance
 
@@ -25,6 +26,11 @@ class Go(hf.Message[int]):
 
 class Sorry(hf.Refusal):
     """It cannot be done now."""
+
+
+async def in_vain() -> None:
+    await asyncio.sleep(3.0)
+    raise OSError("nobody is there")
 
 
 class Worker(hf.Actor):
@@ -55,6 +61,11 @@ class Worker(hf.Actor):
                 self.ctx.stash()
             case ["long", seconds]:
                 await asyncio.sleep(float(seconds))
+            case ["retry", times]:
+                for n in range(int(times)):
+                    with contextlib.suppress(hf.errors.EffectFailed):
+                        await self.ctx.effect(in_vain, key=f"post {n}")
+                    await self.ctx.sleep(0.5)
             case _:
                 pass
         return 1
@@ -153,6 +164,69 @@ async def test_a_long_turn_that_nobody_waits_for_and_one_that_is_usual_are_no_fa
     assert (await watching.diagnosis()).state is State.HEALTHY
     await advance(20.0)
     assert await asking == 1
+
+
+async def told_steadily(ref: hf.ActorRef[Worker], seconds: float, watching: diagnosis.Watch) -> set[Literal]:
+    """Tell it something now and then; returns what was said against anybody."""
+    against: set[Literal] = set()
+    for n in range(int(10 * seconds)):
+        if n % 3 == 0:
+            ref.tell(Go())
+        await advance(0.1)
+        against |= (await watching.observed()).negative
+    return against
+
+
+async def test_of_who_is_only_told_things_it_is_not_said_that_it_does_not_answer(system: hf.ActorSystem) -> None:
+    watching, told = await watched(system), worker(system, "a")
+    told.tell(Go("long 9"))
+    against = await told_steadily(told, 8.5, watching)
+    assert progress("all/a") in against  # Messages wait, and it does not say that it rests.
+    assert replies("all/a") not in against
+    assert await told_steadily(told, 3.0, watching) <= {progress("all/a")}
+    assert (await watching.observed()).negative == frozenset()  # It works again.
+    assert (await watching.diagnosis()).state is State.HEALTHY
+
+
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["none", "hybrid"])
+async def test_who_rests_in_its_turn_as_it_has_said_is_not_accused_by_who_tells_it_things(
+    system: hf.ActorSystem, recovery: hf.Method | None
+) -> None:
+    uploader = await system.start(hf.child("uploader", hf.start(Worker), recovery=recovery))
+    watching = await watched(system)
+    assert await told_steadily(uploader, 10.0, watching) == set()
+    uploader.tell(Go("retry 20"))
+    assert await told_steadily(uploader, 65.0, watching) == set()
+    assert (await watching.diagnosis()).state is State.HEALTHY
+    asking = asyncio.ensure_future(asked(uploader.ask(Go(), timeout=2.0)))
+    assert replies("uploader") in await told_steadily(uploader, 3.0, watching)  # Somebody waits for it.
+    await asking
+    assert keeps_up("uploader") not in await told_steadily(uploader, 20.0, watching)
+    assert (await watching.observed()).negative == frozenset()
+
+
+async def test_that_it_does_not_answer_is_unknown_again_when_the_last_reason_is_old(system: hf.ActorSystem) -> None:
+    watching, late = await watched(system), worker(system, "a")
+    asking = asyncio.ensure_future(asked(late.ask(Go("long 9"), timeout=3.0)))
+    assert replies("all/a") in await told_steadily(late, 4.0, watching)
+    await asking
+    await told_steadily(late, 17.0, watching)  # Ten seconds behind the last ask that ran out, and its turn.
+    observed = await watching.observed()
+    assert replies("all/a") not in observed.negative | observed.positive
+    await late.ask(Go())
+    await advance(0.3)
+    assert replies("all/a") in (await watching.observed()).positive
+
+
+async def test_a_full_mailbox_says_nothing_of_asks_that_nobody_has_made(system: hf.ActorSystem) -> None:
+    watching, full = await watched(system), worker(system, "full")
+    senders = [asyncio.ensure_future(full.send(Go("long 0.8"))) for _ in range(12)]  # Who waits takes any room.
+    against: set[Literal] = set()
+    for _ in range(60):
+        await advance(0.1)
+        against |= (await watching.observed()).negative
+    assert against == {room("all/full")}  # It gets on.
+    await asyncio.gather(*senders)
 
 
 @pytest.mark.parametrize("end", ["crash", "stop"])
