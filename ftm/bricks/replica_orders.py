@@ -159,10 +159,12 @@ class Withdraw(Message[bool]):
     """Give back what is inside, if that is a turn which only rests (for days, perhaps), and go back to before it.
 
     The reply is False if more than that is out: nothing has happened then. What is given back is sent again.
+    `number`: the input that the turn handles; a follower that is not there yet has nothing to give back.
     """
 
     epoch: int
     config: int
+    number: int
 
 
 class ReplicaBeat(Message):

@@ -194,7 +194,7 @@ class RequestProtocol(Transfer):
             if done.epoch != standing.epoch:
                 done = msgspec.structs.replace(done, epoch=standing.epoch)
             self._came_out += len({end.turn for end in done.ends if end.turn > self._turn})
-            self._leave(done)
+            self._leave(msgspec.structs.replace(done, is_last=done.is_last and not self._is_leaving))
         else:
             self._keep(done)
         if done.is_last and done.number == self._current:
@@ -446,13 +446,15 @@ class RequestProtocol(Transfer):
     def _withdraw(self, message: Withdraw) -> Any:
         self._check(message.epoch, message.config)
         handle = self.ctx.reply_handle()
-        self.ctx.create_task(self._give_back(handle))  # Not in line with other orders: one of them may wait for this.
+        self.ctx.create_task(
+            self._give_back(handle, message)
+        )  # Not in line with other orders: one of them may wait for this.
         return handle
 
-    async def _give_back(self, handle: ReplyHandle[bool]) -> None:
+    async def _give_back(self, handle: ReplyHandle[bool], message: Withdraw) -> None:
         self._is_leaving = True
         try:
-            has_left = await self._has_given_back()
+            has_left = await self._has_given_back(message.number)
             if has_left:  # Home sends all of it again; what has not begun here would be run without its knowing.
                 self._held.clear()
             handle.reply(has_left)
@@ -462,14 +464,18 @@ class RequestProtocol(Transfer):
             self._is_leaving = False
             self._go_on()
 
-    async def _has_given_back(self) -> bool:
+    async def _has_given_back(self, number: int) -> bool:
         standing, server = self._standing, self._standing.server
         life = server.life
         if life is None or life.feed is None:
             return self._current is None or not standing.leads
+        if not standing.leads and life.feed.id != number:
+            return True  # It has yet to end what is at home already: nobody would send it that again.
         if standing.leads and not (server.state.has_access and life.only_rests):
             return False
         await server.withdraw()
+        if not standing.leads:
+            standing.inside.clear()  # What comes again is no duplicate: nothing here will end it.
         await self.proceed.ask(Flush(), timeout=FOREVER)
         await server.ensure_as_given()
         return True

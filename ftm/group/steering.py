@@ -96,12 +96,13 @@ async def _withdraw(group: Group) -> None:
     """Have the replicas leave it, the one that leads first: it knows whether more than that is out."""
     known, replicas = group.membership, group.replicas
     primary, members = known.primary, replicas.well()
-    order = Withdraw(known.epoch, group.adaptation.config)
+    order = Withdraw(known.epoch, group.adaptation.config, group.switch.ledger.begun)
     if primary is None or not await _has_left(group, primary, order):
         return
     await asyncio.gather(*(_has_left(group, name, order) for name in members if name != primary))
-    if known.primary == primary and known.epoch == order.epoch:  # Else whoever leads next is sent all of it anyway.
-        group.withdraw()
+    is_elsewhere = group.switch.life.port is not group  # Meanwhile, and perhaps the turn rests there.
+    if known.primary == primary and known.epoch == order.epoch and not is_elsewhere:
+        group.withdraw()  # Else whoever goes on is sent all of it anyway.
 
 
 async def _has_left(group: Group, name: str, order: Withdraw) -> bool:

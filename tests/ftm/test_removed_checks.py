@@ -37,6 +37,27 @@ CHECKS = {
         "tests/effects/test_timers_while_resting.py",
         "whoever_leads_next and lfr",
     ),
+    "a batch that is left in the middle has not ended": Check(
+        "ftm/bricks/request_protocol.py",
+        "is_last=done.is_last and not self._is_leaving",
+        "is_last=done.is_last",
+        "tests/effects/test_waits_under_mechanisms.py",
+        "test_all_that_is_asked_comes_in_order and tmr",
+    ),
+    "what a follower has left is no duplicate when it comes again": Check(
+        "ftm/bricks/request_protocol.py",
+        "            standing.inside.clear()  # What comes again",
+        "            pass  # What comes again",
+        "tests/effects/test_waits_under_mechanisms.py",
+        "test_what_was_found_comes_in_order",
+    ),
+    "a turn that was left is not given up where it waits without mechanisms meanwhile": Check(
+        "ftm/group/steering.py",
+        "is_elsewhere = group.switch.life.port is not group",
+        "is_elsewhere = False",
+        "tests/effects/test_waits_under_mechanisms.py",
+        "test_what_was_found_comes_in_order",
+    ),
     "whoever leads next hears which message its turn has waited for": Check(
         "checkpoint/home/pending_asks.py",
         "taken = -1 if source is None else source.id",
