@@ -308,13 +308,16 @@ async def test_an_ask_that_waits_for_room_waits_on(tmp_path: Path) -> None:
         ref.tell(Do([f"gate {gate}"]))
         await until(gate.exists)
         ref.tell(Note("queued"))
+        outside = ref.ask(Note("outside"), timeout=IN_TIME)  # Has the place that is free when the turn in hand ends.
         await at(system, "a").send(Do(["add begun", "ask hello"], peer=ref))
         switch = home(ref)
-        await until(lambda: bool(switch.intake.bound.waiting), IN_TIME)
+        await until(lambda: len(switch.intake.bound.waiting) > 1, IN_TIME)
         ending = asyncio.ensure_future(restarted(system))
         await told_to_stop(ref)
         let_through(gate)
         await ending
+        with pytest.raises(hf.ActorStopped):
+            await outside
         assert await has_seen(system, "a", "hello:2") == ["begun", "hello:2"]
 
 
