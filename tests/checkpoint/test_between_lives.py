@@ -277,9 +277,9 @@ async def test_who_is_told_something_after_a_stop_by_order(how: str, tmp_path: P
 @pytest.mark.parametrize("isolation", ["task", "process", "subtree"])
 @pytest.mark.parametrize("when", ["asks then", "has asked", "is busy as well"])
 async def test_who_waits_for_it_does_not_hold_up_the_stop(isolation: str, when: str, tmp_path: Path) -> None:
-    """The stop has no time limit, and the ask a long one: the turn is left, and the next life has the answer."""
+    """The stop has a long time limit, and the ask a longer one: the turn is left, and the next life has the answer."""
     gate, other = tmp_path / "gate", tmp_path / "other"
-    async with running(team(isolation, a={"shutdown": "infinity"})) as system:
+    async with running(team(isolation, a={"shutdown": 2 * IN_TIME})) as system:
         ref, said = at(system, "b"), "hello" if when == "asks then" else str(other)
         switch = home(ref)
         if when == "asks then":
@@ -296,7 +296,7 @@ async def test_who_waits_for_it_does_not_hold_up_the_stop(isolation: str, when: 
         if when != "has asked":  # Else nothing keeps them from living again at once.
             await until(lambda: switch.life.port is None and switch.intake.between is not None, IN_TIME)
             let_through(gate if when == "asks then" else other)
-        await ending
+        await asyncio.wait_for(ending, IN_TIME)
         assert await has_seen(system, "a", f"{said}:1") == ["begun", f"{said}:1"]
         assert await seen(system, "b") == [said]
 
