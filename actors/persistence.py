@@ -66,6 +66,10 @@ class Keeper(Protocol):
         """
         ...
 
+    def dismissed(self, path: str) -> None:
+        """The child at `path` is forgotten by its supervisor: what comes for those below it waits for no next life."""
+        ...
+
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a small fact; None forgets it. Raises HoldfastError if the store refused."""
         ...
@@ -100,6 +104,9 @@ class NothingKept:
 
     def returned(self, path: str) -> None:
         """Do nothing: nobody is brought back from records."""
+
+    def dismissed(self, path: str) -> None:
+        """Do nothing: nothing waits for a next life."""
 
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a fact until the node ends."""

@@ -316,10 +316,22 @@ class Glance(msgspec.Struct, array_like=True, tag=24):
     feed: Feed
 
 
+class Stranded(msgspec.Struct, array_like=True, tag=28):
+    """Who is to answer what was asked as output (turn, k) has been stopped, and does so in its next life.
+
+    A life that is to end does not wait for that: it leaves the turn to its own next life.
+    """
+
+    turn: int
+    k: int
+
+
 PastInputs = Outcome | Perform | SnapshotNow
 """What a home says to a life beside its inputs: it overtakes those that wait."""
 
-ToLife = Feed | Outcome | Perform | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec | Glance
+ToLife = (
+    Feed | Outcome | Perform | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec | Glance | Stranded
+)
 
 
 # -- life to home ----------------------------------------------------------------------------------------------------

@@ -234,6 +234,7 @@ class DynamicSupervisor(Supervisor):
     def _give_up_address(self, one: Child, reason: object) -> None:
         super()._give_up_address(one, reason)
         self._forget(one)
+        self._dismiss(one)
 
     async def _stop_children(self) -> None:
         """We end: all children are told at once, and each has the time its spec gives it."""

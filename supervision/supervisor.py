@@ -406,6 +406,12 @@ class Supervisor(Inquiries):
             lifecycle.retire(one.cell, reason)
         if one.spec.restart == "temporary":
             self._forget(one)
+            self._dismiss(one)
+
+    def _dismiss(self, one: Child) -> None:
+        """Its address is free and its spec forgotten: nothing that comes waits for next lives of those below it."""
+        if one.spec.is_supervisor:
+            self.ctx._cell.node.ports.keeper.dismissed(self._path_of(one))
 
     def _note_end(self, one: Child, reason: object) -> None:
         self._ended.pop(one.spec.id, None)
@@ -740,6 +746,7 @@ class Supervisor(Inquiries):
         self._note_end(one, reason)
         if one.cell is not None:
             lifecycle.retire(one.cell, reason)
+        self._dismiss(one)
         if message.erase:
             await self._erase(one)
 
@@ -825,6 +832,7 @@ class Supervisor(Inquiries):
             if one.state != STOPPED:
                 raise ChildBusy(message.id, one.state)
         self._forget(one)
+        self._dismiss(one)
 
     @on(ChangeSupervisor)
     def _change(self, message: ChangeSupervisor) -> Any:

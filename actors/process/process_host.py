@@ -632,6 +632,8 @@ def keep(worker: Worker, frame: frames.Command) -> None:
                 keeper.blame(path)
             case "returned":
                 keeper.returned(path)
+            case "dismissed":
+                keeper.dismissed(path)
             case "note":
                 above, _, name = path.rpartition("/")
                 keeper.note(child_key(above, name), data.get("value"))

@@ -10,13 +10,14 @@ import asyncio
 from collections import deque
 from typing import TYPE_CHECKING
 
-from ...actors.errors import MailboxFull
+from ...actors.errors import HoldfastError, MailboxFull
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.mailbox import Bound, Senders
 from ...actors.overflow import DROPS, Overflow, decide
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer
 from .disposal import lose
+from .pending_asks import turned_away
 
 if TYPE_CHECKING:
     from ...actors.kernel.envelope import Ask
@@ -131,11 +132,12 @@ class HomeBound:
                 home.take(ask, name, body, sender)
         self.senders.wake(lambda: not self.is_full)
 
-    def release(self, error: MailboxFull | Exception) -> None:
-        """The address is given up: whoever waits shall see it."""
+    def release(self, error: HoldfastError, *, keep_asks: bool = False) -> None:
+        """The address is given up: whoever waits shall see it. `keep_asks`: turns of recorded actors wait on."""
         waiting, self.waiting = self.waiting, deque()
-        for ask, *_ in waiting:
-            ask.fail(error)
+        for one in waiting:
+            if not turned_away(one[0], error, keep_asks=keep_asks):
+                self.waiting.append(one)
         self.senders.release()
 
     def in_hand(self) -> tuple[int, dict[int, Input]]:

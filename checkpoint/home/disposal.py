@@ -12,6 +12,7 @@ from ...actors.kernel.codec import Parcel
 from ..group_commit import Unkept
 from ..inputs import Batch, Input
 from ..protocol import DROPPED, MESSAGE, START, TICK, Answer
+from .pending_asks import SwitchAsk
 
 if TYPE_CHECKING:
     from .switch import Switch
@@ -51,13 +52,17 @@ def undo_begun(home: Switch, why: str) -> None:
     batch.commit(home.journal)
 
 
-def drop_all(home: Switch, why: str, *, keep_tells: bool = False, keep_ticks: bool = True) -> None:
+def drop_all(
+    home: Switch, why: str, *, keep_tells: bool = False, keep_asks: bool = False, keep_ticks: bool = True
+) -> None:
     """End what waits where nobody lives any more: whoever waits for it is told, the rest goes to dead letters.
 
     What has begun, and what is to be answered later, fails otherwise than what has surely not.
 
     `keep_tells`: it is the actor's supervisor that has ended. Both may be started again, so what nobody waits for
     stays for the next life.
+    `keep_asks`: that will be. What turns of recorded actors ask stays as well: they wait for it, or their next lives
+    do. A turn in hand that waits for such an answer stays too; whoever asked for it from outside is told now.
     `keep_ticks`: what timers have brought stays as well, as the timers do that run: the address is not erased.
     """
     batch, stopped, ledger = Batch(), ActorStopped(home.path, why), home.ledger
@@ -66,15 +71,19 @@ def drop_all(home: Switch, why: str, *, keep_tells: bool = False, keep_ticks: bo
     home.life.abandon()
     home.timers.pause()
     if home.intake.bound is not None:
-        home.intake.bound.release(stopped)
+        home.intake.bound.release(stopped, keep_asks=keep_asks)
+    lasts = ledger.waits.lasts or (keep_asks and home.calls.waits_for_answer)
     for source in list(ledger.open.values()):
         if source.kind == START or (keep_tells and source.ask is None) or (keep_ticks and source.kind == TICK):
             continue
         if home.homes.far.goes_on(source.ask):
             continue
+        if keep_asks and isinstance(source.ask, SwitchAsk):
+            source.ask.strand()  # Also if it is the turn in hand: the next life goes on with that.
+            continue
         if source.ask is None and source.kind == MESSAGE:
             lose(home, source, why)
-        if source.id == ledger.begun and ledger.released and ledger.waits.lasts and keep_tells:
+        if source.id == ledger.begun and ledger.released and lasts and keep_tells:
             ask, source.ask = source.ask, None  # It goes on in the next life: what it has done is not left half done.
             if ask is not None:
                 ask.fail(ended)
@@ -83,7 +92,7 @@ def drop_all(home: Switch, why: str, *, keep_tells: bool = False, keep_ticks: bo
         else:
             home.end_without_turn(source, _failure(home, ended if source.was_cut else stopped), batch)
     batch.commit(home.journal)
-    home.calls.renounce(ended)
+    home.calls.renounce(ended, keep_asks=keep_asks)
     home.limit.wake()
     home.due.abandon(why)
 
@@ -96,7 +105,9 @@ def forget_home(home: Switch, why: str) -> None:
     home.timers.replace({})
     home.ties.replace([])
     home.images.close()
-    home.cell = None
+    if home.intake.between is not None:
+        home.intake.between.over()
+    home.cell = home.intake.between = None
 
 
 def lose(home: Switch, message: Input | Parcel, why: str) -> None:

@@ -11,22 +11,26 @@ from collections import deque
 from collections.abc import Awaitable
 from typing import TYPE_CHECKING, Any
 
-from ...actors.errors import MailboxFull
+from ...actors.errors import HoldfastError, MailboxFull
 from ...actors.events import HeldMessages
-from ...actors.kernel.cell import Cell
+from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.codec import Parcel
-from ...actors.kernel.mailbox import Senders
+from ...actors.kernel.envelope import Item
+from ...actors.kernel.mailbox import Senders, admit_gone
 from ...actors.overflow import decide
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer
 from ..recovery_settings import Held
 from .disposal import lose
+from .pending_asks import SwitchAsk, turned_away
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Host
     from ...actors.kernel.envelope import Ask
     from .capacity import HomeBound
     from .switch import Switch
+
+MAY_LIVE_AGAIN = "its supervisor has ended, and may start it again"
 
 
 class Holding:
@@ -170,14 +174,15 @@ class Holding:
     def refill(self) -> None:
         """Nothing is let in while it is held."""
 
-    def release(self, error: MailboxFull | Exception) -> None:
-        """The address is given up: whoever waits shall see it."""
+    def release(self, error: HoldfastError, *, keep_asks: bool = False) -> None:
+        """The address is given up: whoever waits shall see it. `keep_asks`: turns of recorded actors wait on."""
         waiting, self._waiting = self._waiting, deque()
-        for ask, *_ in waiting:
-            ask.fail(error)
+        for ask, name, body, sender, _ in waiting:
+            if not turned_away(ask, error, keep_asks=keep_asks):
+                self._home.take(ask, name, body, sender)  # What is held is over: it waits with all that was told.
         self._senders.release()
         if self.inner is not None:
-            self.inner.release(error)
+            self.inner.release(error, keep_asks=keep_asks)
 
     def restart(self) -> None:
         """The life is over: nothing is in hand."""
@@ -276,6 +281,53 @@ def admit_inlet(cell: Cell, item: Any) -> None:
             home.intake.holding.topic = ""
 
 
+class Between(Cell):
+    """A recorded address between two lives, whose supervisor has ended with it: what comes waits here for the next one.
+
+    Whoever knew it there hears of its end, and nobody finds an actor there; only what must not be lost is taken.
+    """
+
+    __slots__ = ("home",)
+
+    def __init__(self, home: Switch, last: Cell) -> None:
+        self.home = home
+        super().__init__(home.node, last.parent, last.name, last.host)
+        before, more = last.extra(), self.extra()
+        more.start, more.reason, more.last, more.outlet = before.start, before.reason, before.last, home
+        self.table, self.admit = last.table, admit_between
+
+    def room(self) -> asyncio.Future[None] | None:
+        """For `send`: None while there is room; nobody here makes any.
+
+        Raises:
+            ActorStopped: there is none.
+        """
+        if self.state is GONE:
+            return super().room()
+        if not self.has_room:
+            raise self.stopped_error(MAY_LIVE_AGAIN)
+        return None
+
+    def renamed(self, path: str) -> None:
+        """The address is another one from now on."""
+        self.parent, self.name = None, path
+
+    def over(self) -> None:
+        """The next life is about to begin, or none will: who has a ref to this reaches whoever lives there then."""
+        self.state, self.admit = GONE, admit_gone
+        for topic in list(self.extra().belongings.topics):
+            self.node.topics.unsubscribe(topic, self)
+
+
+def admit_between(cell: Cell, item: Any) -> None:
+    """Admit a message that waits for the next life. An ask from outside fails at once: it can be asked again."""
+    assert isinstance(cell, Between)
+    if isinstance(item, Item) and item.is_ask and not isinstance(item, SwitchAsk):
+        item.fail(cell.stopped_error(MAY_LIVE_AGAIN))
+    else:
+        cell.home.admit(cell, item)
+
+
 @dataclasses.dataclass(slots=True)
 class Intake:
     """What stands between the senders and one home.
@@ -285,12 +337,14 @@ class Intake:
         holding: stands as the bound while the actor is recovered.
         inlets: the topics that have a rule of their own then.
         last: the last input that was to be safe before it is fed.
+        between: stands as the actor's cell while nobody lives there, and its supervisor may bring it back.
     """
 
     bound: HomeBound | Holding | None = None
     holding: Holding | None = None
     inlets: dict[str, Inlet] = dataclasses.field(default_factory=dict)
     last: Input | None = None
+    between: Between | None = None
 
     @property
     def mailbox(self) -> HomeBound | None:
@@ -315,6 +369,21 @@ def let_go(home: Switch) -> Holding | None:
     if holding is not None:
         intake.bound = holding.inner
     return holding
+
+
+def wait_for_next_life(home: Switch) -> None:
+    """Nobody lives at the address any more, and somebody may again: what must not be lost is taken in meanwhile."""
+    last = home.cell
+    assert last is not None
+    home.cell = home.intake.between = Between(home, last)
+
+
+def end_wait(home: Switch) -> bool:
+    """Take nothing in for the next life any more, for it begins, or there will be none; False if nothing was."""
+    between, home.intake.between = home.intake.between, None
+    if between is not None:
+        between.over()
+    return between is not None
 
 
 def inlet(home: Switch, topic: str) -> Cell:

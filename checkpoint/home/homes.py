@@ -24,7 +24,7 @@ from ..snapshot.snapshot_schedule import nobody
 from .ask_recovery import FarMail, Rejoin
 from .capacity import HomeBound
 from .disposal import drop_all, forget_home, put_into_quarantine
-from .held_messages import Holding, let_go
+from .held_messages import Holding, end_wait, let_go
 from .quarantine import Quarantine
 from .switch import Switch
 
@@ -334,6 +334,16 @@ class Homes:
             except HoldfastError as error:
                 self.node.emit(RecoveryFailed(blamed, f"it comes back as it was: {error}"))
 
+    def dismissed(self, path: str) -> None:
+        """The child at `path` is forgotten by its supervisor, and nobody brings back those below it.
+
+        What has come while they ended waits for whoever is started there anew; what comes now is lost, and told so.
+        """
+        prefix = f"{path}/"
+        for waiting, switch in self._switches.items():
+            if waiting.startswith(prefix):
+                end_wait(switch)
+
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a small fact; None forgets it."""
         self.journal.note(key, value)
@@ -355,6 +365,8 @@ class Homes:
         """Close the store, and let go of the states."""
         self.recoveries.close()
         for switch in self._switches.values():
+            if not switch.journal.durable and end_wait(switch):
+                drop_all(switch, "the system has ended")
             switch.images.close()
         self.journal.close()
 

@@ -25,7 +25,7 @@ from ..recovery.recoveries import Recovery
 from ..snapshot.unreplayed import forget_turns
 from ..turn_word import input_of
 from .disposal import drop_all
-from .held_messages import hold, inlet, let_go
+from .held_messages import MAY_LIVE_AGAIN, end_wait, hold, inlet, let_go, wait_for_next_life
 from .homes import ENDED, Homes
 from .life_ports import RemoteLife, own_records
 from .present_life import LifePort
@@ -142,6 +142,7 @@ class JournalHome(RecordedHome):
     def subscribe(self, cell: Cell, topics: Iterable[str]) -> None:
         """Have the home admit what is published, also between two lives."""
         assert self.switch is not None
+        end_wait(self.switch)  # It was subscribed until now, so that nothing was missed.
         for topic in (*topics, *self.switch.topics):
             cell.node.topics.subscribe(topic, inlet(self.switch, topic))
 
@@ -331,19 +332,26 @@ class JournalHome(RecordedHome):
         self.give_up(cell)
 
     def give_up(self, cell: Cell) -> None:
-        """The address is free: it hears nothing more."""
+        """The address is free: it hears nothing more, but what must not be lost if it will live again."""
         if self.switch is None:
             return
         restarting = self.parent.is_restarting(cell)
-        for topic in (*self.parent.topics(cell), *self.switch.topics):
+        waits = restarting and self.method.records and self._outlives(cell)
+        topics = (*self.parent.topics(cell), *self.switch.topics)
+        for topic in topics:
             cell.node.topics.unsubscribe(topic, inlet(self.switch, topic))
+        end_wait(self.switch)  # Of the life before, if this one has not come so far.
         diverged, reason = self.switch.life.diverged, str(cell.extra().reason)
-        gone = "its supervisor has ended, and may start it again" if restarting else "nobody lives at its address now"
+        gone = MAY_LIVE_AGAIN if restarting else "nobody lives at its address now"
         unfit = reason if UNFIT in reason else gone
         # A start that has failed leaves what waits, and the turn in hand, to one that does not.
         keeps = restarting or diverged is not None or (self.switch.has_past and not self.switch.life.has_come_up)
-        drop_all(self.switch, unfit if diverged is None else str(diverged), keep_tells=keeps)
+        drop_all(self.switch, unfit if diverged is None else str(diverged), keep_tells=keeps, keep_asks=waits)
         let_go(self.switch)
+        if waits:
+            wait_for_next_life(self.switch)
+            for topic in topics:
+                cell.node.topics.subscribe(topic, inlet(self.switch, topic))
         self.switch.ties.untie()
         if restarting:
             self.switch.life.has_ended = False  # Nobody has dealt with its end yet.
@@ -351,6 +359,12 @@ class JournalHome(RecordedHome):
             cell.node.loop.call_soon(self.switch.forget_end)
         why = "its supervisor has ended" if restarting else "it is not started again"
         self.homes.recoveries.given_up(cell.path, why)
+
+    def _outlives(self, cell: Cell) -> bool:
+        """Whether there will be a next life to wait for: a durable store has it in the next program, too."""
+        root = cell.node.root
+        assert self.switch is not None
+        return self.switch.journal.durable or (root is not None and root.state is RUNNING)
 
     async def replay(self, cell: Cell, port: LifePort, entered: Entered) -> None:
         """The rest of S3, what a life that has begun has handled since; then S4.

@@ -251,7 +251,8 @@ class Outputs:
     def _wait(self, target: Cell, switch: Switch, over: Callable[[HoldfastError | None], None]) -> None:
         """Let the sender go on when its receiver, which has the message, has room; nobody waits for itself."""
         room = None
-        if switch is not self._home and switch.cell is not None and switch.cell.state is not GONE:
+        is_there = switch.cell is not None and switch.cell.state is not GONE and switch.intake.between is None
+        if switch is not self._home and is_there:
             room = target.room() if isinstance(target, Inlet) else switch.room()
         if room is None:
             over(None)
@@ -318,6 +319,8 @@ class Outputs:
             asked = switch.record(MESSAGE, out.name, out.body, home.path, batch, origin_of(ask))
             asked.ask, asked.chain = ask, chain
             batch.after.append(lambda: switch.admitted(asked))
+        if switch is not None and switch.intake.between is not None:
+            batch.after.append(ask.strand)
 
     def _send_ask(self, key: int, target: Cell, ask: SwitchAsk) -> None:
         home, target = self._home, target.living

@@ -26,6 +26,7 @@ from ..protocol import (
     Outcome,
     Perform,
     Performed,
+    Stranded,
     came,
     timed,
     untimed,
@@ -109,6 +110,11 @@ class SwitchAsk(RelayedAsk, eq=False):
         """Hand over an encoded error."""
         self.give(Answer(kind, name, body))
 
+    def strand(self) -> None:
+        """Who is to answer has been stopped, and does so in its next life: a turn that is told to stop is left then."""
+        if self.switch is not None and not self.is_over and self.switch.life.port is not None:
+            self.switch.life.port.to_life(Stranded(self.turn, self.k))
+
     def give(self, answer: Answer, batch: Batch | None = None) -> None:
         """Hand over the outcome, once."""
         if not self.is_over:
@@ -142,6 +148,15 @@ def answer_ask(home: Switch, ask: Ask, answer: Answer) -> None:
         ask.fail(BadReply(home.path, type_name(type(ask.message)), str(error)))
     else:
         ask.answer(reply)
+
+
+def turned_away(ask: Ask, error: HoldfastError, *, keep_asks: bool) -> bool:
+    """Fail an ask whose receiver has ended; False if it waits for the next life there, as a recorded turn may."""
+    if keep_asks and isinstance(ask, SwitchAsk):
+        ask.strand()
+        return False
+    ask.fail(error)
+    return True
 
 
 class PendingCalls:
@@ -180,11 +195,11 @@ class PendingCalls:
         asks = ((key, ask) for key, ask in self.later.items() if isinstance(ask, SwitchAsk) and not ask.is_over)
         return {key: (ask.sender.path, origin_of(ask)) for key, ask in asks}
 
-    def renounce(self, error: HoldfastError) -> None:
-        """Nothing that is owed will be answered."""
-        for ask in self.later.values():
-            ask.fail(error)
-        self.later.clear()
+    def renounce(self, error: HoldfastError, *, keep_asks: bool = False) -> None:
+        """Nothing that is owed will be answered. `keep_asks`: but to turns of recorded actors, by the next life."""
+        for key, ask in list(self.later.items()):
+            if turned_away(ask, error, keep_asks=keep_asks):
+                del self.later[key]
 
     # -- what is waited for -----------------------------------------------------------------------------------------
 
@@ -232,6 +247,11 @@ class PendingCalls:
         now = self._home.node.clock.wall()
         asked = [f"waits for an answer of {ask.to.path}" for ask in self.asks.values() if ask.to is not None]
         return " and ".join([*(rest.said(now) for rest in self.resting()), *asked])
+
+    @property
+    def waits_for_answer(self) -> bool:
+        """Whether the turn in hand has asked somebody who has not answered yet."""
+        return any(turn > self._home.ledger.turn for turn, _ in self.asks)
 
     def order(self, turn: int, out: Out) -> None:
         """Have the present life perform an effect: all that precedes it is safe."""

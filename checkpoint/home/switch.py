@@ -118,6 +118,8 @@ class Switch:
         self.path = self.ledger.path = path
         for inlet in self.intake.inlets.values():
             inlet.name = path
+        if self.intake.between is not None:
+            self.intake.between.renamed(path)
 
     def begin_at(self, cell: Cell, method: Method) -> None:
         """Have the next life begin there, and work as this method says from now on."""

@@ -131,6 +131,7 @@ class TurnWaits:
         outcomes: futures of what comes of outputs, by (turn, output), each with what it has to be.
         moment: until when the handler of the turn in hand has waited, in Unix time.
         resting: how many moments and messages the turn in hand waits for.
+        stranded: asks whose receivers have been stopped, and answer in their next lives, by (turn, output).
         heard: how many outcomes the home has told.
         order: tells the turn in hand its outcomes, one after another.
     """
@@ -139,7 +140,14 @@ class TurnWaits:
     outcomes: dict[tuple[int, int], tuple[asyncio.Future[Any], Awaited]] = dataclasses.field(default_factory=dict)
     moment: float = 0.0
     resting: int = 0
+    stranded: set[tuple[int, int]] = dataclasses.field(default_factory=set)
     heard: int = 0
+
+    @property
+    def are_stranded(self) -> bool:
+        """Whether all that the turn in hand waits for at home are answers that do not come before others live again."""
+        places = [place for place, (future, _) in self.outcomes.items() if not future.done()]
+        return bool(places) and self.stranded.issuperset(places)
 
     def rested(self) -> None:
         """Something has come that a turn has waited for, perhaps an earlier one."""
@@ -156,6 +164,7 @@ class LifeStage:
         postponed: orders from outside that wait until it is live.
         ending: that it is to end behind the turn in hand, as that has said.
         stop_wanted: why it is to end when it is live.
+        stopping: why it is to end behind the turn in hand, as it was told.
         stop_turn: the turn that has said so, if it was handled again; -1: it was none.
         begun: the input that has sent something in a turn without an end: it comes before what hooks have put back.
         is_cut_off: whether it ends by an EXIT that it does not trap.
@@ -170,6 +179,7 @@ class LifeStage:
     postponed: list[Item] = dataclasses.field(default_factory=list)
     ending: EndWanted | None = None
     stop_wanted: ExitReason | None = None
+    stopping: ExitReason | None = None
     stop_turn: int = -1
     begun: int = -1
     is_cut_off: bool = False

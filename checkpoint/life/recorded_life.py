@@ -60,6 +60,7 @@ from ..protocol import (
     Restore,
     Snapshot,
     SnapshotNow,
+    Stranded,
     ToHome,
     ToLife,
     TurnEnd,
@@ -80,6 +81,7 @@ from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSna
 from .replay_guard import digest_of
 
 if TYPE_CHECKING:
+    from ...actors.kernel.loop import Suspended
     from ..inputs import Input
 
 NOT_SAVED: Final = -2
@@ -211,6 +213,9 @@ class Life:
                 self.waits.order.take(record)
             case Perform():
                 self._perform(record)
+            case Stranded():
+                self.waits.stranded.add((record.turn, record.k))
+                self.cell.node.loop.call_soon(self.leave_stranded)
             case Glance():  # Not here and now: this may be called in a turn of the very actor.
                 self.cell.node.loop.call_soon(answer_beside, self, record.feed)
             case Go():
@@ -326,6 +331,8 @@ class Life:
         self.feed, self.last_k, self.stage.ending = feed, 0, None
         waits = self.waits
         waits.moment, waits.resting = 0.0, 0
+        if waits.stranded:
+            waits.stranded.clear()
         if waits.order.is_used:
             waits.order.begin()
         if self.outs:  # What a turn that was left in the middle has said does not count.
@@ -371,14 +378,30 @@ class Life:
     def stop(self, reason: ExitReason) -> None:
         """End in good order: behind the turn in hand, or in the middle of one that rests, for that may be for days.
 
-        The next life goes on with that. There is no snapshot of such a moment, and `on_stop` is not called in it.
+        So it is in one that waits for an answer of somebody who has been stopped before. The next life goes on with
+        that. There is no snapshot of such a moment, and `on_stop` is not called in it.
         """
         if self.cell.state is not RUNNING:
             return
         turn = None if self.cell.more is None else self.cell.more.turn
-        if not self.waits.resting or turn is None or turn.then is not None:
-            self.cell.urge(StopRecorded(self, reason))
+        if self.waits.resting and turn is not None and turn.then is None:
+            self._leave(turn, reason)
             return
+        self.stage.stopping = reason
+        self.cell.urge(StopRecorded(self, reason))
+        self.leave_stranded()
+
+    def leave_stranded(self) -> None:
+        """End in the middle of the turn in hand, if the life is to end and the turn waits for who has ended before."""
+        reason, turn = self.stage.stopping, None if self.cell.more is None else self.cell.more.turn
+        if reason is None or turn is None or turn.then is not None or turn.killed or self.feed is None:
+            return
+        if self.is_live and self.method.replays and self.waits.are_stranded:
+            if self.page is not None:
+                self.page[0] = 0  # No end of this life is due to the turn.
+            self._leave(turn, reason)
+
+    def _leave(self, turn: Suspended, reason: ExitReason) -> None:
         self.feed, self.outs = None, []  # What its handler says while it is cancelled does not count.
         turn.then = functools.partial(lifecycle.finish, self.cell, reason, is_orderly=False)
         turn.runner.task.cancel()

@@ -154,6 +154,11 @@ class GuestKeeper:
         """A supervisor in this process is started again."""
         self._say("returned", path)
 
+    def dismissed(self, path: str) -> None:
+        """A supervisor in this process has given up an address."""
+        if any(one.startswith(f"{path}/") for one in self._known):  # Else nothing waits below it.
+            self._say("dismissed", path)
+
     def note(self, key: str, value: bytes | None) -> None:
         """Keep the fact that a supervisor has a child; None forgets it."""
         self._notes.pop(key, None)

@@ -39,7 +39,7 @@ def shorten(db: sqlite3.Connection, path: str) -> None:
     disk = os.statvfs(path)
     free = disk.f_bavail * disk.f_frsize
     with contextlib.suppress(FileNotFoundError):
-        if os.path.getsize(f"{path}-wal") > min(LEAST_BYTES, free):
+        if os.path.getsize(f"{path}-wal") > free:  # Else it is brought over while the store works.
             try:
                 db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
             except sqlite3.OperationalError as error:

@@ -21,6 +21,7 @@ IN_HAND = "tests/checkpoint/test_diverging_in_hand.py"
 
 SMALL_DISK = "tests/checkpoint/sqlite/test_small_disk.py"
 CLOCKS_SET = "tests/effects/test_clocks_set.py"
+BETWEEN = "tests/checkpoint/test_between_lives.py"
 
 CHECKS = {
     "a wait of so many seconds goes by a clock that nobody sets": Check(
@@ -64,6 +65,90 @@ CHECKS = {
         "        if True:\n",
         SMALL_DISK,
         "test_a_store_that_has_filled_its_disk and needs",
+    ),
+    "what comes between two lives waits for the next one": Check(
+        "checkpoint/home/journal_home.py",
+        "waits = restarting and self.method.records and self._outlives(cell)",
+        "waits = False",
+        BETWEEN,
+        "test_what_is_said_to_who_was_stopped_before_comes_once and task and tell",
+    ),
+    "and what is published": Check(
+        "checkpoint/home/journal_home.py",
+        "            wait_for_next_life(self.switch)\n            for topic in topics:\n",
+        "            wait_for_next_life(self.switch)\n            for topic in ():\n",
+        BETWEEN,
+        "test_what_is_said_to_who_was_stopped_before_comes_once and task and publish",
+    ),
+    "without a store nothing waits for the next program": Check(
+        "checkpoint/home/journal_home.py",
+        "return self.switch.journal.durable or (root is not None and root.state is RUNNING)",
+        "return True",
+        BETWEEN,
+        "test_without_a_store_it_is_a_dead_letter_when_the_program_ends",
+    ),
+    "what has waited in vain is a dead letter": Check(
+        "checkpoint/home/homes.py",
+        "            if not switch.journal.durable and end_wait(switch):\n",
+        "            if False:\n",
+        BETWEEN,
+        "test_without_a_store_what_waits_is_a_dead_letter_when_the_program_ends",
+    ),
+    "an ask of a recorded turn that waits stays when its receiver is stopped": Check(
+        "checkpoint/home/disposal.py",
+        "if keep_asks and isinstance(source.ask, SwitchAsk):",
+        "if False:",
+        BETWEEN,
+        "test_who_waits_for_it_does_not_hold_up_the_stop and task and asked",
+    ),
+    "so does one that waits for room": Check(
+        "checkpoint/home/disposal.py",
+        "release(stopped, keep_asks=keep_asks)",
+        "release(stopped)",
+        BETWEEN,
+        "test_an_ask_that_waits_for_room_waits_on",
+    ),
+    "and one that is to be answered later": Check(
+        "checkpoint/home/disposal.py",
+        "renounce(ended, keep_asks=keep_asks)",
+        "renounce(ended)",
+        BETWEEN,
+        "test_a_reply_that_was_promised_to_a_recorded_turn",
+    ),
+    "a turn is left that waits for somebody who was stopped": Check(
+        "checkpoint/home/pending_asks.py",
+        "        if self.switch is not None and not self.is_over and self.switch.life.port is not None:\n",
+        "        if False:\n",
+        BETWEEN,
+        "test_who_waits_for_it_does_not_hold_up_the_stop and task and then",
+    ),
+    "and only when nothing else is out that it waits for": Check(
+        "checkpoint/life/life_state.py",
+        "return bool(places) and self.stranded.issuperset(places)",
+        "return bool(self.stranded)",
+        BETWEEN,
+        "test_an_effect_that_is_out_is_waited_for",
+    ),
+    "it is looked again when that has come": Check(
+        "checkpoint/life/recorded_context.py",
+        "        if life.stage.stopping is not None:\n",
+        "        if False:\n",
+        BETWEEN,
+        "test_who_waits_for_it_does_not_hold_up_the_stop and task and busy",
+    ),
+    "nothing waits below who was removed": Check(
+        "checkpoint/home/homes.py",
+        "            if waiting.startswith(prefix):\n",
+        "            if False:\n",
+        BETWEEN,
+        "test_who_is_told_something_after_a_stop_by_order and removed",
+    ),
+    "nobody from outside waits for room where nobody lives": Check(
+        "checkpoint/home/held_messages.py",
+        "        if not self.has_room:\n            raise self.stopped_error(MAY_LIVE_AGAIN)\n",
+        "        if not self.has_room:\n            return super().room()\n",
+        BETWEEN,
+        "test_a_mailbox_that_is_full_stays_full_between_two_lives",
     ),
     "a turn that is killed has given up nothing": Check(
         "checkpoint/life/outcome_order.py",
@@ -557,7 +642,7 @@ CHECKS = {
     ),
     "a workflow that was asked outlives the program": Check(
         "checkpoint/home/disposal.py",
-        "ledger.released and ledger.waits.lasts and keep_tells",
+        "ledger.released and lasts and keep_tells",
         "False",
         "tests/effects/test_long_waits.py",
         "test_a_turn_that_was_asked_goes_on_too",
