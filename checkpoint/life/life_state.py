@@ -140,7 +140,7 @@ class TurnWaits:
     outcomes: dict[tuple[int, int], tuple[asyncio.Future[Any], Awaited]] = dataclasses.field(default_factory=dict)
     moment: float = 0.0
     resting: int = 0
-    stranded: set[tuple[int, int]] = dataclasses.field(default_factory=set)
+    stranded: frozenset[tuple[int, int]] = frozenset()
     heard: int = 0
 
     @property

@@ -214,7 +214,7 @@ class Life:
             case Perform():
                 self._perform(record)
             case Stranded():
-                self.waits.stranded.add((record.turn, record.k))
+                self.waits.stranded |= {(record.turn, record.k)}
                 self.cell.node.loop.call_soon(self.leave_stranded)
             case Glance():  # Not here and now: this may be called in a turn of the very actor.
                 self.cell.node.loop.call_soon(answer_beside, self, record.feed)
@@ -332,7 +332,7 @@ class Life:
         waits = self.waits
         waits.moment, waits.resting = 0.0, 0
         if waits.stranded:
-            waits.stranded.clear()
+            waits.stranded = frozenset()
         if waits.order.is_used:
             waits.order.begin()
         if self.outs:  # What a turn that was left in the middle has said does not count.

@@ -11,6 +11,7 @@ import types
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
+from ...checkpoint.life.recorded_context import OutcomeFuture
 from ..swaps import Swaps
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ class LoopMethods:
         for name in ("create_future", "create_task"):
             swaps.put(kind, name, self._noting_futures(kind, name))
         swaps.put(kind, "call_exception_handler", self._noting_exceptions(kind))
+        swaps.put(OutcomeFuture, "__init__", self._noting_outcomes(OutcomeFuture.__init__))  # No loop makes these.
 
     @staticmethod
     def of(kind: type) -> LoopMethods:
@@ -87,6 +89,16 @@ class LoopMethods:
             for one in notes.get(loop, ()):
                 one.future_made(made)
             return made
+
+        return noted
+
+    def _noting_outcomes(self, init: Callable[..., None]) -> Any:
+        notes = self._notes
+
+        def noted(made: OutcomeFuture[Any], *, loop: asyncio.AbstractEventLoop) -> None:
+            init(made, loop=loop)
+            for one in notes.get(loop, ()):
+                one.future_made(made)
 
         return noted
 

@@ -139,7 +139,7 @@ class Stroll:
         for number in range(ASKS):
             message: Any = self.draw.choice((Count(), Peek(), None, None))
             if message is None:
-                steps = self.draw.choices(("sleep", "wait", "effect"), k=self.draw.randint(1, 5))
+                steps: list[str] = self.draw.choices(("sleep", "wait", "effect"), k=self.draw.randint(1, 5))
                 message = Go(steps, f"walk {number}")
             self.asked.append((message, asyncio.ensure_future(self.walker.ask(message, IN_TIME))))
             await asyncio.sleep(self.draw.choice(PAUSES))
