@@ -97,8 +97,8 @@ class LoopMethods:
 
         def noted(made: OutcomeFuture[Any], *, loop: asyncio.AbstractEventLoop) -> None:
             init(made, loop=loop)
-            for one in notes.get(loop, ()):
-                one.future_made(made)
+            for each in notes.get(loop, ()):
+                each.future_made(made)
 
         return noted
 
