@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 import msgspec
 
 from ..actors.errors import WaitTimeout
-from ..actors.kernel.cell import Rest
+from ..actors.kernel.cell import TurnRest
 from .inputs import Batch, Input
 from .protocol import MESSAGE, MOMENT, REPLY, SINCE_THEN, Answer, Glance, Glanced, Out, timed
 
@@ -140,16 +140,16 @@ class LongWaits:
         if clock is not None:
             clock.cancel()
 
-    def rests(self) -> list[Rest]:
+    def rests(self) -> list[TurnRest]:
         """What the turn in hand waits for, since when and until when."""
         clock = self._home.node.clock
         ago = clock.wall() - clock.passed()  # Unix time at the beginning of the other clock
-        found: list[Rest] = []
+        found: list[TurnRest] = []
         for place, names in self.wanted.items():
             when, is_moment = self._ends.get(place, (None, True))
             until = when if when is None or is_moment else when + ago
             kind: Literal["wait", "sleep"] = "wait" if names else "sleep"
-            found.append(Rest(kind, names.replace("|", " or "), self._since[place] + ago, until))
+            found.append(TurnRest(kind, names.replace("|", " or "), self._since[place] + ago, until))
         return found
 
     def abandon(self) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from ..events import ActorKilled
-from .cell import RUNNING, Rest
+from .cell import RUNNING, TurnRest
 from .envelope import Ask, Item
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class Home:
         has_answered = isinstance(item, Ask) and item.is_done
         return Work(item, turn is not None, None if turn is None else turn.since, has_answered)
 
-    def rests(self, cell: Cell) -> list[Rest]:
+    def rests(self, cell: Cell) -> list[TurnRest]:
         """What the turn in hand waits for that is no other actor's work; empty if that is not known in this process."""
         more = cell.more
         if more is None or more.turn is None or not (begun := more.belongings.rests):
@@ -301,7 +301,7 @@ class AddressHost:
     def work(self, cell: Cell) -> Work:
         return self.home.work(cell, self.place.running(cell))
 
-    def rests(self, cell: Cell) -> list[Rest]:
+    def rests(self, cell: Cell) -> list[TurnRest]:
         return self.home.rests(cell)
 
     def mailbox(self, cell: Cell) -> Capacity | None:

@@ -128,7 +128,7 @@ class Host(Protocol):
         """What the actor is at, as far as is known in this process."""
         ...
 
-    def rests(self, cell: Cell) -> list[Rest]:
+    def rests(self, cell: Cell) -> list[TurnRest]:
         """What the turn in hand waits for that is no other actor's work, as far as is known in this process."""
         ...
 
@@ -153,7 +153,7 @@ class GivenName:
     scope: Scope = "system"
 
 
-class Rest(NamedTuple):
+class TurnRest(NamedTuple):
     """What a turn waits for that is no other actor's work: a moment, an effect that is out, or a message.
 
     Attributes:
@@ -171,7 +171,7 @@ class Rest(NamedTuple):
     def said(self, now: float) -> str:
         """It in words, behind whoever waits; `now` is Unix time.
 
-        >>> Rest("effect", "charge", 10.0).said(12.0), Rest("wait", "shop:Call", 10.0).said(12.0)
+        >>> TurnRest("effect", "charge", 10.0).said(12.0), TurnRest("wait", "shop:Call", 10.0).said(12.0)
         ('waits for the effect charge, which has been out for 2.0 s', 'has waited for 2.0 s for shop:Call')
         """
         seconds = now - self.since
@@ -198,7 +198,7 @@ class Belongings:
     def __init__(self) -> None:
         self.names: dict[str, Scope] = {}
         self.tasks = Ordered[asyncio.Task[Any]]()
-        self.rests: dict[asyncio.Task[Any], tuple[Any, Rest]] | None = None  # with the item in hand when it began
+        self.rests: dict[asyncio.Task[Any], tuple[Any, TurnRest]] | None = None  # with the item in hand when it began
         self.timers = Ordered[Any]()
         self.topics = Ordered[str]()
 

@@ -17,7 +17,7 @@ from ..exit_reasons import NORMAL, ExitReason
 from ..seconds import check_seconds
 from . import links, mailbox
 from .blocking_handlers import is_async
-from .cell import Rest
+from .cell import TurnRest
 from .envelope import (
     NO_DEADLINE,
     Ask,
@@ -477,7 +477,7 @@ class ActorContext:
         """A task of this life, of which those who look see that the turn in hand rests in it."""
         task, belongings = self._beside(work, kind), self._cell.extra().belongings
         rests = belongings.rests = {} if belongings.rests is None else belongings.rests
-        rests[task] = self._item, Rest(kind, name, self._cell.node.clock.wall(), until)
+        rests[task] = self._item, TurnRest(kind, name, self._cell.node.clock.wall(), until)
         task.add_done_callback(rests.pop)
         return task
 

@@ -15,7 +15,7 @@ from ..control.orders_lane import QueuedOrder
 from ..errors import HoldfastError, error_text
 from ..kernel import lifecycle, mailbox
 from ..kernel.address_host import Work
-from ..kernel.cell import GONE, RUNNING, Cell, Host, Rest
+from ..kernel.cell import GONE, RUNNING, Cell, Host, TurnRest
 from ..kernel.codec import Parcel
 from ..kernel.context import Piped
 from ..kernel.envelope import LEAVE, Ask, Envelope, Item
@@ -250,7 +250,7 @@ class Transit:
     def work(self, cell: Cell) -> Work:
         return Work()  # While it moves it is not up, and nothing is held against it.
 
-    def rests(self, cell: Cell) -> list[Rest]:
+    def rests(self, cell: Cell) -> list[TurnRest]:
         return []
 
     def mailbox(self, cell: Cell) -> Capacity | None:

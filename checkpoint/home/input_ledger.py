@@ -76,7 +76,7 @@ class SharedRows:
 
 
 @dataclasses.dataclass(slots=True)
-class TurnWaits:
+class LedgerWaits:
     """What the turn in hand at one address has waited for.
 
     Attributes:
@@ -130,7 +130,7 @@ class InputLedger:
     begun: int = -1
     released: list[int] = dataclasses.field(default_factory=list)
     outcomes: dict[tuple[int, int], Came] = dataclasses.field(default_factory=dict)
-    waits: TurnWaits = dataclasses.field(default_factory=lambda: TurnWaits())
+    waits: LedgerWaits = dataclasses.field(default_factory=lambda: LedgerWaits())
     pipes_done: dict[int, set[int]] = dataclasses.field(default_factory=dict)
     journal_bytes: int = 0
     newest: Meta | None = None

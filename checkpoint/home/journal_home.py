@@ -17,7 +17,7 @@ from ...actors.events import ActorStarted, Recovered, RecoveryFailed
 from ...actors.exit_reasons import KILLED, ExitReason, Hung, crash
 from ...actors.kernel import links
 from ...actors.kernel.address_host import Work
-from ...actors.kernel.cell import RUNNING, Cell, Rest
+from ...actors.kernel.cell import RUNNING, Cell, TurnRest
 from ...actors.kernel.lifecycle import MAILBOX
 from ...actors.persistence import UNFIT
 from ..method import Method
@@ -243,7 +243,7 @@ class JournalHome(RecordedHome):
         has_answered = ended is not None and bool(ended.reply) and ended.input.ask is None  # Else it is to come later.
         return Work(mark, source is not None, None if turn is None else turn.since, has_answered)
 
-    def rests(self, cell: Cell) -> list[Rest]:
+    def rests(self, cell: Cell) -> list[TurnRest]:
         return [] if self.switch is None else self.switch.calls.resting()
 
     def holds_back(self, cell: Cell) -> str:

@@ -9,7 +9,7 @@ import msgspec
 
 from ...actors.errors import AskTimeout, BadMessage, BadReply, EffectInDoubt, HoldfastError, type_name
 from ...actors.events import EffectRepeated
-from ...actors.kernel.cell import Cell, Rest
+from ...actors.kernel.cell import Cell, TurnRest
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import NO_DEADLINE, Ask, ReplyHandle
 from ...actors.process.wire.peer import RelayedAsk, asked
@@ -176,7 +176,7 @@ class PendingCalls:
         self.asks: dict[tuple[int, int], SwitchAsk] = {}
         self.sends: set[tuple[int, int]] = set()
         self.rests = LongWaits(home)
-        self.effects: dict[tuple[int, int], Rest] = {}
+        self.effects: dict[tuple[int, int], TurnRest] = {}
         self.later: dict[int, Ask] = {}
         self.owed: dict[int, tuple[str, str]] = {}
 
@@ -236,7 +236,7 @@ class PendingCalls:
         home.node.emit(EffectRepeated(home.path, out.to, "" if source is None else source.name))
         self.order(turn, out)
 
-    def resting(self) -> list[Rest]:
+    def resting(self) -> list[TurnRest]:
         """What the turn in hand waits for that is no other actor's work."""
         ledger = self._home.ledger
         effects = [one for place, one in self.effects.items() if place[0] > ledger.turn]
@@ -259,7 +259,7 @@ class PendingCalls:
         if place not in self.effects:  # Else it is done again by a later life.
             if self.effects and next(iter(self.effects))[0] != turn:
                 self.effects.clear()  # An earlier turn has ended without waiting for them.
-            self.effects[place] = Rest("effect", out.to, self._home.node.clock.wall())
+            self.effects[place] = TurnRest("effect", out.to, self._home.node.clock.wall())
         if self._home.life.port is not None:
             self._home.life.port.to_life(Perform(turn, out.k, self._home.life.token))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Any
@@ -175,7 +176,6 @@ class Evidence(msgspec.Struct, frozen=True):
         memory: of its own process, if its limits bound that.
         waiting: what waits most in its mailbox.
         silence: that its process has not answered.
-        rests: what its turn waits for that is no other actor's work, in words; "" if nothing is known.
     """
 
     address: str
@@ -198,7 +198,6 @@ class Evidence(msgspec.Struct, frozen=True):
     memory: ProcessMemory | None = None
     waiting: Waiting | None = None
     silence: Silence | None = None
-    rests: str = ""
 
     def ago(self, at: float) -> str:
         """A moment as people say it: how long ago, or the time of day if that is long."""
@@ -252,7 +251,7 @@ def collect(
         answer(recorder, question(literal(address), limit=MOST)).events,
         sorted(ancestors, key=lambda event: event.number),
         answer(recorder, question(kinds=STORE_KINDS, limit=20)).events,
-        told.status,
+        _known_at_home(told.status, cell),
         told.queued_before,
         # All mailboxes are searched for them, and only of a turn that goes on is anything said of its asks.
         outstanding(node, address) if told.status is not None and told.status.turn is not None else [],
@@ -274,9 +273,13 @@ def collect(
         None if cell is None else _memory(cell),
         None if cell is None else _waiting(cell),
         told.silence,
-        # The home of a recorded actor knows more than the process that it lives in.
-        ("" if cell is None else rests_said(cell)) or ("" if told.status is None else told.status.turn_rests),
     )
+
+
+def _known_at_home(status: Status | None, cell: Cell | None) -> Status | None:
+    """A status with what the home of a recorded actor knows of its turn, and the process that it lives in does not."""
+    rests = "" if cell is None else rests_said(cell)
+    return dataclasses.replace(status, turn_rests=rests) if status is not None and rests else status
 
 
 def _children(node: Node, address: str, overview: dict[str, Any]) -> list[ChildNow]:

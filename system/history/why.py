@@ -285,8 +285,8 @@ def _waits(evidence: Evidence) -> list[str]:
         return []
     said = f"{evidence.address} has been in the turn of {status.turn} for {seconds_text(status.turn_seconds)}"
     at = f", at {status.turn_at}" if status.turn_at else ""
-    if not evidence.asks and evidence.rests:
-        return [f"{said}{at}; it {evidence.rests}."]
+    if not evidence.asks and status.turn_rests:
+        return [f"{said}{at}; it {status.turn_rests}."]
     if not evidence.asks:
         return [f"{said}{at}; it waits for something that is no ask of this process."]
     first = evidence.asks[0]

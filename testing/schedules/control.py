@@ -14,6 +14,7 @@ import concurrent.futures
 import inspect
 import itertools
 import threading
+import types
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable
 from contextvars import Context
@@ -255,7 +256,8 @@ def _close(coroutine: Any) -> None:
 
 def _close_unbegun(handle: Any) -> None:
     """Close the coroutines that a callback has which is never called, and that have not begun: nobody awaits them."""
-    for cell in getattr(handle._callback, "__closure__", None) or ():
+    callback = handle._callback
+    for cell in (callback.__closure__ or ()) if isinstance(callback, types.FunctionType) else ():
         try:
             held = cell.cell_contents
         except ValueError:  # It is empty.

@@ -23,7 +23,7 @@ STEPS = (None, "task_wakeup", "__step", "__wakeup")
 """How the methods of a task are named that go on with it, in C and in Python."""
 
 
-class Behind(NamedTuple):
+class Fence(NamedTuple):
     """Whose step it is that comes behind all that was scheduled before it: a lane."""
 
     lane: Hashable
@@ -87,7 +87,7 @@ class DueQueue:
             key, has_place = handle, False
         else:
             lane = lane_of(handle)
-            key, has_place = Behind(lane) if type(owner) is OutcomeOrder else lane, True
+            key, has_place = Fence(lane) if type(owner) is OutcomeOrder else lane, True
         self._ordered += has_place
         if type(handle) is not TellingHandle:
             self._silent += 1
@@ -138,7 +138,7 @@ class DueQueue:
                 tasks.add(id(key))
             elif not has_place:
                 found.append(option)
-            elif type(key) is Behind:
+            elif type(key) is Fence:
                 if not (tasks or lanes):
                     found.append(option)
                 lanes.add(key.lane)

@@ -213,7 +213,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         f"{AT} has been in the turn of shop.Pay for 1.5 s; it waits for something that is no ask of this process.",
     ),
     "rests as it has said": (
-        {"status": status(turn="shop.Pay", turn_seconds=1.5), "rests": "has slept for 1.5 s"},
+        {"status": status(turn="shop.Pay", turn_seconds=1.5, turn_rests="has slept for 1.5 s")},
         f"{AT} has been in the turn of shop.Pay for 1.5 s; it has slept for 1.5 s.",
     ),
     "mailbox grows": (

@@ -15,7 +15,7 @@ LOOPS = "tests/testing/test_loop_methods.py"
 CHECKS = {
     "a turn has time between two outcomes": Check(
         "testing/schedules/due.py",
-        "Behind(lane) if type(owner) is OutcomeOrder else lane",
+        "Fence(lane) if type(owner) is OutcomeOrder else lane",
         "lane",
         "tests/effects/test_race_programs.py",
         "test_so_it_does_in_any_order_of_steps and task",
