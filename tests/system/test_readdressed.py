@@ -321,6 +321,25 @@ async def test_it_waits_for_nobody_who_waits_for_it(tmp_path: Path) -> None:
         assert answers == list(range(1, 201))
 
 
+async def test_it_answers_whoever_asks_while_it_rests(tmp_path: Path) -> None:
+    """What the other one has sent has to be saved before addresses change, and its turn ends with this answer only."""
+    async with program(tmp_path / "store") as system:
+        other, one = ref(system, "/app/there/friend"), ref(system, "/app/here/one")
+        assert await other.ask(Know(one))
+        await moved(system, "/app/aside")  # All that was sent is saved now, so it can rest at once.
+        asked: list[asyncio.Future[int]] = []
+
+        async def ask(system: hf.ActorSystem) -> None:
+            asked.append(asyncio.ensure_future(other.ask(Pass(1), IN_TIME)))
+            while (await system.get_status(other)).turn is None:
+                assert not asked[0].done(), "it did not rest"
+                await asyncio.sleep(0.001)
+
+        await moved(system, of="/app/aside/one", then=Stumble(ask))
+        assert one.path == "/app/there/one"
+        assert await asked[0] == 1
+
+
 async def test_it_goes_past_recorded_actors_that_are_suspended(tmp_path: Path) -> None:
     async with program(tmp_path / "store") as system:
         one, other = ref(system, "/app/here/one"), ref(system, "/app/there/friend")

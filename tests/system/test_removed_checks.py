@@ -580,7 +580,7 @@ CHECKS = {
         "        if waits:  # Perhaps for what those here have to answer.\n",
         "        if False:\n",
         MOVED,
-        "test_it_waits_for_nobody",
+        "test_it_answers_whoever_asks",
     ),
     "a binding follows the actor and not its address": Check(
         "system/transaction/arrangement.py",
