@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
-from ...actors.errors import HoldfastError
+from ...actors.errors import HoldfastError, type_name
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.bindings import Binding
 from ...actors.kernel.envelope import ReplyHandle
-from ...actors.kernel.message import Message
+from ...actors.kernel.message import Message, Refusal
 from ...actors.kernel.ref import current
 from ...checkpoint.protocol import (
     DROPPED,
@@ -35,7 +35,7 @@ from ...checkpoint.protocol import (
 )
 from .brick_messages import FORWARDED, Beside, Done, Inward, Outward, PartEnded, Request, StaleLeader, Taken, Work
 from .letters import FOREVER as FOREVER
-from .peer_channel import Inbox, Posting
+from .peer_channel import AGAIN, Inbox, Posting
 
 if TYPE_CHECKING:
     from ..model.mechanism import Mechanism
@@ -121,6 +121,11 @@ class Brick(Posting):
             return True
         return False
 
+    def _failed(self, method: str, no: Refusal) -> HoldfastError:
+        """What ends the replica when a method of a brick has raised a refusal, as any other exception does."""
+        raised = type_name(type(no))
+        return HoldfastError(f"{self.ctx.path}: {method} raised {raised}: {no}; self.refuse in `before` ends a request")
+
 
 class Before(Brick):
     """The brick that does something with a batch before it is computed; without `before` it passes through."""
@@ -161,7 +166,12 @@ class Before(Brick):
     async def _work(self, work: Work) -> None:
         if self._refuses():
             return
-        out = await self.before(work)
+        try:
+            out = await self.before(work)
+        except StaleLeader:
+            return  # Another one leads: this batch never was.
+        except Refusal as no:  # Nobody would hear of it.
+            raise self._failed("before", no) from no
         self.next.tell(msgspec.structs.replace(work, requests=[]) if out is None else out)
 
 
@@ -190,6 +200,8 @@ class After(Brick):
                     out = msgspec.structs.replace(done, ends=[], more=[])
             except StaleLeader:
                 out = None  # Another one leads: these outcomes never were.
+            except Refusal as no:  # Proceed would hand over the same again, for ever.
+                raise self._failed("after", no) from no
             if out is not None:
                 await self.next.ask(out, timeout=FOREVER)
         handle.reply(Taken())
@@ -376,13 +388,15 @@ class Proceed(Brick):
         return ends, more
 
     async def _pass(self, done: Done) -> None:
+        pause = 0.0
         while True:
             try:
                 await self.next.ask(done, timeout=FOREVER)
-            except HoldfastError:  # It was exchanged in between: the one that is bound now gets it.
-                await asyncio.sleep(0)
-                continue
-            return
+            except HoldfastError:  # It was exchanged in between, and the one that is bound now gets it; or has died.
+                await asyncio.sleep(pause)
+                pause = AGAIN
+            else:
+                return
 
     # -- past the bricks --------------------------------------------------------------------------------------------
 
@@ -401,7 +415,10 @@ class Proceed(Brick):
             return
         for record in message.records:
             if isinstance(record, Outcome):
-                await self.heard(record)
+                try:
+                    await self.heard(record)
+                except Refusal as no:  # The turn would wait for ever.
+                    raise self._failed("heard", no) from no
             self._standing.server.inward(record)
 
     def tell_outward(self, record: Released | Performed | GivenUp) -> None:

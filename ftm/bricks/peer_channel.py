@@ -190,35 +190,43 @@ class Posting(Letters):
 
         Raises:
             PeerLost: nobody waits for it any longer. StaleEpoch: it is we that do not count.
+            Refusal: what that brick's `from_peer` has raised.
         """
-        standing = self._standing
+        standing, peer = self._standing, self._standing.other.cell
         codec = standing.node.codec
         body = codec.encoder.encode(message)
-        peer = standing.other.cell
-        if standing.link is not None:
-            if peer is None:
-                raise PeerLost("there is none")
-            sealed = self._ask_peer_sealed(standing.link, peer, message, body)
-            return codec.decode_reply(type(message), await sealed)  # type: ignore[no-any-return]
         while True:
             if peer is None or standing.other.cell is not peer:
                 raise PeerLost("there is none")
             try:
-                async with self._sending:  # In order: finding the peer takes the first one longer than the others.
-                    if standing.other.cell is not peer:
-                        continue
-                    posted = self._post(await self._find_peer(peer.path), message, body)
-                reply = await self._reply_to(posted)
-            except (PeerLost, ConfigMismatch):
+                if standing.link is not None:
+                    reply = await self._ask_peer_sealed(standing.link, peer, message, body)
+                else:
+                    async with self._sending:  # In order: finding the peer takes the first one longer than the others.
+                        if standing.other.cell is not peer:
+                            continue
+                        posted = self._post(await self._find_peer(peer.path), message, body)
+                    reply = await self._reply_to(posted)
+            except PeerLost:
                 raise
             except StaleLeader:
                 standing.fence()
                 raise
+            except NotFollowing:  # It is told soon that it follows.
+                pass
+            except ConfigMismatch as no:
+                if no.here > no.there:  # All that mattered had come to its end before.
+                    raise PeerLost("the mechanisms have changed since this was said") from no
+                standing.other.lose_brick(self.slot)  # It changes them soon, or does not count any more.
+            except Refusal as no:
+                if not isinstance(no, Refused | NotHere):
+                    raise
+                standing.other.lose_brick(self.slot)
             except HoldfastError:  # It has died, which we shall be told, or its brick was exchanged.
                 standing.other.lose_brick(self.slot)
-                await standing.other.changes(AGAIN)
-                continue
-            return codec.decode_reply(type(message), reply)  # type: ignore[no-any-return]
+            else:
+                return codec.decode_reply(type(message), reply)  # type: ignore[no-any-return]
+            await standing.other.changes(AGAIN)
 
     def _post(self, outbox: Outbox, message: Message[Any], body: bytes) -> Posted:
         return Posted(self._standing, outbox, message_name(type(message)), body, self._numbers)
@@ -236,14 +244,10 @@ class Posting(Letters):
         async def find() -> ActorRef[Any]:
             return (await self._find_peer(peer.path)).ref
 
-        while True:
-            try:
-                return await self._ask_sealed(
-                    link, peer, self.slot, part, find, lambda error: standing.other.lose_brick(self.slot),
-                    lambda: standing.other.cell is peer,
-                )  # fmt: skip
-            except NotFollowing:  # It is told soon that it follows.
-                await standing.other.changes(AGAIN)
+        return await self._ask_sealed(
+            link, peer, self.slot, part, find, lambda error: standing.other.lose_brick(self.slot),
+            lambda: standing.other.cell is peer,
+        )  # fmt: skip
 
     async def ask_at(self, path: str, slot: str, message: Message[R]) -> R:
         """Ask a brick of a certain replica, once.

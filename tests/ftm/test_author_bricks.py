@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import msgspec
 import pytest
@@ -11,9 +11,11 @@ import pytest
 import holdfast as hf
 from holdfast.ftm.alarms import RequestsDropped
 from holdfast.ftm.bricks.brick_messages import Done, ReplyEvicted, RequestDropped, Work
-from holdfast.ftm.bricks.bricks import After, Before
+from holdfast.checkpoint.protocol import Outcome
+from holdfast.ftm.bricks.bricks import After, Before, Proceed
 from holdfast.ftm.model.mechanism import Mechanism, Role
-from tests.ftm.accounts import Add, Counter, Tags
+from tests.ftm.accounts import Account, Add, Counter, Pay, Purse, Tags
+from tests.ftm.campaign import whole
 
 REFUSED, ANSWERED, DROPPED = -1, -2, -3
 """Amounts that the brick does something about."""
@@ -118,3 +120,123 @@ async def test_an_outcome_that_a_brick_lets_fall_fails_and_may_have_been(
         await ref.ask(Add(1), timeout=30)
     assert dropped.value.may_have_run
     assert await ref.ask(Tags(), timeout=30) == [1]
+
+
+class RaisingBefore(Before):
+    async def before(self, work: Work) -> Work:
+        messages = map(self.message_of, work.requests)
+        if amounts := [one.amount for one in messages if isinstance(one, Add) and one.amount == REFUSED]:
+            raise TooMuch(amount=amounts[0])
+        return work
+
+
+class RaisingAfter(After):
+    async def after(self, done: Done) -> Done:
+        requests = [self._standing.inside[end.id] for end in done.ends if end.id in self._standing.inside]
+        if any(REFUSED_BODY in one.feed.body for one in requests):
+            raise TooMuch(amount=REFUSED)
+        return done
+
+
+REFUSED_BODY = b"\xff"
+"""How -1 is encoded; no other amount of these tests has that byte."""
+
+
+class RaisingHeard(Proceed):
+    async def heard(self, outcome: Outcome) -> None:
+        raise TooMuch(amount=outcome.k)
+
+
+@dataclasses.dataclass(frozen=True)
+class RaisesBefore(Mechanism):
+    name: ClassVar[str] = "raises-before"
+    layer: ClassVar[str] = "assertion"
+    roles: ClassVar[dict[str, Role]] = {"leader": Role(before=RaisingBefore), "other": Role(before=RaisingBefore)}
+
+
+@dataclasses.dataclass(frozen=True)
+class RaisesAfter(Mechanism):
+    name: ClassVar[str] = "raises-after"
+    layer: ClassVar[str] = "assertion"
+    roles: ClassVar[dict[str, Role]] = {"leader": Role(after=RaisingAfter), "other": Role()}
+
+
+@dataclasses.dataclass(frozen=True)
+class RaisesHeard(Mechanism):
+    name: ClassVar[str] = "raises-heard"
+    layer: ClassVar[str] = "assertion"
+    roles: ClassVar[dict[str, Role]] = {"leader": Role(proceed=RaisingHeard), "other": Role()}
+
+
+@pytest.mark.parametrize("outer", [RaisesBefore(), RaisesAfter()], ids=["before", "after"])
+async def test_a_refusal_that_a_brick_raises_ends_its_replica_as_any_exception_does(
+    system: hf.ActorSystem, outer: Mechanism
+) -> None:
+    """Nobody is answered by it, so the request comes again, until it has ended too many."""
+    stack = hf.ftm.compose(outer, hf.ftm.PBR())
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=stack, recovery=hf.hybrid()))
+    assert await ref.ask(Add(1)) == 1
+    with system.events() as events:
+        with pytest.raises(hf.Quarantined):
+            await ref.ask(Add(2, REFUSED), timeout=60)
+        crashes = [one for one in events.take() if isinstance(one, hf.events.ActorCrashed)]
+    assert crashes
+    assert "raised tests.ftm.test_author_bricks.TooMuch: " in str(crashes[0])
+    assert await ref.ask(Add(3), timeout=60) == 2
+    assert await ref.ask(Tags()) == [1, 3]
+
+
+async def test_so_it_does_when_it_hears_of_an_ask(system: hf.ActorSystem) -> None:
+    account = await system.start(hf.child("account", hf.start(Account, 0)))
+    stack = hf.ftm.compose(RaisesHeard(), hf.ftm.PBR())
+    spec = hf.child("purse", hf.start(Purse), mechanism=stack, bindings={"account": account.path})
+    purse = await system.start(spec)
+    with pytest.raises((hf.Quarantined, hf.AskFailed)):
+        await purse.ask(Pay(1), timeout=60)
+
+
+class Consent(hf.Message[bool]):
+    """Whether the other replica has nothing against an amount."""
+
+    amount: int
+
+
+class Consenting(Before):
+    peer_messages = (Consent,)
+
+    async def before(self, work: Work) -> Work:
+        for one in list(work.requests) if self.leads and self.has_peer else ():
+            message = self.message_of(one)
+            if isinstance(message, Add):
+                try:
+                    await self.ask_peer(Consent(message.amount))
+                except TooMuch as no:
+                    work = self.refuse(work, one, no)
+        return work
+
+    async def from_peer(self, message: hf.Message[Any]) -> bool:
+        assert isinstance(message, Consent)
+        if message.amount == REFUSED:
+            raise TooMuch(amount=message.amount)
+        return True
+
+
+@dataclasses.dataclass(frozen=True)
+class Consents(Mechanism):
+    """Asks the other replica for its consent."""
+
+    name: ClassVar[str] = "consents"
+    layer: ClassVar[str] = "assertion"
+    roles: ClassVar[dict[str, Role]] = {"leader": Role(before=Consenting), "other": Role(before=Consenting)}
+
+
+@pytest.mark.parametrize("is_secured", [False, True])
+async def test_what_a_brick_refuses_its_peer_is_the_answer(secured: hf.ActorSystem, is_secured: bool) -> None:
+    layers = (hf.ftm.SEC("ca"), Consents(), hf.ftm.PBR()) if is_secured else (Consents(), hf.ftm.PBR())
+    spec = hf.child("alice", hf.start(Counter), mechanism=hf.ftm.compose(*layers))
+    ref = await secured.start(spec)
+    await whole(ref)
+    assert await ref.ask(Add(1), timeout=60) == 1
+    with pytest.raises(TooMuch):
+        await ref.ask(Add(2, REFUSED), timeout=60)
+    assert await ref.ask(Tags(), timeout=60) == [1]

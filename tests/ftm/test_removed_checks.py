@@ -15,7 +15,43 @@ PUT_BACK, UNAWAITED = "tests/ftm/test_put_back.py", "tests/ftm/test_unawaited_as
 SPOILED = "tests/ftm/test_spoiled_states.py"
 RANDOM_HOOKS = "tests/ftm/test_random_hooks.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
+AUTHORS = "tests/ftm/test_author_bricks.py"
 CHECKS = {
+    "a refusal that `before` raises ends the replica": Check(
+        "ftm/bricks/bricks.py",
+        """            raise self._failed("before", no) from no\n""",
+        "            raise\n",
+        AUTHORS,
+        "test_a_refusal_that_a_brick_raises and before",
+    ),
+    "a refusal that `after` raises ends the replica": Check(
+        "ftm/bricks/bricks.py",
+        """                raise self._failed("after", no) from no\n""",
+        "                raise\n",
+        AUTHORS,
+        "test_a_refusal_that_a_brick_raises and after",
+    ),
+    "a refusal that `heard` raises ends the replica": Check(
+        "ftm/bricks/bricks.py",
+        """                    raise self._failed("heard", no) from no\n""",
+        "                    raise\n",
+        AUTHORS,
+        "test_so_it_does_when_it_hears",
+    ),
+    "what the peer refuses is its answer": Check(
+        "ftm/bricks/peer_channel.py",
+        "                if not isinstance(no, Refused | NotHere):\n",
+        "                if False:\n",
+        AUTHORS,
+        "test_what_a_brick_refuses_its_peer and False",
+    ),
+    "what was said before the mechanisms changed is waited for by nobody": Check(
+        "ftm/bricks/peer_channel.py",
+        "                if no.here > no.there:  # All",
+        "                if False:  # All",
+        "tests/effects/test_waits_under_mechanisms.py",
+        "test_what_was_found_comes_in_order",
+    ),
     "the start of an actor is nothing that could be lost": Check(
         "ftm/bricks/standing.py",
         " and any(one.feed.kind != START for one in inside):\n",
