@@ -56,8 +56,7 @@ class OtherReplica:
         self.state, self.turn = state if path is not None else "none", turn
         if self.state == "live":
             self.caught_up()
-        self._bricks.clear()
-        self.forwarded = []
+        self.forget_bricks()
         waiting, self._waiting = self._waiting, set()
         for one in waiting:
             if not one.done():
@@ -80,8 +79,9 @@ class OtherReplica:
         self._bricks.pop(slot, None)
 
     def forget_bricks(self) -> None:
-        """The bricks there may be others now."""
+        """The bricks, here and there, may be others now: for what these have said nobody waits any more."""
         self._bricks.clear()
+        self.forwarded = []
 
     async def wait_for(self, asked: asyncio.Future[Any]) -> Any:
         """The outcome of what the other replica was asked, as long as it counts.

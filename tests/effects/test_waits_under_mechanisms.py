@@ -1,6 +1,7 @@
 """Random turns that wait behind every mechanism, with more asks behind them, while replicas die and mechanisms change.
 
-`HOLDFAST_WAITS=1000` has so many seeds of each kind; `HOLDFAST_SEED` is the first one.
+`HOLDFAST_WAITS=1000` has so many seeds of each kind; `HOLDFAST_FIRST` is the first one. (`HOLDFAST_SEED` is that of all
+schedules, as everywhere.)
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from holdfast.testing import GuardedSystem, Simulation, simulate
 from tests.effects.patient import Call, Count, Go
 from tests.effects.race_player import WORLD, act
 
-FIRST = int(os.environ.get("HOLDFAST_SEED", "1"))
+FIRST = int(os.environ.get("HOLDFAST_FIRST", "1"))
 WAITS = int(os.environ.get("HOLDFAST_WAITS", "2"))
 SEEDS = range(FIRST, FIRST + WAITS)
 ASKS = 10
@@ -205,10 +206,10 @@ class Stroll:
         assert all(WORLD[effect] for effect in effects)
 
 
-def stroll(seed: int, stack: str, recovery: Any) -> None:
-    """One walk under one schedule."""
+def stroll(seed: int, stack: str, recovery: Any, *, schedule: int | None = None) -> None:
+    """One walk under one schedule, that of the same seed if no other one is given."""
 
-    @simulate(latency=(0.0, 0.005), intensity=10_000, seed=seed)
+    @simulate(latency=(0.0, 0.005), intensity=10_000, seed=seed if schedule is None else schedule)
     async def walk(system: GuardedSystem, simulation: Simulation) -> None:
         system.expect_crashes()
         system.expect_exceptions()  # Of asks between the parts of a group, one of which was killed.
@@ -247,3 +248,8 @@ def test_what_was_found_comes_in_order(stack: str, seed: int) -> None:
 def test_so_it_does_without_recovery(stack: str) -> None:
     for seed in SEEDS:
         stroll(seed, stack, None)
+
+
+def test_what_was_said_before_the_mechanisms_changed_is_waited_for_by_nobody() -> None:
+    """The brick that had said it had ended, and what it had begun with it: whoever waited for that was cancelled."""
+    stroll(48, "lfr", None, schedule=37)

@@ -46,11 +46,11 @@ CHECKS = {
         "test_what_a_brick_refuses_its_peer and False",
     ),
     "what was said before the mechanisms changed is waited for by nobody": Check(
-        "ftm/bricks/peer_channel.py",
-        "                if no.here > no.there:  # All",
-        "                if False:  # All",
+        "ftm/bricks/standing.py",
+        "        self._bricks.clear()\n        self.forwarded = []\n",
+        "        self._bricks.clear()\n",
         "tests/effects/test_waits_under_mechanisms.py",
-        "test_what_was_found_comes_in_order",
+        "test_what_was_said_before",
     ),
     "the start of an actor is nothing that could be lost": Check(
         "ftm/bricks/standing.py",
