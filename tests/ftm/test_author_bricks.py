@@ -9,9 +9,9 @@ import msgspec
 import pytest
 
 import holdfast as hf
+from holdfast.checkpoint.protocol import Outcome
 from holdfast.ftm.alarms import RequestsDropped
 from holdfast.ftm.bricks.brick_messages import Done, ReplyEvicted, RequestDropped, Work
-from holdfast.checkpoint.protocol import Outcome
 from holdfast.ftm.bricks.bricks import After, Before, Proceed
 from holdfast.ftm.model.mechanism import Mechanism, Role
 from tests.ftm.accounts import Account, Add, Counter, Pay, Purse, Tags
