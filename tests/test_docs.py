@@ -249,7 +249,16 @@ def test_the_reference_has_every_public_name() -> None:
     """As a page of mkdocstrings has it: `::: holdfast.Actor`; rooms of errors and events are there as a whole."""
     text = "".join(path.read_text("utf-8") for path in sorted((ROOT / "docs" / "reference").glob("*.md")))
     there = set(re.findall(r"^::: holdfast\.(\S+)$", text, re.MULTILINE))
-    for room in ("", "adapters", "checkpoint", "ftm", "supervision", "system"):
+    for room in (
+        "",
+        "adapters",
+        "checkpoint",
+        "checkpoint.store_tools",
+        "ftm",
+        "supervision",
+        "system",
+        "system.upgrade",
+    ):
         module = importlib.import_module(f"holdfast.{room}" if room else "holdfast")
         errors = set(importlib.import_module("holdfast.errors").__all__)
         wanted = {f"{room}.{name}".lstrip(".") for name in module.__all__ if name not in errors and name[0] != "_"}
