@@ -249,7 +249,9 @@ class JournalHome(RecordedHome):
     def holds_back(self, cell: Cell) -> str:
         """A turn that has ended waits for a store without room: what it has done is kept, and its reply comes then."""
         blocked = self.homes.journal.blocked
-        return "" if blocked is None else f"in time, for its store takes nothing: {blocked}"
+        if blocked is None:
+            return ""
+        return f"in time; do not ask again, for it goes on with this when its store takes something again: {blocked}"
 
     def mailbox(self, cell: Cell) -> Capacity | None:
         return None if self.switch is None else self.switch.intake.mailbox

@@ -340,7 +340,7 @@ async def test_an_ask_that_has_met_a_full_disk_says_so_when_its_time_is_over(eng
         engine.full = True
         with pytest.raises(hf.AskTimeout) as late:
             await doer.ask(Note("b"), timeout=0.3)
-        assert "its store takes nothing: " in str(late.value)
+        assert "do not ask again, for it goes on with this when its store takes something again: " in str(late.value)
         assert "no room" in str(late.value)
         assert str(late.value).endswith("it may have been handled")
         engine.full = False
