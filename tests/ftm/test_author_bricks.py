@@ -232,7 +232,7 @@ class Consents(Mechanism):
 
 @pytest.mark.parametrize("is_secured", [False, True])
 async def test_what_a_brick_refuses_its_peer_is_the_answer(secured: hf.ActorSystem, is_secured: bool) -> None:
-    layers = (hf.ftm.SEC("ca"), Consents(), hf.ftm.PBR()) if is_secured else (Consents(), hf.ftm.PBR())
+    layers = (hf.ftm.SEC("/app/ca"), Consents(), hf.ftm.PBR()) if is_secured else (Consents(), hf.ftm.PBR())
     spec = hf.child("alice", hf.start(Counter), mechanism=hf.ftm.compose(*layers))
     ref = await secured.start(spec)
     await whole(ref)
