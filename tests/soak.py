@@ -26,7 +26,7 @@ from typing import Any
 import psutil
 
 import holdfast as hf
-from tests.ftm.campaign import whole
+from tests.ftm.campaign import Stuck, whole
 
 PATIENCE = 120.0
 """Seconds in which whatever is asked is answered."""
@@ -252,10 +252,14 @@ class Soak:
         return "a replica" if kind == "protected" else "a process"
 
     async def well(self) -> None:
-        """Wait until each of them answers, and the group is whole."""
-        await whole(self.refs["protected"])
-        for kind, ref in self.refs.items():
-            twice, missed = await ref.ask(Read(), timeout=PATIENCE)
+        """Wait until each of them answers, and the group is whole; a problem if that never comes."""
+        try:
+            await whole(self.refs["protected"])
+            read = {kind: await ref.ask(Read(), timeout=PATIENCE) for kind, ref in self.refs.items()}
+        except (Stuck, hf.HoldfastError) as error:
+            self._report.problems.append(f"they are not well again: {error!r}")
+            return
+        for kind, (twice, missed) in read.items():
             if kind not in ("task", "process") and (twice or missed):
                 self._report.problems.append(f"{kind}: {missed} lost, {twice} doubled")
 
