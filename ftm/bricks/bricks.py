@@ -121,7 +121,7 @@ class Brick(Posting):
             return True
         return False
 
-    def _failed(self, method: str, no: Refusal) -> HoldfastError:
+    def _raised(self, method: str, no: Refusal) -> HoldfastError:
         """What ends the replica when a method of a brick has raised a refusal, as any other exception does."""
         raised = type_name(type(no))
         return HoldfastError(f"{self.ctx.path}: {method} raised {raised}: {no}; self.refuse in `before` ends a request")
@@ -171,7 +171,7 @@ class Before(Brick):
         except StaleLeader:
             return  # Another one leads: this batch never was.
         except Refusal as no:  # Nobody would hear of it.
-            raise self._failed("before", no) from no
+            raise self._raised("before", no) from no
         self.next.tell(msgspec.structs.replace(work, requests=[]) if out is None else out)
 
 
@@ -201,7 +201,7 @@ class After(Brick):
             except StaleLeader:
                 out = None  # Another one leads: these outcomes never were.
             except Refusal as no:  # Proceed would hand over the same again, for ever.
-                raise self._failed("after", no) from no
+                raise self._raised("after", no) from no
             if out is not None:
                 await self.next.ask(out, timeout=FOREVER)
         handle.reply(Taken())
@@ -418,7 +418,7 @@ class Proceed(Brick):
                 try:
                     await self.heard(record)
                 except Refusal as no:  # The turn would wait for ever.
-                    raise self._failed("heard", no) from no
+                    raise self._raised("heard", no) from no
             self._standing.server.inward(record)
 
     def tell_outward(self, record: Released | Performed | GivenUp) -> None:

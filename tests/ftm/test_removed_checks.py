@@ -19,21 +19,21 @@ AUTHORS = "tests/ftm/test_author_bricks.py"
 CHECKS = {
     "a refusal that `before` raises ends the replica": Check(
         "ftm/bricks/bricks.py",
-        """            raise self._failed("before", no) from no\n""",
+        """            raise self._raised("before", no) from no\n""",
         "            raise\n",
         AUTHORS,
         "test_a_refusal_that_a_brick_raises and before",
     ),
     "a refusal that `after` raises ends the replica": Check(
         "ftm/bricks/bricks.py",
-        """                raise self._failed("after", no) from no\n""",
+        """                raise self._raised("after", no) from no\n""",
         "                raise\n",
         AUTHORS,
         "test_a_refusal_that_a_brick_raises and after",
     ),
     "a refusal that `heard` raises ends the replica": Check(
         "ftm/bricks/bricks.py",
-        """                    raise self._failed("heard", no) from no\n""",
+        """                    raise self._raised("heard", no) from no\n""",
         "                    raise\n",
         AUTHORS,
         "test_so_it_does_when_it_hears",
