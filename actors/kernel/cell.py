@@ -132,6 +132,10 @@ class Host(Protocol):
         """What the turn in hand waits for that is no other actor's work, as far as is known in this process."""
         ...
 
+    def ask_turns(self, cell: Cell) -> None:
+        """Have its process tell of its turns, for the next `work` and `rests`; nothing to do where they are known."""
+        ...
+
     def mailbox(self, cell: Cell) -> Capacity | None:
         """How full the mailbox is; None if it takes any number of messages."""
         ...
@@ -203,6 +207,21 @@ class Belongings:
         self.topics = Ordered[str]()
 
 
+class Looks:
+    """What those who look from another process have seen of an actor's turns: what it had in hand at the last look."""
+
+    __slots__ = ("count", "item")
+
+    def __init__(self) -> None:
+        self.count, self.item = 0, None
+
+    def take(self, item: Any) -> int:
+        """Note what is in hand now, or was last; returns at how many looks that was something new."""
+        if item is not self.item:
+            self.item, self.count = item, self.count + 1
+        return self.count
+
+
 class More:
     """What only some cells have; made when first needed, so that an idle actor stays small.
 
@@ -218,6 +237,7 @@ class More:
         "enders",
         "has_more",
         "last",
+        "looks",
         "outlet",
         "reason",
         "start",
@@ -235,6 +255,7 @@ class More:
     belongings: Belongings
     bindings: dict[str, Cell]
     calls: list[QueuedOrder]  # control that waits for the actor's process to be up
+    looks: Looks
     ties: Ties
 
     def __init__(self) -> None:
@@ -266,7 +287,13 @@ class More:
         return made
 
 
-_MADE_LATER: dict[str, Callable[[], Any]] = {"belongings": Belongings, "bindings": dict, "calls": list, "ties": Ties}
+_MADE_LATER: dict[str, Callable[[], Any]] = {
+    "belongings": Belongings,
+    "bindings": dict,
+    "calls": list,
+    "looks": Looks,
+    "ties": Ties,
+}
 
 
 class _Hot:

@@ -114,8 +114,8 @@ class _Flow:
     """What is seen of one topic."""
 
     __slots__ = (
-        "began", "came_in", "guess", "in_block", "is_cut", "is_missed", "last", "lives", "marks", "missed",
-        "out_of_block", "poor", "recent", "seen",
+        "began", "came_in", "guess", "in_block", "is_cut", "is_missed", "last", "lives", "missed", "out_of_block",
+        "poor", "recent", "seen", "works",
     )  # fmt: skip
 
     began: float
@@ -123,7 +123,7 @@ class _Flow:
     recent: list[float]
 
     def __init__(self, now: float) -> None:
-        self.marks: tuple[object, ...] = ()
+        self.works: list[Work] = []  # of its publishers, at the last look
         self.lives: tuple[int, ...] = ()  # of its publishers
         self.is_cut = False  # one of them was started again since the last message
         self.is_missed = False  # it should flow, and does not
@@ -296,11 +296,10 @@ class FlowObserver(Observer):
         works = [cell.host.work(cell) for cell in cells]
         flow.look_at(cells)
         if not made.inputs:  # Its publishers' turns are what comes in.
-            marks = tuple(work.mark for work in works)
-            had_turns = len(marks) == len(flow.marks) and any(
-                one is not old for one, old in zip(marks, flow.marks, strict=True)
-            )
-            flow.came_in, flow.marks = flow.came_in + had_turns, marks
+            had_turns = len(works) == len(flow.works) and any(map(_had_turns, flow.works, works))
+            flow.came_in, flow.works = flow.came_in + had_turns, works
+            for cell in cells:
+                cell.host.ask_turns(cell)  # for the next look
         if flow.last is None and learned.count < ENOUGH:
             return None
         silent = now - (flow.began if flow.last is None else flow.last)
@@ -317,6 +316,10 @@ class FlowObserver(Observer):
         if flow.poor > 1:
             return False
         return True if flow.last is not None and silent < max(self._patience, LONGER * learned.mean_gap) else None
+
+
+def _had_turns(before: Work, now: Work) -> bool:
+    return now.mark is not before.mark or now.own_turns != before.own_turns
 
 
 def _is_idle(cell: Cell, work: Work) -> bool:
