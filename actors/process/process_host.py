@@ -47,7 +47,7 @@ class OwnTurns(NamedTuple):
     """What the process of an actor has told of its turns, as `turns_of` says it."""
 
     seen: int = 0
-    rests: list[TurnRest] = []
+    rests: tuple[TurnRest, ...] = ()
 
 
 class Outlet:
@@ -74,7 +74,9 @@ class Outlet:
         self.question = None
         self.own_turns = OwnTurns(self.own_turns.seen)
         if not answer.cancelled() and answer.exception() is None:
-            with contextlib.suppress(msgspec.ValidationError):  # A process may say anything; this is about its own actor.
+            with contextlib.suppress(
+                msgspec.ValidationError
+            ):  # A process may say anything; this is about its own actor.
                 self.own_turns = msgspec.convert(answer.result(), OwnTurns)
 
     def hand_over(self, cell: Cell, item: Any) -> None:
@@ -406,7 +408,7 @@ class FlightHome(WorkerHome):
 
     def rests(self, cell: Cell) -> list[TurnRest]:
         outlet: Outlet | None = cell.extra().outlet
-        return [] if outlet is None else outlet.own_turns.rests
+        return [] if outlet is None else list(outlet.own_turns.rests)
 
     def ask_turns(self, cell: Cell) -> None:
         outlet: Outlet | None = cell.extra().outlet
