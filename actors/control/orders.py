@@ -475,7 +475,10 @@ def status_of(cell: Cell) -> Status:
 
 def turns_of(cell: Cell) -> list[object]:
     """At how many looks an actor in this process had something new in hand, and what its turn rests in: plain data."""
-    return [cell.extra().looks.take(cell.host.work(cell).mark), [list(rest) for rest in cell.host.rests(cell)]]
+    return [
+        cell.extra().belongings.take_look(cell.host.work(cell).mark),
+        [list(rest) for rest in cell.host.rests(cell)],
+    ]
 
 
 def rests_said(cell: Cell) -> str:

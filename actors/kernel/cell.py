@@ -194,19 +194,6 @@ def _moment(at: float, now: float) -> str:
     return f"{time.strftime(form, time.localtime(at))} ({max(0.0, at - now):.1f} s from now)"
 
 
-class Belongings:
-    """What a life has taken, and gives back at its end: background tasks, timers, subscriptions, names."""
-
-    __slots__ = ("names", "rests", "tasks", "timers", "topics")
-
-    def __init__(self) -> None:
-        self.names: dict[str, Scope] = {}
-        self.tasks = Ordered[asyncio.Task[Any]]()
-        self.rests: dict[asyncio.Task[Any], tuple[Any, TurnRest]] | None = None  # with the item in hand when it began
-        self.timers = Ordered[Any]()
-        self.topics = Ordered[str]()
-
-
 class Looks:
     """What those who look from another process have seen of an actor's turns: what it had in hand at the last look."""
 
@@ -220,6 +207,25 @@ class Looks:
         if item is not self.item:
             self.item, self.count = item, self.count + 1
         return self.count
+
+
+class Belongings:
+    """What a life has taken, and gives back at its end: background tasks, timers, subscriptions, names."""
+
+    __slots__ = ("looks", "names", "rests", "tasks", "timers", "topics")
+
+    def __init__(self) -> None:
+        self.looks: Looks | None = None  # of those who look from another process, if anybody does
+        self.names: dict[str, Scope] = {}
+        self.tasks = Ordered[asyncio.Task[Any]]()
+        self.rests: dict[asyncio.Task[Any], tuple[Any, TurnRest]] | None = None  # with the item in hand when it began
+        self.timers = Ordered[Any]()
+        self.topics = Ordered[str]()
+
+    def take_look(self, item: Any) -> int:
+        """Note what is in hand now, or was last, for who looks from another process; at how many looks it was new."""
+        looks = self.looks = self.looks or Looks()
+        return looks.take(item)
 
 
 class More:
@@ -237,7 +243,6 @@ class More:
         "enders",
         "has_more",
         "last",
-        "looks",
         "outlet",
         "reason",
         "start",
@@ -255,7 +260,6 @@ class More:
     belongings: Belongings
     bindings: dict[str, Cell]
     calls: list[QueuedOrder]  # control that waits for the actor's process to be up
-    looks: Looks
     ties: Ties
 
     def __init__(self) -> None:
@@ -287,13 +291,7 @@ class More:
         return made
 
 
-_MADE_LATER: dict[str, Callable[[], Any]] = {
-    "belongings": Belongings,
-    "bindings": dict,
-    "calls": list,
-    "looks": Looks,
-    "ties": Ties,
-}
+_MADE_LATER: dict[str, Callable[[], Any]] = {"belongings": Belongings, "bindings": dict, "calls": list, "ties": Ties}
 
 
 class _Hot:

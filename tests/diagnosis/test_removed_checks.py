@@ -80,8 +80,8 @@ CHECKS = {
     ),
     "a source in a process is seen to have turns": Check(
         "diagnosis/observers/flow.py",
-        "marks = tuple(work.mark for work in works)",
-        "marks = tuple(cell.item for cell in cells)",
+        "return now.mark is not before.mark or now.own_turns != before.own_turns",
+        "return now.own_turns != before.own_turns",
         FLOW,
         "a_source_in_a_process",
     ),
