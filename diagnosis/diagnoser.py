@@ -290,7 +290,7 @@ class DiagnoserActor(Actor):
         if diagnosis.state is not State.FAULTY:
             text = "\n".join(torn) or _STATES[diagnosis.state]
             if diagnosis.state is State.HEALTHY and diagnosis.unknown:
-                text += f"; of the work of {', '.join(diagnosis.unknown)} nothing is seen"
+                text += f"; nothing is seen of the work of {diagnosis.unknown_in_words()}"
             return Explained(text, refused=refused)
         with beside_a_loop():
             why = engine.explain(observed, seconds=self._most.explaining)
@@ -307,7 +307,8 @@ class DiagnoserActor(Actor):
     async def _conclude(self, message: _Thought) -> None:
         is_of_now = message.diagnosis.version == self._engine.model.version  # Else the model has changed meanwhile.
         if is_of_now:
-            await self._tell(message.diagnosis)
+            diagnosis = await self._tell(message.diagnosis)
+            message = msgspec.structs.replace(message, diagnosis=diagnosis)
         if is_of_now and not message.is_last and not self._is_due:
             self.ctx.pipe_to_self(self._rest_of(self._engine, message), lambda thought: thought)
             return
@@ -320,14 +321,17 @@ class DiagnoserActor(Actor):
         else:
             self._rest()
 
-    async def _tell(self, diagnosis: Diagnosis) -> None:
+    async def _tell(self, diagnosis: Diagnosis) -> Diagnosis:
+        """Publish it if it says something new; returns it with the moments since when it does."""
         before, now = self._newest, self.ctx._cell.node.clock.wall()
         known = {} if before is None else before.since
         since = {name: known.get(name, now) for name in diagnosis.suspects}
-        self._newest = diagnosis = msgspec.structs.replace(diagnosis, since=since)
+        known_until = {} if before is None else _known_until(before, diagnosis, now)
+        self._newest = diagnosis = msgspec.structs.replace(diagnosis, since=since, known_until=known_until)
         if before is None or _content(before) != _content(diagnosis):
             await self.ctx.publish(DIAGNOSIS, diagnosis)
             await self.ctx.publish(ROS_DIAGNOSTICS, RosDiagnostics(diagnosis.ros(self.ctx.now())))
+        return diagnosis
 
     def _begin_to_explain(self) -> None:
         """One explanation at a time: of several diagnoses that come meanwhile, the newest is explained."""
@@ -394,6 +398,17 @@ def _content(diagnosis: Diagnosis) -> object:
         torn,
         diagnosis.version,
     )
+
+
+def _unseen(diagnosis: Diagnosis) -> set[str]:
+    return set(diagnosis.components if diagnosis.state is State.BLIND else diagnosis.unknown)
+
+
+def _known_until(before: Diagnosis, diagnosis: Diagnosis, now: float) -> dict[str, float]:
+    """Until when each was known of whom nothing is seen now: until now, if it was known before."""
+    lost = _unseen(diagnosis)
+    known = dict.fromkeys(set(before.components) - _unseen(before), now)
+    return {name: until for name, until in (before.known_until | known).items() if name in lost}
 
 
 def _names_below(model: Model, components: Iterable[str]) -> tuple[str, ...]:

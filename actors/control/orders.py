@@ -473,6 +473,14 @@ def status_of(cell: Cell) -> Status:
     )
 
 
+def turns_of(cell: Cell) -> list[object]:
+    """At how many looks an actor in this process had something new in hand, and what its turn rests in: plain data."""
+    return [
+        cell.extra().belongings.take_look(cell.host.work(cell).mark),
+        [list(rest) for rest in cell.host.rests(cell)],
+    ]
+
+
 def rests_said(cell: Cell) -> str:
     """What the turn in hand waits for that is no other actor's work, in words; "" if none is known here."""
     now = cell.node.clock.wall()

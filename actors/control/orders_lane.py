@@ -15,7 +15,7 @@ from ..process.wire import frames
 from ..process.wire.frames import BadFrame
 from ..process.wire.peer import Peer, RelayedAsk
 from ..values import SavedRef, decode_value, encode_value
-from .orders import ORDERS, GetState, Mark, Order, status_of
+from .orders import ORDERS, GetState, Mark, Order, status_of, turns_of
 
 if TYPE_CHECKING:
     from ..process.worker_node import Guest
@@ -189,11 +189,21 @@ def take_orders(peer: Peer, cell: Cell | None = None) -> list[QueuedOrder]:
 
 def ask_status(peer: Peer, cell: Cell, timeout: float) -> asyncio.Future[Any]:
     """The status that the process of an actor gives of it."""
+    return _ask_beside(peer, cell, "status", timeout)
+
+
+def ask_turns(peer: Peer, cell: Cell, timeout: float) -> asyncio.Future[Any]:
+    """What the process of an actor knows of its turns, as `turns_of` tells it."""
+    return _ask_beside(peer, cell, "turns", timeout)
+
+
+def _ask_beside(peer: Peer, cell: Cell, verb: str, timeout: float) -> asyncio.Future[Any]:
+    """Ask what the process of an actor tells at once, also while a turn waits."""
     node = cell.node
     future: asyncio.Future[Any] = node.loop.create_future()
     ask = OrderAsk(ORDERED, None, (), timeout, NO_DEADLINE, future, cell)
     node.deadlines.add(ask)
-    _send(peer, cell.path, ask, "status", encode_value({}))
+    _send(peer, cell.path, ask, verb, encode_value({}))
     return future
 
 
@@ -212,8 +222,9 @@ def obey_order(guest: Guest, cell: Cell, frame: frames.Command) -> None:
     if cell.is_dead:
         ask.fail(lifecycle.nobody_at(cell))
         return
-    if verb == "status":
-        ask.answer(encode_value(status_of(cell)))
+    beside = {"status": status_of, "turns": turns_of}.get(str(verb))
+    if beside is not None:
+        ask.answer(encode_value(beside(cell)))
         return
     kind = ORDERS.get(str(verb))
     if kind is None:

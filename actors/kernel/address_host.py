@@ -30,12 +30,15 @@ class Work(NamedTuple):
         is_in_turn: it has something in hand.
         since: when it began to wait in that turn, on the loop clock; None if that is not known.
         has_answered: what it has in hand, or had last, is an ask, and whoever made that has an answer.
+        own_turns: times its process was seen to have got on, by turns that the home knows nothing of, too (of timers,
+            say); it is as new as the last answer to `Home.ask_turns`.
     """
 
     mark: object = None
     is_in_turn: bool = False
     since: float | None = None
     has_answered: bool = False
+    own_turns: int = 0
 
 
 class Capacity(Protocol):
@@ -89,6 +92,9 @@ class Home:
         if more is None or more.turn is None or not (begun := more.belongings.rests):
             return []
         return [rest for item, rest in begun.values() if item is more.turn.item]
+
+    def ask_turns(self, cell: Cell) -> None:
+        """Have its process tell of its turns, for the next `work` and `rests`; nothing to do where they are known."""
 
     def mailbox(self, cell: Cell) -> Capacity | None:
         """How full the mailbox is; None if it takes any number of messages."""
@@ -303,6 +309,9 @@ class AddressHost:
 
     def rests(self, cell: Cell) -> list[TurnRest]:
         return self.home.rests(cell)
+
+    def ask_turns(self, cell: Cell) -> None:
+        self.home.ask_turns(cell)
 
     def mailbox(self, cell: Cell) -> Capacity | None:
         return self.home.mailbox(cell)

@@ -132,6 +132,10 @@ class Host(Protocol):
         """What the turn in hand waits for that is no other actor's work, as far as is known in this process."""
         ...
 
+    def ask_turns(self, cell: Cell) -> None:
+        """Have its process tell of its turns, for the next `work` and `rests`; nothing to do where they are known."""
+        ...
+
     def mailbox(self, cell: Cell) -> Capacity | None:
         """How full the mailbox is; None if it takes any number of messages."""
         ...
@@ -190,17 +194,38 @@ def _moment(at: float, now: float) -> str:
     return f"{time.strftime(form, time.localtime(at))} ({max(0.0, at - now):.1f} s from now)"
 
 
+class Looks:
+    """What those who look from another process have seen of an actor's turns: what it had in hand at the last look."""
+
+    __slots__ = ("count", "item")
+
+    def __init__(self) -> None:
+        self.count, self.item = 0, None
+
+    def take(self, item: Any) -> int:
+        """Note what is in hand now, or was last; returns at how many looks that was something new."""
+        if item is not self.item:
+            self.item, self.count = item, self.count + 1
+        return self.count
+
+
 class Belongings:
     """What a life has taken, and gives back at its end: background tasks, timers, subscriptions, names."""
 
-    __slots__ = ("names", "rests", "tasks", "timers", "topics")
+    __slots__ = ("looks", "names", "rests", "tasks", "timers", "topics")
 
     def __init__(self) -> None:
+        self.looks: Looks | None = None  # of those who look from another process, if anybody does
         self.names: dict[str, Scope] = {}
         self.tasks = Ordered[asyncio.Task[Any]]()
         self.rests: dict[asyncio.Task[Any], tuple[Any, TurnRest]] | None = None  # with the item in hand when it began
         self.timers = Ordered[Any]()
         self.topics = Ordered[str]()
+
+    def take_look(self, item: Any) -> int:
+        """Note what is in hand now, or was last, for who looks from another process; at how many looks it was new."""
+        looks = self.looks = self.looks or Looks()
+        return looks.take(item)
 
 
 class More:

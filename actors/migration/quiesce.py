@@ -253,6 +253,9 @@ class Transit:
     def rests(self, cell: Cell) -> list[TurnRest]:
         return []
 
+    def ask_turns(self, cell: Cell) -> None:
+        pass
+
     def mailbox(self, cell: Cell) -> Capacity | None:
         return None
 

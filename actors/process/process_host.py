@@ -7,17 +7,21 @@ both sides share and that survives a SIGKILL, says how far the dead one came.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable
 from time import monotonic
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import msgspec
+
+from ..control.orders_lane import ask_turns, send_call
 from ..errors import AskFailed, BadMessage, HoldfastError, StartFailed
 from ..events import ActorStarted, StoreRefused
 from ..exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
 from ..kernel import lifecycle, links, mailbox
 from ..kernel.address_host import AddressHost, Home, Parent, Place, Work
-from ..kernel.cell import DOWN, GONE, RUNNING, Cell, GivenName
+from ..kernel.cell import DOWN, GONE, RUNNING, Cell, GivenName, TurnRest
 from ..kernel.codec import Parcel
 from ..kernel.envelope import Ask, Envelope, Item
 from ..kernel.lifecycle import NEAR
@@ -35,10 +39,21 @@ if TYPE_CHECKING:
     from ..kernel.node import Node
 
 
+PATIENCE = 1.0
+"""Seconds in which a process tells of its actor's turns; else what it said of a rest does not count any more."""
+
+
+class OwnTurns(NamedTuple):
+    """What the process of an actor has told of its turns, as `turns_of` says it."""
+
+    seen: int = 0
+    rests: tuple[TurnRest, ...] = ()
+
+
 class Outlet:
     """The way from an address to the process its actor lives in, and what is on the way."""
 
-    __slots__ = ("begun", "flight", "path", "sent", "worker")
+    __slots__ = ("begun", "flight", "own_turns", "path", "question", "sent", "worker")
 
     def __init__(self, path: str) -> None:
         self.path = path
@@ -46,6 +61,23 @@ class Outlet:
         self.worker: Worker | None = None
         self.flight: deque[tuple[int, Any]] = deque()  # (number, item), oldest first, until the page says done
         self.sent = 0
+        self.own_turns = OwnTurns()
+        self.question: asyncio.Future[Any] | None = None  # to the process, of its actor's turns
+
+    def ask_turns(self, cell: Cell) -> None:
+        """Have the process tell of its actor's turns, unless it was asked already."""
+        if self.worker is not None and self.question is None:
+            self.question = ask_turns(self.worker, cell, PATIENCE)
+            self.question.add_done_callback(self._told)
+
+    def _told(self, answer: asyncio.Future[Any]) -> None:
+        self.question = None
+        self.own_turns = OwnTurns(self.own_turns.seen)
+        if not answer.cancelled() and answer.exception() is None:
+            with contextlib.suppress(
+                msgspec.ValidationError
+            ):  # A process may say anything; this is about its own actor.
+                self.own_turns = msgspec.convert(answer.result(), OwnTurns)
 
     def hand_over(self, cell: Cell, item: Any) -> None:
         """Send what was queued, the runtime's own signals among it."""
@@ -110,6 +142,7 @@ class Outlet:
         numbers = (0, 0) if worker is None else (worker.number(0, self.sent), worker.number(1, self.sent))
         running, done = numbers
         flight, self.flight, self.sent, self.begun = self.flight, deque(), 0, 0
+        self.own_turns = OwnTurns(self.own_turns.seen)
         begun = [item for number, item in flight if number == running > done]
         queued = [item for number, item in flight if number > max(running, done)]
         for item in queued:
@@ -370,8 +403,17 @@ class FlightHome(WorkerHome):
         newest = outlet.trim()
         has_answered = isinstance(newest, Ask) and newest.is_done
         if outlet.flight:
-            return Work(outlet.flight[0][1], is_in_turn=True, has_answered=has_answered)
-        return Work(outlet.sent, has_answered=has_answered)
+            return Work(outlet.flight[0][1], True, None, has_answered, outlet.own_turns.seen)
+        return Work(outlet.sent, False, None, has_answered, outlet.own_turns.seen)
+
+    def rests(self, cell: Cell) -> list[TurnRest]:
+        outlet: Outlet | None = cell.extra().outlet
+        return [] if outlet is None else list(outlet.own_turns.rests)
+
+    def ask_turns(self, cell: Cell) -> None:
+        outlet: Outlet | None = cell.extra().outlet
+        if outlet is not None:
+            outlet.ask_turns(cell)
 
     def load(self, cell: Cell) -> int:
         queued = len(cell.queue or ())
@@ -514,7 +556,6 @@ class WorkerPlace(Place):
     # -- what else a place does -------------------------------------------------------------------------------------
 
     def control(self, cell: Cell, call: QueuedOrder) -> None:
-        from ..control.orders_lane import send_call
 
         worker = self.workers.of(cell)
         if worker is not None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import enum
-from typing import Any, TypeAlias
+import time
+from typing import Any, Final, TypeAlias
 
 import msgspec
 
@@ -13,6 +14,10 @@ from ..observations import Contradiction
 
 Plain: TypeAlias = dict[str, Any]
 """A message of another system, as plain data."""
+
+
+MOST_NAMES: Final = 5
+"""Unknown components that are named in a text."""
 
 
 class State(enum.Enum):
@@ -62,6 +67,8 @@ class Diagnosis(Message):
     """Sources of observations that are not believed, because they contradict several others that agree."""
     since: dict[str, float] = msgspec.field(default_factory=dict)
     """Since when each suspect has been one without a break, in Unix seconds."""
+    known_until: dict[str, float] = msgspec.field(default_factory=dict)
+    """Until when something was known of those that are unknown, in Unix seconds; who never was known is left out."""
 
     def __str__(self) -> str:
         """In words: `faulty: ja, or jn`."""
@@ -71,8 +78,22 @@ class Diagnosis(Message):
             return f"{self.state.value}: {words}{more}"
         if self.state is State.FAULTY:
             return f"{self.state.value}: no candidate yet ({' and '.join(self.truncated)} ran out)"
-        some = self.state is State.HEALTHY and self.unknown
-        return f"{self.state.value}, as far as is known: {len(self.unknown)} unknown" if some else self.state.value
+        is_partly = self.state is State.HEALTHY and self.unknown
+        some = f", as far as is known: {len(self.unknown)} unknown ({self.unknown_in_words()})" if is_partly else ""
+        return f"{self.state.value}{some}"
+
+    def unknown_in_words(self) -> str:
+        """Who is unknown, and until when it was not, in local time: a few by name, who was known last first."""
+        latest = sorted(self.unknown, key=lambda name: -self.known_until.get(name, 0.0))
+        said = [f"{name} {self._known_until(name)}" for name in latest[:MOST_NAMES]]
+        more = len(latest) - len(said)
+        return ", ".join([*said, f"and {more} more"] if more else said)
+
+    def _known_until(self, name: str) -> str:
+        until = self.known_until.get(name)
+        if until is None:
+            return "never seen"
+        return f"known until {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(until))}"
 
     @property
     def is_complete(self) -> bool:

@@ -25,7 +25,9 @@ ENOUGH: Final = 20
 LONGER: Final = 4.0
 """Times the longest silence so far, after which a topic that should flow is silent for too long."""
 REGULAR: Final = 3.0
-"""A topic whose longest silence was at most so many times its mean one goes by a clock."""
+"""Times its mean silence, up to which one is in the rhythm of a topic that goes by a clock."""
+FORGIVEN: Final = 1000.0
+"""Times the seconds of its silences out of rhythm, after which a topic goes by a clock all the same."""
 BLOCK: Final = 50
 """Messages that come in, at least, over which those that go out are counted."""
 BLOCKS: Final = 6
@@ -48,6 +50,8 @@ class Usual(msgspec.Struct):
         most_in: most that came in between two messages.
         blocks: blocks of inputs that were counted.
         least_out: the smallest part of what came in that went out, of all blocks; of two poor ones in a row neither.
+        seconds: of all silences.
+        odd_seconds: of those that were out of rhythm.
     """
 
     count: int = 0
@@ -56,6 +60,14 @@ class Usual(msgspec.Struct):
     most_in: int = 0
     blocks: int = 0
     least_out: float = 1.0
+    seconds: float = 0.0
+    odd_seconds: float = 0.0
+
+    @property
+    def goes_by_clock(self) -> bool:
+        """Whether its silences are alike, but for a thousandth of the time at most: one hiccup wears off."""
+        odd_seconds = max(self.odd_seconds, self.longest_gap)  # Of an older file only the longest is known.
+        return self.longest_gap <= REGULAR * self.mean_gap or FORGIVEN * odd_seconds <= self.seconds
 
     def take(self, gap: float, came_in: int) -> None:
         """Learn of one more message."""
@@ -63,6 +75,9 @@ class Usual(msgspec.Struct):
         self.mean_gap += (gap - self.mean_gap) / min(self.count, 1000)
         self.longest_gap = max(self.longest_gap, gap)
         self.most_in = max(self.most_in, came_in)
+        self.seconds += gap
+        if gap > REGULAR * self.mean_gap:
+            self.odd_seconds += gap
 
     def take_block(self, part: float) -> None:
         """Learn of one more block of inputs, of which `part` has gone out."""
@@ -114,8 +129,8 @@ class _Flow:
     """What is seen of one topic."""
 
     __slots__ = (
-        "began", "came_in", "guess", "in_block", "is_cut", "is_missed", "last", "lives", "marks", "missed",
-        "out_of_block", "poor", "recent", "seen",
+        "began", "came_in", "guess", "in_block", "is_cut", "is_missed", "last", "lives", "missed", "out_of_block",
+        "poor", "recent", "seen", "works",
     )  # fmt: skip
 
     began: float
@@ -123,7 +138,7 @@ class _Flow:
     recent: list[float]
 
     def __init__(self, now: float) -> None:
-        self.marks: tuple[object, ...] = ()
+        self.works: list[Work] = []  # of its publishers, at the last look
         self.lives: tuple[int, ...] = ()  # of its publishers
         self.is_cut = False  # one of them was started again since the last message
         self.is_missed = False  # it should flow, and does not
@@ -296,11 +311,10 @@ class FlowObserver(Observer):
         works = [cell.host.work(cell) for cell in cells]
         flow.look_at(cells)
         if not made.inputs:  # Its publishers' turns are what comes in.
-            marks = tuple(work.mark for work in works)
-            had_turns = len(marks) == len(flow.marks) and any(
-                one is not old for one, old in zip(marks, flow.marks, strict=True)
-            )
-            flow.came_in, flow.marks = flow.came_in + had_turns, marks
+            had_turns = len(works) == len(flow.works) and any(map(_had_turns, flow.works, works))
+            flow.came_in, flow.works = flow.came_in + had_turns, works
+            for cell in cells:
+                cell.host.ask_turns(cell)  # for the next look
         if flow.last is None and learned.count < ENOUGH:
             return None
         silent = now - (flow.began if flow.last is None else flow.last)
@@ -308,7 +322,7 @@ class FlowObserver(Observer):
             return True if silent < self._patience else None
         is_long = silent > max(self._patience, LONGER * learned.longest_gap)
         is_due = flow.came_in > ENOUGH // 2 + LONGER * flow.most_in(learned)
-        is_by_clock = not made.inputs and learned.longest_gap <= REGULAR * learned.mean_gap
+        is_by_clock = not made.inputs and learned.goes_by_clock
         if (is_due and silent > self._patience) or (is_by_clock and is_long):
             flow.is_missed = True
             return False
@@ -317,6 +331,10 @@ class FlowObserver(Observer):
         if flow.poor > 1:
             return False
         return True if flow.last is not None and silent < max(self._patience, LONGER * learned.mean_gap) else None
+
+
+def _had_turns(before: Work, now: Work) -> bool:
+    return now.mark is not before.mark or now.own_turns != before.own_turns
 
 
 def _is_idle(cell: Cell, work: Work) -> bool:

@@ -58,6 +58,10 @@ class _Seen:
     """Whether it had something in hand at the last look."""
     turns: int = 0
     """Looks in which it had got on."""
+    own_turns: int = 0
+    """Turns that its process had told of at the last look."""
+    moved: float = -math.inf
+    """When it was seen to get on for the last time, by such turns or others."""
     longest: float = 0.0
     """Seconds of the longest turn that was seen to end."""
     full: float | None = None
@@ -275,6 +279,8 @@ class RuntimeObserver(Observer):
         seen = self._seen(component)
         work, backlog = cell.host.work(cell), cell.host.backlog(cell)
         has_got_on = seen.take(work, cell.life, now, self._patience)
+        has_moved = has_got_on or work.own_turns != seen.own_turns
+        seen.own_turns, seen.moved = work.own_turns, now if has_moved else seen.moved
         waits_now = sorted(waits.get(component, ()))
         seen.waited.append(waits_now[0] if waits_now else "")
         usual = max(self._patience, LONGER * seen.longest)
@@ -287,8 +293,9 @@ class RuntimeObserver(Observer):
         stood = now - max(seen.since, seen.idle)
         keeps_waiting = asked_since is not None and min(stood, now - asked_since) > limit
         # Who tells it something does not wait for that: it may rest in its turn, now and then for a moment in no wait.
-        if is_busy and backlog > 0 and 2 * stood > self._patience and cell.host.rests(cell):
-            seen.rested = now
+        if is_busy and backlog > 0 and 2 * stood > self._patience:
+            seen.rested = now if cell.host.rests(cell) else seen.rested
+            cell.host.ask_turns(cell)  # for the next look
         is_at_rest = is_busy and stood > usual and now - seen.rested <= usual
         stands = is_busy and backlog > 0 and stood > limit and not is_at_rest
         if is_at_rest:  # What waits does so because of the outside: that is no leak.
@@ -305,7 +312,7 @@ class RuntimeObserver(Observer):
             asked_since is not None or bool(seen.unanswered),
             self._is_full(component, cell, now),
             cell.host.mailbox(cell) is not None,
-            has_got_on,
+            has_moved,
             has_got_on and work.has_answered and not seen.unanswered,
         )
 
@@ -361,7 +368,7 @@ class RuntimeObserver(Observer):
     def _tell_good(self, component: str, of_it: _Shown) -> None:
         """Say of who is not late what it was seen to do, and for a while what it was seen to do before."""
         seen, now, keeps = self._known[component], self.now, self.manner.time_to_live
-        was = None if now - seen.since > keeps else self._kept(progress(component))
+        was = None if now - max(seen.since, seen.moved) > keeps else self._kept(progress(component))
         self.verdict(progress(component), True if of_it.has_got_on else was)
         has_refused = now - seen.refused <= keeps
         was = self._kept(replies(component))

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from holdfast.diagnosis.engine import Diagnoser, State, minimal_diagnoses
+from holdfast.diagnosis.engine import Diagnoser, Diagnosis, State, minimal_diagnoses
 from holdfast.diagnosis.engine.cone import Index, RulePart, cone_of
 from holdfast.diagnosis.engine.solve import SearchBudget, Solved, solve
 from holdfast.diagnosis.literals import BadLiteral, Vocabulary, ok, parse, running
@@ -312,7 +312,11 @@ def test_a_component_of_whose_work_nothing_is_seen_is_unknown() -> None:
     system.node("watcher")
     said = Diagnoser(system).diagnose_now(["running(feed)", "running(watcher)"])
     assert (said.state, said.unknown) == (State.HEALTHY, ("feed",))
-    assert str(said) == "healthy, as far as is known: 1 unknown"
+    assert str(said) == "healthy, as far as is known: 1 unknown (feed never seen)"
+    many = Diagnosis(State.HEALTHY, unknown=tuple("abcdefg"))
+    assert str(many).endswith(
+        "7 unknown (a never seen, b never seen, c never seen, d never seen, e never seen, and 2 more)"
+    )
     assert Diagnoser(system).diagnose_now(["ok(/prices)", "running(watcher)"]).unknown == ()
 
 

@@ -29,6 +29,32 @@ class Each(hf.Message):
     each: int
 
 
+class Tick(hf.Message):
+    pass
+
+
+class Sensor(hf.Actor):
+    """Publishes in the turns of a timer of its own, with a hiccup now and then."""
+
+    def __init__(self) -> None:
+        self.each, self.count = 1, 0
+
+    def on_start(self, restored: bool) -> None:
+        self.ctx.every(0.01, Tick())
+
+    @hf.on(Each)
+    def set(self, message: Each) -> None:
+        self.each = message.each
+
+    @hf.on(Tick)
+    async def tick(self, message: Tick) -> None:
+        if self.each:
+            self.count += 1
+            if self.count % 40 == 0:
+                await asyncio.sleep(0.3)
+            await self.ctx.publish("/out", Item(self.count))
+
+
 class Filter(hf.Actor):
     """Publishes each `each`-th, after so many seconds."""
 
@@ -221,6 +247,45 @@ async def test_a_source_in_a_process_that_has_turns_and_publishes_nothing_is_see
                 while said.get(ok("/out")) is not bool(each) or number < 100:
                     source.tell(Item(number := number + 1))
                     await asyncio.sleep(0.5 if number % 20 == 0 else 0.01)
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("place", ["task", "process"])
+async def test_a_sensor_of_which_only_the_timer_goes_on_is_seen(place: Any) -> None:
+    """It went by no clock, so only its turns tell; in a process those are known there alone."""
+    said: dict[Literal, bool] = {}
+    async with hf.ActorSystem("t", log=False, seed=1) as system:
+        system.spawn(hf.start(Notes, said))
+        sensor = await system.start(hf.child("sensor", hf.start(Sensor), isolation=place))
+        made = {"/out": FlowSource((sensor.path,))}
+        start = hf.start(FlowObserver, made, leave_out=(OBSERVATIONS,), patience=0.5, manner=Manner(every=0.05))
+        await system.start(observer("topics", start))
+        for each in (1, 0, 1):
+            await sensor.ask(Each(each))
+            async with asyncio.timeout(30.0):
+                while said.get(ok("/out")) is not bool(each):
+                    await asyncio.sleep(0.05)
+            await asyncio.sleep(2.0 * each)  # Now it is known that it goes by no clock.
+
+
+async def test_a_clock_that_had_one_hiccup_is_one_again_after_a_while_and_bursts_are_none(world: World) -> None:
+    await world.send(50, 0.1)
+    await asyncio.sleep(0.6)
+    await world.send(200, 0.1)
+    await asyncio.sleep(1.0)
+    await world.send(20000, 0.1)
+    assert not world.bad
+    await asyncio.sleep(10.0)
+    assert world.said[ok("/in")] is False
+
+
+async def test_bursts_never_go_by_a_clock(world: World) -> None:
+    for _ in range(20):
+        await world.send(1000, 0.1)
+        await asyncio.sleep(1.5)
+    await asyncio.sleep(60.0)
+    assert not world.bad
+    assert ok("/in") not in world.said
 
 
 async def test_what_was_learned_is_kept_by_the_hour_and_a_damaged_file_is_refused(tmp_path: Path) -> None:

@@ -51,6 +51,9 @@ class Slow(hf.Message): ...
 class Hang(hf.Message): ...
 
 
+class Rest(hf.Message): ...
+
+
 class Node(hf.Actor):
     def __init__(self) -> None:
         self.counted = 0
@@ -67,6 +70,10 @@ class Node(hf.Actor):
     @hf.on(Slow)
     async def slow(self, message: Slow) -> None:
         await asyncio.sleep(1.5)
+
+    @hf.on(Rest)
+    async def rest(self, message: Rest) -> None:
+        await self.ctx.sleep(5.0)
 
     @hf.on(Hang)
     async def hang(self, message: Hang) -> None:
@@ -134,6 +141,20 @@ async def test_it_is_seen_to_work_and_to_hang(place: str, kind: str) -> None:
             node.tell(Hang())
             found = await until(watching, component, State.FAULTY)
         assert found.certain == (component,)
+
+
+@pytest.mark.parametrize("kind", ["plain", "hybrid"])
+async def test_who_rests_in_its_turn_in_a_process_is_not_accused(kind: str) -> None:
+    async with hf.ActorSystem("t", log=False) as system:
+        await system.start(tree("process", kind))
+        node = system.ref(PATHS["process"], Node)
+        watching = await diagnosis.watch(system, seconds=0.1, repair="off")
+        async with doing(told(node)):
+            await asyncio.sleep(3.0)  # For twenty looks and more.
+            node.tell(Rest())
+            for _ in range(40):
+                await asyncio.sleep(0.1)
+                assert (await watching.observed()).negative == frozenset()
 
 
 @pytest.mark.asyncio(loop_factories=["virtual"])

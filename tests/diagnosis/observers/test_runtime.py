@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import time
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -286,7 +287,26 @@ async def test_nothing_is_said_of_who_was_asked_nothing_and_it_is_unknown(system
     await advance(1.0)
     found = await watching.diagnosis()
     assert set(found.unknown) == {"all/b", "all/c", "all/full"}
-    assert str(found) == "healthy, as far as is known: 3 unknown"
+    never = "all/b never seen, all/c never seen, all/full never seen"
+    assert str(found) == f"healthy, as far as is known: 3 unknown ({never})"
+
+
+async def test_who_was_known_and_is_not_any_more_is_told_from_who_was_never_seen(system: hf.ActorSystem) -> None:
+    watching = await diagnosis.watch(system, seconds=0.1)
+    worker(system, "a").tell(Go())
+    await advance(1.0)
+    assert not (await watching.diagnosis()).known_until
+    await advance(30.0)
+    found, now = await watching.diagnosis(), system._node.clock.wall()
+    assert found.unknown[0] == "all/a"
+    assert set(found.known_until) == {"all/a"}
+    assert now - 30.0 < found.known_until["all/a"] < now - 20.0
+    moment = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(found.known_until["all/a"]))
+    assert f"4 unknown (all/a known until {moment}, all/b never seen, " in str(found)
+    assert f"nothing is seen of the work of all/a known until {moment}, " in (await watching.why()).text
+    worker(system, "a").tell(Go())
+    await advance(1.0)
+    assert not (await watching.diagnosis()).known_until
 
 
 async def test_children_that_come_later_and_those_that_go_are_followed(system: hf.ActorSystem) -> None:
