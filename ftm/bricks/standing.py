@@ -42,6 +42,7 @@ class OtherReplica:
         self.turn = -2  # the last turn whose state it has acknowledged, -2 if that is not known
         self.forwarded: list[asyncio.Task[bool]] = []  # batches on their way to it
         self.missed_by = ""  # who has told that there is no other one, since there was one
+        self.told = 0  # how often home has said who it is
         self._bricks: dict[str, Outbox] = {}  # by slot
         self._waiting: set[asyncio.Future[Any]] = set()
 

@@ -92,17 +92,21 @@ class Transfer(SealedGate):
     @on(SetPeer)
     def _peer(self, message: SetPeer) -> None:
         self._check(message.epoch)
-        standing = self._standing
-        if message.path != standing.other.path:
-            standing.other.replace(message.path, "live")
+        other = self._standing.other
+        other.told += 1
+        if message.path != other.path:
+            other.replace(message.path, "live")
 
     @on(Join)
     def _join(self, message: Join) -> Any:
         self._check(message.epoch)
-        return self._answer(self._bring(message.peer))
+        return self._answer(self._bring(message.peer, self._standing.other.told))
 
-    async def _bring(self, path: str) -> int:
-        """Bring another replica to our state; requests wait only while that is captured."""
+    async def _bring(self, path: str, told: int) -> int:
+        """Bring another replica to our state; requests wait only while that is captured.
+
+        `told`: as it was when this was ordered. If home has said since who the other one is, that life may have ended.
+        """
         standing, server = self._standing, self._standing.server
         if not standing.leads:
             raise CannotJoin(path=path, why=f"{standing.path} does not lead")
@@ -114,6 +118,8 @@ class Transfer(SealedGate):
             await self._quiet()
             standing.check(epoch)
             await server.ensure()
+            if standing.other.told != told:
+                raise CannotJoin(path=path, why="it was given up meanwhile")
             state, point = None, server.points.point
             if server.state.has_access:
                 state = self._captured(path) if point is not None or server.turn >= 0 else None

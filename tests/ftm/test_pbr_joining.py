@@ -8,8 +8,10 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.bricks.replica_orders import Export, Install
-from tests.ftm.replicated import Add, Read, Total, pair
+from holdfast.checkpoint.protocol import Outcome, came
+from holdfast.ftm.bricks.brick_messages import CannotJoin
+from holdfast.ftm.bricks.replica_orders import Export, Install, SetPeer
+from tests.ftm.replicated import Add, Fetch, Read, Total, pair
 
 
 class Unwilling(Total):
@@ -68,6 +70,33 @@ async def test_a_backup_that_lives_anew_at_its_address_gets_the_state(system: hf
     await driver.stop_replica("r1")
     await driver.fail_over("r2")
     assert await driver.ask(Read()) == [1, 2]
+
+
+async def test_a_join_that_was_given_up_before_it_began_is_not_begun(system: hf.ActorSystem) -> None:
+    """The one that was to join has died meanwhile, and its next life has not been told yet that it follows."""
+    driver = await pair(system, others=())
+    await driver.add("r2")
+    answer, driver.outside = driver.outside, lambda out: None
+    (key,) = driver.send(Fetch(5))
+    async with asyncio.timeout(5):
+        while driver.partial != key:
+            await asyncio.sleep(0.001)
+    joining = asyncio.ensure_future(driver.join("r2"))
+    async with asyncio.timeout(5):
+        while not driver.brick("r1", "protocol")._holds:  # It waits for the end of that turn.
+            await asyncio.sleep(0.001)
+    await driver.stop_replica("r2")
+    await driver.protocol("r1").ask(SetPeer(driver.epoch, None))
+    await driver.add("r2")
+    driver.outside = answer
+    for (turn, k), out in driver.released.items():
+        driver.inward(Outcome(turn, k, came(answer(out))))
+    async with asyncio.timeout(5):
+        with pytest.raises(CannotJoin, match="it was given up meanwhile"):
+            await joining
+    assert await driver.reply(key)
+    await driver.join("r2")
+    assert driver.standing("r2").server.turn == driver.order[-1].turn
 
 
 async def test_a_backup_counts_only_when_it_has_all_that_has_left(system: hf.ActorSystem) -> None:

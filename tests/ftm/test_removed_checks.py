@@ -17,6 +17,13 @@ RANDOM_HOOKS = "tests/ftm/test_random_hooks.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 AUTHORS = "tests/ftm/test_author_bricks.py"
 CHECKS = {
+    "a join that was given up before it began is not begun": Check(
+        "ftm/bricks/state_transfer.py",
+        "            if standing.other.told != told:\n",
+        "            if False:\n",
+        JOINING,
+        "test_a_join_that_was_given_up",
+    ),
     "a refusal that `before` raises ends the replica": Check(
         "ftm/bricks/bricks.py",
         """            raise self._raised("before", no) from no\n""",
