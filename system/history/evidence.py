@@ -337,9 +337,7 @@ def _child_now(cell: Cell | None, name: str, about: dict[str, Any]) -> ChildNow:
 
 def _now(cell: Cell, status: Status, name: str, state: str, awaited: str = "") -> ChildNow:
     waited = max((one.seconds for one in _queued(cell, FIRST)), default=0.0) if status.queued else 0.0
-    return ChildNow(
-        name, state, status.turn or "", status.turn_seconds, status.turn_at, awaited, status.queued, waited
-    )
+    return ChildNow(name, state, status.turn or "", status.turn_seconds, status.turn_at, awaited, status.queued, waited)
 
 
 def _ended_below(recorder: HistoryRecorder, address: str, children: list[ChildNow]) -> dict[str, PastLife]:

@@ -351,8 +351,10 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
             "waiting": Waiting("shop.Pay", 30, "/app/till", waited=8.0, late=24),
             "mean_turn": 0.25,
         },
-        "33 messages wait in its mailbox; most of them are shop.Pay from /app/till; one has waited for 8.0 s or more; "
-        "nobody waits for the answers of 24 any more; a turn takes 0.25 s in the mean.",
+        (
+            "33 messages wait in its mailbox; most of them are shop.Pay from /app/till; one has waited for 8.0 s or "
+            "more; nobody waits for the answers of 24 any more; a turn takes 0.25 s in the mean."
+        ),
     ),
     "asks that have just come": (
         {"is_there": True, "status": status(queued=33), "waiting": Waiting("shop.Pay", 33, waited=0.5)},
