@@ -42,17 +42,17 @@ def _read_file(path: str) -> bytes:
             info = os.fstat(file.fileno())
             if not stat.S_ISREG(info.st_mode) or info.st_uid not in (0, os.geteuid()):
                 raise SpecError("store_key", f"the key file {path} must be a regular file of this user")
-            if info.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-                raise SpecError("store_key", f"others may use the key file {path}: chmod 600 {path}")
             data = file.read(_MOST_BYTES + 1)
     except OSError as error:
         raise SpecError("store_key", f"the key file cannot be read: {error}") from error
-    if len(data) == KEY_BYTES:
-        return data
-    try:
-        found = bytes.fromhex(data.decode("ascii").strip())
-    except ValueError:
-        found = b""
+    found = data
+    if len(data) != KEY_BYTES:
+        try:
+            found = bytes.fromhex(data.decode("ascii").strip())
+        except ValueError:
+            found = b""
     if len(found) != KEY_BYTES:
         raise SpecError("store_key", f"the key file {path} must have {KEY_BYTES} bytes or {2 * KEY_BYTES} hex digits")
+    if info.st_mode & (stat.S_IRWXG | stat.S_IRWXO):  # Not before: the advice is for keys, and harms other files.
+        raise SpecError("store_key", f"others may use the key file {path}: chmod 600 {path}")
     return found

@@ -54,7 +54,7 @@ def _show_check(found: UpgradeCheck) -> None:
         typer.echo(f"{one.address}: {_verdict(one)}")
         if one.note:
             typer.echo(f"    {one.note}")
-    count = sum(one.verdict != "fine" for one in found.addresses)
+    count = sum(not one.is_fine for one in found.addresses)
     verdict = "all is fine" if found.is_fine else f"{count} of them are not fine"
     turns = sum(one.turns for one in found.addresses)
     typer.echo(f"{found.store}: {len(found.addresses)} addresses, {turns} turns handled again: {verdict}")

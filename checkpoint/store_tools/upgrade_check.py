@@ -22,7 +22,7 @@ from ..snapshot.snapshot_record import Meta
 from .kept_lives import KeptLife, kept_lives, state_differences
 from .rerun import LifeEnded, NotRecorded, Recipe, Rerun
 
-Verdict = Literal["fine", "differs", "refused", "missing", "unchecked"]
+Verdict = Literal["fine", "ended", "differs", "refused", "missing", "unchecked"]
 DIFFERENT: Final = ("differs", "refused", "missing")
 """The verdicts that say that the new code does not go on as the old one would."""
 
@@ -33,9 +33,9 @@ class AddressCheck:
 
     Attributes:
         address: whose.
-        verdict: "fine"; "differs": a turn, or a state, is not what it was; "refused": the new code would not be started
-            on what is recorded, or could not handle what waits; "missing": the new program has no such address;
-            "unchecked": it could not be found out.
+        verdict: "fine"; "ended": its supervisor does not bring it back, and it was not checked; "differs": a turn, or a
+            state, is not what it was; "refused": the new code would not be started on what is recorded, or could not
+            handle what waits; "missing": the new program has no such address; "unchecked": it could not be found out.
         turns: so many were handled again, as before.
         turn: the first one that differs; -1: none, or it is no matter of a turn.
         message: the type of its message, or the kind of its input.
@@ -50,6 +50,11 @@ class AddressCheck:
     message: str = ""
     problem: str = ""
     note: str = ""
+
+    @property
+    def is_fine(self) -> bool:
+        """Say whether nothing is known against the new code at this address, and nothing was left to be checked."""
+        return self.verdict in ("fine", "ended")
 
 
 async def check_address(

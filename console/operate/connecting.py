@@ -31,7 +31,7 @@ def list_connections(ctx: typer.Context, system: System = None, socket: Socket =
     if as_json:
         show_json({"connections": msgspec.to_builtins(found)})
     else:
-        print_lines(map(connection_line, found))
+        print_lines(map(connection_line, found), none="no program is connected, and nothing is kept for one")
 
 
 @connections.command()

@@ -39,6 +39,13 @@ AGO: Final = re.compile(r"(?P<number>\d+(?:\.\d+)?)(?P<unit>[smhd]?)")
 SECONDS: Final = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
 
 
+Last = Annotated[int, typer.Option("--last", min=1, max=1000, help="How many, the newest.")]
+Since = Annotated[
+    str | None,
+    typer.Option("--since", metavar="WHEN", help="Only since then: 90s, 10m, 2h, 1d ago, or 2026-01-31T12:00."),
+]
+
+
 class LogLevel(StrEnum):
     """How grave a line is."""
 
@@ -94,11 +101,8 @@ def logs(
     follow: Annotated[
         bool, typer.Option("--follow", "-f", help="Go on with lines as they come, until Ctrl+C.")
     ] = False,
-    last: Annotated[int, typer.Option("--last", min=1, max=1000, help="How many, the newest.")] = 50,
-    since: Annotated[
-        str | None,
-        typer.Option(metavar="WHEN", help="Only lines since then: 90s, 10m, 2h, 1d ago, or 2026-01-31T12:00."),
-    ] = None,
+    last: Last = 50,
+    since: Since = None,
     level: Annotated[LogLevel, typer.Option(help="Only lines as grave as this: stdout is info, stderr warning.")] = (
         LogLevel.DEBUG
     ),
@@ -110,10 +114,7 @@ def logs(
 
     Exit status 0: done. 1: nobody is there, and nothing is kept of it. 2: no system answers.
     """
-    try:
-        begin = 0.0 if since is None else moment_meant(since, time.time())
-    except ValueError as error:
-        raise ended("logs", f"--since: {error}", UNUSABLE) from error
+    begin = begin_meant("logs", since)
     with reached("logs", system, socket) as remote, contextlib.suppress(KeyboardInterrupt):
         path = _address_of(remote, path)
         page = remote.logs(path, level=level.value, since=begin, limit=last)
@@ -143,6 +144,14 @@ def print_log(lines: Iterable[LoggedLine], *, as_json: bool) -> None:
     """Print lines as text, or each as a JSON object."""
     for line in lines:
         typer.echo(msgspec.json.encode(line).decode() if as_json else log_line(line))
+
+
+def begin_meant(command: str, since: str | None) -> float:
+    """The Unix time that `--since` means, 0 if it is left out. Raises typer.Exit: it means none."""
+    try:
+        return 0.0 if since is None else moment_meant(since, time.time())
+    except ValueError as error:
+        raise ended(command, f"--since: {error}", UNUSABLE) from error
 
 
 def moment_meant(text: str, now: float) -> float:

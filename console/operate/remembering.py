@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import difflib
-import time
 from collections.abc import Iterable
 from typing import Annotated
 
@@ -13,6 +12,7 @@ import typer
 
 from ... import events as events_of_all
 from ...system import PastEvent
+from .following import Last, Since, begin_meant
 from .reaching import (
     FAILED,
     UNUSABLE,
@@ -34,7 +34,6 @@ KINDS = frozenset(events_of_all.__all__) | {"SystemStarted", "SystemStopped", "E
 """The names of the events that there are."""
 
 Pattern = Annotated[str, typer.Argument(help="An address, or a pattern such as '/app/bank/**'.")]
-Limit = Annotated[int, typer.Option("--limit", min=1, max=1000, help="How many, the newest.")]
 
 
 def why(path: OnePath, system: System = None, socket: Socket = None, as_json: Json = False) -> None:
@@ -66,10 +65,8 @@ def events(
     system: System = None,
     socket: Socket = None,
     kinds: Annotated[list[str] | None, typer.Option("--kind", help="Only this kind of event; may be repeated.")] = None,
-    seconds: Annotated[
-        float | None, typer.Option("--last", min=0.0, help="Only what was told in so many last seconds.")
-    ] = None,
-    limit: Limit = 50,
+    last: Last = 50,
+    since: Since = None,
     follow: Annotated[bool, typer.Option("--follow", help="Go on with events as they come, until Ctrl+C.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -79,11 +76,13 @@ def events(
         known = difflib.get_close_matches(wrong[0], KINDS)
         hint = f"; there are {', '.join(known)}" if known else ", as docs/events.md lists them"
         raise ended("events", f"there is no kind of event {wrong[0]!r}{hint}", UNUSABLE)
+    begin = begin_meant("events", since)
     try:
         with reached("events", system, socket) as remote:
-            since = 0.0 if seconds is None else time.time() - seconds
-            page = remote.history(path, kinds=kinds or (), since=since, limit=limit)
+            page = remote.history(path, kinds=kinds or (), since=begin, limit=last)
             _print_events(page.events, as_json=as_json)
+            if not page.events and not follow and not as_json:
+                print_lines([], none="no such event is kept")
             while follow:
                 asked = remote.follow_history(path, kinds=kinds or (), after=page.next, timeout=ONE_LOOK)
                 page = asyncio.run(asked)
@@ -93,17 +92,29 @@ def events(
 
 
 def dead_letters(
-    path: Pattern = "**", system: System = None, socket: Socket = None, limit: Limit = 50, as_json: Json = False
+    path: Pattern = "**",
+    system: System = None,
+    socket: Socket = None,
+    last: Last = 50,
+    since: Since = None,
+    as_json: Json = False,
 ) -> None:
     """Print the messages that nobody handled, or that were refused: type, sender, and why."""
+    begin = begin_meant("dead-letters", since)
     with reached("dead-letters", system, socket) as remote:
-        page = remote.history(path, kinds=["DeadLetter"], limit=limit)
+        page = remote.history(path, kinds=["DeadLetter"], since=begin, limit=last)
     _print_events(page.events, as_json=as_json)
+    if not page.events and not as_json:
+        print_lines([], none="no such dead letter is kept")
 
 
-def print_lines(lines: Iterable[str]) -> None:
-    for line in lines:
-        typer.echo(printable(line))
+def print_lines(lines: Iterable[str], *, none: str = "") -> None:
+    """Print lines as a terminal may have them; if there is none, say so on standard error."""
+    shown = [printable(line) for line in lines]
+    for line in shown:
+        typer.echo(line)
+    if not shown and none:
+        typer.echo(none, err=True)
 
 
 def _print_events(found: Iterable[PastEvent], *, as_json: bool) -> None:

@@ -90,7 +90,7 @@ def list_quarantine(
     if as_json:
         show_json({"quarantine": msgspec.to_builtins(messages)})
     else:
-        print_lines(map(quarantine_line, messages))
+        print_lines(map(quarantine_line, messages), none="no such message is in quarantine")
 
 
 @quarantine.command()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import difflib
+import os
 import traceback
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import typer
 
 from ...actors.errors import HoldfastError, SpecError
 from ...system.script import load_script
+from ...system.upgrade.new_program import find_in
 from ..remote import RemoteChange, RemoteRef, RemoteSystem
 from .reaching import FAILED, GREETING_SECONDS, UNUSABLE, chosen, ended, told
 
@@ -18,6 +20,7 @@ from .reaching import FAILED, GREETING_SECONDS, UNUSABLE, chosen, ended, told
 def run_script(script: Path, system: str | None, socket: Path | None, *, dry_run: bool, timeout: float) -> None:
     """Run a reconfiguration script against a running system, and show what each of its transactions has done."""
     with told("apply"):
+        find_in(os.getcwd(), first=False)  # What a script imports must hide nothing of others.
         try:
             loaded = load_script(script)
         except SpecError as error:

@@ -5,14 +5,18 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections import Counter, deque
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from itertools import islice
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
 from ...actors.control.orders import Status, rests_said, status_of
 from ...actors.kernel.cell import GONE
-from ...actors.kernel.envelope import Item, message_in
+from ...actors.kernel.envelope import NO_DEADLINE, Ask, Item, message_in
 from ...actors.process.open_asks import items_at, open_asks
+from ...checkpoint.home.recorded_home import switch_of
+from ...checkpoint.protocol import MESSAGE
 from ...ftm.group.protected import ProtectionStatus, protection_of
 from ...supervision.children import STOPPED
 from ...supervision.intensity import recent_restarts
@@ -35,6 +39,8 @@ GAVE_UP_KINDS = ("SupervisorGaveUp", "AutoShutdown")
 """Events of supervisors that end with all below them."""
 MOST_LOOKED_AT = 50_000
 """Actors and messages in mailboxes that are looked at for asks of one actor."""
+FIRST = 100
+"""Messages that are looked at for one that has waited for long, of each that is below a supervisor."""
 MOST = 200
 """Events of the address that are looked at, the newest."""
 PARTS = "ftm"
@@ -44,7 +50,7 @@ MOST_DEEPER = 10_000
 MOST_TEXT = 300
 """Characters of an error that a sentence quotes."""
 LONG_TURN = 1.0
-"""Seconds from which on a turn is worth a sentence."""
+"""Seconds from which on a turn, or the wait of a message, is worth a sentence."""
 DEEPER_KINDS = (*GAVE_UP_KINDS, "ChildRestarted", "JournalFull", "MessageQuarantined", "RecoveryFailed", "ReplicaLost")
 """Events further below a supervisor of which it tells, too."""
 CHILD_KINDS = ("ChildRestarted", "JournalFull", "MessageQuarantined", "RecoveryFailed", "ReplicaLost", "StopOverdue")
@@ -99,6 +105,8 @@ class ChildNow(msgspec.Struct, frozen=True):
         turn_seconds: how long that turn has taken so far.
         turn_at: the line of the user's code at which it waits.
         awaited: the address for which its start waits, because it is bound to it.
+        queued: messages that wait for it.
+        waited: seconds for which one of them has waited at least; 0 if that is not known.
     """
 
     name: str
@@ -107,6 +115,13 @@ class ChildNow(msgspec.Struct, frozen=True):
     turn_seconds: float = 0.0
     turn_at: str = ""
     awaited: str = ""
+    queued: int = 0
+    waited: float = 0.0
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether its turn, or a message that waits for it, takes long enough for a sentence."""
+        return bool(self.turn and self.turn_seconds >= LONG_TURN) or self.waited >= LONG_TURN
 
 
 class ProcessMemory(msgspec.Struct, frozen=True):
@@ -117,11 +132,21 @@ class ProcessMemory(msgspec.Struct, frozen=True):
 
 
 class Waiting(msgspec.Struct, frozen=True):
-    """The commonest message type in a mailbox: its name, how many there are, and one of their senders or ""."""
+    """What waits in a mailbox.
+
+    Attributes:
+        message: the commonest type.
+        count: how many of that type there are.
+        sender: one of their senders, or "".
+        waited: seconds for which one of them has waited at least; 0 if that is not known.
+        late: asks whose time is over, so that nobody waits for their answers any more.
+    """
 
     message: str
     count: int
     sender: str = ""
+    waited: float = 0.0
+    late: int = 0
 
 
 class Below(msgspec.Struct, frozen=True):
@@ -174,7 +199,8 @@ class Evidence(msgspec.Struct, frozen=True):
         own_allowance: what it allows itself, if it is a supervisor that answers.
         protection: its mechanisms and replicas, if somebody lives there.
         memory: of its own process, if its limits bound that.
-        waiting: what waits most in its mailbox.
+        waiting: what waits in its mailbox.
+        mean_turn: seconds that its turns take in the mean; 0 if its statistics are off, or another process has them.
         silence: that its process has not answered.
     """
 
@@ -198,6 +224,7 @@ class Evidence(msgspec.Struct, frozen=True):
     memory: ProcessMemory | None = None
     waiting: Waiting | None = None
     silence: Silence | None = None
+    mean_turn: float = 0.0
 
     def ago(self, at: float) -> str:
         """A moment as people say it: how long ago, or the time of day if that is long."""
@@ -214,6 +241,15 @@ def seconds_text(seconds: float) -> str:
     ('12 s', '1.2 s')
     """
     return f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.1f} s"
+
+
+def messages_text(count: int) -> str:
+    """How many messages wait, as people say it.
+
+    >>> messages_text(1), messages_text(7)
+    ('1 message waits', '7 messages wait')
+    """
+    return "1 message waits" if count == 1 else f"{count} messages wait"
 
 
 class Told(msgspec.Struct, frozen=True):
@@ -273,6 +309,7 @@ def collect(
         None if cell is None else _memory(cell),
         None if cell is None else _waiting(cell),
         told.silence,
+        0.0 if cell is None else _mean_turn(cell),
     )
 
 
@@ -295,7 +332,12 @@ def _child_now(cell: Cell | None, name: str, about: dict[str, Any]) -> ChildNow:
         return ChildNow(name, state, awaited=awaited)
     status = status_of(cell)
     state = status.state if (state, status.state) == ("running", "suspended") else state
-    return ChildNow(name, state, status.turn or "", status.turn_seconds, status.turn_at, awaited)
+    return _now(cell, status, name, state, awaited)
+
+
+def _now(cell: Cell, status: Status, name: str, state: str, awaited: str = "") -> ChildNow:
+    waited = max((one.seconds for one in _queued(cell, FIRST)), default=0.0) if status.queued else 0.0
+    return ChildNow(name, state, status.turn or "", status.turn_seconds, status.turn_at, awaited, status.queued, waited)
 
 
 def _ended_below(recorder: HistoryRecorder, address: str, children: list[ChildNow]) -> dict[str, PastLife]:
@@ -328,9 +370,12 @@ def _deeper_now(cell: Cell) -> list[ChildNow]:
             break
         one = level.popleft()
         level += _below(one)
-        status = None if one.is_dead else status_of(one)
-        if status is not None and (status.state == "suspended" or (status.turn and status.turn_seconds >= LONG_TURN)):
-            found.append(ChildNow(one.path, status.state, status.turn or "", status.turn_seconds, status.turn_at))
+        if one.is_dead:
+            continue
+        status = status_of(one)
+        now = _now(one, status, one.path, status.state)
+        if now.state == "suspended" or now.is_slow:
+            found.append(now)
     return found
 
 
@@ -382,17 +427,58 @@ def _memory(cell: Cell) -> ProcessMemory | None:
 
 
 def _waiting(cell: Cell) -> Waiting | None:
-    """What waits most in the mailbox, as far as that is in this process."""
-    counts: Counter[str] = Counter()
-    senders: dict[str, str] = {}
-    for item in items_at(cell, MOST_LOOKED_AT):
-        name = message_type(message_in(item))
-        counts[name] += 1
-        if isinstance(item, Item) and item.sender is not None:
-            senders[name] = item.sender.path
+    """What waits for an actor, as far as that is known in this process."""
+    found = list(_queued(cell, MOST_LOOKED_AT))
+    counts = Counter(one.message for one in found)
+    senders = {one.message: one.sender for one in found if one.sender}
     for name, count in counts.most_common(1):
-        return Waiting(name, count, senders.get(name, ""))
+        longest = max(one.seconds for one in found)
+        return Waiting(name, count, senders.get(name, ""), longest, sum(one.is_late for one in found))
     return None
+
+
+class _Queued(NamedTuple):
+    """A message that waits: its type, its sender or "", for how long (0 if unknown), and whether an ask gave it up."""
+
+    message: str
+    sender: str
+    seconds: float
+    is_late: bool
+
+
+def _queued(cell: Cell, most: int) -> Iterator[_Queued]:
+    """What waits at an actor, oldest first: a home knows when it was admitted, a mailbox when an ask was made."""
+    switch, node = switch_of(cell), cell.node
+    if switch is None:
+        for item in items_at(cell, most):
+            sender = item.sender.path if isinstance(item, Item) and item.sender is not None else ""
+            is_late = isinstance(item, Ask) and item.is_done
+            yield _Queued(message_type(message_in(item)), sender, _waited(item, node.loop.time()), is_late)
+        return
+    in_hand = cell.host.place.running(cell)
+    for source in islice(switch.ledger.open.values(), most):
+        if source.kind == MESSAGE and source.id != in_hand and not source.was_stashed:
+            seconds = max(0.0, node.clock.wall() - source.time)
+            is_late = source.ask is not None and source.ask.is_done
+            yield _Queued(source.name.replace(":", "."), source.sender or "", seconds, is_late)
+
+
+def _waited(item: Any, now: float) -> float:
+    """For how long an ask has waited; once its time is over, only that is known: it was at least its timeout."""
+    if not isinstance(item, Ask):
+        return 0.0
+    if item.deadline == NO_DEADLINE:
+        return item.timeout if item.is_done else 0.0
+    return max(0.0, now - (item.deadline - item.timeout))
+
+
+def _mean_turn(cell: Cell) -> float:
+    """How long a turn takes in the mean, in seconds, if that is counted in this process."""
+    tap = cell.more.tap if cell.more is not None else None
+    if tap is None or not tap.counting or not cell.host.place.is_here:
+        return 0.0
+    counts = tap.counts()
+    return counts.turn_seconds / counts.turns if counts.turns else 0.0
 
 
 def put_aside(one: QuarantinedMessage, *, payloads: bool = False) -> PutAside:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from ...ftm.group.protected import ProtectionStatus
-from .evidence import LONG_TURN, MOST_TEXT, Evidence, PutAside, seconds_text
+from .evidence import LONG_TURN, MOST_TEXT, Evidence, PutAside, messages_text, seconds_text
 from .lives import CLEAN, PastLife, is_fault
 from .past_event import PastEvent
 from .raised import raised_at
@@ -308,16 +308,22 @@ def _silent(evidence: Evidence) -> list[str]:
 
 
 def _mailbox(evidence: Evidence) -> list[str]:
-    status = evidence.status
-    if status is None or status.queued < MANY or status.state == "suspended":
+    """Many messages wait for it, or one has waited for long."""
+    status, before, waiting = evidence.status, evidence.queued_before, evidence.waiting
+    if status is None or not status.queued or status.state == "suspended":
         return []
-    before, most = evidence.queued_before, evidence.waiting
-    said = f"{status.queued} messages wait in its mailbox"
+    if status.queued < MANY and (waiting is None or (waiting.waited < LONG_TURN and not waiting.late)):
+        return []
+    said = f"{messages_text(status.queued)} in its mailbox"
     if before is not None and before != status.queued:
         said += ", and they become more" if status.queued > before else ", and they become fewer"
-    if most is not None:
-        sender = f" from {most.sender}" if most.sender else ""
-        said += f"; most of them are {most.message}{sender}"
+    if waiting is not None:
+        sender = f" from {waiting.sender}" if waiting.sender else ""
+        said += f"; most of them are {waiting.message}{sender}"
+        said += f"; one has waited for {seconds_text(waiting.waited)} or more" if waiting.waited >= LONG_TURN else ""
+        said += f"; nobody waits for the answers of {waiting.late} any more" if waiting.late else ""
+    if evidence.mean_turn:
+        said += f"; a turn takes {evidence.mean_turn:.2g} s in the mean"
     return [f"{said}."]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from .evidence import LONG_TURN, MOST_TEXT, ChildNow, Evidence, seconds_text
+from .evidence import LONG_TURN, MOST_TEXT, ChildNow, Evidence, messages_text, seconds_text
 from .past_event import PastEvent
 
 LATELY = 60.0
@@ -69,9 +69,9 @@ def moving_children(evidence: Evidence) -> list[str]:
 
 
 def waiting_children(evidence: Evidence) -> list[str]:
-    """Which children are up and do not get on: suspended, or in a turn that waits for long."""
-    slow = [one for one in _in(evidence, "running") if one.turn and one.turn_seconds >= LONG_TURN]
-    slow.sort(key=lambda one: -one.turn_seconds)
+    """Which children are up and do not get on: suspended, in a turn that waits for long, or behind with their work."""
+    slow = [one for one in _in(evidence, "running") if one.is_slow]
+    slow.sort(key=lambda one: -max(one.turn_seconds, one.waited))
     held = [f"Its child {one.name} is suspended." for one in _in(evidence, "suspended")]
     return _first([f"Its child {one.name} does not get on{_hangs(one)}." for one in slow] + held)
 
@@ -151,11 +151,13 @@ def _in(evidence: Evidence, *states: str) -> list[ChildNow]:
 
 
 def _hangs(one: ChildNow) -> str:
-    """Where a child's turn waits, or whom its start waits for."""
+    """Where a child's turn waits, whom its start waits for, and who waits for it."""
     said = f", and waits for {one.awaited} to be there" if one.awaited else ""
     if one.turn and one.turn_seconds >= LONG_TURN:
         at = f" at {one.turn_at}" if one.turn_at else ""
         said += f": it has been in the turn of {one.turn} for {seconds_text(one.turn_seconds)}{at}"
+    if one.waited >= LONG_TURN:
+        said += f"; {messages_text(one.queued)} for it, one for {seconds_text(one.waited)} or more"
     return said
 
 

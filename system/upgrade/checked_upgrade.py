@@ -53,7 +53,7 @@ class UpgradeCheck:
     @property
     def is_fine(self) -> bool:
         """Say whether the new code goes on with all that is recorded as the old one would."""
-        return all(one.verdict == "fine" for one in self.addresses)
+        return all(one.is_fine for one in self.addresses)
 
     @property
     def has_differences(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import os
 import sys
@@ -76,10 +77,10 @@ def specs_in(target: str, found: Any) -> Named:
     return specs
 
 
-def find_in(folder: str) -> None:
-    """Let modules be found in a folder first, as `python -m` does with the one it is started in."""
+def find_in(folder: str, *, first: bool = True) -> None:
+    """Let modules be found in a folder: first, as `python -m` does with the current one, or after all others."""
     if folder not in sys.path:
-        sys.path.insert(0, folder)
+        sys.path.insert(0 if first else len(sys.path), folder)
 
 
 def _import(module: str) -> None:
@@ -110,6 +111,7 @@ class NewProgram:
         self._mechanisms = MechanismNotes(homes)
         self._found: dict[str, ChildSpec] = {}
         self._unasked: dict[str, str] = {}
+        self._dynamic: dict[str, Plan] = {}
         named = {address: spec for address, spec in specs.items() if address.count("/") > 1}
         for system in {address.split("/")[1] for address in homes.known("")}:
             for address, spec in specs.items():
@@ -128,8 +130,10 @@ class NewProgram:
         for one in plan.children:
             if one.id != NAMELESS and not spec.start.kind._is_dynamic:
                 self._take(f"{path}/{one.id}", one)
-        if spec.start.kind._is_dynamic and plan.flags.journal:
-            self._take_noted(path, plan.children[0] if plan.children else None)
+        if spec.start.kind._is_dynamic and path not in self._unasked:
+            self._dynamic[path] = plan
+            if plan.flags.journal:
+                self._take_noted(path, plan.children[0] if plan.children else None)
 
     def _plan(self, path: str, spec: ChildSpec) -> Plan:
         """The children that a supervisor begins with: it is constructed, and asked as at its start."""
@@ -155,14 +159,41 @@ class NewProgram:
 
     def recipe(self, path: str) -> Recipe | AddressCheck:
         """How the new program starts the actor at an address, or what is to be said if it does not."""
-        spec = self._found.get(path)
+        spec = self._found.get(path) or self._started_later(path)
         if spec is None:
             above = next((one for one in self._unasked if path == one or path.startswith(f"{one}/")), None)
             if above is not None:
                 return AddressCheck(path, "unchecked", problem=f"{above} could not be asked: {self._unasked[above]}")
+            if (supervisor := self._forgotten_by(path)) is not None:
+                why = f"{supervisor} has forgotten it, as whoever has ended in good order, and starts nobody there"
+                return AddressCheck(path, "ended", problem=why)
             why = "the new program starts nobody there; an actor that is started later can be named by its address"
             return AddressCheck(path, "missing", problem=why)
         if spec.recovery is None or not spec.recovery.records:
             why = "the new program starts it without a recovery method, so what is recorded would not be used"
             return AddressCheck(path, "refused", problem=why)
         return Recipe(spec.start, spec.recovery, spec.bindings)
+
+    def _started_later(self, path: str) -> ChildSpec | None:
+        """How a dynamic supervisor would start the actor at an address by its template, if it is asked for it again."""
+        above, _, name = path.rpartition("/")
+        template = (
+            self._dynamic[above].children[0] if above in self._dynamic and self._dynamic[above].children else None
+        )
+        if template is None or path in self._unasked:
+            return None
+        try:
+            template.start.check()
+        except TypeError:  # Each start brings arguments of its own, and nobody has noted them.
+            return None
+        self._take(path, dataclasses.replace(template, id=name))
+        return self._found[path]
+
+    def _forgotten_by(self, path: str) -> str | None:
+        """The dynamic supervisor with a journal of its children in which that at an address, or above it, is not."""
+        parts = path.split("/")
+        for end in range(len(parts) - 1, 1, -1):
+            above, child = "/".join(parts[:end]), "/".join(parts[: end + 1])
+            if above in self._dynamic and child not in self._found:
+                return above if self._dynamic[above].flags.journal else None
+        return None

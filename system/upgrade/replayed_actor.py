@@ -45,7 +45,7 @@ from ...checkpoint.store_tools.kept_lives import KeptLife, apart, kept_lives
 from ...checkpoint.store_tools.plain_export import plain_message, plain_result, plain_state
 from ...checkpoint.store_tools.rerun import LifeEnded, Recipe, Rerun
 from ...checkpoint.store_tools.upgrade_check import AddressCheck
-from .new_program import NewProgram, load_specs
+from .new_program import NewProgram, find_in, load_specs
 
 TURN_TIMEOUT: Final = 30.0
 """Seconds that a turn may wait, unless a debugger is at work."""
@@ -174,8 +174,7 @@ def _recorded(address: str, lives: list[KeptLife]) -> Recipe:
         if entry[0] == "in" and entry[2] == START:
             name = name or cast("bytes", entry[4]).decode()
     hint = "name the specs of its program with --spec"
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
+    find_in(os.getcwd())
     try:
         kind = find_class(name)
     except DamagedValue as error:

@@ -112,6 +112,34 @@ async def reconfigure(system):
     assert "/app/left/greeter" in system.tree()
 
 
+async def test_a_script_may_use_the_modules_of_the_current_folder(
+    system: hf.ActorSystem, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, scripts = tmp_path / "code", tmp_path / "scripts"
+    code.mkdir()
+    scripts.mkdir()
+    monkeypatch.setattr(sys, "path", [*sys.path, str(code)])  # of the running system
+    monkeypatch.setenv("PYTHONSAFEPATH", "1")  # The command is started as a program, not by `python -m`.
+    monkeypatch.chdir(code)
+    helper = f"near_{tmp_path.name}"
+    written(code / f"{helper}.py", GROW.partition("async def reconfigure")[0])
+    script = written(
+        scripts / "uses.py",
+        f"""
+import holdfast as hf
+from {helper} import Greeter
+
+
+async def reconfigure(system):
+    async with system.transaction() as change:
+        change.add("/app/left", hf.child("greeter", hf.start(Greeter)))
+""",
+    )
+    status, _, errors = await holdfast("apply", script, "--socket", path)
+    assert (status, errors) == (DONE, "")
+    assert "/app/left/greeter" in system.tree()
+
+
 async def test_a_script_is_carried_out_in_the_running_system(system: hf.ActorSystem, path: Path, grow: Path) -> None:
     with system.events() as stream:
         status, output, errors = await holdfast("apply", grow, "--socket", path)

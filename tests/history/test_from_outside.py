@@ -157,7 +157,7 @@ async def test_the_commands_in_json(system: hf.ActorSystem, path: Path) -> None:
     assert json.loads(said)["address"] == "/app/worker"
     _, said, _ = await command(path, "history", "/app/worker", "--json")
     assert msgspec.convert(json.loads(said)["lives"], list[hf.system.PastLife]) == system.lives("/app/worker")
-    _, said, _ = await command(path, "events", "/app/worker", "--json", "--limit", "2")
+    _, said, _ = await command(path, "events", "/app/worker", "--json", "--last", "2")
     assert [json.loads(line)["number"] for line in said.splitlines()] == [
         one.number for one in system.history("/app/worker").events[-2:]
     ]
@@ -192,10 +192,29 @@ async def test_what_is_in_quarantine_is_retried_and_dropped(system: hf.ActorSyst
     assert system.quarantined() == []
 
 
+async def test_last_is_a_number_since_is_a_time_and_nothing_is_said_in_words(path: Path) -> None:
+    async with asyncio.timeout(20.0):
+        code, said, errors = await command(path, "events", "/app/worker", "--kind", "ActorStarted", "--last", "1")
+    assert (code, said.count("\n"), errors) == (0, 1, "")
+    for words in (["events", "--kind", "SupervisorGaveUp"], ["events", "--since", "2999-01-01"], ["dead-letters"]):
+        code, said, errors = await command(path, *words)
+        assert (code, said) == (0, "")
+        assert errors == f"no such {'dead letter' if words == ['dead-letters'] else 'event'} is kept\n"
+        code, said, errors = await command(path, *words, "--json")
+        assert (code, said, errors) == (0, "", "")
+    code, said, errors = await command(path, "events", "--since", "lately")
+    assert (code, said) == (2, "")
+    assert "holdfast events: --since: 'lately' is neither" in errors
+    for name, none in (("quarantine", "no such message is in quarantine"), ("connections", "no program is connected")):
+        code, said, errors = await command(path, name)
+        assert (code, said) == (0, "")
+        assert errors.startswith(none)
+
+
 async def test_events_that_are_followed_come_as_they_are_told(system: hf.ActorSystem, path: Path) -> None:
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "holdfast.console.cli", "events", "/app/worker", "--follow", "--json"),
-        *("--limit", "1", "--socket", str(path)),
+        *("--last", "1", "--socket", str(path)),
         stdout=asyncio.subprocess.PIPE,
     )
     assert process.stdout is not None

@@ -345,6 +345,25 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         {"status": status(queued=150), "waiting": Waiting("shop.Pay", 140, "/app/till")},
         "150 messages wait in its mailbox; most of them are shop.Pay from /app/till.",
     ),
+    "asks that wait for long": (
+        {
+            "status": status(queued=33),
+            "waiting": Waiting("shop.Pay", 30, "/app/till", waited=8.0, late=24),
+            "mean_turn": 0.25,
+        },
+        (
+            "33 messages wait in its mailbox; most of them are shop.Pay from /app/till; one has waited for 8.0 s or "
+            "more; nobody waits for the answers of 24 any more; a turn takes 0.25 s in the mean."
+        ),
+    ),
+    "asks that have just come": (
+        {"is_there": True, "status": status(queued=33), "waiting": Waiting("shop.Pay", 33, waited=0.5)},
+        f"{AT} is running, in life 2, and nothing is wrong as far as is known.",
+    ),
+    "a child whose asks wait": (
+        {"below": Below(now=[ChildNow("a", "running", queued=1, waited=8.0)])},
+        "Its child a does not get on; 1 message waits for it, one for 8.0 s or more.",
+    ),
     "where it waits": (
         {"status": status(turn="shop.Pay", turn_seconds=1.5, turn_at="shop.py:41, await answer")},
         (

@@ -405,6 +405,23 @@ async def test_suspended_and_full(system: hf.ActorSystem) -> None:
     await system.resume(ref)
 
 
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["unrecorded", "recorded"])
+async def test_messages_that_wait_for_long_are_told(system: hf.ActorSystem, isolation: Any, recovery: Any) -> None:
+    ref = await system.start(worker(isolation=isolation, recovery=recovery, shutdown="brutal_kill"))
+    await system.statistics(ref, True)
+    await ref.ask(Do("well"), 20.0)
+    ref.tell(Do("wait"))
+    late = await asyncio.gather(*(ref.ask(Do("well"), 1.0) for _ in range(3)), return_exceptions=True)
+    assert [type(error) for error in late] == [hf.AskTimeout] * 3
+    async with asyncio.timeout(20.0):
+        while "one has waited for 1" not in (text := await said(system, ref)):
+            await asyncio.sleep(0.05)
+    assert "3 messages wait in its mailbox; most of them are tests.history.players.Do; one has waited for " in text
+    assert "; nobody waits for the answers of 3 any more; a turn takes " in text or isolation == "process"
+    assert re.search(r"Its child worker does not get on.*; 3 messages wait for it, one for", await said(system, "/app"))
+
+
 async def test_a_mailbox_that_grows(system: hf.ActorSystem) -> None:
     ref = await system.start(worker(shutdown="brutal_kill"))
     ref.tell(Do("wait"))

@@ -181,6 +181,14 @@ def test_a_key_may_be_in_a_file(tmp_path: Path, data: bytes) -> None:
         read_store_key(file)
 
 
+def test_a_file_that_is_no_key_is_not_to_be_closed_to_others(tmp_path: Path) -> None:
+    file = tmp_path / "passwd"
+    file.write_text("root:x:0:0:root:/root:/bin/sh\n")
+    file.chmod(0o644)
+    with pytest.raises(hf.SpecError, match=r"must have 32 bytes or 64 hex digits$"):
+        read_store_key(file)
+
+
 @pytest.mark.parametrize("key", [b"", KEY[:31], KEY + b"x", lambda: "x" * 32, lambda: KEY.hex().encode()])
 def test_what_is_no_key_is_refused_and_not_shown(path: Path, key: StoreKey) -> None:
     with pytest.raises(hf.SpecError, match="must be 32 bytes") as caught:

@@ -175,6 +175,47 @@ async def main(store: str, what: str) -> None:
 if __name__ == "__main__":
     asyncio.run(main(*sys.argv[1:]))
 """
+SESSIONS = """
+import asyncio
+
+import holdfast as hf
+
+
+class Leave(hf.Message[str]): ...
+
+
+class Session(hf.Actor):
+    def __init__(self, name: str = "nobody") -> None:
+        self.name = name
+        self.left = 0
+
+    @hf.on(Leave)
+    def leave(self, message: Leave) -> str:
+        self.left += 1
+        self.ctx.stop()
+        return 'bye'
+
+
+LASTS = hf.replay_only()
+session = hf.child(None, hf.start(Session), recovery=LASTS, restart="transient")
+tree = [
+    hf.dynamic("rooms", journal=True),
+    hf.dynamic("sleeping", template=session, journal=True),
+]
+
+
+async def main(store: str) -> None:
+    async with hf.ActorSystem("app", store=f"sqlite:{store}", log=False) as system:
+        for one in tree:
+            above = await system.start(one)
+            given = {"id": "ann"}
+            if one.id != "sleeping":
+                given = {"spec": hf.child("ann", hf.start(Session, "ann"), recovery=LASTS, restart="transient")}
+            session = await above.ask(hf.StartChild(**given))
+            await session.ask(Leave())
+            while session.path in system.tree():
+                await asyncio.sleep(0.01)
+"""
 RUN = "import asyncio, sys, shop; asyncio.run(shop.main(*sys.argv[1:]))"
 
 

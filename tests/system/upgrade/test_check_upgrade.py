@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
 from tests.checkpoint.store_tools.writing import everything
-from tests.system.upgrade.shops import begin, check, killed, newer
+from tests.system.upgrade.shops import SESSIONS, begin, check, environment, killed, newer
 
 ALICE, LEDGER, TRIP, SEARCH, ROOM = "/app/bank/alice", "/app/ledger", "/app/trip", "/app/search", "/app/rooms/one"
 ALL = {ALICE, LEDGER, TRIP, SEARCH, ROOM}
@@ -204,6 +206,28 @@ def test_specs_that_cannot_be_had_are_refused_in_words(
     assert errors.startswith("holdfast check-upgrade: ")
     assert said in errors
     assert errors.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "verdict", "status"), [("", "fine", 0), ("return 'later'", "differs", 1)], ids=["same", "other"]
+)
+def test_children_that_sleep_are_checked_by_their_template_and_those_that_have_ended_are_no_difference(
+    change: str, verdict: str, status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = tmp_path / "code"
+    code.mkdir()
+    (code / "sessions.py").write_text(SESSIONS)
+    run = "import asyncio, sys, sessions; asyncio.run(sessions.main(sys.argv[1]))"
+    store = tmp_path / "app.db"
+    subprocess.run(
+        [sys.executable, "-c", run, str(store)], check=True, cwd=code, env=environment(tmp_path), timeout=60.0
+    )
+    (code / "sessions.py").write_text(SESSIONS.replace("return 'bye'", change or "return 'bye'"))
+    ended, found, _ = check(monkeypatch, store, code, spec="sessions:tree")
+    verdicts = {address: one["verdict"] for address, one in found.items()}
+    assert verdicts == {"/app/rooms/ann": "ended", "/app/sleeping/ann": verdict}
+    assert ended == status
+    assert "/app/rooms has forgotten it" in found["/app/rooms/ann"]["problem"]
 
 
 def test_a_store_that_cannot_be_read_is_refused_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
