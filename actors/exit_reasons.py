@@ -12,6 +12,8 @@ import msgspec
 
 from .errors import StartFailed, error_text, format_error, type_name
 
+START_FAILED = type_name(StartFailed)
+
 
 class ExitReason(msgspec.Struct, frozen=True):
     """Base of the exit reasons."""
@@ -77,6 +79,8 @@ class Crash(ExitReason, frozen=True, eq=False):
         return self.formatted if self.error is None else format_error(self.error)
 
     def __str__(self) -> str:
+        if self.type_name == START_FAILED and self.text:
+            return self.text  # It says who could not be started, and why: once for each level is enough.
         return f"{self.type_name}: {self.text}" if self.text else self.type_name
 
     def portable(self) -> Crash:

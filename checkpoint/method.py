@@ -28,6 +28,8 @@ Pacing = Literal["fast", "original"] | float
 JOURNAL_LIMIT = 256_000_000
 HUNG_DELIVERIES = 2
 """Turns of one message, in a row, that did not end, after which it is the message, and not who handles it."""
+WITH_SNAPSHOTS = ("hybrid", "checkpoint_only")
+"""Names of the methods that save the state now and then."""
 OF_LIVES = ("name", "interval", "check_readonly", "key_variables", "origin", "strict", "check_replay")
 """The settings that concern a life, not its home."""
 
@@ -105,7 +107,7 @@ class Method:
     @property
     def snapshots(self) -> bool:
         """Say whether the state is saved now and then."""
-        return self.name in ("hybrid", "checkpoint_only")
+        return self.name in WITH_SNAPSHOTS
 
     @property
     def replays(self) -> bool:

@@ -10,11 +10,12 @@ from typing import Annotated, Any
 
 import typer
 
-from ...actors.errors import HoldfastError
+from ...actors.errors import ActorStopped, HoldfastError, NoSuchActor
+from ...checkpoint.method import WITH_SNAPSHOTS
 from ..overview import ActorRow
 from ..remote import RemoteChange, RemoteSystem
 from .losses import WARNINGS, held_up_by, lost_states, tops
-from .patterns import select
+from .patterns import read_pattern, select
 from .reaching import (
     FAILED,
     DryRun,
@@ -261,22 +262,30 @@ def protect(
 def checkpoint(
     paths: Paths, system: System = None, socket: Socket = None, timeout: Timeout = 10.0, as_json: Json = False
 ) -> None:
-    """Have the states of recorded actors saved, and wait until they are.
+    """Have the states of recorded actors saved, and wait until they are; of a pattern, of those that have snapshots.
 
-    Exit status 0: done. 1: one has no snapshots, or could not be saved in time. 2: no system answers.
+    Exit status 0: done. 1: one that is named has no snapshots, or one could not be saved in time. 2: no system answers.
     """
     with reached("checkpoint", system, socket) as remote:
         rows = meant_rows(remote, paths)
+        names = [pattern for pattern in map(read_pattern, paths) if pattern.is_one]
+        named = {row.path for row in rows if any(pattern.matches(row) for pattern in names)}
+        rows = [row for row in rows if row.path in named or row.recovery in WITH_SNAPSHOTS]
         failed: list[str] = []
+        saved = 0
         for row in rows:
             try:
                 asyncio.run(remote.checkpoint(row.path, timeout=timeout))
+            except (ActorStopped, NoSuchActor) as error:  # It may have ended since the rows were read.
+                failed += [str(error)] if row.path in named else []
             except HoldfastError as error:
                 failed.append(str(error))
+            else:
+                saved += 1
     if as_json:
-        show_json({"saved": len(rows) - len(failed), "failed": failed})
+        show_json({"saved": saved, "failed": failed})
     else:
-        typer.echo(f"{len(rows) - len(failed)} of {len(rows)} saved")
+        typer.echo(f"{saved} of {saved + len(failed)} saved")
     if failed:
         raise ended("checkpoint", "; ".join(failed), FAILED)
 

@@ -141,7 +141,9 @@ OnePath = Annotated[str, typer.Argument(metavar="PATH", help="An address or a na
 
 
 NOBODY = "no system of yours is found by its name"
-OF_ITS_OWN = "a program whose endpoint has a path of its own is reached by --socket FILE"
+OF_ITS_OWN = (
+    "a program opens an endpoint by control_endpoint(system), and with a path of its own it is reached by --socket FILE"
+)
 
 
 def chosen(system: str | None, socket: Path | None) -> Path:
@@ -160,8 +162,7 @@ def chosen(system: str | None, socket: Path | None) -> Path:
     if not meant:
         there = ", ".join(f"{one.system} (pid {one.pid})" for one in live)
         wanted = f"no system {system!r} is found by its name" if system else NOBODY
-        others = f"there are {there}" if there else "a program opens a control endpoint by control_endpoint(system)"
-        raise NoSystem(f"{wanted}; {others}; {OF_ITS_OWN}")
+        raise NoSystem("; ".join(filter(None, (wanted, f"there are {there}" if there else "", OF_ITS_OWN))))
     return _one_of([program_at(one) for one in meant], node).socket
 
 

@@ -306,6 +306,7 @@ async def test_protect_and_checkpoint(named: hf.ActorSystem) -> None:
     assert (await holdfast("checkpoint", "/app/kept"))[:2] == (DONE, "1 of 1 saved\n")
     status, _, errors = await holdfast("checkpoint", "/app/left/a")
     assert (status, "keeps no snapshots" in errors) == (FAILED, True)
+    assert (await holdfast("checkpoint", "/app/**"))[:2] == (DONE, "1 of 1 saved\n")
     assert (await holdfast("protect", "/app/left/a", "pbr"))[0] == DONE
     (told,) = await as_json("inspect", "/app/left/a")
     assert (told["protection"]["stack"], told["actor"]["place"]) == (["pbr"], "replicas")

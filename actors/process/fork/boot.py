@@ -110,7 +110,10 @@ def watch_parent(parent: int) -> int:
     # While modules are imported nobody looks at the socket; there are no children yet, so being killed is fine.
     bind_prctl()(PR_SET_PDEATHSIG, signal.SIGKILL)
     # The end of the socket is not enough: a process the parent forked without exec holds a copy of the other end.
-    parent_fd = os.pidfd_open(parent)
+    try:
+        parent_fd = os.pidfd_open(parent)
+    except ProcessLookupError:
+        return -1
     return parent_fd if os.getppid() == parent else -1
 
 
