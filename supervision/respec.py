@@ -110,8 +110,8 @@ def _tell_parent(cell: Cell) -> None:
     if not isinstance(supervisor, Supervisor) or child is None:
         return
     if child.cell is cell and isinstance(cell.spec, ChildSpec) and child.spec is not cell.spec:
-        child.spec = cell.spec
-        supervisor._respecified(child)
+        before, child.spec = child.spec, cell.spec
+        supervisor._respecified(child, before)
 
 
 def rebuilt(start: Start[Any], names: list[str], change: Change) -> Start[Any]:
