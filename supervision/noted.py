@@ -62,7 +62,7 @@ class OfTemplate:
             was, now = self._as_made(template, field), getattr(after, field)
             if was is not now and packed_digest(was, field) != packed_digest(now, field):
                 changes[field] = (_said(template, field), pack_data(now, f"{field} of child {after.id!r}"))
-        return dataclasses.replace(self, changes=changes)
+        return self if changes == self.changes else dataclasses.replace(self, changes=changes)
 
     def _as_made(self, template: ChildSpec, field: str) -> Any:
         """What a child has in a field that nobody has changed."""
@@ -98,6 +98,11 @@ def renewed(known: Noted | None, template: ChildSpec | None, before: ChildSpec, 
         return known.changed(template, before, after)
     base = known if isinstance(known, ChildSpec) else before
     now = {name: getattr(after, name) for name in _changed(before, after)}
+    now = {
+        name: said
+        for name, said in now.items()
+        if packed_digest(getattr(base, name), name) != packed_digest(said, name)
+    }
     return first_noted(template, dataclasses.replace(base, **now)) if now else base
 
 
