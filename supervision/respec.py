@@ -45,8 +45,8 @@ def replace_place(cell: Cell, spec: ChildSpec, *, is_lent: bool = False) -> None
     )  # fmt: skip
 
 
-def replace_mechanism(cell: Cell, spec: ChildSpec) -> None:
-    """The next lives at `cell` are protected as `spec` says, and live where it says."""
+def replace_mechanism(cell: Cell, spec: ChildSpec, *, is_lent: bool = False) -> None:
+    """The next lives at `cell` are protected as `spec` says, and live there; `is_lent` as in `replace_place`."""
     if isinstance(cell.spec, ChildSpec) and cell.spec.start is not spec.start:  # Its code was replaced meanwhile.
         spec = dataclasses.replace(spec, start=cell.spec.start)
     _change(
@@ -55,6 +55,7 @@ def replace_mechanism(cell: Cell, spec: ChildSpec) -> None:
         lambda known: dataclasses.replace(
             known, isolation=spec.isolation, limits=spec.limits, mechanism=spec.mechanism
         ),
+        is_noted=not is_lent,
     )  # fmt: skip
 
 

@@ -62,3 +62,27 @@ async def test_what_is_changed_of_a_child_is_kept(tmp_path: Path, kind: str, dir
             before = await player.looks(system)
             await again(system, how)
         assert await player.looks(system) == before
+
+
+async def test_a_new_template_and_a_transaction_reach_all_and_are_kept(tmp_path: Path) -> None:
+    """Also those that are started later; a program that says nothing new changes nothing, one that says it goes on."""
+    store = f"sqlite:{tmp_path / 'app.db'}"
+    team = player.trees("template")[-1]
+    new = hf.child(None, hf.start(player.New), recovery=hf.hybrid(), bindings=player.BOUND)
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        await player.begin(system, "template")
+        await player.come(system, "template", "one", "two")
+        await system.ref("/app/team", hf.Supervisor).ask(hf.supervision.ChangeSupervisor(children=[new]))
+        async with system.transaction() as change:
+            for name in ("one", "two"):
+                change.replace_code(player.at(name), player.New)
+        await player.come(system, "template", "three")
+        for name in ("one", "two", "three"):
+            await system.ref(player.at(name)).ask(player.Count())
+    later = hf.dynamic("team", template=new, journal=True, intensity=100)
+    for said in (team, team, later, later):
+        async with hf.ActorSystem("app", store=store, log=False) as system:
+            for tree in (*player.trees("template")[:-1], said):
+                await system.start(tree)
+            seen = await player.looks(system)
+            assert [seen[player.at(name)][:3] for name in ("one", "two", "three")] == [["New", "task", 2]] * 3
