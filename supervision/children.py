@@ -45,6 +45,7 @@ class Child:
     up: asyncio.Future[None] | None = None  # a start that is waited for outside our turn; None once it is known or void
     row: StartRow | None = None  # those that are started one after another, and it is one of them
     candidate: int = 0  # as whose candidate it was started; 0: it is none
+    noted: Any = None  # what its supervisor's journal says of it, if that is known
     awaited: str = ""  # the address that its start waits for, because its spec binds it to that
 
     @property

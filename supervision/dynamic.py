@@ -21,9 +21,9 @@ from ..actors.kernel.actor import Start, on
 from ..actors.kernel.cell import DOWN, GONE, Cell
 from ..actors.persistence import child_key
 from ..actors.process.resource_limits import Limits
-from ..actors.process.wire.start_codec import pack_data, unpack_data
 from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
 from .children import STARTING, Child, StartRow, complete, tell_ended_with
+from .noted import FIELDS, Noted, OfTemplate, filled, first_noted, pack_noted, renewed, unpack_noted
 from .rules import Rule
 from .spec import NAMELESS, ChildSpec, Flags, Isolation, Plan, Restart, Shutdown, check_spec, child
 from .supervisor import Supervisor
@@ -55,7 +55,7 @@ class DynamicSupervisor(Supervisor):
     async def _start_all(self) -> None:
         """Start empty, or with the children that were there before, if there is a journal of them."""
         node, where = self.ctx._cell.node, child_key(self.ctx.path, "")
-        noted: list[Child] = []
+        come: list[Child] = []
         for key, data in node.ports.keeper.notes(where).items():
             name = key.removeprefix(where)
             if "/" in name:
@@ -66,11 +66,12 @@ class DynamicSupervisor(Supervisor):
             if not self._flags.journal:
                 continue
             try:
-                noted.append(Child(self._noted(name, data)))
+                spec, known = unpack_noted(self.ctx.path, self._template, name, data)
+                come.append(Child(spec, noted=known))
             except HoldfastError as error:  # It stays in the journal: perhaps its class is only not there today.
                 node.emit(ChildStartFailed(f"{self.ctx.path}/{name}", str(error)))
-        self._children.update((one.spec.id, one) for one in noted)
-        row = StartRow(noted, STARTING)
+        self._children.update((one.spec.id, one) for one in come)
+        row = StartRow(come, STARTING)
         while (one := row.next()) is not None:
             try:
                 await self._come_up_in(row, one)
@@ -92,25 +93,25 @@ class DynamicSupervisor(Supervisor):
         if erased is not None:
             await erased
 
-    def _noted(self, name: str, data: bytes) -> ChildSpec:
-        """A child as the journal has it. Raises HoldfastError if it can not be made any more."""
-        return noted_child(self.ctx.path, self._template, name, data)
-
     def _enlist(self, one: Child) -> None:
         # First: what is started must come back, also if we die in the middle of the start. But of two, of which one is
         # to take the place of the other, that is noted which has it.
         if self._is_in_place and one.spec.start.begins_with is None:
-            self._note(one, one.spec)
+            self._note(one, self._first_noted(one.spec))
         super()._enlist(one)
 
-    def _note(self, one: Child, spec: ChildSpec) -> None:
+    def _first_noted(self, spec: ChildSpec, changed: tuple[str, ...] | None = None) -> Noted | None:
+        """What is noted of a child that has come. Raises HoldfastError if it cannot be."""
+        if not self._flags.journal:
+            return None
+        return first_noted(self._template, spec, FIELDS if changed is None else changed)
+
+    def _note(self, one: Child, known: Noted | None) -> None:
         """Note what becomes of a child when we are started again. Raises HoldfastError if that cannot be."""
         key, keeper = child_key(self.ctx.path, one.spec.id), self.ctx._cell.node.ports.keeper
-        if self._flags.journal:
-            template = self._template
-            is_made = template is not None and _is_made_of(template, spec)
-            given = (*_added(template, spec), spec.made_up) if template is not None and is_made else spec
-            keeper.note(key, pack_data(given, f"child {one.spec.id!r}"))
+        if known is not None:
+            keeper.note(key, pack_noted(known, one.spec))
+            one.noted = known
         elif one.spec.made_up and self._is_recorded(one):
             keeper.note(key, MADE_UP)
 
@@ -121,15 +122,19 @@ class DynamicSupervisor(Supervisor):
         self._try_to_note(one, lambda: self.ctx._cell.node.ports.keeper.note(child_key(self.ctx.path, name), None))
         return one
 
-    def _welcome(self, one: Child) -> None:
-        super()._welcome(one)
+    def _welcome(self, one: Child, declared: ChildSpec) -> None:
+        super()._welcome(one, declared)
         if self._is_in_place:
-            self._try_to_note(one, lambda: self._note(one, one.spec))
+            self._try_to_note(one, lambda: self._note(one, self._first_noted(declared)))
 
-    def _respecified(self, one: Child) -> None:
-        template = self._template  # What only it says need not be noted again: each note is the newest in the journal.
-        if self._flags.journal and self._is_in_place and (template is None or not _is_made_of(template, one.spec)):
-            self._try_to_note(one, lambda: self._note(one, one.spec))
+    def _respecified(self, one: Child, before: ChildSpec) -> None:
+        def note() -> None:
+            known = renewed(one.noted, self._template, before, one.spec)
+            if known is not one.noted:  # Each note is the newest in the journal, which tells the order.
+                self._note(one, known)
+
+        if self._flags.journal and self._is_in_place:
+            self._try_to_note(one, note)
 
     def _try_to_note(self, one: Child, note: Callable[[], None]) -> None:
         """A child has come, or gone, whatever the store says."""
@@ -165,8 +170,11 @@ class DynamicSupervisor(Supervisor):
         count = left.get("count")
         self._count = count if isinstance(count, int) else 0
 
-    def _keep_noted(self, one: Child, spec: ChildSpec) -> None:
-        self._try_to_note(one, lambda: self._note(one, spec))
+    def _keep_noted(self, one: Child, spec: ChildSpec, changed: tuple[str, ...] | None) -> None:
+        self._try_to_note(one, lambda: self._note(one, self._first_noted(spec, changed)))
+
+    def _changed_of(self, one: Child) -> tuple[str, ...] | None:
+        return tuple(one.noted.changes) if isinstance(one.noted, OfTemplate) else None
 
     def _take(self, plan: Plan) -> None:
         """New flags and template; those who live now stay as they are, even if there are more than there may be."""
@@ -190,7 +198,7 @@ class DynamicSupervisor(Supervisor):
         elif self._template is not None:
             if given is not None:
                 raise SpecError("StartChild", f"{self.ctx.path} has a template: give args and kwargs only")
-            spec = _filled(self._template, message.args, message.kwargs)
+            spec = filled(self._template, message.args, message.kwargs)
         elif message.args or message.kwargs:
             raise SpecError("StartChild", f"{self.ctx.path} has no template for these arguments: give a child spec")
         elif isinstance(given, Start):
@@ -299,44 +307,6 @@ def _kill_all(cells: list[Cell]) -> None:
     for cell in cells:
         if cell.state not in (DOWN, GONE):
             cell.kill()
-
-
-def noted_child(supervisor: str, template: ChildSpec | None, name: str, data: bytes) -> ChildSpec:
-    """A child of a dynamic supervisor as its journal has it. Raises HoldfastError if it can not be made any more."""
-    what = unpack_data(data)
-    if isinstance(what, ChildSpec):
-        return dataclasses.replace(what, id=name)
-    if template is None:
-        raise SpecError(supervisor, f"{name!r} was started from a template, and there is none now")
-    args, kwargs, *made_up = what
-    return dataclasses.replace(_filled(template, args, kwargs), id=name, made_up=made_up == [True])
-
-
-def _filled(template: ChildSpec, args: tuple[Any, ...], kwargs: dict[str, Any]) -> ChildSpec:
-    """The template with the arguments of one start behind its own.
-
-    Raises:
-        SpecError: the arguments do not fit the class.
-    """
-    own = template.start
-    start = Start(own.kind, (*own.args, *args), {**own.kwargs, **kwargs})
-    try:
-        start.check()
-    except TypeError as error:
-        raise SpecError("StartChild", f"start({type_name(own.kind)}, ...): {error}") from error
-    return dataclasses.replace(template, start=start)
-
-
-def _is_made_of(template: ChildSpec, spec: ChildSpec) -> bool:
-    """Whether a child is of the class that its template says, so that its arguments say all of it."""
-    return spec.start.kind is template.start.kind
-
-
-def _added(template: ChildSpec, spec: ChildSpec) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """The arguments that a start has added to those of its template."""
-    own, start = template.start, spec.start
-    kwargs = {key: value for key, value in start.kwargs.items() if own.kwargs.get(key, start) is not value}
-    return start.args[len(own.args) :], kwargs
 
 
 def check_dynamic(where: str, plan: Plan) -> None:

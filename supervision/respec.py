@@ -30,15 +30,23 @@ def respec(cell: Cell, start: Start[Any]) -> None:
     _change(cell, spec, lambda known: dataclasses.replace(known, start=start))
 
 
-def replace_place(cell: Cell, spec: ChildSpec) -> None:
-    """The next lives at `cell` are lived where `spec` says, also those under supervisors that are started anew."""
+def replace_place(cell: Cell, spec: ChildSpec, *, is_lent: bool = False) -> None:
+    """The next lives at `cell` are lived where `spec` says, also those under supervisors that are started anew.
+
+    `is_lent`: for the time of a move only, so that no journal notes it.
+    """
     if isinstance(cell.spec, ChildSpec) and cell.spec.start is not spec.start:  # Its code was replaced meanwhile.
         spec = dataclasses.replace(spec, start=cell.spec.start)
-    _change(cell, spec, lambda known: dataclasses.replace(known, isolation=spec.isolation, limits=spec.limits))
+    _change(
+        cell,
+        spec,
+        lambda known: dataclasses.replace(known, isolation=spec.isolation, limits=spec.limits),
+        is_noted=not is_lent,
+    )  # fmt: skip
 
 
-def replace_mechanism(cell: Cell, spec: ChildSpec) -> None:
-    """The next lives at `cell` are protected as `spec` says, and live where it says."""
+def replace_mechanism(cell: Cell, spec: ChildSpec, *, is_lent: bool = False) -> None:
+    """The next lives at `cell` are protected as `spec` says, and live there; `is_lent` as in `replace_place`."""
     if isinstance(cell.spec, ChildSpec) and cell.spec.start is not spec.start:  # Its code was replaced meanwhile.
         spec = dataclasses.replace(spec, start=cell.spec.start)
     _change(
@@ -47,6 +55,7 @@ def replace_mechanism(cell: Cell, spec: ChildSpec) -> None:
         lambda known: dataclasses.replace(
             known, isolation=spec.isolation, limits=spec.limits, mechanism=spec.mechanism
         ),
+        is_noted=not is_lent,
     )  # fmt: skip
 
 
@@ -90,9 +99,9 @@ def keep_plan(supervisor: Supervisor, flags: Flags, given: tuple[ChildSpec, ...]
         respec(cell, Start(start.kind, (flags, children), start.kwargs))
 
 
-def _change(cell: Cell, spec: ChildSpec | None, change: Change) -> None:
+def _change(cell: Cell, spec: ChildSpec | None, change: Change, *, is_noted: bool = True) -> None:
     cell.spec = spec
-    _tell_parent(cell)
+    _tell_parent(cell, is_noted=is_noted)
     names, above = [cell.name], cell.parent
     while above is not None:
         more = above.more
@@ -104,14 +113,15 @@ def _change(cell: Cell, spec: ChildSpec | None, change: Change) -> None:
         names, above = [above.name, *names], above.parent
 
 
-def _tell_parent(cell: Cell) -> None:
+def _tell_parent(cell: Cell, *, is_noted: bool = True) -> None:
     supervisor = cell.parent.actor if cell.parent is not None else None
     child = supervisor._children.get(cell.name) if isinstance(supervisor, Supervisor) else None
     if not isinstance(supervisor, Supervisor) or child is None:
         return
     if child.cell is cell and isinstance(cell.spec, ChildSpec) and child.spec is not cell.spec:
-        child.spec = cell.spec
-        supervisor._respecified(child)
+        before, child.spec = child.spec, cell.spec
+        if is_noted:
+            supervisor._respecified(child, before)
 
 
 def rebuilt(start: Start[Any], names: list[str], change: Change) -> Start[Any]:

@@ -692,11 +692,11 @@ class Supervisor(Inquiries):
         """Another supervisor has this child from now on, and its life goes on."""
         return self._children.pop(name)
 
-    def _respecified(self, one: Child) -> None:
-        """The next lives of a child begin otherwise, or elsewhere."""
+    def _respecified(self, one: Child, before: ChildSpec) -> None:
+        """The next lives of a child begin otherwise, or elsewhere, than its spec said `before`."""
 
-    def _welcome(self, one: Child) -> None:
-        """A child that another supervisor has had is ours from now on."""
+    def _welcome(self, one: Child, declared: ChildSpec) -> None:
+        """A child that another supervisor has had is ours from now on; `declared`: with the mechanism it began with."""
         self._children[one.spec.id] = one
 
     def _check_free(self, spec: ChildSpec) -> None:
@@ -877,8 +877,15 @@ class Supervisor(Inquiries):
     def _inherit(self, left: Bequest) -> None:
         """Go on with what another one of our kind has left; with nothing as long as that has our place still."""
 
-    def _keep_noted(self, one: Child, spec: ChildSpec) -> None:
-        """Have our next life know that we have this child, which begins so, as far as our kind notes that."""
+    def _keep_noted(self, one: Child, spec: ChildSpec, changed: tuple[str, ...] | None) -> None:
+        """Have our next life know that we have this child, which begins so, as far as our kind notes that.
+
+        `changed`: what of it is not as in the template; None: it may be anything.
+        """
+
+    def _changed_of(self, one: Child) -> tuple[str, ...] | None:
+        """What of a child is not as in the template; None: nobody knows."""
+        return None
 
     def _take(self, plan: Plan) -> None:
         """Follow another plan from now on; raises SpecError if that cannot be."""

@@ -152,6 +152,8 @@ class Heir(msgspec.Struct, frozen=True):
     """Restarts in a row without a healthy life."""
     up_for: float
     """Seconds that its life has been up."""
+    changed: tuple[str, ...] | None = None
+    """What of it is not as in the template; None: it may be anything."""
 
 
 class Account(msgspec.Struct, frozen=True):
@@ -198,7 +200,14 @@ def account_of(supervisor: Supervisor) -> Account:
     return Account(
         supervisor._flags,
         tuple(
-            Heir(one.spec.id, one.state, Boxed(one.spec), one.attempts, now - one.up_since)
+            Heir(
+                one.spec.id,
+                one.state,
+                Boxed(one.spec),
+                one.attempts,
+                now - one.up_since,
+                supervisor._changed_of(one),
+            )
             for one in supervisor._listed().values()
         ),
         tuple(now - at for at in supervisor._restarts),
@@ -287,6 +296,7 @@ def take_over(supervisor: Supervisor, account: Account) -> None:
     supervisor._dismissed = dict.fromkeys(account.dismissed)
     supervisor._template = opened(account.template, cell.node)
     specs = {heir.id: opened(heir.spec, cell.node) for heir in account.children}
+    changed = {heir.id: heir.changed for heir in account.children}
     children = dict[str, Child]()
     for heir in account.children:
         one, spec = known.get(heir.id), specs[heir.id]
@@ -298,7 +308,7 @@ def take_over(supervisor: Supervisor, account: Account) -> None:
     supervisor._children, supervisor._is_in_place = {**children, **known}, True
     supervisor._inherit(account.own)
     for name, one in children.items():
-        supervisor._keep_noted(one, specs[name] or one.spec)
+        supervisor._keep_noted(one, specs[name] or one.spec, changed.get(name))
     if account.state is not None:
         _restore(supervisor, account.state)
     if account.is_suspended:

@@ -72,7 +72,8 @@ class Moves:
     ) -> bool:
         """Move an actor; if whoever wants it does not wait any more, the move comes to its end all the same.
 
-        With a gate it waits there when all is ready. `known`: its spec, if no recipe at the root need have that.
+        With a gate it waits there when all is ready. `known`: its spec, if it is lent a process
+        for the time of another move; no recipe at the root need have that.
         Returns whether it has been moved: not if it lived there.
 
         Raises:
@@ -109,7 +110,7 @@ class Moves:
         gate: CommitGate | None,
         known: ChildSpec | None,
     ) -> bool:
-        origin, place = place_of(cell), cell.host.place
+        origin, place, is_lent = place_of(cell), cell.host.place, known is not None
         if isinstance(cell.spec, ChildSpec) or recipe_spec(cell) is not None:
             known = _spec_of(cell)
         if origin == isolation and (known is None or known.mechanism is None):
@@ -120,7 +121,11 @@ class Moves:
             cell.host.parent.respecified(cell, place.spec_data(cell))
             return False
         move = await self._moved(
-            cell, timeout, lambda: self._made(cell, spec, timeout), lambda: replace_place(cell, spec), gate
+            cell,
+            timeout,
+            lambda: self._made(cell, spec, timeout),
+            lambda: replace_place(cell, spec, is_lent=is_lent),
+            gate,
         )
         if self._node.events.has_listeners:
             self._node.emit(Moved(cell.path, origin, isolation, move.gone_on_at - move.rest_at))

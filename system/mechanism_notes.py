@@ -92,6 +92,11 @@ class MechanismNotes:
             raise SpecError(address, f"the mechanism that it had cannot be had any more: {error}") from error
         return dataclasses.replace(spec, mechanism=mechanism)
 
+    def as_declared(self, spec: ChildSpec, address: str) -> ChildSpec:
+        """A spec in force with the mechanism that is declared for the address."""
+        said = self._kept.get(address)
+        return spec if said is None else dataclasses.replace(spec, mechanism=_mechanism(said[0]))
+
     def _completed_below(self, spec: ChildSpec, address: str) -> ChildSpec:
         """The same for all that its process will start, which does not ask here."""
         above = f"{address}/"

@@ -113,9 +113,9 @@ def respec(cell: Cell, said: Respec) -> None:
     layers = tuple(map(revive, msgspec.convert(said.layers, list[Description])))
     mechanism = None if not layers else layers[0] if len(layers) == 1 else layers
     limits = Limits(**said.limits) if said.limits else None
-    replace_mechanism(
-        cell, dataclasses.replace(cell.spec, mechanism=mechanism, isolation=said.isolation, limits=limits)
-    )  # fmt: skip
+    spec = dataclasses.replace(cell.spec, mechanism=mechanism, isolation=said.isolation, limits=limits)
+    # What lasts stands in a recipe at the root; a supervisor that notes its children has none of them in one.
+    replace_mechanism(cell, spec, is_lent=True)
 
 
 # -- lives that are handed over while they are lived -----------------------------------------------------------------

@@ -105,7 +105,7 @@ class PoolSupervisor(UniformSupervisor):
         self._crew = [self._children[name] for name in crew if name in self._children] if isinstance(crew, list) else []
         self._wake_router()
 
-    def _keep_noted(self, one: Child, spec: ChildSpec) -> None:
+    def _keep_noted(self, one: Child, spec: ChildSpec, changed: tuple[str, ...] | None) -> None:
         if one.spec.id not in {first.id for first in self._given.children}:
             self._try_to_note(one, b"")
 

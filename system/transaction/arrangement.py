@@ -130,8 +130,10 @@ class Arrangement:
         if moved or self.successions:
             settle_bindings(system._node.root)
         taken = {child: _taken(child, self.handings[child], here, cells) for child in moved}
+        notes = system._mechanism_notes
+        declared = {child: notes.as_declared(taken[child].spec, path) for child, path in was.items()}
         for place, supervisor in here.items():
-            _arrange(place, supervisor, taken)
+            _arrange(place, supervisor, taken, declared)
         _readdress(cells, here, taken)
         now = {path: f"{cells[_below(child)].path}/{child.name}" for child, path in was.items()}
         now |= dict(one.leave_tree(system) for one in reversed(self.successions))
@@ -314,12 +316,17 @@ def lose_child(supervisor: Supervisor, name: str, place: DraftPlace | None) -> C
     return supervisor._give_away(name)
 
 
-def _arrange(place: DraftPlace, supervisor: Supervisor, taken: dict[DraftPlace, Child]) -> None:
+def _arrange(
+    place: DraftPlace,
+    supervisor: Supervisor,
+    taken: dict[DraftPlace, Child],
+    declared: dict[DraftPlace, ChildSpec],
+) -> None:
     """The children in the order of the draft; those that came meanwhile, and are not known there, behind them."""
     known, children = supervisor._children, dict[str, Child]()
     for child in place.children.values():
         if child in taken:
-            supervisor._welcome(taken[child])
+            supervisor._welcome(taken[child], declared[child])
     for name, child in place.children.items():
         one = taken.get(child) or known.get(name)
         if one is None and child.comes_last:
@@ -357,8 +364,8 @@ def _respecify(place: DraftPlace, supervisor: Supervisor) -> None:
         if one is None:
             continue
         if child.is_planned:
-            one.spec = planned_spec(child, in_force=True)
-            supervisor._respecified(one)
+            before, one.spec = one.spec, planned_spec(child, in_force=True)
+            supervisor._respecified(one, before)
         elif child.is_switched and child.spec is not None:
             one.spec = dataclasses.replace(one.spec, autostart=child.spec.autostart)
         else:

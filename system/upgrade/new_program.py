@@ -17,7 +17,8 @@ from ...checkpoint.home.homes import Homes
 from ...checkpoint.recovery_file import RecoveryFile
 from ...checkpoint.store_tools.rerun import Recipe
 from ...checkpoint.store_tools.upgrade_check import AddressCheck
-from ...supervision.dynamic import MADE_UP, noted_child
+from ...supervision.dynamic import MADE_UP
+from ...supervision.noted import unpack_noted
 from ...supervision.spec import NAMELESS, ChildSpec, Plan
 from ...supervision.supervisor import Supervisor
 from ..mechanism_notes import MechanismNotes
@@ -153,7 +154,7 @@ class NewProgram:
             if "/" in name or data == MADE_UP:
                 continue
             try:
-                self._take(f"{path}/{name}", noted_child(path, template, name, data))
+                self._take(f"{path}/{name}", unpack_noted(path, template, name, data)[0])
             except HoldfastError as error:
                 self._unasked[f"{path}/{name}"] = str(error)
 

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, TypeVar
 from ...errors import SpecError, type_name
 from ...kernel.actor import Actor, Start
 from ...kernel.message import message_name
-from ...values import decode_value, encode_value
+from ...values import decode_value, encode_value, state_digest
 
 T = TypeVar("T")
 
@@ -78,6 +78,15 @@ def pack_data(value: object, where: str) -> bytes:
         UnsavableValue, SpecError: as `pack_recipe`.
     """
     return encode_value(_lower(value, where), where=where, refs=False)
+
+
+def packed_digest(value: object, where: str) -> bytes:
+    """Digest what `pack_data` would write: the same in every process for equal values.
+
+    Raises:
+        UnsavableValue, SpecError: as `pack_recipe`.
+    """
+    return state_digest(_lower(value, where))
 
 
 def unpack_data(data: bytes) -> Any:

@@ -1,0 +1,88 @@
+"""What is changed of a child is kept, there and back: what x how, for each kind of supervisor."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.checkpoint.players import until
+from tests.supervision import changes_player as player
+
+
+async def again(system: hf.ActorSystem, how: str) -> None:
+    """Each child, or its supervisor, ends and is started again."""
+    above = system.ref("/app/team", hf.Supervisor)
+    paths = [one.path for one in await above.ask(hf.WhichChildren())] if how == "child" else ["/app/team"]
+    with system.events() as events:
+        for path in paths:
+            system.ref(path).kill()
+        waiting = set(paths)
+        async for one in events:
+            if isinstance(one, hf.events.ChildRestarted):
+                waiting.discard(one.address)
+            if not waiting:
+                break
+    await until(lambda: "/app/team" in system.tree() and above._cell.host.is_up(above._cell))
+
+
+def killed(store: str, kind: str, direction: str) -> dict[str, list[Any]]:
+    """What a program was like that is killed then."""
+    paths = os.pathsep.join(filter(None, (str(Path(hf.__file__).parents[1]), os.environ.get("PYTHONPATH"))))
+    code = "from tests.supervision import changes_player; changes_player.main()"  # Whose classes have their own name.
+    command = [sys.executable, "-c", code, store, kind, direction]
+    ended = subprocess.run(
+        command, capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPATH": paths}
+    )
+    assert ended.returncode == -9, ended.stderr
+    seen: dict[str, list[Any]] = json.loads(ended.stdout)
+    return seen
+
+
+@pytest.mark.parametrize("how", ["child", "supervisor", "program", "killed"])
+@pytest.mark.parametrize("direction", ["there", "back"])
+@pytest.mark.parametrize("kind", player.KINDS)
+async def test_what_is_changed_of_a_child_is_kept(tmp_path: Path, kind: str, direction: str, how: str) -> None:
+    store = f"sqlite:{tmp_path / 'app.db'}"
+    if how == "killed":
+        before = killed(store, kind, direction)
+    elif how == "program":
+        before = await player.first(store, kind, direction, is_killed=False)
+    async with hf.ActorSystem("app", store=store, log=False, intensity=100) as system:
+        await player.begin(system, kind)
+        if how in ("child", "supervisor"):
+            for step in player.DIRECTIONS[direction]:
+                await step(system, kind)
+            before = await player.looks(system)
+            await again(system, how)
+        assert await player.looks(system) == before
+
+
+async def test_a_new_template_and_a_transaction_reach_all_and_are_kept(tmp_path: Path) -> None:
+    """Also those that are started later; a program that says nothing new changes nothing, one that says it goes on."""
+    store = f"sqlite:{tmp_path / 'app.db'}"
+    team = player.trees("template")[-1]
+    new = hf.child(None, hf.start(player.New), recovery=hf.hybrid(), bindings=player.BOUND)
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        await player.begin(system, "template")
+        await player.come(system, "template", "one", "two")
+        await system.ref("/app/team", hf.Supervisor).ask(hf.supervision.ChangeSupervisor(children=[new]))
+        async with system.transaction() as change:
+            for name in ("one", "two"):
+                change.replace_code(player.at(name), player.New)
+        await player.come(system, "template", "three")
+        for name in ("one", "two", "three"):
+            await system.ref(player.at(name)).ask(player.Count())
+    later = hf.dynamic("team", template=new, journal=True, intensity=100)
+    for said in (team, team, later, later):
+        async with hf.ActorSystem("app", store=store, log=False) as system:
+            for tree in (*player.trees("template")[:-1], said):
+                await system.start(tree)
+            seen = await player.looks(system)
+            assert [seen[player.at(name)][:3] for name in ("one", "two", "three")] == [["New", "task", 2]] * 3
