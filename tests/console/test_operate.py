@@ -23,7 +23,9 @@ from tests.console.commands import holdfast
 from tests.system.trees import Add, Counter, ref
 
 DONE, FAILED, UNUSABLE = 0, 1, 2
-PATHS = "a program whose endpoint has a path of its own is reached by --socket FILE"
+PATHS = (
+    "a program opens an endpoint by control_endpoint(system), and with a path of its own it is reached by --socket FILE"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -76,12 +78,8 @@ async def test_a_program_with_a_path_of_its_own_is_said_to_be_reached_by_it(
     system: hf.ActorSystem, tmp_path: Path
 ) -> None:
     async with control_endpoint(system, tmp_path / "own.sock") as where:
-        opens = "a program opens a control endpoint by control_endpoint(system)"
         status, _, errors = await holdfast("tree")
-        assert (status, errors) == (
-            UNUSABLE,
-            f"holdfast tree: no system of yours is found by its name; {opens}; {PATHS}\n",
-        )
+        assert (status, errors) == (UNUSABLE, f"holdfast tree: no system of yours is found by its name; {PATHS}\n")
         assert (await holdfast("ls"))[::2] == (DONE, f"no system of yours is found by its name; {PATHS}\n")
         assert (await holdfast("tree", "--paths", "--socket", where))[0] == DONE
 
