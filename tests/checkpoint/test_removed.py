@@ -1504,8 +1504,8 @@ CHECKS = {
     ),
     "encrypted: a key file is the user's alone": Check(
         "checkpoint/store_key.py",
-        "            if info.st_mode & (stat.S_IRWXG | stat.S_IRWXO):\n",
-        "            if False:\n",
+        "    if info.st_mode & (stat.S_IRWXG | stat.S_IRWXO):  # Not before",
+        "    if False:  # Not before",
         "tests/checkpoint/sqlite/test_encrypted.py",
         "test_a_key_may_be_in_a_file",
     ),

@@ -207,8 +207,8 @@ CHECKS = {
     ),
     "a terminal obeys no event": Check(
         "console/operate/remembering.py",
-        "        typer.echo(printable(line))\n",
-        "        typer.echo(line)\n",
+        "    shown = [printable(line) for line in lines]\n",
+        "    shown = list(lines)\n",
         OUTSIDE,
         "test_what_a_terminal_would_obey_is_not_printed",
     ),
