@@ -7,7 +7,6 @@ before coverage begins to measure.
 from __future__ import annotations
 
 import importlib
-import importlib.util
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -88,8 +87,6 @@ __all__ = [
     "simulate",
     "virtual",
 ]
-if importlib.util.find_spec("hypothesis") is None:  # It comes with the extra `machines`.
-    __all__.remove("ActorMachine")
 
 
 def __getattr__(name: str) -> object:
