@@ -49,7 +49,7 @@ def killed(store: str, kind: str, direction: str) -> dict[str, list[Any]]:
 @pytest.mark.parametrize("direction", ["there", "back"])
 @pytest.mark.parametrize("kind", player.KINDS)
 async def test_what_is_changed_of_a_child_is_kept(tmp_path: Path, kind: str, direction: str, how: str) -> None:
-    store = f"sqlite:{tmp_path / 'app.db'}"
+    store, before = f"sqlite:{tmp_path / 'app.db'}", None
     if how == "killed":
         before = killed(store, kind, direction)
     elif how == "program":
@@ -61,6 +61,7 @@ async def test_what_is_changed_of_a_child_is_kept(tmp_path: Path, kind: str, dir
                 await step(system, kind)
             before = await player.looks(system)
             await again(system, how)
+        assert before is not None
         assert await player.looks(system) == before
 
 
