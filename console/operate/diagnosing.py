@@ -41,9 +41,9 @@ def diagnose(
     """
     last: list[dict[str, Any]] | None = None
     try:
-        with reached("diagnose", system, socket) as remote:
+        with reached("diagnose", system, socket) as remote, asyncio.Runner() as runner:
             while True:
-                found = asyncio.run(remote.diagnosis(path, timeout=timeout))
+                found = runner.run(remote.diagnosis(path, timeout=timeout))
                 if png is not None:
                     _draw(found, case, png)
                 if found != last:

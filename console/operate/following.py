@@ -121,11 +121,12 @@ def logs(
         print_log(page.lines, as_json=as_json)
         if not page.lines and not follow:
             why_empty(remote, path)
-        while follow:
-            page = asyncio.run(remote.follow_logs(path, level=level.value, after=page.next, timeout=ONE_WAIT))
-            if page.dropped:
-                typer.echo(f"{page.dropped} lines came too fast and are not shown", err=True)
-            print_log(page.lines, as_json=as_json)
+        with asyncio.Runner() as runner:  # One loop: a Ctrl+C that comes while one is made is told on standard error.
+            while follow:
+                page = runner.run(remote.follow_logs(path, level=level.value, after=page.next, timeout=ONE_WAIT))
+                if page.dropped:
+                    typer.echo(f"{page.dropped} lines came too fast and are not shown", err=True)
+                print_log(page.lines, as_json=as_json)
 
 
 def _address_of(remote: RemoteSystem, path: str) -> str:
