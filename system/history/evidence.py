@@ -140,6 +140,7 @@ class Waiting(msgspec.Struct, frozen=True):
         sender: one of their senders, or "".
         waited: seconds for which one of them has waited at least; 0 if that is not known.
         late: asks whose time is over, so that nobody waits for their answers any more.
+        mean_turn: seconds that a turn takes in the mean; 0 if statistics are off, or another process has them.
     """
 
     message: str
@@ -147,6 +148,7 @@ class Waiting(msgspec.Struct, frozen=True):
     sender: str = ""
     waited: float = 0.0
     late: int = 0
+    mean_turn: float = 0.0
 
 
 class Below(msgspec.Struct, frozen=True):
@@ -200,7 +202,6 @@ class Evidence(msgspec.Struct, frozen=True):
         protection: its mechanisms and replicas, if somebody lives there.
         memory: of its own process, if its limits bound that.
         waiting: what waits in its mailbox.
-        mean_turn: seconds that its turns take in the mean; 0 if its statistics are off, or another process has them.
         silence: that its process has not answered.
     """
 
@@ -224,7 +225,6 @@ class Evidence(msgspec.Struct, frozen=True):
     memory: ProcessMemory | None = None
     waiting: Waiting | None = None
     silence: Silence | None = None
-    mean_turn: float = 0.0
 
     def ago(self, at: float) -> str:
         """A moment as people say it: how long ago, or the time of day if that is long."""
@@ -309,7 +309,6 @@ def collect(
         None if cell is None else _memory(cell),
         None if cell is None else _waiting(cell),
         told.silence,
-        0.0 if cell is None else _mean_turn(cell),
     )
 
 
@@ -433,7 +432,8 @@ def _waiting(cell: Cell) -> Waiting | None:
     senders = {one.message: one.sender for one in found if one.sender}
     for name, count in counts.most_common(1):
         longest = max(one.seconds for one in found)
-        return Waiting(name, count, senders.get(name, ""), longest, sum(one.is_late for one in found))
+        late = sum(one.is_late for one in found)
+        return Waiting(name, count, senders.get(name, ""), longest, late, _mean_turn(cell))
     return None
 
 

@@ -322,8 +322,7 @@ def _mailbox(evidence: Evidence) -> list[str]:
         said += f"; most of them are {waiting.message}{sender}"
         said += f"; one has waited for {seconds_text(waiting.waited)} or more" if waiting.waited >= LONG_TURN else ""
         said += f"; nobody waits for the answers of {waiting.late} any more" if waiting.late else ""
-    if evidence.mean_turn:
-        said += f"; a turn takes {evidence.mean_turn:.2g} s in the mean"
+        said += f"; a turn takes {waiting.mean_turn:.2g} s in the mean" if waiting.mean_turn else ""
     return [f"{said}."]
 
 

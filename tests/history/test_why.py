@@ -348,8 +348,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     "asks that wait for long": (
         {
             "status": status(queued=33),
-            "waiting": Waiting("shop.Pay", 30, "/app/till", waited=8.0, late=24),
-            "mean_turn": 0.25,
+            "waiting": Waiting("shop.Pay", 30, "/app/till", waited=8.0, late=24, mean_turn=0.25),
         },
         (
             "33 messages wait in its mailbox; most of them are shop.Pay from /app/till; one has waited for 8.0 s or "
