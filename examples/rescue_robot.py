@@ -19,7 +19,7 @@ from typing import Any, Final
 import msgspec
 
 import holdfast as hf
-from holdfast.diagnosis import DIAGNOSIS, OBSERVATIONS, REPAIR, observer, repair, tree
+from holdfast.diagnosis import DIAGNOSIS, OBSERVATIONS, REPAIR, DiagnoserActor, GetDiagnosis, observer, repair, tree
 from holdfast.diagnosis.board import TOPIC, Board, BoardActor, BoardMeasured, BoardSimulator, GetBoard
 from holdfast.diagnosis.engine import Diagnosis, State
 from holdfast.diagnosis.model import System
@@ -380,6 +380,9 @@ async def play(scenario: str, board: str | None) -> Told:
             mending = system.ref("/robot/diagnosis/repairer", repair.Repairer)
             first = Until(ALL_DOWN, State.FAULTY) if is_off else Until(ALL_WELL, State.HEALTHY)
             await recorder.ask(first, LONG)
+            diagnoser = system.ref("/robot/diagnosis/diagnoser", DiagnoserActor)
+            await diagnoser.ask(GetDiagnosis(), LONG)  # Made of all that was observed, not of the first of it.
+            await recorder.ask(GetLines())
             await asyncio.sleep(0 if is_off else GRACE)
             began = asyncio.get_running_loop().time()
             mending.tell(repair.SetMode(repair.NORMAL))

@@ -23,6 +23,8 @@ PREFIX = "holdfast_script_"
 """How the modules of scripts are called; the rest is the beginning of their sha256."""
 LARGEST = 4 * 1024 * 1024
 """Bytes a script may have."""
+_BROUGHT: list[str] = []
+"""Entries of `sys.path` that scripts have brought, these very strings: the next program does not have them."""
 
 
 class UntrustedFile(HoldfastError, text="{path} is not used: {problem}"):
@@ -30,12 +32,6 @@ class UntrustedFile(HoldfastError, text="{path} is not used: {problem}"):
 
     path: str
     problem: str
-
-
-class ScriptFolder(str):
-    """An entry of `sys.path` that a script has brought: a program that is started again does not have it."""
-
-    __slots__ = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -126,7 +122,8 @@ def find_beside(source: ScriptSource) -> None:
     """Let modules be found in the folder of a script too, after all others, so that it can hide none of them."""
     folder = str(Path(source.path).parent)
     if folder not in sys.path:
-        sys.path.append(ScriptFolder(folder))
+        sys.path.append(folder)
+        _BROUGHT.append(folder)
 
 
 def find_only_here(kind: type) -> str:
@@ -139,10 +136,10 @@ def find_only_here(kind: type) -> str:
     file, origin = _file_of(kind.__module__), _file_of(package)
     if kind.__module__.startswith(PREFIX):
         return file or kind.__module__
-    brought = [folder for folder in sys.path if isinstance(folder, ScriptFolder)]
+    brought = [entry for entry in sys.path if any(entry is one for one in _BROUGHT)]
     if not any(Path(origin).is_relative_to(folder) for folder in brought):
         return ""
-    rest = [folder for folder in sys.path if not isinstance(folder, ScriptFolder)]
+    rest = [entry for entry in sys.path if not any(entry is one for one in brought)]
     return "" if PathFinder.find_spec(package, rest) is not None else file
 
 

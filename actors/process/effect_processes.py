@@ -21,6 +21,7 @@ from ..control.orders import pack_function
 from ..effects import FunctionDied, FunctionRaised, fencing_token
 from ..kernel.codec import Codec
 from ..values import decode_value, encode_value
+from .fork.launch import import_path
 
 ENTRY: Final = "holdfast.actors.process.effect_main"
 MOST_IDLE: Final = 4
@@ -39,19 +40,24 @@ class EffectProcess:
     """One process, and the socket to it."""
 
     def __init__(self) -> None:
-        ours, theirs = socket.socketpair()
-        with theirs:
-            command = [sys.executable, "-m", ENTRY, str(theirs.fileno()), str(os.getpid())]
-            environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-            self._process = subprocess.Popen(
-                command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env=environment
-            )
-        ours.setblocking(False)
-        self._socket = ours
         from multiprocessing.spawn import get_preparation_data  # only now: it brings pickle and more
 
-        told: dict[str, Any] = get_preparation_data("effect")
+        path = import_path()
+        told: dict[str, Any] = get_preparation_data("effect") | {"sys_path": path}
         self._first = msgspec.msgpack.encode({key: told[key] for key in PREPARED if key in told})
+        self._socket, theirs = socket.socketpair()
+        try:
+            self._socket.setblocking(False)
+            with theirs:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", ENTRY, str(theirs.fileno()), str(os.getpid())],
+                    pass_fds=(theirs.fileno(),),
+                    stdin=subprocess.DEVNULL,
+                    env=os.environ | {"PYTHONPATH": os.pathsep.join(path)},
+                )
+        except BaseException:
+            self._socket.close()
+            raise
 
     async def call(self, request: bytes) -> bytes:
         """Have it answer a request.

@@ -22,6 +22,7 @@ from typing import IO, Any, Final, NoReturn
 
 from ...actors.errors import HoldfastError, SpecError
 from ...actors.exit_reasons import Signal
+from ...actors.process.fork.launch import import_path
 from ...actors.seconds import check_seconds
 from ...checkpoint.store_tools.copies import back_up_store
 from ...checkpoint.store_tools.upgrade_check import DIFFERENT, AddressCheck
@@ -173,7 +174,7 @@ def _running(
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
                 pass_fds=(write,),
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(import_path())},
                 start_new_session=True,
             )
         finally:

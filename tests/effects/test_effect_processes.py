@@ -232,6 +232,31 @@ def no_ref(path: str) -> Any:
     raise LookupError(path)
 
 
+async def test_what_no_import_looks_at_in_the_path_harms_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    class Folder(str): ...  # as an editable install or a script may have brought it
+
+    monkeypatch.setattr(sys, "path", [Folder(tmp_path), *sys.path, tmp_path])
+    begin_effect(1)
+    processes = EffectProcesses(Codec(lambda path: None))  # type: ignore[arg-type, return-value]
+    try:
+        assert await processes.run(run, "pid", "", os.getpid()) is True
+    finally:
+        processes.close()
+
+
+async def test_one_that_cannot_be_begun_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    begin_effect(1)
+    processes = EffectProcesses(Codec(lambda path: None))  # type: ignore[arg-type, return-value]
+    try:
+        with monkeypatch.context() as patched:
+            patched.setattr(sys, "executable", "/nowhere/python")
+            with pytest.raises(FileNotFoundError):
+                await processes.run(run, "pid", "", os.getpid())
+        assert await processes.run(run, "pid", "", os.getpid()) is True
+    finally:
+        processes.close()
+
+
 @simulate(seeds=3, latency=(0.0, 0.01), intensity=1000)
 async def test_they_are_simulated(system: GuardedSystem) -> None:
     """Under a seed the function runs in the process of the test, behind the same codec."""

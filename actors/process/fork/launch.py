@@ -113,7 +113,7 @@ def server_config(entry: str, preload: list[str]) -> Config:
         parent=os.getpid(),
         entry=entry,
         preload=preload,
-        path=[str(directory) or os.getcwd() for directory in sys.path],
+        path=import_path(),
         argv=sys.argv,
         server=f"{__package__}.zygote",
         package=package,
@@ -121,6 +121,11 @@ def server_config(entry: str, preload: list[str]) -> Config:
         main=main,
         main_is_path=is_path,
     )
+
+
+def import_path() -> list[str]:
+    """Where this process finds modules, as another one can be told: plain strings, without what imports overlook."""
+    return [str(entry) or os.getcwd() for entry in sys.path if isinstance(entry, str)]
 
 
 def _program() -> tuple[str, bool]:
