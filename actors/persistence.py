@@ -66,8 +66,12 @@ class Keeper(Protocol):
         """
         ...
 
-    def dismissed(self, path: str) -> None:
-        """The child at `path` is forgotten by its supervisor: what comes for those below it waits for no next life."""
+    def dismissed(self, path: str, *, below: bool, for_good: bool) -> None:
+        """The child at `path` is forgotten by its supervisor.
+
+        `below`: others may live below it, and what comes for them waits for no next life. `for_good`: it does not come
+        back with its supervisor, either; whoever is started there is another one.
+        """
         ...
 
     def note(self, key: str, value: bytes | None) -> None:
@@ -105,7 +109,7 @@ class NothingKept:
     def returned(self, path: str) -> None:
         """Do nothing: nobody is brought back from records."""
 
-    def dismissed(self, path: str) -> None:
+    def dismissed(self, path: str, *, below: bool, for_good: bool) -> None:
         """Do nothing: nothing waits for a next life."""
 
     def note(self, key: str, value: bytes | None) -> None:

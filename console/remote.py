@@ -264,26 +264,26 @@ class RemoteSystem:
         found: SystemLook = LOOK.decode(self._client.call(Overview(parts), 10.0))
         return found
 
-    def inspect(self, ref: RemoteTarget, *, timeout: float = 5.0) -> dict[str, Any]:
+    def inspect(self, target: RemoteTarget, *, timeout: float = 5.0) -> dict[str, Any]:
         """All that can be said of one actor, as plain data."""
-        found: dict[str, Any] = self._client.call(InspectActor(text_of(ref), timeout), timeout)
+        found: dict[str, Any] = self._client.call(InspectActor(text_of(target), timeout), timeout)
         return found
 
-    def state(self, ref: RemoteTarget, *, timeout: float = 5.0) -> Any:
+    def state(self, target: RemoteTarget, *, timeout: float = 5.0) -> Any:
         """An actor's state as plain data: no class of it is imported here."""
         from ..checkpoint.store_tools.plain_export import as_plain  # only now: it takes a while to import
 
         return as_plain(
-            self._client.call(ControlActor("get_state", text_of(ref), [], timeout), timeout, describe_value)
+            self._client.call(ControlActor("get_state", text_of(target), [], timeout), timeout, describe_value)
         )
 
-    async def outline(self, ref: RemoteTarget, *, timeout: float = 5.0) -> dict[str, str]:
+    async def outline(self, target: RemoteTarget, *, timeout: float = 5.0) -> dict[str, str]:
         """An actor's state in short texts, one for each variable; see `ActorSystem.outline`."""
-        return msgspec.convert(await self._control("outline", ref, timeout), dict[str, str])
+        return msgspec.convert(await self._control("outline", target, timeout), dict[str, str])
 
-    def follow(self, ref: RemoteTarget) -> None:
+    def follow(self, target: RemoteTarget) -> None:
         """Follow what an actor does, for as long as this connection lasts: `next_events` tells."""
-        self._client.call(FollowActor(text_of(ref)), 10.0)
+        self._client.call(FollowActor(text_of(target)), 10.0)
 
     def next_events(self, seconds: float) -> dict[str, Any]:
         """What the actor that is followed has done since the last time, waiting at most so long for something."""
@@ -308,24 +308,26 @@ class RemoteSystem:
         """The address; whether somebody lives there is seen when it is used. (`kind` is for the call in process.)"""
         return RemoteRef(path)
 
-    async def get_status(self, ref: RemoteTarget, *, timeout: float = 5.0) -> Status:
+    async def get_status(self, target: RemoteTarget, *, timeout: float = 5.0) -> Status:
         """Get the status of an actor, also while a turn of it waits."""
-        status: Status = await self._control("get_status", ref, timeout)
+        status: Status = await self._control("get_status", target, timeout)
         return status
 
-    async def protection(self, ref: RemoteTarget, *, timeout: float = 5.0) -> ProtectionStatus:
+    async def protection(self, target: RemoteTarget, *, timeout: float = 5.0) -> ProtectionStatus:
         """Whether an actor is protected by mechanisms, by which, who leads, and whether a replica may die."""
-        found: ProtectionStatus = await self._control("protection", ref, timeout)
+        found: ProtectionStatus = await self._control("protection", target, timeout)
         return found
 
-    async def get_state(self, ref: RemoteTarget, *, timeout: float = 5.0) -> Any:
+    async def get_state(self, target: RemoteTarget, *, timeout: float = 5.0) -> Any:
         """A copy of an actor's state."""
-        return await self._control("get_state", ref, timeout)
+        return await self._control("get_state", target, timeout)
 
-    async def statistics(self, ref: RemoteTarget, on: bool | None = None, *, timeout: float = 5.0) -> Statistics | None:
+    async def statistics(
+        self, target: RemoteTarget, on: bool | None = None, *, timeout: float = 5.0
+    ) -> Statistics | None:
         """What an actor has done since its statistics were switched on; None while they are off."""
         args = [] if on is None else [int(on)]
-        counts: Statistics | None = await self._control("statistics", ref, timeout, *args, changes=on is not None)
+        counts: Statistics | None = await self._control("statistics", target, timeout, *args, changes=on is not None)
         return counts
 
     # -- its past -----------------------------------------------------------------------------------------------------
@@ -460,52 +462,52 @@ class RemoteSystem:
 
     # -- orders to one actor ------------------------------------------------------------------------------------------
 
-    async def suspend(self, ref: RemoteTarget, *, timeout: float = 5.0) -> None:
+    async def suspend(self, target: RemoteTarget, *, timeout: float = 5.0) -> None:
         """Have an actor handle no message until `resume`."""
-        await self._control("suspend", ref, timeout, changes=True)
+        await self._control("suspend", target, timeout, changes=True)
 
-    async def resume(self, ref: RemoteTarget, *, timeout: float = 5.0) -> None:
+    async def resume(self, target: RemoteTarget, *, timeout: float = 5.0) -> None:
         """Have it handle messages again."""
-        await self._control("resume", ref, timeout, changes=True)
+        await self._control("resume", target, timeout, changes=True)
 
-    async def replace_state(self, ref: RemoteTarget, change: StateChange, *, timeout: float = 5.0) -> Any:
+    async def replace_state(self, target: RemoteTarget, change: StateChange, *, timeout: float = 5.0) -> Any:
         """Put `change(state)` in the place of an actor's state; a function of the script, or of another module."""
-        return await self._control("replace_state", ref, timeout, change, changes=True)
+        return await self._control("replace_state", target, timeout, change, changes=True)
 
     async def replace_code(
         self,
-        ref: RemoteTarget,
+        target: RemoteTarget,
         new: type[Actor] | Start[Any],
         change: StateChange | None = None,
         *,
         timeout: float = 5.0,
     ) -> None:
         """Have a suspended actor go on as another class."""
-        await self._control("replace_code", ref, timeout, new, change, changes=True)
+        await self._control("replace_code", target, timeout, new, change, changes=True)
 
-    async def checkpoint(self, ref: RemoteTarget, *, timeout: float = 5.0) -> None:
+    async def checkpoint(self, target: RemoteTarget, *, timeout: float = 5.0) -> None:
         """Have a recorded actor's state saved."""
-        await self._control("checkpoint", ref, timeout, changes=True)
+        await self._control("checkpoint", target, timeout, changes=True)
 
-    async def restart(self, ref: RemoteTarget, *, timeout: float = 5.0, at_once: bool = False) -> str:
+    async def restart(self, target: RemoteTarget, *, timeout: float = 5.0, at_once: bool = False) -> str:
         """End a life in good order, so that the supervisor begins the next one. Returns how it ended, in words.
 
         With `at_once` it is killed, also in the middle of a turn that hangs.
         """
-        ended: str = await self.call(RestartActor(text_of(ref), timeout, at_once), timeout)
+        ended: str = await self.call(RestartActor(text_of(target), timeout, at_once), timeout)
         return ended
 
-    async def terminate(self, ref: RemoteTarget, *, timeout: float = 5.0) -> str:
+    async def terminate(self, target: RemoteTarget, *, timeout: float = 5.0) -> str:
         """End a life in good order; its supervisor then does as its spec says. Returns its exit reason in words."""
-        reason: str = await self._control("terminate", ref, timeout, changes=True)
+        reason: str = await self._control("terminate", target, timeout, changes=True)
         return reason
 
-    async def _control(self, verb: Any, ref: RemoteTarget, timeout: float, *args: Any, changes: bool = False) -> Any:
+    async def _control(self, verb: Any, target: RemoteTarget, timeout: float, *args: Any, changes: bool = False) -> Any:
         if changes and self._dry_run:
             raise SpecError(verb, "in a dry run no order is given to an actor: put it into a transaction")
-        check_seconds(text_of(ref), "timeout", timeout)
+        check_seconds(text_of(target), "timeout", timeout)
         packed = [pack_arg(arg, verb) for arg in args]
-        return await self.call(ControlActor(verb, text_of(ref), packed, timeout, self._script), timeout)
+        return await self.call(ControlActor(verb, text_of(target), packed, timeout, self._script), timeout)
 
     # -- transactions -------------------------------------------------------------------------------------------------
 

@@ -410,8 +410,11 @@ class Supervisor(Inquiries):
 
     def _dismiss(self, one: Child) -> None:
         """Its address is free and its spec forgotten: nothing that comes waits for next lives of those below it."""
-        if one.spec.is_supervisor:
-            self.ctx._cell.node.ports.keeper.dismissed(self._path_of(one))
+        spec = one.spec
+        is_over = self._is_dynamic or spec.id not in self._planned  # Else our next life has it again.
+        is_known = spec.mechanism is not None or not spec.made_up  # Else nobody will have this name again.
+        if spec.is_supervisor or (is_over and is_known):
+            self.ctx._cell.node.ports.keeper.dismissed(self._path_of(one), below=spec.is_supervisor, for_good=is_over)
 
     def _note_end(self, one: Child, reason: object) -> None:
         self._ended.pop(one.spec.id, None)

@@ -29,7 +29,7 @@ from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import cell_kind
-from ..actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
+from ..actors.kernel.ref import DEFAULT_TIMEOUT, Target
 from ..actors.process.process_host import WorkerPlace
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.peer import OutsideHost
@@ -57,7 +57,8 @@ A = TypeVar("A", bound=Actor)
 class Controls:
     """Control of live actors: tasks, processes, actors of a subtree in a process, recorded or not.
 
-    Each call raises ActorStopped if nobody lives there, AskTimeout if the actor does not come to it within `timeout`
+    Who is meant is said by a ref or an address. Each call raises ActorStopped if nobody lives there any more, and
+    NoSuchActor if nobody is found at an address, AskTimeout if the actor does not come to it within `timeout`
     seconds (it is carried out between two turns), and SpecError if that is no finite number > 0. While an actor is
     restarted, its next life is waited for.
     """
@@ -74,34 +75,34 @@ class Controls:
         """Several changes of the running tree as one."""
         raise NotImplementedError
 
-    async def suspend(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> None:
+    async def suspend(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> None:
         """Have an actor handle no message until `resume`; they wait in order. Twice is once.
 
         It still obeys its supervisor and all control. A suspension ends with the life.
         """
-        await self._order(ref, Suspend(), timeout)
+        await self._order(target, Suspend(), timeout)
 
-    async def resume(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> None:
+    async def resume(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> None:
         """Have it handle messages again. Twice is once."""
-        await self._order(ref, Resume(), timeout)
+        await self._order(target, Resume(), timeout)
 
-    async def get_state(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Any:
+    async def get_state(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> Any:
         """A copy of an actor's state: what its `get_state()` gives, else a dict of its key variables.
 
         What cannot be copied (a ref, a socket) stands in it as `Opaque`. Of a supervisor it has its flags, its restarts
         within the period, and each child's class, state, restart type and restarts, beside what its class adds.
         """
-        return await self._order(ref, GetState(), timeout)
+        return await self._order(target, GetState(), timeout)
 
-    async def outline(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> dict[str, str]:
+    async def outline(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> dict[str, str]:
         """Tell an actor's state in short texts, one for each variable; of a large one how large it is, and its start.
 
         Nothing is copied, so it also answers for a state that is too large to be sent. A state that is no dict has the
         name "".
         """
-        return cast("dict[str, str]", await self._order(ref, OutlineState(), timeout))
+        return cast("dict[str, str]", await self._order(target, OutlineState(), timeout))
 
-    async def replace_state(self, ref: ActorRef[Any], change: Change, *, timeout: float = DEFAULT_TIMEOUT) -> Any:
+    async def replace_state(self, target: Target, change: Change, *, timeout: float = DEFAULT_TIMEOUT) -> Any:
         """Put `change(state)` in the place of an actor's state; returns the new one.
 
         `change` gets a copy and runs where the actor lives; for another process it must be a function of a module, or
@@ -112,11 +113,11 @@ class Controls:
                 class's body, or there is one that the body does not declare. The old one stays.
             SpecError: another process cannot import `change`.
         """
-        return await self._replace(ref, ReplaceState(change), timeout)
+        return await self._replace(target, ReplaceState(change), timeout)
 
     async def replace_code(
         self,
-        ref: ActorRef[Any],
+        target: Target,
         new: type[Actor] | Start[Any],
         change: Change | None = None,
         *,
@@ -127,7 +128,7 @@ class Controls:
         A variable that the actor has not yet is what `__init__` of the new class gives it.
 
         Args:
-            ref: the actor.
+            target: the actor.
             new: the class, or `start(Class, ...)` if its arguments are to change too.
             change: `change(state)` gives the state as the new class wants it. Left out, the new class's classmethod
                 `migrate(state, from_version)` does, as for a saved state, if its `schema_version` is higher.
@@ -139,7 +140,7 @@ class Controls:
                 `change`. The old class stays.
             SpecError: the class does not take the arguments, or cannot be imported by the actor's process.
         """
-        cell = self._living(ref)
+        cell = self._living(target)
         if not isinstance(new, Start) and not (isinstance(new, type) and issubclass(new, Actor)):
             raise SpecError(cell.path, f"replace_code takes an Actor class or start(Class, ...), not {new!r}")
         start = new if isinstance(new, Start) else Start(new)
@@ -152,7 +153,7 @@ class Controls:
             if switch is not None and isinstance(cell.spec, ChildSpec):
                 switch.arrival.becomes = becomes
         try:
-            recipe = await self._replace(ref, ReplaceCode(start, keeps, change), timeout)
+            recipe = await self._replace(target, ReplaceCode(start, keeps, change), timeout)
         finally:
             if switch is not None:
                 switch.arrival.becomes = None
@@ -163,13 +164,13 @@ class Controls:
                 cell.more.tap.attach()
             respec(cell, start)
 
-    async def get_status(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Status:
+    async def get_status(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> Status:
         """How an actor is, also while a turn of it waits for something, and between two lives."""
-        cell = self._living(ref)
+        cell = self._living(target)
         try:
             return await self._status(cell, timeout)
         except (ActorStopped, AskFailed):  # Its process has ended, or is about to.
-            return dataclasses.replace(status_of(self._living(ref)), state="restarting", pid=0)
+            return dataclasses.replace(status_of(self._living(target)), state="restarting", pid=0)
 
     async def _status(self, cell: Cell, timeout: float) -> Status:
         host = cell.host
@@ -191,30 +192,30 @@ class Controls:
             monitors=own.monitors,
         )
 
-    async def protection(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> ProtectionStatus:
+    async def protection(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> ProtectionStatus:
         """Whether an actor is protected by mechanisms now, by which, who leads, and whether a replica may die.
 
         It is what the root knows at this moment. (`timeout` is as for the other questions; nobody is asked.)
         """
         from ..ftm.group.protected import protection_of
 
-        return protection_of(self._living(ref))
+        return protection_of(self._living(target))
 
     async def statistics(
-        self, ref: ActorRef[Any], on: bool | None = None, *, timeout: float = DEFAULT_TIMEOUT
+        self, target: Target, on: bool | None = None, *, timeout: float = DEFAULT_TIMEOUT
     ) -> Statistics | None:
         """What an actor has done since its statistics were switched on; None while they are off.
 
         Args:
-            ref: the actor.
+            target: the actor.
             on: True switches them on, False off; left out, they stay as they are.
             timeout: seconds.
 
         Of an actor with a process of its own, what was counted before its last restart is lost (but for `restarts`
         and `messages_in`).
         """
-        cell = self._living(ref)
-        counts = cast("Statistics | None", await self._order(ref, ObserveTurns(on, None), timeout))
+        cell = self._living(target)
+        counts = cast("Statistics | None", await self._order(target, ObserveTurns(on, None), timeout))
         if not has_process(cell):
             return counts
         own = tap_of(cell).switch(on, None)
@@ -222,14 +223,14 @@ class Controls:
             return None
         return dataclasses.replace(own, **_done(counts))
 
-    async def trace(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> EventStream:
+    async def trace(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> EventStream:
         """Follow an actor: a stream of MessageIn, TurnBegan, TurnEnded and MessageOut. Close it when done.
 
         It goes on over restarts and ends when the address is given up.
         """
-        cell = self._living(ref)
+        cell = self._living(target)
         tap = tap_of(cell)
-        await self._order(ref, ObserveTurns(None, True), timeout)
+        await self._order(target, ObserveTurns(None, True), timeout)
         stream = tap.listen()
         if has_process(cell):
             tap.attach()
@@ -239,7 +240,7 @@ class Controls:
 
     async def set_isolation(
         self,
-        ref: ActorRef[Any],
+        target: Target,
         isolation: Isolation,
         *,
         limits: Limits | None = None,
@@ -252,7 +253,7 @@ class Controls:
         A supervisor goes with all below it, by a transaction of this one step: see `docs/control.md`.
 
         Args:
-            ref: the actor: a child of a supervisor in this process.
+            target: the actor: a child of a supervisor in this process.
             isolation: "task" or "process".
             limits: of the process; left out, those of its spec.
             timeout: seconds within which another change of where it lives must be over, within which it must come to
@@ -266,19 +267,19 @@ class Controls:
             ProcessUnavailable: no process could be had.
         """
         check_isolation(isolation, limits, timeout)
-        cell = self._living(ref)
+        cell = self._living(target)
         kind = cell_kind(cell)
         if kind is None or not issubclass(kind, Supervisor):
             await self._moves.move(cell, isolation, limits, timeout)
             return
         try:
             async with self.transaction(timeout=timeout) as change:
-                change.step(Isolate(ref, isolation, limits))
+                change.step(Isolate(cell.ref, isolation, limits))
         except TransactionFailed as error:
-            raise CannotMove(ref.path, error.cause) from error
+            raise CannotMove(cell.path, error.cause) from error
 
     async def terminate(
-        self, ref: ActorRef[Any], reason: ExitReason = SHUTDOWN, *, timeout: float = DEFAULT_TIMEOUT
+        self, target: Target, reason: ExitReason = SHUTDOWN, *, timeout: float = DEFAULT_TIMEOUT
     ) -> ExitReason:
         """Have a life end in good order, for `reason`; its supervisor then does as its spec says.
 
@@ -287,8 +288,8 @@ class Controls:
         Returns:
             The reason with which it ended.
         """
-        check_seconds(ref.path, "timeout", timeout)
-        cell = self._living(ref)
+        cell = self._living(target)
+        check_seconds(cell.path, "timeout", timeout)
         gone = cell.ended()
         if reason == KILLED:
             cell.ref.kill()
@@ -303,13 +304,13 @@ class Controls:
 
     # -- how --------------------------------------------------------------------------------------------------------
 
-    def _living(self, ref: ActorRef[Any]) -> Cell:
-        living = ref._cell.living
+    def _living(self, target: Target) -> Cell:
+        living = self._node.meant(target)
         if living.is_dead:
             raise lifecycle.nobody_at(living)
         return living
 
-    async def checkpoint(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> None:
+    async def checkpoint(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> None:
         """Have a recorded actor's state saved; returns when all that it has handled up to now is in a snapshot.
 
         With a store that lasts, the snapshot is in it then. While the actor is being recovered, its next life is
@@ -319,31 +320,33 @@ class Controls:
             SpecError: its method keeps no snapshots. CheckpointFailed: it could not be saved, or has stopped.
             AskTimeout: it was not within `timeout` seconds.
         """
-        check_seconds(ref.path, "timeout", timeout)
-        switch = switch_of(self._living(ref))
+        cell = self._living(target)
+        check_seconds(cell.path, "timeout", timeout)
+        switch = switch_of(cell)
         if switch is None or not switch.method.snapshots:
-            raise SpecError(ref.path, "keeps no snapshots: give it recovery=hybrid(...)")
+            raise SpecError(cell.path, "keeps no snapshots: give it recovery=hybrid(...)")
         wish = switch.due.wish()
         done, _ = await asyncio.wait([wish], timeout=timeout)
         if not done:
             wish.cancel()
-            raise AskTimeout(ref.path, timeout, None)
+            raise AskTimeout(cell.path, timeout, None)
         wish.result()
 
-    async def _replace(self, ref: ActorRef[Any], wanted: Order, timeout: float) -> Any:
+    async def _replace(self, target: Target, wanted: Order, timeout: float) -> Any:
         """Carry out an order that gives a recorded actor another state; raises ControlFailed if that is not kept."""
-        switch = switch_of(ref._cell.living)
+        cell = self._node.meant(target)
+        switch = switch_of(cell)
         before = 0 if switch is None else len(switch.arrival.unsaved)
         try:
-            result = await self._order(ref, wanted, timeout)
+            result = await self._order(target, wanted, timeout)
         except HoldfastError:
-            _check_saved(switch, before, ref.path, wanted.verb)
+            _check_saved(switch, before, cell.path, wanted.verb)
             raise
-        _check_saved(switch, before, ref.path, wanted.verb)
+        _check_saved(switch, before, cell.path, wanted.verb)
         return result
 
-    async def _order(self, ref: ActorRef[Any], wanted: Order, timeout: float) -> Any:
-        return await self._moves.given(ref._cell, wanted, timeout)
+    async def _order(self, target: Target, wanted: Order, timeout: float) -> Any:
+        return await self._moves.given(self._node.meant(target), wanted, timeout)
 
 
 def has_process(cell: Cell) -> bool:

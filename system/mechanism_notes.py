@@ -52,36 +52,40 @@ class AdaptationUndone(Event, frozen=True, eq=False):
 
 
 class MechanismNotes:
-    """What the mechanisms of addresses have become; `completing` gives them to the specs of this root."""
+    """What the mechanisms of addresses have become; `completed` gives them to the specs of this root."""
 
     def __init__(self, homes: Homes) -> None:
         self._homes = homes
         found = homes.notes(KEPT).get(KEPT)
         self._kept: dict[str, tuple[Any, ...]] = msgspec.msgpack.decode(found) if found else {}
-        self._loaded = set(self._kept)  # those that no spec has got yet
+        self._loaded = set(self._kept)  # those that no spec of this root has got yet
         self._is_dirty = False
+        homes.on_dismissed.append(self.gone)
         for key, step in homes.notes(UNDER_WAY).items():
             homes.note(key, None)
             homes.node.emit(AdaptationUndone(key.removeprefix(UNDER_WAY), step.decode()))
 
     def completed(self, spec: ChildSpec, address: str) -> ChildSpec:
-        """A spec with the mechanism that the address had when the last root ended.
+        """A spec with the mechanism that the address has: each time it is started as the program says.
 
         Raises:
             SpecError: that mechanism cannot be had any more.
         """
         if spec.is_supervisor and spec.isolation == "process":
             spec = self._completed_below(spec, address)
-        if address not in self._loaded:
+        said = self._kept.get(address)
+        if said is None:
             return spec
         from ..ftm.model.mechanism import MechanismRefused
 
+        is_first = address in self._loaded
         self._loaded.discard(address)
-        declared, current, *before = self._kept[address]
-        if _data(spec.mechanism) != declared:  # The program says something else now: that is newer.
-            self.forget(address)
+        declared, current, *before = said
+        if _data(spec.mechanism) != declared:  # It is in force already, or the program says something else now,
+            if is_first:  # which is newer.
+                self.forget(address)
             return spec
-        if before:  # The last root has not lived to see whether it stays.
+        if before and is_first:  # The last root has not lived to see whether it stays.
             (current,) = before
             self._keep(address, declared, current)
             self.flush()
@@ -100,7 +104,7 @@ class MechanismNotes:
     def _completed_below(self, spec: ChildSpec, address: str) -> ChildSpec:
         """The same for all that its process will start, which does not ask here."""
         above = f"{address}/"
-        for path in [path for path in self._loaded if path.startswith(above)]:
+        for path in [path for path in self._kept if path.startswith(above)]:
             names = path.removeprefix(above).split("/")
             child = spec_below(spec.start, names)
             if child is not None:
@@ -139,6 +143,12 @@ class MechanismNotes:
             self._is_dirty = True
             self._loaded.discard(address)
             self.flush()
+
+    def gone(self, address: str) -> None:
+        """Who lives there, and below it, is removed for good: whoever is started there next is another one."""
+        below = f"{address}/"
+        for one in [one for one in self._kept if one == address or one.startswith(below)]:
+            self.forget(one)
 
     def moved(self, names: Mapping[str, str]) -> None:
         """Actors have other addresses from now on, and all below them: where they live now, by where they did."""

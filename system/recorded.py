@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..actors.errors import HoldfastError, SpecError
-from ..actors.kernel.ref import ActorRef
+from ..actors.kernel.ref import ActorRef, Target
 from ..actors.seconds import check_seconds
 from ..checkpoint.home.homes import Homes
 from ..checkpoint.home.quarantine import QuarantinedMessage
@@ -28,7 +28,7 @@ class Recorded:
     _lines: Lines
     """The lines to other systems."""
 
-    def quarantined(self, actor: ActorRef[Any] | str | None = None) -> list[QuarantinedMessage]:
+    def quarantined(self, actor: Target | None = None) -> list[QuarantinedMessage]:
         """Messages put aside because they have ended their actor's process again and again, oldest first.
 
         They survive a restart of the root if the actor's journal does.
@@ -100,7 +100,7 @@ class Recorded:
             raise SpecError("backup", "needs a system with a store on the disk: store='sqlite:PATH'")
         return await asyncio.to_thread(back_up_store, file.path, path, key=file.key)
 
-    async def checkpoint_group(self, actors: Sequence[ActorRef[Any] | str], *, name: str) -> None:
+    async def checkpoint_group(self, actors: Sequence[Target], *, name: str) -> None:
         """Keep one consistent cut of several recorded actors: their states, and the messages between them (R78).
 
         It takes the place of an older one of that name. With a store it is kept over restarts of the root, and as safe

@@ -22,7 +22,7 @@ from ..actors.kernel.lifecycle import LOCAL, NEAR
 from ..actors.kernel.mailbox import Bounded
 from ..actors.kernel.message import Message
 from ..actors.kernel.node import Node, Ports, cell_kind
-from ..actors.kernel.ref import ActorRef, current
+from ..actors.kernel.ref import ActorRef, Target, current
 from ..actors.kernel.topics import publish
 from ..actors.loop_watchdog import LoopWatch
 from ..actors.process.fork.launch import check_is_program
@@ -558,14 +558,14 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         return cast("ActorRef[A]", self._node.spawn(start, name, mailbox=mailbox).ref)
 
     async def stop(
-        self, ref: ActorRef[Any], reason: ExitReason = SHUTDOWN, *, drain: bool = False, deadline: float = 5.0
+        self, target: Target, reason: ExitReason = SHUTDOWN, *, drain: bool = False, deadline: float = 5.0
     ) -> None:
         """Stop an actor for good; returns when its children have ended, then its hook has run. Twice is no error.
 
         What was recorded of it stays: started again under the same id, it is restored.
 
         Args:
-            ref: the actor.
+            target: the actor: a ref, or its address.
             reason: what `on_stop` is told.
             drain: let it handle what is queued first, and refuse what is new (an ask fails with ActorStopped, a tell
                 is a dead letter). What is left at the deadline goes to `on_undelivered`, as without draining.
@@ -576,7 +576,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         Raises:
             SpecError: it is a part of a mechanism, which would go on without it: `terminate` ends its life alone.
         """
-        cell = ref._cell.living
+        cell = self._node.meant(target)
         check_no_part(cell)
         expect_end(self._history, cell.path, "it was stopped")
         caller = current.get(None)
@@ -587,7 +587,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         node = self._node  # In nobody's name: it has to go on when the caller's life is over.
         task = node.loop.create_task(
             self._stop(cell, reason, deadline if drain else None),
-            name=f"stop of {ref.path}",
+            name=f"stop of {cell.path}",
             context=node.base_context.copy(),
         )
         self._stopping.add(task)
@@ -631,7 +631,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
 
     # -- several changes as one -------------------------------------------------------------------------------------
 
-    def roll_back(self, path: str) -> None:
+    def roll_back(self, target: Target) -> None:
         """Have a recorded actor that is stopped begin its next life with its snapshot before the newest.
 
         What its turns since did to its state is undone (`RolledBack`); what has left stays out.
@@ -639,7 +639,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         Raises:
             ControlFailed: it is not recorded, it runs, or it has no older snapshot.
         """
-        self._homes.roll_back(path, "it was asked for")
+        self._homes.roll_back(target.path if isinstance(target, ActorRef) else target, "it was asked for")
 
     def transaction(self, *, dry_run: bool = False, timeout: float = 10.0) -> Transaction:
         """Make several changes of the tree as one: `async with system.transaction() as change: change.add(...)`.
@@ -666,12 +666,12 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
 
     # -- names, topics, bindings ------------------------------------------------------------------------------------
 
-    def register(self, name: str, ref: ActorRef[Any], *, scope: Scope = "system") -> None:
+    def register(self, name: str, target: Target, *, scope: Scope = "system") -> None:
         """Give an actor a name beside its address, for the life that it has.
 
         Args:
             name: the name.
-            ref: the actor.
+            target: the actor: a ref, or its address.
             scope: who finds it by the name: "system", or "fleet": other systems and clients that are connected, too.
 
         Raises:
@@ -679,7 +679,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         """
         if scope not in get_args(Scope):
             raise SpecError("register", f"scope must be 'system' or 'fleet', not {scope!r}")
-        self._node.register(name, ref._cell.living, scope=scope)
+        self._node.register(name, self._node.meant(target), scope=scope)
 
     def unregister(self, name: str) -> None:
         """Free a name; unknown ones are fine."""
@@ -696,12 +696,12 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         """Send to every subscriber of a topic, and return when each has accepted; it waits for room at bounded ones."""
         await publish(self._node, topic, message, lambda cell: cell.ref.send(message))
 
-    def bind(self, ref: ActorRef[Any], port: str, target: ActorRef[Any]) -> None:
-        """Point a binding elsewhere; the owner sees it from its next turn on. Raises SpecError.
+    def bind(self, owner: Target, port: str, target: Target) -> None:
+        """Point a binding elsewhere; the owner sees it from its next turn on. Raises SpecError, or NoSuchActor.
 
         It lasts until the supervisor of the owner is restarted. `change.bind`, in a transaction, is for good.
         """
-        self._node.bind(ref._cell.living, port, target._cell.living)
+        self._node.bind(self._node.meant(owner), port, self._node.meant(target))
 
     # -- looking at it ----------------------------------------------------------------------------------------------
 
@@ -736,7 +736,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         """Messages that nobody handled, so far."""
         return self._node.numbers.dead_letters
 
-    def pid_of(self, ref: ActorRef[Any]) -> int:
+    def pid_of(self, target: Target) -> int:
         """Return the pid of the OS process that an actor lives in now: its own, or this one.
 
         A protected actor lives in the process of the replica that leads.
@@ -744,16 +744,17 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         Raises:
             NoSuchActor: it lives nowhere at the moment.
         """
-        cell: Cell | None = ref._cell.living
-        if cell is None or cell.state is GONE:
-            raise NoSuchActor(ref.path)
+        meant = self._node.meant(target)
+        cell: Cell | None = meant
+        if meant.state is GONE:
+            raise NoSuchActor(meant.path)
         while cell is not None:
             place = cell.host.place
             worker = place.process(cell)
             if worker is not None:
                 return int(worker.pid)
             if place.owns_processes:
-                raise NoSuchActor(ref.path)
+                raise NoSuchActor(meant.path)
             cell = cell.parent
         return os.getpid()
 

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from ..deadline_thread import Overdue
     from .actor import Actor, Start
     from .address_host import AddressHost
-    from .ref import ActorRef
+    from .ref import ActorRef, Target
 
 A = TypeVar("A", bound="Actor")
 
@@ -353,6 +353,19 @@ class Node(RunLoop):
         if found is not None and not issubclass(found, kind):
             raise WrongActor(path, type_name(kind), type_name(found))
         return ActorRef(cell)
+
+    def meant(self, target: Target) -> Cell:
+        """The cell that a ref or an address leads to. Raises NoSuchActor: nobody lives at the address."""
+        from .ref import ActorRef
+
+        if isinstance(target, ActorRef):
+            return target._cell.living
+        if not isinstance(target, str):
+            raise SpecError(repr(target), "is neither a ref nor an address")
+        cell = self.find(target)
+        if cell is None or cell.is_dead:
+            raise NoSuchActor(target)
+        return cell
 
     def register(self, name: str, cell: Cell, *, is_starting: bool = False, scope: Scope | None = None) -> None:
         """Give an actor a name beside its path; it is free again before anybody hears of the actor's end.

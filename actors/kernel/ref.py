@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
-from typing import TYPE_CHECKING, Any, Generic, Literal
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeAlias
 
 from typing_extensions import TypeVar
 
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 A_co = TypeVar("A_co", bound="Actor", default=Any, covariant=True)
 R = TypeVar("R")
+
+Target: TypeAlias = "ActorRef[Any] | str"
+"""Who is meant: a ref, or the address of whoever lives there by then."""
 
 Restarting = Literal["wait", "fail"]
 """What an ask does at an actor that is between two lives."""

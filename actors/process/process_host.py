@@ -674,7 +674,7 @@ def keep(worker: Worker, frame: frames.Command) -> None:
             case "returned":
                 keeper.returned(path)
             case "dismissed":
-                keeper.dismissed(path)
+                keeper.dismissed(path, below=bool(data.get("below")), for_good=bool(data.get("for_good")))
             case "note":
                 above, _, name = path.rpartition("/")
                 keeper.note(child_key(above, name), data.get("value"))

@@ -63,6 +63,7 @@ class Homes:
         self.recoveries = Recoveries(node, self.journal, hooks)
         self.on_first: Callable[[], None] | None = None  # there is something to watch over from now on
         self.on_home: Callable[[Switch], None] = nobody  # a home has a life again, or for the first time
+        self.on_dismissed: list[Callable[[str], None]] = []  # who is told of children that are gone for good
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
         self.file = file
         self.planted: dict[str, Saved] = {}  # what the next life at an address begins with, whatever is recorded
@@ -334,11 +335,15 @@ class Homes:
             except HoldfastError as error:
                 self.node.emit(RecoveryFailed(blamed, f"it comes back as it was: {error}"))
 
-    def dismissed(self, path: str) -> None:
+    def dismissed(self, path: str, *, below: bool, for_good: bool) -> None:
         """The child at `path` is forgotten by its supervisor, and nobody brings back those below it.
 
         What has come while they ended waits for whoever is started there anew; what comes now is lost, and told so.
         """
+        for tell in self.on_dismissed if for_good else ():
+            tell(path)
+        if not below:
+            return
         prefix = f"{path}/"
         for waiting, switch in self._switches.items():
             if waiting.startswith(prefix):

@@ -154,10 +154,9 @@ class GuestKeeper:
         """A supervisor in this process is started again."""
         self._say("returned", path)
 
-    def dismissed(self, path: str) -> None:
+    def dismissed(self, path: str, *, below: bool, for_good: bool) -> None:
         """A supervisor in this process has given up an address."""
-        if any(one.startswith(f"{path}/") for one in self._known):  # Else nothing waits below it.
-            self._say("dismissed", path)
+        self._say("dismissed", path, below=below, for_good=for_good)
 
     def note(self, key: str, value: bytes | None) -> None:
         """Keep the fact that a supervisor has a child; None forgets it."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ...actors.control.orders import Status
 from ...actors.errors import AskTimeout, HoldfastError, NoSuchActor, SpecError
 from ...actors.kernel.node import cell_kind
-from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
+from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef, Target
 from ...actors.seconds import check_seconds
 from ...supervision.supervisor import Supervisor
 from .counted_work import count_work
@@ -41,25 +41,25 @@ class HistoryCalls:
         """The node that hosts this process's actors."""
         raise NotImplementedError
 
-    async def get_status(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Status:
+    async def get_status(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> Status:
         """Say how an actor is now; see `Controls`."""
         raise NotImplementedError
 
-    def pid_of(self, ref: ActorRef[Any]) -> int:
+    def pid_of(self, target: Target) -> int:
         """Return the pid of the OS process that an actor lives in; see `ActorSystem`."""
         raise NotImplementedError
 
-    async def get_state(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Any:
+    async def get_state(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> Any:
         """Copy an actor's state; see `Controls`."""
         raise NotImplementedError
 
-    def quarantined(self, actor: ActorRef[Any] | str | None = None) -> list[QuarantinedMessage]:
+    def quarantined(self, actor: Target | None = None) -> list[QuarantinedMessage]:
         """Messages that are put aside."""
         raise NotImplementedError
 
     def history(
         self,
-        target: ActorRef[Any] | str = "**",
+        target: Target = "**",
         *,
         kinds: Sequence[str] = (),
         since: float = 0.0,
@@ -84,7 +84,7 @@ class HistoryCalls:
         return answer(self._recorder, asked)
 
     async def follow_history(
-        self, target: ActorRef[Any] | str = "**", *, after: int, kinds: Sequence[str] = (), timeout: float = 30.0
+        self, target: Target = "**", *, after: int, kinds: Sequence[str] = (), timeout: float = 30.0
     ) -> HistoryPage:
         """Past events behind `after`, as soon as there is one; an empty page if none came within `timeout` seconds.
 
@@ -104,7 +104,7 @@ class HistoryCalls:
             page = answer(recorder, asked)
         return page
 
-    def lives(self, target: ActorRef[Any] | str) -> list[PastLife]:
+    def lives(self, target: Target) -> list[PastLife]:
         """The newest lives at an address, oldest first: how each began and ended, by whom, and why; 16 at most.
 
         Raises:
@@ -116,7 +116,7 @@ class HistoryCalls:
             done(lives[-1], count_work(self._node, path))
         return lives
 
-    async def why(self, target: ActorRef[Any] | str, *, timeout: float = DEFAULT_TIMEOUT) -> list[str]:
+    async def why(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> list[str]:
         """Say in a few sentences why an actor restarts, has ended, or does not get on.
 
         Args:
@@ -128,20 +128,20 @@ class HistoryCalls:
         """
         return why(await self._evidence("why", target, timeout))
 
-    async def causes(self, target: ActorRef[Any] | str, *, timeout: float = DEFAULT_TIMEOUT) -> list[Cause]:
+    async def causes(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> list[Cause]:
         """Say what `why` says of a target, within a timeout in seconds, each sentence with the name of its cause.
 
         For programs; nothing if nothing is wrong. Raises SpecError: the system was made with `history=False`.
         """
         return causes(await self._evidence("causes", target, timeout))
 
-    async def _evidence(self, call: str, target: ActorRef[Any] | str, timeout: float) -> Evidence:
+    async def _evidence(self, call: str, target: Target, timeout: float) -> Evidence:
         check_seconds(call, "timeout", timeout)
         path = _path(target)
         node, recorder = self._node, self._recorder
         return collect(node, recorder, path, await self._ask_itself(path, timeout), self.quarantined(path))
 
-    def put_aside(self, target: ActorRef[Any] | str | None = None) -> list[PutAside]:
+    def put_aside(self, target: Target | None = None) -> list[PutAside]:
         """The messages in quarantine as plain data, oldest first; what is in them only with `log_payloads`.
 
         `quarantined` returns the messages themselves, to be tried again or dropped.
@@ -188,7 +188,7 @@ class HistoryCalls:
         return self._history
 
 
-def _path(target: ActorRef[Any] | str) -> str:
+def _path(target: Target) -> str:
     path = target.path if isinstance(target, ActorRef) else target
     if not isinstance(path, str):
         raise SpecError("history", f"takes an actor or an address, not {target!r}")

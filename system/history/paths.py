@@ -5,10 +5,9 @@ from __future__ import annotations
 import fnmatch
 import re
 from collections.abc import Callable
-from typing import Any
 
 from ...actors.errors import SpecError
-from ...actors.kernel.ref import ActorRef
+from ...actors.kernel.ref import ActorRef, Target
 
 LONGEST = 1_000
 """Characters of a pattern."""
@@ -50,7 +49,7 @@ def literal(address: str) -> str:
     return "".join(f"[{sign}]" if sign in "*?[" else sign for sign in address)
 
 
-def pattern_of(target: ActorRef[Any] | str) -> str:
+def pattern_of(target: Target) -> str:
     """The pattern of addresses that a caller means by an actor, or by a text."""
     return literal(target.path) if isinstance(target, ActorRef) else target
 

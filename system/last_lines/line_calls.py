@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ...actors.errors import SpecError
 from ...actors.seconds import check_seconds
@@ -13,7 +13,7 @@ from .line_memory import LineMemory
 from .line_page import LogPage, LogQuestion, answer_lines, log_question
 
 if TYPE_CHECKING:
-    from ...actors.kernel.ref import ActorRef
+    from ...actors.kernel.ref import Target
     from ..history.recorder import HistoryRecorder
 
 GATHERED = 0.05
@@ -27,7 +27,7 @@ class LineCalls:
 
     def logs(
         self,
-        target: ActorRef[Any] | str = "**",
+        target: Target = "**",
         *,
         level: str = "debug",
         since: float = 0.0,
@@ -54,7 +54,7 @@ class LineCalls:
 
     async def follow_logs(
         self,
-        target: ActorRef[Any] | str = "**",
+        target: Target = "**",
         *,
         after: int,
         level: str = "debug",

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.control.orders import Change as StateChange
 from ...actors.kernel.actor import Actor, Start
+from ...actors.kernel.ref import Target
 from ...supervision.spec import ChildSpec, Isolation, Strategy
 from . import living
-from .draft import Target
 from .mechanisms import Isolate, OnProtection, Protect, Update
 from .operation import Operation, Step, text_of
 from .reparenting import Reparent

@@ -13,7 +13,7 @@ from ...actors.control.orders_lane import order
 from ...actors.errors import ActorRestarting, NoSuchActor
 from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.node import Node, cell_kind
-from ...actors.kernel.ref import ActorRef
+from ...actors.kernel.ref import ActorRef, Target
 from ...actors.process.process_host import WorkerPlace
 from ...actors.process.wire.peer import OutsidePlace
 from ...checkpoint.method import Method
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 
 START_TIMEOUT = 3600.0
 """Seconds a child may take to start; the transaction's own time limit is shorter."""
-Target = ActorRef[Any] | str
-"""What an operation is about: a ref, or the address at that point of the transaction."""
 
 
 @dataclass(slots=True)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from ...actors.control.orders import Change, ReplaceCode, ReplaceState, next_start
 from ...actors.errors import SpecError, type_name
 from ...actors.kernel.actor import Actor, Start
-from .draft import Draft, DraftPlace, Target, is_elsewhere
+from ...actors.kernel.ref import Target
+from .draft import Draft, DraftPlace, is_elsewhere
 from .operation import PROTECTED, Operation, StagedWork, wrong
 from .rework import Rework
 

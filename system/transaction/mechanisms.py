@@ -6,11 +6,12 @@ import dataclasses
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from ...actors.errors import SpecError
+from ...actors.kernel.ref import Target
 from ...supervision.arbiter import Hand, arbiter_of
 from ...supervision.respec import NO_RECIPE, recipe_spec
 from ...supervision.spec import Isolation
 from ...supervision.supervisor_changes import check_subtree
-from .draft import Draft, DraftPlace, Target, is_elsewhere, rules
+from .draft import Draft, DraftPlace, is_elsewhere, rules
 from .handing import is_far
 from .living import OnSharedWork
 from .operation import wrong

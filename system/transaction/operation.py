@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, ClassVar
 from ...actors.errors import SpecError
 
 if TYPE_CHECKING:
+    from ...actors.kernel.ref import Target
     from ..system import ActorSystem
-    from .draft import Draft, DraftPlace, Target
+    from .draft import Draft, DraftPlace
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -203,6 +203,8 @@ class Relocation(StagedWork):
             replace_mechanism(
                 cell, dataclasses.replace(now, mechanism=self._after.mechanism, isolation=isolation)
             )  # fmt: skip
+            # A life that begins before the end of the change has it too.
+            system._mechanism_notes.put(cell.path, self.before.mechanism, self._after.mechanism, is_trusted=False)
         self._move.open()
 
     async def finish(self, system: ActorSystem) -> None:

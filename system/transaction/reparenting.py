@@ -15,12 +15,13 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.errors import ControlFailed, HoldfastError
+from ...actors.kernel.ref import Target
 from ...checkpoint.home.recorded_home import said_of_turn, switch_of
 from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import SnapshotNow
 from ...supervision.children import STOPPED, UP
 from .arrangement import busy, child_of
-from .draft import Draft, DraftPlace, Target, is_elsewhere
+from .draft import Draft, DraftPlace, is_elsewhere
 from .handing import UNKNOWN, Handing, check_handed, check_handing, is_far
 from .living import OnSharedWork
 from .operation import Operation, StagedWork, text_of, wrong

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from ...actors.errors import ActorStopped, NoSuchActor
 from ...actors.kernel.cell import Cell
-from ...actors.kernel.ref import ActorRef
+from ...actors.kernel.ref import ActorRef, Target
 from ...supervision.admin import ChildBusy, NoSuchChild, NotSupported, RestartChild, TerminateChild
 from ...supervision.respec import replace_options
 from ...supervision.spec import check_spec
 from ...supervision.supervisor import Supervisor
 from ..history.recorder import expect_end
 from .arrangement import child_of
-from .draft import START_TIMEOUT, Draft, DraftPlace, Target, check_awake, is_elsewhere
+from .draft import START_TIMEOUT, Draft, DraftPlace, check_awake, is_elsewhere
 from .operation import Operation, wrong
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from ...actors.errors import ActorStopped, NameTaken, StartFailed
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import Cell
-from ...actors.kernel.ref import ActorRef
+from ...actors.kernel.ref import ActorRef, Target
 from ...supervision.admin import (
     AlreadyPresent,
     AlreadyStarted,
@@ -26,7 +26,7 @@ from ...supervision.spec import NAMELESS, ChildSpec, Flags, Plan, check_spec, ch
 from ...supervision.supervisor import Supervisor
 from ...supervision.supervisor_changes import check_subtree
 from .arrangement import planned_spec
-from .draft import START_TIMEOUT, Draft, DraftPlace, Target, check_awake, is_elsewhere
+from .draft import START_TIMEOUT, Draft, DraftPlace, check_awake, is_elsewhere
 from .lasting import recipe_specs
 from .operation import Operation, text_of, wrong
 
@@ -243,6 +243,9 @@ class RemoveActor(Operation):
         place.is_leaving = True
         if above.is_supervisor:
             draft.arrangement.touch(above, self, only_recipe=True)
+
+    def commit(self, system: ActorSystem) -> None:
+        system._mechanism_notes.gone(self._place.path)
 
     async def finish(self, system: ActorSystem) -> None:
         place = self._place

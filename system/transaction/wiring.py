@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.errors import ActorStopped, NameTaken, NoSuchActor, type_name
 from ...actors.kernel.cell import RUNNING
+from ...actors.kernel.ref import Target
 from ...actors.values.path_parts import check_beside
 from ...supervision.respec import rebind
-from .draft import Draft, DraftPlace, Target
+from .draft import Draft, DraftPlace
 from .operation import Operation, text_of, wrong
 
 if TYPE_CHECKING:

@@ -57,6 +57,31 @@ async def test_a_suspended_actor_handles_what_came_meanwhile_in_order(
     assert (await system.get_state(one))["seen"] == [0, 1, 2, 3, 4, 5]
 
 
+async def test_an_address_does_as_well_as_a_ref(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    await system.suspend(one.path)
+    assert await system.get_state(one.path) == await system.get_state(one)
+    assert await system.outline(one.path) == await system.outline(one)
+    await system.replace_code(one.path, hf.start(Account))
+    await system.resume(one.path)
+    assert (await system.replace_state(one.path, functools.partial(plus, 5)))["total"] == 5
+    assert (await system.get_status(one.path)).life == 1
+    assert not (await system.protection(one.path)).stack
+    assert await system.statistics(one.path) is None
+    (await system.trace(one.path)).close()
+    assert system.pid_of(one.path) == system.pid_of(one)
+    system.register("till", one.path)
+    assert system.whereis("till").path == one.path
+    assert await system.terminate(one.path) == hf.SHUTDOWN
+    assert await one.ask(Total(), timeout=30.0) in (0, 5)  # Of its next life, which remembers if it is recorded.
+    await system.stop(one.path)
+    for call in (system.suspend, system.get_state, system.protection, system.stop):
+        with pytest.raises(hf.errors.NoSuchActor, match=one.path):
+            await call(one.path)
+    with pytest.raises(hf.SpecError, match="neither a ref nor an address"):
+        await system.resume(1)  # type: ignore[arg-type]
+
+
 async def test_a_state_in_outline_is_told_whatever_its_size(system: hf.ActorSystem, start_one: Starter) -> None:
     one = await start_one(hf.start(Account))
     for n in range(12):

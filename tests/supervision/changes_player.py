@@ -12,6 +12,8 @@ from typing import Any
 
 import holdfast as hf
 from holdfast.actors.process.resource_limits import Limits
+from holdfast.ftm.group import probation
+from holdfast.supervision.spec import Isolation
 
 
 class Tell(hf.Message[list[Any]]):
@@ -68,7 +70,7 @@ def back(state: dict[str, Any]) -> dict[str, Any]:
 BOUND = {"peer": "/app/first"}
 OPTIONS: dict[str, Any] = {"restart": "permanent", "shutdown": 5.0, "backoff": None, "start_timeout": 60.0}
 OTHERS: dict[str, Any] = {"restart": "transient", "shutdown": 4.0, "backoff": hf.Backoff(initial=0.01)}
-NAMES = ("same", "code", "start", "by_order", "place", "limits", "options", "bind", "gone", "moved")
+NAMES = ("same", "code", "start", "by_order", "place", "limits", "options", "bind", "gone", "moved", "guarded")
 KINDS = ("template", "spec", "plain")
 IN = hf.child(
     "guest",
@@ -80,14 +82,17 @@ IN = hf.child(
 )
 
 
+PROBATION = {"SECONDS": 0.0, "TURNS": 0, "LOOK_EVERY": 0.05}
+
+
 def member(name: str | None) -> hf.ChildSpec:
     return hf.child(name, hf.start(Old), recovery=hf.hybrid(), bindings=BOUND)
 
 
-def trees(kind: str) -> list[hf.ChildSpec]:
+def trees(kind: str, place: Isolation = "task") -> list[hf.ChildSpec]:
     first = [hf.child("first", hf.start(Peer)), hf.child("second", hf.start(Peer))]
     if kind == "plain":
-        team = hf.supervisor("team", children=[member(name) for name in NAMES], intensity=100)
+        team = hf.supervisor("team", children=[member(name) for name in NAMES], intensity=100, isolation=place)
     else:
         team = hf.dynamic("team", template=member(None) if kind == "template" else None, journal=True, intensity=100)
     return [*first, hf.supervisor("others", children=[IN], intensity=100), team]
@@ -129,8 +134,10 @@ async def there(system: hf.ActorSystem, kind: str) -> None:
         change.bind(at("bind"), "peer", "/app/second")
         change.remove(at("gone"))
         change.move(at("moved"), "/app/others")
+        change.protect(at("guarded"), hf.ftm.PBR())
         if kind != "template":  # Which takes nobody from elsewhere.
             change.move("/app/others/guest", "/app/team")
+    await change.settled()
 
 
 async def and_back(system: hf.ActorSystem, kind: str) -> None:
@@ -145,11 +152,13 @@ async def and_back(system: hf.ActorSystem, kind: str) -> None:
         change.isolation(at("place"), "task")
         change.respecify(at("options"), register=None, **OPTIONS)
         change.bind(at("bind"), "peer", "/app/first")
+        change.protect(at("guarded"), None)
         if kind != "template":
             change.move("/app/others/moved", "/app/team")
             change.move(at("guest"), "/app/others")
         if kind == "plain":
             change.add("/app/team", member("gone"))
+    await change.settled()
     if kind != "plain":
         await come(system, kind, "gone")
 
@@ -170,7 +179,8 @@ async def looks(system: hf.ActorSystem) -> dict[str, list[Any]]:
             kind, pid, total, peer = await ref.ask(Tell(), timeout=30.0)
             said = (spec.restart, spec.shutdown, spec.backoff, spec.register, spec.isolation, spec.limits)
             where = "task" if pid == os.getpid() else "process"
-            seen[one.path] = [kind, where, total, peer, repr((*said, spec.mailbox, spec.recovery))]
+            stack = list((await system.protection(ref)).stack)
+            seen[one.path] = [kind, where, total, peer, repr((*said, spec.mailbox, spec.recovery)), stack]
     return seen
 
 
@@ -193,4 +203,6 @@ async def first(store: str, kind: str, direction: str, *, is_killed: bool) -> di
 
 def main() -> None:
     """Live the first program, with the arguments of the command, and die."""
+    for name, value in PROBATION.items():
+        setattr(probation, name, value)
     asyncio.run(first(*sys.argv[1:4], is_killed=True))

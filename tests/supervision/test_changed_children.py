@@ -12,8 +12,16 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.ftm.group import probation
+from holdfast.supervision.spec import Isolation
 from tests.checkpoint.players import until
 from tests.supervision import changes_player as player
+
+
+@pytest.fixture(autouse=True)
+def brief_probation(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in player.PROBATION.items():
+        monkeypatch.setattr(probation, name, value)
 
 
 async def again(system: hf.ActorSystem, how: str) -> None:
@@ -87,3 +95,52 @@ async def test_a_new_template_and_a_transaction_reach_all_and_are_kept(tmp_path:
                 await system.start(tree)
             seen = await player.looks(system)
             assert [seen[player.at(name)][:3] for name in ("one", "two", "three")] == [["New", "task", 2]] * 3
+
+
+@pytest.mark.parametrize(
+    ("kind", "place"), [("template", "task"), ("spec", "task"), ("plain", "task"), ("plain", "process")]
+)
+async def test_a_mechanism_is_that_of_one_child(tmp_path: Path, kind: str, place: Isolation) -> None:
+    """It has it each time it is started, in this program and the next ones; another child of its name has none."""
+    member = player.member("gone")
+    store = f"sqlite:{tmp_path / 'app.db'}"
+
+    async def stacks(system: hf.ActorSystem) -> dict[str, tuple[str, ...]]:
+        refs = {name: system.ref(player.at(name)) for name in ("same", "gone")}
+        for ref in refs.values():
+            await ref.ask(player.Tell(), timeout=30.0)
+        return {name: (await system.protection(ref)).stack for name, ref in refs.items()}
+
+    async def begun(system: hf.ActorSystem) -> hf.ActorRef[Any]:
+        for tree in player.trees(kind, place):
+            await system.start(tree)
+        return system.ref("/app/team", hf.Supervisor)
+
+    async with hf.ActorSystem("app", store=store, log=False, intensity=100) as system:
+        await begun(system)
+        if kind != "plain":
+            await player.come(system, kind, "same", "gone")
+        async with system.transaction() as change:
+            change.protect(player.at("same"), hf.ftm.PBR())
+            change.protect(player.at("gone"), hf.ftm.LFR())
+        await change.settled()
+        await again(system, "supervisor")
+        assert await stacks(system) == {"same": ("pbr",), "gone": ("lfr",)}
+    async with hf.ActorSystem("app", store=store, log=False, intensity=100) as system:
+        team = await begun(system)
+        assert await stacks(system) == {"same": ("pbr",), "gone": ("lfr",)}
+        await again(system, "supervisor")
+        assert await stacks(system) == {"same": ("pbr",), "gone": ("lfr",)}
+        if kind == "plain":
+            for step in (lambda change: change.remove(player.at("gone")), lambda change: change.add(team, member)):
+                async with system.transaction() as change:
+                    step(change)
+        else:
+            await team.ask(hf.TerminateChild("gone"))
+            await player.come(system, kind, "gone")
+        assert await stacks(system) == {"same": ("pbr",), "gone": ()}
+        await again(system, "supervisor")
+        assert await stacks(system) == {"same": ("pbr",), "gone": ()}
+    async with hf.ActorSystem("app", store=store, log=False, intensity=100) as system:
+        await begun(system)
+        assert await stacks(system) == {"same": ("pbr",), "gone": ()}

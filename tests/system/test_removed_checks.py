@@ -32,6 +32,7 @@ RESTING = "tests/effects/test_moves_while_resting.py"
 LINKS = "tests/actors/test_links.py"
 TURNS = "tests/supervision/test_turn_timeout.py"
 EFFECTS = "tests/effects/test_effect_processes.py"
+CHANGED = "tests/supervision/test_changed_children.py"
 
 DYNAMIC = "tests/supervision/test_dynamic.py"
 
@@ -645,6 +646,27 @@ CHECKS = {
         REPLICAS,
         "test_a_root_that_is_killed and trial and finish",
     ),
+    "who is started again as declared has the mechanism that it has come to have": Check(
+        "system/mechanism_notes.py",
+        "        is_first = address in self._loaded\n",
+        "        is_first = address in self._loaded\n        if not is_first:\n            return spec\n",
+        CHANGED,
+        "is_that_of_one_child and template",
+    ),
+    "a mechanism is forgotten with a child that its supervisor forgets": Check(
+        "supervision/supervisor.py",
+        "        is_over = self._is_dynamic or spec.id not in self._planned",
+        "        is_over = False",
+        CHANGED,
+        "is_that_of_one_child and template",
+    ),
+    "a mechanism is forgotten with a child that a transaction removes": Check(
+        "system/transaction/structure.py",
+        "        system._mechanism_notes.gone(self._place.path)",
+        "        pass",
+        CHANGED,
+        "is_that_of_one_child and plain",
+    ),
     "what comes of a mechanism on trial is noted where it is now": Check(
         "system/transaction/relocation.py",
         "            at = path if cell is None else cell.path",
@@ -1156,7 +1178,7 @@ CHECKS = {
         "supervision/noted.py",
         "        changes = {field: change for field, change in self.changes.items() if field not in fields}\n",
         "        changes = dict(self.changes)\n",
-        "tests/supervision/test_changed_children.py",
+        CHANGED,
         "back and template and killed",
     ),
     "a program waits for whoever gets its lines": Check(
