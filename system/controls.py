@@ -362,7 +362,7 @@ def _check_saved(switch: Switch | None, before: int, path: str, verb: str) -> No
 
 def _done(counts: Statistics) -> dict[str, Any]:
     """What only the process itself has counted."""
-    names = ("messages_out", "turns", "turn_seconds", "longest_turn")
+    names = ("messages_out", "turns", "turn_seconds", "longest_turn", "turn_times")
     return {name: getattr(counts, name) for name in names}
 
 

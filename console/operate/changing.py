@@ -268,7 +268,7 @@ def checkpoint(
     """
     with reached("checkpoint", system, socket) as remote:
         rows = meant_rows(remote, paths)
-        names = [pattern for pattern in map(read_pattern, paths) if pattern.is_one]
+        names = [pattern for pattern in map(read_pattern, paths) if pattern.one is not None]
         named = {row.path for row in rows if any(pattern.matches(row) for pattern in names)}
         rows = [row for row in rows if row.path in named or row.recovery in WITH_SNAPSHOTS]
         failed: list[str] = []

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
+from ...system.history.paths import literal
 from ..overview import ActorRow, ProcessUse, SystemLook
 from ..runtime_folder import found_sockets, sweep
 from .patterns import select
@@ -93,7 +94,7 @@ def tree(
     if as_json:
         show_json(as_plain_look(look, rows))
     elif paths:
-        typer.echo("\n".join(printable(row.path) for row in rows))
+        typer.echo("\n".join(printable(literal(row.path)) for row in rows))
     else:
         typer.echo("\n".join(tree_lines(with_ancestors(look.rows, rows), look.processes)))
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 from ...actors.errors import HoldfastError, NoSuchActor
-from ...system.history.paths import matcher
+from ...system.history.paths import literal, matcher, one_meant
 from ..overview import ActorRow
 
 COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {
@@ -21,7 +21,7 @@ COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {
     "<": operator.lt,
     "=": operator.eq,
 }
-FORM: Final = re.compile(r"(?P<glob>[^\[\]]+)(?:\[(?P<conditions>[^\[\]]*)\])?")
+FORM: Final = re.compile(r"(?P<glob>(?:\\[*?\[\]\\]|[^\[\]])+?)(?:\[(?P<conditions>[^\[\]]*)\])?")
 CONDITION: Final = re.compile(r"\s*(?P<field>\w+)\s*(?P<verb>>=|<=|!=|=|>|<)\s*(?P<value>.*?)\s*")
 FIELDS: Final = tuple(name for name in ActorRow.__struct_fields__ if name not in ("path", "is_supervisor"))
 NUMBERS: Final = ("pid", "restarts", "queued", "turn_seconds", "allowed_bytes")
@@ -56,18 +56,19 @@ class Condition:
 class Pattern:
     """An address, a name, or a pattern with conditions.
 
-    `*` stands for a part of an address, or a piece of one, and `**` for any number of whole parts.
+    `*` stands for a part of an address, or a piece of one, and `**` for any number of whole parts. A sign with a
+    backslash before it stands for itself.
     """
 
     text: str
     is_like: Callable[[str], bool]
     conditions: tuple[Condition, ...]
-    is_one: bool
-    """Whether it is one address or name, which has to be there."""
+    one: str | None
+    """The one address or name that it is, which has to be there."""
 
     def matches(self, row: ActorRow) -> bool:
         """Whether an actor is meant."""
-        named = self.is_one and self.text in row.names
+        named = self.one is not None and self.one in row.names
         return (named or self.is_like(row.path)) and all(one.holds(row) for one in self.conditions)
 
 
@@ -78,10 +79,10 @@ def read_pattern(text: str) -> Pattern:
         raise BadPattern(text, "write an address, with conditions behind it in brackets: '/app/**[restarts>3]'")
     glob, given = form["glob"].strip(), form["conditions"]
     conditions = () if given is None else tuple(_condition(text, one) for one in given.split(","))
-    is_one = given is None and "*" not in glob and "?" not in glob
-    if not glob.startswith("/") and not is_one:
+    one = one_meant(glob) if given is None else None
+    if not glob.startswith("/") and one is None:
         raise BadPattern(text, "an address begins with '/', as /app/bank does")
-    return Pattern(text, _below(glob.rstrip("/") or "/"), conditions, is_one)
+    return Pattern(text, _below(glob.rstrip("/") or "/"), conditions, one)
 
 
 def _condition(pattern: str, text: str) -> Condition:
@@ -109,7 +110,7 @@ def _below(glob: str) -> Callable[[str], bool]:
     >>> [_below("/app/**/x*")(path) for path in ("/app/x", "/app/a/x1", "/app/a")]
     [True, True, False]
     """
-    return matcher(f"{glob}/*" if glob.endswith("**") else glob)
+    return matcher(f"{glob}/*" if glob.split("/")[-1] == "**" else glob)
 
 
 def _values(row: ActorRow) -> tuple[Any, ...]:
@@ -120,10 +121,15 @@ def select(rows: Iterable[ActorRow], texts: Iterable[str]) -> list[ActorRow]:
     """Those that are meant, each once, in the order of the rows.
 
     Raises:
-        BadPattern: a text is no pattern. NoSuchActor: an address or name is nobody's, or a pattern fits nobody.
+        BadPattern: a text is no pattern, or an actor has that very address.
+        NoSuchActor: an address or name is nobody's, or a pattern fits nobody.
     """
     known, wanted = list(rows), [read_pattern(text) for text in texts]
+    addresses = {row.path for row in known}
     for pattern in wanted:
+        if pattern.one is None and pattern.text in addresses:
+            problem = f"an actor has this very address; to mean it alone write '{literal(pattern.text)}'"
+            raise BadPattern(pattern.text, problem)
         if not any(pattern.matches(row) for row in known):
             raise NoSuchActor(pattern.text)
     return [row for row in known if any(pattern.matches(row) for pattern in wanted)]

@@ -15,6 +15,7 @@ import typer
 
 from ...actors.errors import HoldfastError
 from ...actors.values.path_parts import CONTROL
+from ...system.history.paths import literal, one_meant
 from ...system.options import ProgramRole
 from ...system.script import UntrustedFile
 from ..overview import ActorRow
@@ -98,7 +99,7 @@ def complete_system(incomplete: str) -> list[str]:
 
 def complete_path(ctx: typer.Context, incomplete: str) -> list[str]:
     """The addresses in the system that is meant, for the shell."""
-    return complete(ctx, incomplete, lambda remote: remote.tree())
+    return complete(ctx, incomplete, lambda remote: map(literal, remote.tree()))
 
 
 def complete(ctx: typer.Context, incomplete: str, words: Callable[[RemoteSystem], Iterable[str]]) -> list[str]:
@@ -137,7 +138,17 @@ Paths = Annotated[
         autocompletion=complete_path,
     ),
 ]
-OnePath = Annotated[str, typer.Argument(metavar="PATH", help="An address or a name.", autocompletion=complete_path)]
+
+
+def alone(path: str | None) -> str | None:
+    """The address that is meant where no pattern is: with or without backslashes before its signs."""
+    return path if path is None else one_meant(path) or path
+
+
+OnePath = Annotated[
+    str,
+    typer.Argument(metavar="PATH", help="An address or a name.", autocompletion=complete_path, callback=alone),
+]
 
 
 NOBODY = "no system of yours is found by its name"

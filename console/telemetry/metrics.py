@@ -24,7 +24,7 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
-from ...actors.control.tracing import Statistics, tap_of
+from ...actors.control.tracing import TURN_BOUNDS, Statistics, tap_of
 from ...actors.errors import HoldfastError
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.ref import ActorRef
@@ -229,8 +229,7 @@ def _fill_look(out: Filled, look: _Look) -> None:
     for address, counts in look.counted.items():
         out.put("holdfast_actor_messages_total", counts.messages_in, address, "in")
         out.put("holdfast_actor_messages_total", counts.messages_out, address, "out")
-        out.put("holdfast_actor_turns_total", counts.turns, address)
-        out.put("holdfast_actor_turn_seconds_total", counts.turn_seconds, address)
+        out.spread("holdfast_actor_turn_seconds", Spread(TURN_BOUNDS, counts.turn_times, counts.turn_seconds), address)
         out.put("holdfast_actor_longest_turn_seconds", counts.longest_turn, address)
     out.put("holdfast_asks_outstanding", found.asks)
     out.put("holdfast_late_replies_total", look.late_replies)

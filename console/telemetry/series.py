@@ -53,12 +53,14 @@ class Spread:
 
     Args:
         bounds: upper bounds of the buckets, rising.
+        counts: how many values were in each so far, and how many were larger than all bounds; left out, none.
+        total: their sum so far.
     """
 
-    def __init__(self, bounds: Sequence[float]) -> None:
+    def __init__(self, bounds: Sequence[float], counts: Sequence[int] = (), total: float = 0.0) -> None:
         self.bounds = tuple(bounds)
-        self._counts = [0] * (len(bounds) + 1)
-        self._sum = 0.0
+        self._counts = list(counts) or [0] * (len(bounds) + 1)
+        self._sum = total
         self._lock = threading.Lock()  # A store is called in threads, too.
 
     def add(self, value: float) -> None:

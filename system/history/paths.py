@@ -11,13 +11,15 @@ from ...actors.kernel.ref import ActorRef, Target
 
 LONGEST = 1_000
 """Characters of a pattern."""
+_QUOTED = re.compile(r"\\([*?\[\]\\])")
+"""A sign that stands for itself."""
 
 
 def matcher(pattern: str) -> Callable[[str], bool]:
-    """A test for the addresses that a pattern means.
+    r"""A test for the addresses that a pattern means.
 
     In a name, `*` stands for any characters and `?` for one. `**` as a name stands for any number of names, none
-    included: `/app/shop/**` is the shop with all below it.
+    included: `/app/shop/**` is the shop with all below it. A sign with a backslash before it stands for itself.
 
     Raises:
         SpecError: it is no text, or too long.
@@ -27,12 +29,16 @@ def matcher(pattern: str) -> Callable[[str], bool]:
     (True, True, False)
     >>> matcher("/app/*/worker-?")("/app/north/worker-1"), matcher("/app/*")("/app/north/worker-1")
     (True, False)
+    >>> matcher(r"/app/\*")("/app/*"), matcher(r"/app/\*")("/app/a"), matcher(r"/app/\[1\]*")("/app/[1]st")
+    (True, False, True)
     """
     if not isinstance(pattern, str) or len(pattern) > LONGEST:
         raise SpecError("history", f"a path is text of at most {LONGEST} characters, not {str(pattern)[:50]!r}")
-    if not any(sign in pattern for sign in "*?["):
-        return pattern.__eq__
-    names = [re.compile(fnmatch.translate(name)) if name != "**" else None for name in pattern.split("/")]
+    meant = one_meant(pattern)
+    if meant is not None:
+        return meant.__eq__
+    parts = _QUOTED.sub(r"[\1]", pattern).split("/")
+    names = [re.compile(fnmatch.translate(part)) if part != "**" else None for part in parts]
 
     def matches(path: str) -> bool:
         reached = _past_any({0}, names)
@@ -44,9 +50,23 @@ def matcher(pattern: str) -> Callable[[str], bool]:
     return matches
 
 
+def one_meant(pattern: str) -> str | None:
+    r"""The one address, or name, that a pattern means; None if it may mean several.
+
+    >>> one_meant("/app/till"), one_meant(r"/app/\*"), one_meant("/app/*")
+    ('/app/till', '/app/*', None)
+    """
+    is_one = not any(sign in _QUOTED.sub("", pattern) for sign in "*?[")
+    return _QUOTED.sub(r"\1", pattern) if is_one else None
+
+
 def literal(address: str) -> str:
-    """A pattern that means just this address, whatever signs are in it."""
-    return "".join(f"[{sign}]" if sign in "*?[" else sign for sign in address)
+    r"""A pattern that means just this address, whatever signs are in it.
+
+    >>> print(literal("/app/[1]*"))
+    /app/\[1\]\*
+    """
+    return "".join(f"\\{sign}" if sign in "*?[]\\" else sign for sign in address)
 
 
 def pattern_of(target: Target) -> str:

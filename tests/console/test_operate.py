@@ -227,6 +227,33 @@ async def test_actors_in_processes_say_themselves_how_they_are(named: hf.ActorSy
 # -- changing ---------------------------------------------------------------------------------------------------------
 
 
+async def test_an_address_with_signs_of_patterns_is_meant_alone(named: hf.ActorSystem) -> None:
+    ids = ["ann", "*", "[x]", "a[state=running]", "back\\slash"]
+    guests = await named.start(hf.dynamic("guests", template=hf.child(None, hf.start(Counter))))
+    for name in ids:
+        await guests.ask(hf.StartChild(id=name))
+    _, output, _ = await holdfast("tree", "--paths", "/app/guests/**")
+    quoted = output.splitlines()
+    assert quoted == [
+        "/app/guests/ann",
+        r"/app/guests/\*",
+        r"/app/guests/\[x\]",
+        r"/app/guests/a\[state=running\]",
+        r"/app/guests/back\\slash",
+    ]
+    for name, path in zip(ids, quoted, strict=True):
+        (seen,) = await as_json("inspect", path)
+        assert seen["actor"]["path"] == f"/app/guests/{name}"
+        status, output, _ = await holdfast("why", path)
+        assert (status, output.split()[0]) == (DONE, f"/app/guests/{name}")
+    status, output, errors = await holdfast("remove", "/app/guests/*", "--yes")
+    assert (status, output) == (FAILED, "")
+    assert errors.endswith("an actor has this very address; to mean it alone write '/app/guests/\\*'\n"), errors
+    status, _, _ = await holdfast("remove", r"/app/guests/\*", r"/app/guests/\[x\]", "--yes")
+    assert status == DONE
+    assert [one.id for one in await guests.ask(hf.WhichChildren())] == ["ann", "a[state=running]", "back\\slash"]
+
+
 async def test_suspend_and_resume_by_pattern_are_one_transaction(named: hf.ActorSystem) -> None:
     with named.events() as stream:
         status, output, _ = await holdfast("suspend", "/app/left/*")

@@ -61,6 +61,8 @@ async def test_statistics_count_from_when_they_are_switched_on(system: hf.ActorS
     assert counts is not None
     assert (counts.turns, counts.messages_out, counts.restarts) == (4, 1, 0)
     assert 0 < counts.longest_turn <= counts.turn_seconds < 60.0
+    assert sum(counts.turn_times) == 4
+    assert 0 < counts.turn_quantile(0.5) <= counts.turn_quantile(1.0) == counts.longest_turn
     if "/top/" not in one.path:
         assert counts.messages_in == 4
     assert await system.statistics(one, False) is None

@@ -45,7 +45,7 @@ async def test_a_scrape_tells_of_kills_and_of_what_waits(tmp_path: Path) -> None
         assert found.value("holdfast_events_total", event="ProcessDied") == 1
         assert found.value("holdfast_actor_mailbox_messages", address="/app/bob") == 3 + 1  # and what holds them
         assert found.value("holdfast_asks_outstanding") == 3
-        assert found.value("holdfast_actor_turns_total", address="/app/alice") == 1  # of this life
+        assert found.value("holdfast_actor_turn_seconds_count", address="/app/alice") == 1  # of this life
         assert found.value("holdfast_actors", place="process", state="running") == 1
         assert found.value("holdfast_recorded_actors") == 1
         assert found.value("holdfast_store_seconds_count", operation="append") > 20
