@@ -236,6 +236,13 @@ class AskTimeout(HoldfastError):
         return f"{self.actor} did not reply{f' ({self.why})' if self.why else f' within {self.seconds:g} s'}; {known}"
 
 
+class StillEnding(AskTimeout):
+    """A life that was told to end has not yet: it does when its turn is over, unless it is killed before."""
+
+    def __str__(self) -> str:
+        return f"{self.actor} has not ended within {self.seconds:g} s; it ends when its turn is over, or is killed"
+
+
 class AskFailed(HoldfastError, text="{actor} ended while it handled the message: {reason}"):
     """The receiver ended in the middle of the turn: whether it took effect is unknown."""
 

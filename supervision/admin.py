@@ -126,6 +126,8 @@ class StartChild(RuntimeOrder[Any]):
 
     `spec` is a child spec; a dynamic supervisor takes a bare `start(...)` too. From a template a child is started by
     `StartChild(args=(...), kwargs={...}, id=...)`. With `fresh` nothing comes back that was recorded at its address.
+    With `unless_stopped` a child whose spec has `autostart=False` is known and stopped then, as at a start of its
+    supervisor, and the reply is None.
     A `candidate` (a number that nobody else uses) may be asked for twice, and withdrawn: nobody knows what has become
     of a request when its supervisor ends.
     """
@@ -136,6 +138,7 @@ class StartChild(RuntimeOrder[Any]):
     id: str | None = None
     fresh: bool = False
     candidate: int = 0
+    unless_stopped: bool = False
 
     def __post_init__(self) -> None:
         msgspec.structs.force_setattr(self, "spec", boxed(self.spec))

@@ -662,6 +662,9 @@ class Supervisor(Inquiries):
         if known is None:
             self._check_free(spec)
         one = known or Child(spec, candidate=message.candidate)
+        if message.unless_stopped and not spec.autostart:
+            self._enlist(one)
+            return None
         return await self._start_by_hand(one, self._enlist, self._unlist, fresh=message.fresh)
 
     async def _start_by_hand(

@@ -22,7 +22,16 @@ from ..actors.control.orders import (
 )
 from ..actors.control.orders_lane import ask_status, order
 from ..actors.control.tracing import Statistics, tap_of
-from ..actors.errors import ActorStopped, AskFailed, AskTimeout, CannotMove, ControlFailed, HoldfastError, SpecError
+from ..actors.errors import (
+    ActorStopped,
+    AskFailed,
+    AskTimeout,
+    CannotMove,
+    ControlFailed,
+    HoldfastError,
+    SpecError,
+    StillEnding,
+)
 from ..actors.events import EventStream
 from ..actors.exit_reasons import KILLED, SHUTDOWN, ExitReason
 from ..actors.kernel import lifecycle
@@ -287,6 +296,9 @@ class Controls:
 
         Returns:
             The reason with which it ended.
+
+        Raises:
+            StillEnding: it has not ended within `timeout` seconds; an end that was asked for is not taken back.
         """
         cell = self._living(target)
         check_seconds(cell.path, "timeout", timeout)
@@ -299,7 +311,7 @@ class Controls:
         done, _ = await asyncio.wait((gone,), timeout=timeout)
         if not done:
             gone.cancel()
-            raise AskTimeout(cell.path, timeout, None)
+            raise StillEnding(cell.path, timeout)
         return gone.result()
 
     # -- how --------------------------------------------------------------------------------------------------------

@@ -271,7 +271,9 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             if up is not None:
                 await up
             root.ended().add_done_callback(self._root_ended)
-            await self._specifications.start_added(lambda spec: root.ref.ask(StartChild(spec), LONG))
+            await self._specifications.start_added(
+                lambda spec: root.ref.ask(StartChild(spec, unless_stopped=True), LONG)
+            )
             if (at := options.reached_at) is not None:
                 waits = options.standby is not None
                 self._transport = await serve(self._lines, at, options.nats, waits=waits, silent=self._silent)
@@ -528,7 +530,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
     async def start(self, spec: ChildSpec[A], *, fresh: bool = False) -> ActorRef[A]:
         """Start a child of the root, and wait until it is up; None instead of a ref if it raised `Ignore`.
 
-        With `fresh` nothing comes back that was recorded at its address, or below it, before. While the root is
+        One that a transaction has stopped in an earlier program stays stopped, and the ref is that of its address. With
+        `fresh` nothing comes back that was recorded at its address, or below it, before. While the root is
         suspended the start waits: the event `OrderHeld` says so after 5 seconds, and `resume` lets it go on.
 
         Raises:
@@ -543,11 +546,13 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             await root.ask(RemoveChild(spec.id), LONG)
         wanted: ChildSpec = known.in_force(address, spec, fresh=fresh)
         with seldom_collected(), told_if_held(root._cell.living, "start", address):
-            ref = cast("ActorRef[A]", await root.ask(StartChild(wanted, fresh=fresh), LONG))
+            stays = not wanted.autostart and spec.autostart
+            order = StartChild(wanted, fresh=fresh, unless_stopped=stays)
+            ref = cast("ActorRef[A]", await root.ask(order, LONG))
         known.started(address, spec, wanted, fresh=fresh)
-        await known.start_added(lambda one: root.ask(StartChild(one), LONG))
+        await known.start_added(lambda one: root.ask(StartChild(one, unless_stopped=True), LONG))
         await self._homes.journal.safe()
-        return ref
+        return self._node.ref_at(address) if stays else ref
 
     def spawn(self, start: Start[A], name: str | None = None, *, mailbox: Bounded | None = None) -> ActorRef[A]:
         """Start an actor that nobody restarts, in this process, at once (its `on_start` is its first turn).

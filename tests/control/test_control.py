@@ -82,6 +82,19 @@ async def test_an_address_does_as_well_as_a_ref(system: hf.ActorSystem, start_on
         await system.resume(1)  # type: ignore[arg-type]
 
 
+async def test_an_end_that_was_asked_for_stands(system: hf.ActorSystem, tmp_path: Path) -> None:
+    one = await system.start(hf.child("one", hf.start(Account)))
+    waiting = one.ask(Wait(str(tmp_path / "gate")), timeout=30.0)
+    await until_there(tmp_path / "gate.begun")
+    with pytest.raises(hf.errors.StillEnding, match="it ends when its turn is over, or is killed"):
+        await system.terminate(one, timeout=0.1)
+    ended = one._cell.ended()
+    (tmp_path / "gate").touch()
+    assert await ended == hf.SHUTDOWN
+    assert await waiting == "waited"
+    assert await one.ask(Total(), timeout=30.0) == 0
+
+
 async def test_a_state_in_outline_is_told_whatever_its_size(system: hf.ActorSystem, start_one: Starter) -> None:
     one = await start_one(hf.start(Account))
     for n in range(12):

@@ -163,6 +163,47 @@ async def test_a_transaction_on_top_of_another_one_is_kept_too(tmp_path: Path) -
         assert shape(system) == before
 
 
+async def test_what_was_stopped_stays_stopped_wherever_it_is(tmp_path: Path) -> None:
+    """A child of the root too, of the program or of a transaction; started again it has its state."""
+    paths = ["/app/top", "/app/added", "/app/left/b"]
+
+    @asynccontextmanager
+    async def begun() -> AsyncGenerator[tuple[hf.ActorSystem, hf.ActorRef[Any]]]:
+        async with program(tmp_path / "store") as system:
+            yield system, await system.start(counter("top", recovery=RECORDED))
+
+    def states(system: hf.ActorSystem) -> list[str]:
+        children: dict[str, str] = {}
+        for path, one in shape(system).items():
+            if isinstance(one[1], list):
+                children |= {f"{path}/{name}": state for name, state, _ in one[1]}
+        return [children[path] for path in paths]
+
+    async with begun() as (system, top):
+        assert await top.ask(Add(5)) == 5
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.add("/app", counter("added", recovery=RECORDED))
+        async with system.transaction(timeout=IN_TIME) as change:
+            for path in paths:
+                change.stop(path)
+        assert states(system) == ["stopped"] * 3
+    for _ in range(2):
+        async with begun() as (system, top):
+            assert states(system) == ["stopped"] * 3
+            with pytest.raises(hf.ActorStopped):
+                await top.ask(Add(1))
+    async with begun() as (system, top):
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.start("/app", "top")
+            change.start("/app", "added")
+            change.start("/app/left", "b")
+        assert states(system) == ["running"] * 3
+        assert await top.ask(Add(1)) == 6
+    async with begun() as (system, top):
+        assert states(system) == ["running"] * 3
+        assert await top.ask(Add(1)) == 7
+
+
 async def test_what_is_taken_back_leaves_no_trace(tmp_path: Path) -> None:
     async with program(tmp_path / "store") as system:
         before = shape(system)
