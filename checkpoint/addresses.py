@@ -88,6 +88,17 @@ class Addresses:
             at = (at.children or {}).get(name) if at is not None else None
         return at
 
+    def forget(self, top: str, dry_run: bool = False) -> int:
+        """Forget which addresses lead to one, or to those below it, where nothing is any more; how many they are.
+
+        Raises:
+            HoldfastError: the store refused.
+        """
+        found = [path for path, now in self._left.items() if now == top or now.startswith(f"{top}/")]
+        for path in [] if dry_run else found:
+            self._put(path, None)
+        return len(found)
+
     # -- moves --------------------------------------------------------------------------------------------------------
 
     def moved(self, names: Mapping[str, str]) -> None:
@@ -160,6 +171,10 @@ class Addresses:
             return
         number = next(n for n in range(1, len(self._keys) + 2) if f"{path}//{n}" not in taken)
         self._name(path, f"{path}//{number}")  # No actor's name is empty.
+
+    def is_lent(self, path: str) -> bool:
+        """Whether the store has, under the name of this address, what is recorded at another one."""
+        return path not in self._keys and path in self._keys.values()
 
     def erased(self, path: str) -> None:
         """Nothing is recorded at an address any more.

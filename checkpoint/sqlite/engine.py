@@ -397,8 +397,7 @@ class SqliteJournal:
         while chain.positions:
             self._remove(chain, chain.positions[:CHUNK])
         with self._store.transaction(note=True) as db:
-            owned = db.execute("SELECT id FROM snapshots WHERE address = ?", (chain.id,)).fetchall()
-            files = self._delete_snapshots(db, [number for (number,) in owned])
+            files = self._delete_snapshots(db, chain.kept)
             db.execute("DELETE FROM addresses WHERE id = ?", (chain.id,))
         self._store.remove_files(files)
 
