@@ -134,6 +134,10 @@ class NothingKept:
         return {key: value for key, value in self._notes.items() if key.startswith(prefix)}
 
 
+CHILDREN = "child "
+"""How the keys of facts begin that a supervisor has a child; the child's address follows."""
+
+
 def child_key(supervisor: str, name: str) -> str:
     """The key of the fact that a supervisor has a child of this name."""
-    return f"child {supervisor}/{name}"
+    return f"{CHILDREN}{supervisor}/{name}"

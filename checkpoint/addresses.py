@@ -37,6 +37,15 @@ def is_of_actor(key: str) -> bool:
     return key.startswith("/")
 
 
+def is_at(path: str, top: str) -> bool:
+    """Whether an address is another one, or below it.
+
+    >>> is_at("/app/a/b", "/app/a"), is_at("/app/ab", "/app/a")
+    (True, False)
+    """
+    return path == top or path.startswith(f"{top}/")
+
+
 class Addresses:
     """Where those live who were moved. An address that was left is forgotten when somebody else comes to live there."""
 
@@ -94,7 +103,7 @@ class Addresses:
         Raises:
             HoldfastError: the store refused.
         """
-        found = [path for path, now in self._left.items() if now == top or now.startswith(f"{top}/")]
+        found = [path for path, now in self._left.items() if is_at(now, top)]
         for path in [] if dry_run else found:
             self._put(path, None)
         return len(found)

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 from ...actors.errors import HoldfastError
 from ...actors.events import StoreRefused
-from ...actors.persistence import child_key
+from ...actors.persistence import CHILDREN
+from ..addresses import is_at
 
 if TYPE_CHECKING:
     from .homes import Homes
@@ -23,8 +24,6 @@ ERASING = "erasing"
 """How the facts begin that name an address whose tree is being erased; before that name stands a space."""
 EVERYTHING = b"everything"
 """The value of such a fact if also that is forgotten which others have noted of these addresses."""
-CHILDREN = child_key("", "")[:-1]
-"""How the facts of children begin, in front of an address."""
 AT_ONCE = 8
 """Addresses that are erased in one step: about 2 ms of the loop's time."""
 
@@ -68,15 +67,6 @@ class Erasure:
         return is_at(path, self.top) or is_at(self.top, path)
 
 
-def is_at(path: str, top: str) -> bool:
-    """Whether an address is another one, or below it.
-
-    >>> is_at("/app/a/b", "/app/a"), is_at("/app/ab", "/app/a")
-    (True, False)
-    """
-    return path == top or path.startswith(f"{top}/")
-
-
 class Erasures:
     """The erasures of a root that are under way, or that its store has refused.
 
@@ -91,7 +81,7 @@ class Erasures:
         self._refused: dict[str, bool] = {}
         self._next: asyncio.Handle | None = None
         self.history: Callable[[str, bool], int] | None = None
-        self.notes: list[Callable[[str, bool], int]] = []
+        self.notes: list[Callable[[str, bool], int]] = [homes.groups.forget_below, homes.addresses.forget]
         for key, value in homes.journal.notes(ERASING).items():  # This process's predecessor died in the middle of it.
             top = value.decode() if key == ERASING else key.removeprefix(f"{ERASING} ")
             self._begin(top, everything=key != ERASING and value == EVERYTHING)
@@ -205,6 +195,7 @@ class Erasures:
         homes.forget(top)  # Its store may have parts of a snapshot that was never finished.
         put_aside = homes.quarantine.forget_below(top)
         if one.everything:
+            homes.far.forget_gone()
             others = sum(forget(top, False) for forget in self.notes)
             events = self.history(top, False) if self.history is not None else 0
         homes.journal.note(f"{ERASING} {top}", None)

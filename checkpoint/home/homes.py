@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from ...actors.errors import ControlFailed, HoldfastError, StartFailed
 from ...actors.events import RecordsMapped, RecoveryFailed
 from ...actors.kernel.cell import DOWN, GONE, Cell
-from ...actors.persistence import child_key
+from ...actors.persistence import CHILDREN, child_key
+from ..address_tree import AddressTree
 from ..addresses import Addresses, is_of_actor, renamed
 from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
@@ -22,11 +23,10 @@ from ..snapshot.rollback import older_snapshot, roll_back
 from ..snapshot.snapshot_groups import Groups
 from ..snapshot.snapshot_record import take_over
 from ..snapshot.snapshot_schedule import nobody
-from .address_tree import AddressTree
 from .ask_recovery import FarMail, Rejoin
 from .capacity import HomeBound
 from .disposal import drop_all, forget_home, put_into_quarantine
-from .erasures import CHILDREN, Erased, Erasures
+from .erasures import Erased, Erasures
 from .held_messages import Holding, end_wait, let_go
 from .quarantine import Quarantine
 from .switch import Switch

@@ -14,9 +14,9 @@ from ...actors.exit_reasons import ExitReason, unpack_exit
 from ...actors.kernel.address_host import AddressHost
 from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.lifecycle import HERE, NEAR
+from ...actors.persistence import CHILDREN
 from ...actors.process.wire import frames
-from ..home.address_tree import AddressTree
-from ..home.erasures import CHILDREN
+from ..address_tree import AddressTree
 from ..method import Method
 from ..protocol import (
     Begin,
@@ -181,7 +181,7 @@ class GuestKeeper:
         self._forget_note(key)
         if value is not None:
             self.learn({key: value}, [])
-        self._say("note", key.removeprefix("child "), value=value)
+        self._say("note", key.removeprefix(CHILDREN), value=value)
 
     def notes(self, prefix: str) -> dict[str, bytes]:
         """The facts whose keys begin so, oldest first."""
