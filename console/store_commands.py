@@ -1,5 +1,4 @@
-"""The `holdfast store` commands, for a store on the disk: verify, stats, backup, restore, rekey, export, erase
-and compact."""
+"""The `holdfast store` commands, for a store on the disk: verify it, count, copy, print, erase and compact."""
 
 from __future__ import annotations
 

@@ -199,7 +199,8 @@ class Erasures:
             others = sum(forget(top, False) for forget in self.notes)
             events = self.history(top, False) if self.history is not None else 0
         homes.journal.note(f"{ERASING} {top}", None)
-        homes.journal.note(ERASING, None)
+        if homes.journal.noted(ERASING) is not None:
+            homes.journal.note(ERASING, None)
         del self._under_way[top]
         one.done.set_result(Erased(top, one.addresses, one.children, put_aside, events, others))
 

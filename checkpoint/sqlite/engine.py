@@ -22,7 +22,7 @@ from .entry_chains import MODULUS, Chain
 from .open_store import INSERT, Store
 from .read_back import ChainReader, dropped_by
 from .row_codec import CHUNK, PLACE, pack_positions, snapshot_digest
-from .sealing import SEALED_KIND, drops_place, entry_sealer, note_name, note_row, snapshot_place
+from .sealing import SEALED_KIND, drops_place, entry_sealer, note_row, snapshot_place
 
 _FEW: Final = 128  # More entries at a time, or more bytes, are worth a transaction of their own.
 _SMALL: Final = 64 << 10
@@ -415,11 +415,16 @@ class SqliteJournal:
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a small named fact; see `Journal`."""
         with self._store.transaction(len(value or b""), note=True) as db:
-            db.execute("DELETE FROM notes WHERE name = ?", (note_name(self._cipher, key),))
-            self._store.contents.notes.pop(key, None)
+            contents = self._store.contents
+            contents.notes.pop(key, None)
+            row = contents.note_rows.pop(key, None)
+            if row is not None:
+                db.execute("DELETE FROM notes WHERE key = ?", (row,))
             if value is not None:
-                db.execute("INSERT INTO notes VALUES (NULL, ?, ?, ?)", note_row(self._cipher, key, value))
-                self._store.contents.notes[key] = value
+                kept = db.execute("INSERT INTO notes VALUES (NULL, ?, ?, ?)", note_row(self._cipher, key, value))
+                contents.notes[key] = value
+                assert kept.lastrowid is not None
+                contents.note_rows[key] = kept.lastrowid
 
     def noted(self, key: str) -> bytes | None:
         """The fact of that name, or `None`."""

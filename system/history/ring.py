@@ -96,11 +96,13 @@ class EventRing(Generic[N]):
 
     def forget(self, is_meant: Callable[[N], bool]) -> None:
         """Drop those that are meant."""
-        for event, size in self._events:
-            if is_meant(event):
-                self._bytes -= size
-                self.gone.add(event.number)
-        self._events = deque((event, size) for event, size in self._events if not is_meant(event))
+        kept: deque[tuple[N, int]] = deque()
+        for one in self._events:
+            if is_meant(one[0]):
+                self.gone.add(one[0].number)
+            else:
+                kept.append(one)
+        self._events, self._bytes = kept, sum(size for _, size in kept)
 
     def shrink(self, most_bytes: int) -> None:
         """Drop the oldest ones beyond so many bytes; the newest one stays."""
