@@ -211,6 +211,7 @@ async def test_who_has_moved_away_keeps_what_was_recorded(tmp_path: Path) -> Non
         await first.ask(hf.StartChild(spec, fresh=True))
         assert await system.ref("/app/first/doc", Doc).ask(Get()) == []
         assert await system.ref("/app/second/doc", Doc).ask(Get()) == ["words"]
+        assert system._homes.journal.load("/app/second/doc").entries, "the store has them, too"
         await first.ask(hf.TerminateChild("doc"))
         await system.erase("/app/first/doc")
         await second.ask(hf.TerminateChild("doc"))
