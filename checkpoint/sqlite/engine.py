@@ -334,12 +334,19 @@ class SqliteJournal:
             if address not in self._store.contents.chains:
                 self.forget_blocks(address, self.packs(address))  # of a snapshot that was never cut
                 return
+            files: list[str] | None = None
             with self._store.transaction(note=True) as db:
                 # From here on it is gone; if we die before the rest is done, the next opening does it.
                 chain = self._store.contents.chains.pop(address)
                 chain.path = None
-                chain.write(db, self._cipher)
-        self._finish_erase(chain)
+                if len(chain.positions) <= CHUNK:
+                    files = self._remove_chain(chain, db)
+                else:
+                    chain.write(db, self._cipher)
+        if files is None:
+            self._finish_erase(chain)
+        else:
+            self._store.remove_files(files)
         if self._packs.names(address):
             self._store.sync_rows()
         self._packs.erase(address)
@@ -394,12 +401,19 @@ class SqliteJournal:
                 raise store.translate(error) from error
 
     def _finish_erase(self, chain: Chain) -> None:
-        while chain.positions:
+        while len(chain.positions) > CHUNK:
             self._remove(chain, chain.positions[:CHUNK])
         with self._store.transaction(note=True) as db:
-            files = self._delete_snapshots(db, chain.kept)
-            db.execute("DELETE FROM addresses WHERE id = ?", (chain.id,))
+            files = self._remove_chain(chain, db)
         self._store.remove_files(files)
+
+    def _remove_chain(self, chain: Chain, db: sqlite3.Connection) -> list[str]:
+        """Remove all rows of an address; return the files to be removed once that is committed."""
+        if chain.positions:
+            self._remove_rows(chain, db, chain.positions[:])
+        files = self._delete_snapshots(db, chain.kept)
+        db.execute("DELETE FROM addresses WHERE id = ?", (chain.id,))
+        return files
 
     def addresses(self) -> list[str]:
         """Every address that has something stored, sorted."""

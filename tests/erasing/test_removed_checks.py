@@ -77,9 +77,9 @@ CHECKS = {
     ),
     "an address is erased without a look at all snapshots": Check(
         "checkpoint/sqlite/engine.py",
-        "            files = self._delete_snapshots(db, chain.kept)\n",
-        '            owned = db.execute("SELECT id FROM snapshots WHERE address = ?", (chain.id,)).fetchall()\n'
-        "            files = self._delete_snapshots(db, [number for (number,) in owned])\n",
+        "        files = self._delete_snapshots(db, chain.kept)\n",
+        '        owned = db.execute("SELECT id FROM snapshots WHERE address = ?", (chain.id,)).fetchall()\n'
+        "        files = self._delete_snapshots(db, [number for (number,) in owned])\n",
         ERASING,
         "test_each_address_costs",
     ),
