@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from ..actors.errors import HoldfastError
-from ..checkpoint.home.erasures import Erased
+from ..checkpoint.home.disposal import Erased
 from ..checkpoint.journal import DamagedStore, NotCopied, StoreInUse
 from ..checkpoint.store_tools import (
     StoreCopy,

@@ -12,7 +12,7 @@ from ..actors.kernel import lifecycle
 from ..actors.kernel.cell import DOWN
 from ..actors.kernel.ref import ActorRef, Target
 from ..actors.seconds import check_seconds
-from ..checkpoint.home.erasures import Erased
+from ..checkpoint.home.disposal import Erased
 from ..checkpoint.home.homes import Homes
 from ..checkpoint.home.quarantine import QuarantinedMessage
 from ..cluster.lines.lines import Lines, PeerLook

@@ -8,7 +8,7 @@ from functools import partial
 
 from ..actors.errors import SpecError
 from ..actors.kernel.node import Node
-from ..checkpoint.home.erasures import Erased
+from ..checkpoint.home.disposal import Erased
 from ..checkpoint.home.homes import Homes
 from ..checkpoint.journal import StoreEngine
 from ..checkpoint.store_opening import check_system

@@ -25,8 +25,7 @@ from ..snapshot.snapshot_record import take_over
 from ..snapshot.snapshot_schedule import nobody
 from .ask_recovery import FarMail, Rejoin
 from .capacity import HomeBound
-from .disposal import drop_all, forget_home, put_into_quarantine
-from .erasures import Erased, Erasures
+from .disposal import Erased, Erasures, drop_all, forget_home, put_into_quarantine
 from .held_messages import Holding, end_wait, let_go
 from .quarantine import Quarantine
 from .switch import Switch

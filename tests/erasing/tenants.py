@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import holdfast as hf
-from holdfast.checkpoint.home.erasures import Erased
+from holdfast.checkpoint.home.disposal import Erased
 from holdfast.supervision import DynamicSupervisor
 
 Place = Literal["task", "process"]

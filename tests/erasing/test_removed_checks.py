@@ -9,7 +9,7 @@ from __future__ import annotations
 from tests.removing import Check, as_tests
 
 ERASING = "tests/erasing/test_erasing.py"
-ERASURES = "checkpoint/home/erasures.py"
+ERASURES = "checkpoint/home/disposal.py"
 
 CHECKS = {
     "a start waits for what is being erased at its address": Check(
