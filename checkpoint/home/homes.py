@@ -378,7 +378,7 @@ class Homes:
             tell(path)
         if not below:
             return
-        for waiting in self._known.below(path):
+        for waiting in self.known(path):
             if (switch := self._switches.get(waiting)) is not None:
                 end_wait(switch)
 
