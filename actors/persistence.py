@@ -28,15 +28,23 @@ def ends_in_vain(reason: ExitReason) -> bool:
 class Keeper(Protocol):
     """Keeps state and messages of addresses, and small facts; there is one for each node."""
 
-    def knows(self, path: str) -> bool:
-        """Whether anything was ever recorded at this address, and not erased since."""
+    def has_recorded(self, path: str) -> bool:
+        """Whether anything is recorded at this address or below it, or noted of a child of a supervisor there."""
+        ...
+
+    def erasing(self, path: str) -> asyncio.Future[None] | None:
+        """The erasure that has to be over before a life may begin at this address, if there is one.
+
+        Raises:
+            HoldfastError: what the store had refused to erase before, it refuses again.
+        """
         ...
 
     def erase(self, path: str, *, below: bool) -> asyncio.Future[None] | None:
         """Forget what was recorded at an address where nobody lives; with `below`, also at all addresses below it.
 
         Returns:
-            None: it is done. A future: it is asked of the root, and ends with what that answers.
+            None: it is done. A future: it goes on, a few addresses at a time, or is asked of the root.
 
         Raises:
             HoldfastError: the store refused. What is left is erased when it is opened again.
@@ -89,9 +97,12 @@ class NothingKept:
     def __init__(self) -> None:
         self._notes: dict[str, bytes] = {}
 
-    def knows(self, path: str) -> bool:
-        """Return False: nothing is ever recorded."""
-        return False
+    def has_recorded(self, path: str) -> bool:
+        """Whether a child is noted below this address: nothing is ever recorded."""
+        return bool(self.notes(child_key(path, "")))
+
+    def erasing(self, path: str) -> None:
+        """Return None: what there is to forget is forgotten at once."""
 
     def erase(self, path: str, *, below: bool) -> None:
         """There is nothing but facts."""
@@ -123,6 +134,10 @@ class NothingKept:
         return {key: value for key, value in self._notes.items() if key.startswith(prefix)}
 
 
+CHILDREN = "child "
+"""How the keys of facts begin that a supervisor has a child; the child's address follows."""
+
+
 def child_key(supervisor: str, name: str) -> str:
     """The key of the fact that a supervisor has a child of this name."""
-    return f"child {supervisor}/{name}"
+    return f"{CHILDREN}{supervisor}/{name}"

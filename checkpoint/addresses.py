@@ -37,6 +37,15 @@ def is_of_actor(key: str) -> bool:
     return key.startswith("/")
 
 
+def is_at(path: str, top: str) -> bool:
+    """Whether an address is another one, or below it.
+
+    >>> is_at("/app/a/b", "/app/a"), is_at("/app/ab", "/app/a")
+    (True, False)
+    """
+    return path == top or path.startswith(f"{top}/")
+
+
 class Addresses:
     """Where those live who were moved. An address that was left is forgotten when somebody else comes to live there."""
 
@@ -87,6 +96,17 @@ class Addresses:
         for name in path.split("/")[2:]:
             at = (at.children or {}).get(name) if at is not None else None
         return at
+
+    def forget(self, top: str, dry_run: bool = False) -> int:
+        """Forget which addresses lead to one, or to those below it, where nothing is any more; how many they are.
+
+        Raises:
+            HoldfastError: the store refused.
+        """
+        found = [path for path, now in self._left.items() if is_at(now, top)]
+        for path in [] if dry_run else found:
+            self._put(path, None)
+        return len(found)
 
     # -- moves --------------------------------------------------------------------------------------------------------
 
@@ -160,6 +180,10 @@ class Addresses:
             return
         number = next(n for n in range(1, len(self._keys) + 2) if f"{path}//{n}" not in taken)
         self._name(path, f"{path}//{number}")  # No actor's name is empty.
+
+    def is_lent(self, path: str) -> bool:
+        """Whether the store has, under the name of this address, what is recorded at another one."""
+        return path not in self._keys and path in self._keys.values()
 
     def erased(self, path: str) -> None:
         """Nothing is recorded at an address any more.

@@ -1,7 +1,8 @@
-"""The `holdfast store` commands, for a store on the disk: verify, stats, backup, restore, rekey, export and compact."""
+"""The `holdfast store` commands, for a store on the disk: verify it, count, copy, print, erase and compact."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import dataclasses
 import errno
@@ -14,6 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from ..actors.errors import HoldfastError
+from ..checkpoint.home.disposal import Erased
 from ..checkpoint.journal import DamagedStore, NotCopied, StoreInUse
 from ..checkpoint.store_tools import (
     StoreCopy,
@@ -29,6 +31,8 @@ from ..checkpoint.store_tools import (
 )
 from ..cluster.configuration import read_configuration
 from ..cluster.joining import is_same_store, open_store
+from ..system.stored_erasure import erase_stored
+from .operate.reaching import Yes, confirm
 
 DAMAGED = 1
 UNREADABLE = 2
@@ -181,6 +185,52 @@ def compact(path: StorePath, key_file: KeyFile = None, as_json: Json = False) ->
         typer.echo(json.dumps(dataclasses.asdict(done)))
     else:
         typer.echo(f"{done.path}: {_bytes(done.before)} before, {_bytes(done.after)} now")
+
+
+@store.command()
+def erase(
+    path: StorePath,
+    address: Annotated[str, typer.Argument(help="An address: /app/tenants/acme means that one, and all below it.")],
+    key_file: KeyFile = None,
+    yes: Yes = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only count what would be forgotten.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Forget everything that a store has of an address and of all below it, and give back the room.
+
+    That is what `system.erase` does, also in a copy of a store; then no file of the store has its bytes any more. No
+    system may have it open.
+
+    Exit status 0: done, or there is nothing. 1: the store is in use or damaged, or nobody has said yes. 2: there is no
+    store, it cannot be read, or there is no room.
+    """
+
+    def erased(*, dry_run: bool) -> Erased:
+        return asyncio.run(
+            erase_stored(open_store(f"sqlite:{path}", is_new=False, key=key_file), address, dry_run=dry_run)
+        )
+
+    try:
+        found = erased(dry_run=True)
+        if not dry_run:
+            confirm("store erase", [f"this is forgotten for good: {_erased(found)}"], yes=yes)
+            found = erased(dry_run=False)
+            compact_store(path, key=key_file)
+    except (DamagedStore, StoreInUse) as error:
+        raise _ended("erase", error, DAMAGED) from error
+    except HoldfastError as error:
+        raise _ended("erase", error, UNREADABLE) from error
+    if as_json:
+        typer.echo(json.dumps(dataclasses.asdict(found)))
+    else:
+        typer.echo(f"{path}: {_erased(found)} {'would be forgotten' if dry_run else 'forgotten'}")
+
+
+def _erased(found: Erased) -> str:
+    return (
+        f"{found.address}: {found.addresses} addresses, {found.children} notes of children, "
+        f"{found.put_aside} messages in quarantine, {found.events} events of the history, {found.others} other notes"
+    )
 
 
 @store.command()

@@ -225,7 +225,7 @@ class DynamicSupervisor(Supervisor):
             self._count += 1
             name = f"{prefix}-{self._count}"
             # Whoever had it once may be recorded, and is not to come back as somebody else.
-            is_known = self.ctx._cell.node.ports.keeper.knows(f"{self.ctx.path}/{name}")
+            is_known = self.ctx._cell.node.ports.keeper.has_recorded(f"{self.ctx.path}/{name}")
             if not is_known and name not in self._children and name not in (self.ctx._cell.children or ()):
                 return name
 
@@ -267,7 +267,7 @@ class DynamicSupervisor(Supervisor):
         is_there = message.id in self._children or message.id in (self.ctx._cell.children or ())
         if not is_there:
             self._ended.pop(message.id, None)
-        if not is_there and "/" not in message.id and message.erase and keeper.knows(path):
+        if not is_there and "/" not in message.id and message.erase and keeper.has_recorded(path):
             return self._answered(self._erase_below(path))  # If the store refuses, it can be deleted again.
         self._child(message.id)
         raise NotSupported(

@@ -48,9 +48,10 @@ class Inquiries(Actor):
     @on(EndedChildren, readonly=True)
     def _ended_children(self, message: EndedChildren) -> list[EndedChild]:
         """Who has ended, the last one last."""
-        path, knows = self.ctx.path, self.ctx._cell.node.ports.keeper.knows
+        path, has_recorded = self.ctx.path, self.ctx._cell.node.ports.keeper.has_recorded
         return [
-            EndedChild(name, f"{path}/{name}", str(why), knows(f"{path}/{name}")) for name, why in self._ended.items()
+            EndedChild(name, f"{path}/{name}", str(why), has_recorded(f"{path}/{name}"))
+            for name, why in self._ended.items()
         ]
 
     @on(CountChildren, readonly=True)

@@ -208,6 +208,7 @@ class Supervisor(Inquiries):
             await self._await_bound(row, one)
             if one.row is row and one.spec.register is not None:
                 await self._take_name(one, one.spec.register)
+            await self._await_erased(row, one)
             if one.row is not row:
                 return None
             await self._come_up(one)
@@ -229,6 +230,19 @@ class Supervisor(Inquiries):
             # It ended before we heard that it was up: its end in our queue may be passed over already.
             self.ctx._cell.push(lifecycle.ChildExit(cell, cell.life, cell.extra().reason))
         return True
+
+    async def _await_erased(self, row: StartRow, one: Child) -> None:
+        """Wait until nothing is being erased that was recorded at the child's address, or below it.
+
+        Raises:
+            StartFailed: the store refuses to erase it.
+        """
+        path, keeper = self._path_of(one), self.ctx._cell.node.ports.keeper
+        try:
+            while one.row is row and (erased := keeper.erasing(path)) is not None:
+                await erased
+        except HoldfastError as error:
+            raise StartFailed(path, f"what was recorded there is not erased: {error}") from error
 
     async def _await_bound(self, row: StartRow, one: Child) -> None:
         """Wait until those are there that the child's spec binds it to, if they are being started.

@@ -14,7 +14,7 @@ import msgspec
 
 from ..actors.errors import SpecError
 from ..actors.events import Event
-from ..checkpoint.addresses import renamed
+from ..checkpoint.addresses import is_at, renamed
 from ..supervision.respec import rebuilt, spec_below
 from ..supervision.spec import ChildSpec
 
@@ -149,6 +149,13 @@ class MechanismNotes:
         below = f"{address}/"
         for one in [one for one in self._kept if one == address or one.startswith(below)]:
             self.forget(one)
+
+    def forget_below(self, top: str, dry_run: bool = False) -> int:
+        """Forget what was noted of an address, and of those below it: how many notes that were, or (`dry_run`) are."""
+        noted = sum(is_at(address, top) for address in self._kept)
+        if not dry_run:
+            self.gone(top)
+        return noted
 
     def moved(self, names: Mapping[str, str]) -> None:
         """Actors have other addresses from now on, and all below them: where they live now, by where they did."""

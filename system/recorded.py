@@ -1,4 +1,4 @@
-"""A system's methods for recorded actors: quarantine, backups, and group snapshots."""
+"""A system's methods for recorded actors: quarantine, erasing, backups, and group snapshots."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ..actors.errors import HoldfastError, SpecError
+from ..actors.errors import ControlFailed, HoldfastError, SpecError
+from ..actors.kernel import lifecycle
+from ..actors.kernel.cell import DOWN
 from ..actors.kernel.ref import ActorRef, Target
 from ..actors.seconds import check_seconds
+from ..checkpoint.home.disposal import Erased
 from ..checkpoint.home.homes import Homes
 from ..checkpoint.home.quarantine import QuarantinedMessage
 from ..cluster.lines.lines import Lines, PeerLook
 from ..supervision.admin import RestartChild, TerminateChild, WhichChildren
-from ..supervision.supervisor import Supervisor
+from ..supervision.children import STOPPED
+from ..supervision.supervisor import Supervisor, listed_at
 
 if TYPE_CHECKING:
     from ..checkpoint.store_tools import StoreCopy
@@ -78,6 +82,76 @@ class Recorded:
         dropped = self._lines.forget_system(system)
         await self._homes.journal.safe()
         return dropped
+
+    async def erase(self, target: Target, *, dry_run: bool = False) -> Erased:
+        """Forget everything that was recorded at an address, where nobody lives now, and below it.
+
+        That is the state and the messages that wait, timers, asks that were not answered, what is in quarantine,
+        children that a supervisor would bring back, what transactions have made of mechanisms and specs, group
+        snapshots with one of these actors, and the history. It does not matter whether anybody was started there since
+        the program began. It is done a few addresses at a time, while the system goes on: whoever is started there
+        meanwhile waits. If the program is killed in the middle of it, the next one goes on with it; so it does if
+        whoever waits for this is cancelled. Not forgotten is what others have in their own states and messages.
+
+        The bytes may stay in the files until `holdfast store compact`, and in copies: `holdfast store erase` does the
+        same in one.
+
+        Args:
+            target: the address, or a ref; that of a supervisor means all that was recorded below it, too.
+            dry_run: only count what would be forgotten.
+
+        Returns:
+            what was forgotten; nothing, if nothing was recorded there.
+
+        Raises:
+            ControlFailed: somebody lives there, or is being started or stopped: stop it first; or who lived there was
+                moved. SpecError: it is no address of this system, or of a part of a mechanism.
+            StoreError: the store refused; what is left is erased when it is asked for again, or the store is opened.
+        """
+        path, homes = target.path if isinstance(target, ActorRef) else target, self._homes
+        if not isinstance(path, str) or not path.startswith(f"/{homes.node.name}/") or path.endswith("/"):
+            raise SpecError("erase", f"takes an address below /{homes.node.name}, or a ref, not {target!r}")
+        if dry_run:
+            return homes.erasures.counted(path)
+        await self._vacated(path)
+        now = homes.addresses.now(path)
+        if now != path and not homes.has_recorded(path):
+            raise ControlFailed(path, "erase", f"who lived there was moved to {now}: erase that")
+        erased = await asyncio.shield(homes.erasures.erase(path, everything=True))
+        await homes.synced()
+        await homes.journal.safe()
+        return erased
+
+    async def _vacated(self, path: str) -> None:
+        """See to it that nobody lives at an address, nor is about to, nor below it.
+
+        Raises:
+            ControlFailed: somebody does. SpecError: it is a part of a mechanism.
+        """
+        node = self._homes.node
+        names, above = path.split("/")[2:], f"/{node.name}"
+        for place, name in enumerate(names):
+            here, cell = f"{above}/{name}", node.cell_at(above)
+            listed = listed_at(cell)
+            if listed is None:
+                children = await ActorRef[Supervisor](cell).ask(WhichChildren())
+                found = next(((one.state, one.is_supervisor) for one in children if one.id == name), None)
+            else:
+                one = listed.get(name)
+                found = None if one is None else (one.state, one.spec.is_supervisor)
+            is_last = place == len(names) - 1
+            if found is None or found[0] == STOPPED:
+                other = (cell.children or {}).get(name)  # Without a supervisor, or what is left of a child.
+                if other is not None and other.state is not DOWN:
+                    raise ControlFailed(path, "erase", f"{here} lives: stop it first")
+                if other is not None and is_last:
+                    lifecycle.retire(other, "what was recorded of it is erased")
+                return
+            if is_last:
+                raise ControlFailed(path, "erase", f"it is {found[0]}: stop it first")
+            if not found[1]:
+                raise SpecError(path, f"{here} is no supervisor: erase what was recorded of it with itself")
+            above = here
 
     async def backup(self, path: str | os.PathLike[str]) -> StoreCopy:
         """Copy the store of this system as it is now, while the system goes on; a thread does it.

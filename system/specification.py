@@ -21,6 +21,7 @@ from ..actors.errors import HoldfastError, SpecError, UnsavableValue, type_name
 from ..actors.events import Event
 from ..actors.kernel.actor import Start
 from ..actors.process.wire.start_codec import pack_data, unpack_data
+from ..checkpoint.addresses import is_at
 from ..supervision.children import Child
 from ..supervision.respec import rebuilt
 from ..supervision.spec import ChildSpec, Flags
@@ -311,6 +312,13 @@ class Specifications:
             return None, f"{error.where}: {error.problem} cannot be stored; give the actor what it is made from"
         except HoldfastError as error:
             return None, str(error)
+
+    def forget_below(self, top: str, dry_run: bool = False) -> int:
+        """Forget what was noted of an address, and of those below it: how many notes that were, or (`dry_run`) are."""
+        noted = [address for address in self._kept if is_at(address, top)]
+        for address in [] if dry_run else noted:
+            self._keep(address, None)
+        return len(noted)
 
     def _keep(self, address: str, value: bytes | None) -> None:
         if self._kept.get(address) == value:

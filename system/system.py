@@ -246,6 +246,9 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
                 self._sink.close()
             self._refuse_deposed(error, engine)
             raise
+        self._homes.erasures.notes += [self._mechanism_notes.forget_below, self._specifications.forget_below]
+        if self._history is not None:
+            self._homes.erasures.history = self._history.forget
         RecoveryTree(node, self._homes).begin_with_first_home()
         self._workers = self._make_pool(node)
         if file is not None:

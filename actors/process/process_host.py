@@ -663,10 +663,13 @@ def keep(worker: Worker, frame: frames.Command) -> None:
     node, data = worker.node, frame.data
     path, keeper = data["path"], node.ports.keeper
 
+    goes_on: asyncio.Future[None] | None = None
+
     def tell() -> None:
+        nonlocal goes_on
         match data["what"]:
             case "erase":
-                keeper.erase(path, below=bool(data.get("below")))
+                goes_on = keeper.erase(path, below=bool(data.get("below")))
             case "roll_back":
                 keeper.roll_back(path, str(data.get("why", "")))
             case "blame":
@@ -681,11 +684,17 @@ def keep(worker: Worker, frame: frames.Command) -> None:
             case what:
                 raise BadFrame(f"an actor process cannot have {what!r} done")
 
-    problem, answer = _problem(tell), data.get("answer")
-    if answer is not None:
-        worker.accepted(answer, problem)
-    elif problem is not None:
-        node.emit(StoreRefused(path, str(problem)))
+    def over(problem: HoldfastError | None) -> None:
+        if (answer := data.get("answer")) is not None:
+            worker.accepted(answer, problem)
+        elif problem is not None:
+            node.emit(StoreRefused(path, str(problem)))
+
+    problem = _problem(tell)
+    if goes_on is None:
+        over(problem)
+    else:
+        goes_on.add_done_callback(lambda done: None if done.cancelled() else over(_problem(done.result)))
 
 
 def _problem(work: Callable[[], None]) -> HoldfastError | None:

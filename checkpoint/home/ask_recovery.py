@@ -511,9 +511,14 @@ class FarMail:
         for then in self._opening.pop(path, ()):
             self._homes.node.loop.call_soon(then)  # When its next life has a place there.
 
-    def _tidy(self) -> None:
+    def forget_gone(self) -> None:
+        """Have nothing left in the store of what is not kept any more."""
+        if self._positions:
+            self._tidy(most=0)
+
+    def _tidy(self, most: int = MOST_ENTRIES) -> None:
         """Write what is left anew when much has come and gone."""
-        if len(self._positions) < MOST_ENTRIES:
+        if len(self._positions) < most:
             return
         journal = self._homes.journal
         mails = self._mail.values()

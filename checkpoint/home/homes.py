@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from ...actors.errors import ControlFailed, HoldfastError, StartFailed
 from ...actors.events import RecordsMapped, RecoveryFailed
 from ...actors.kernel.cell import DOWN, GONE, Cell
-from ...actors.persistence import child_key
+from ...actors.persistence import CHILDREN, child_key
+from ..address_tree import AddressTree
 from ..addresses import Addresses, is_of_actor, renamed
 from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
@@ -23,7 +25,7 @@ from ..snapshot.snapshot_record import take_over
 from ..snapshot.snapshot_schedule import nobody
 from .ask_recovery import FarMail, Rejoin
 from .capacity import HomeBound
-from .disposal import drop_all, forget_home, put_into_quarantine
+from .disposal import Erased, Erasures, drop_all, forget_home, put_into_quarantine
 from .held_messages import Holding, end_wait, let_go
 from .quarantine import Quarantine
 from .switch import Switch
@@ -34,8 +36,7 @@ if TYPE_CHECKING:
 
 ENDED = "it ended before it was live"
 ERASED = "what was recorded of it has been erased"
-ERASING = "erasing"
-"""The fact that names the address whose tree is being erased."""
+BEING_ERASED = "what was recorded of it is being erased: start it again when that is over"
 OPENED = "opened"
 """The fact that says when the root was begun whose fencing tokens were the largest: a whole number, of seconds."""
 TOKEN_BITS = 31
@@ -68,13 +69,13 @@ class Homes:
         self.file = file
         self.planted: dict[str, Saved] = {}  # what the next life at an address begins with, whatever is recorded
         node.numbers.begin_tokens(_first_token(journal, node.clock.wall()))
-        unfinished = journal.notes(ERASING).get(ERASING)
         self._stored = set(filter(is_of_actor, journal.addresses()))
+        self._known = AddressTree(self._stored)  # with those at which somebody was started since
+        self._noted = AddressTree(key.removeprefix(CHILDREN) for key in journal.notes(CHILDREN))  # children
         self.groups = Groups(self)
         self.rejoin = Rejoin(self)
         self.far = FarMail(self)
-        if unfinished is not None:  # This process's predecessor died in the middle of it.
-            self._erase_tree(unfinished.decode())
+        self.erasures = Erasures(self)
 
     def of(self, cell: Cell, method: Method) -> Switch:
         """The home of an address; taken up from the store when it is first asked for.
@@ -84,12 +85,15 @@ class Homes:
         """
         path = cell.path
         switch = self._switches.get(path)
+        if self.erasures.covers(path):
+            raise StartFailed(path, BEING_ERASED)
         if switch is None:
             self._settle_key(path)
             switch = Switch(self, cell, method, self._journal_of(method), self.planted.get(path))
             self._check(switch, cell)
             self.planted.pop(path, None)
             self._switches[path] = switch
+            self._known.add(path)
             self.rejoin.loaded(switch)
             switch.ties.rename(self.addresses.now)
             self._count_death(switch)
@@ -173,11 +177,14 @@ class Homes:
     def adopt(self, cell: Cell, switch: Switch, method: Method) -> None:
         """From here on what is sent to the address goes there."""
         self._switches[cell.path] = switch
+        self._known.add(cell.path)
         self.of(cell, method)
 
     def released(self, path: str) -> None:
         """The actor at an address, which was not recorded, goes on without a home."""
         self._switches.pop(path, None)
+        if path not in self._stored:
+            self._known.discard(path)
 
     def move(self, names: Mapping[str, str]) -> None:
         """Actors have moved, with all below them: what is known of their addresses is true of the new ones.
@@ -196,6 +203,7 @@ class Homes:
             self.journal.rename(paths)
             self._switches = {paths.get(path, path): switch for path, switch in self._switches.items()}
             self._stored = {paths.get(path, path) for path in self._stored}
+            self._known = AddressTree((*self._stored, *self._switches))
             self._blamed = {paths.get(path, path) for path in self._blamed}
             self.planted = {paths.get(path, path): saved for path, saved in self.planted.items()}
             for path, switch in self._switches.items():
@@ -209,16 +217,17 @@ class Homes:
             self._erase(path)  # Whoever had it is not there any more, and what comes there has a journal of its own.
         self.addresses.rename(paths)
         self.addresses.moved(names)
-        for key, value in list(self.journal.notes(child_key("", "")[:-1]).items()):
-            above, _, name = key.removeprefix(child_key("", "")[:-1]).rpartition("/")
+        for key, value in list(self.journal.notes(CHILDREN).items()):
+            above, _, name = key.removeprefix(CHILDREN).rpartition("/")
             if (now := renamed(names, above)) != above:
-                self.journal.note(key, None)
-                self.journal.note(child_key(now, name), value)
+                self.note(key, None)
+                self.note(child_key(now, name), value)
         self.quarantine.rename(paths)
 
     def vacate(self, path: str, why: str) -> None:
         """What is known here of an address where nobody lives is not true any more; the store is somebody else's."""
         self._stored.add(path)
+        self._known.add(path)
         switch = self._switches.pop(path, None)
         if switch is not None:
             forget_home(switch, why)
@@ -261,7 +270,11 @@ class Homes:
 
     def knows(self, path: str) -> bool:
         """Whether anything was ever recorded at this address, and not erased since."""
-        return path in self._switches or path in self._stored
+        return path in self._known
+
+    def has_recorded(self, path: str) -> bool:
+        """Whether anything is recorded at this address or below it, or noted of a child of a supervisor there."""
+        return self._known.has(path) or any(True for _ in self._noted.below(path))
 
     def is_unopened(self, path: str) -> bool:
         """Whether something is recorded at this address, and nobody has been started there since the root began."""
@@ -269,35 +282,56 @@ class Homes:
 
     def known(self, above: str) -> list[str]:
         """The addresses below one, at which anything was recorded."""
-        prefix = f"{above}/"
-        return [path for path in {**dict.fromkeys(self._stored), **self._switches} if path.startswith(prefix)]
+        return list(self._known.below(above))
 
-    def erase(self, path: str, *, below: bool) -> None:
+    def tree_of(self, top: str) -> Iterator[str]:
+        """The address, if anything was recorded there, and those below it."""
+        if top in self._known:
+            yield top
+        yield from self._known.below(top)
+
+    def child_notes(self, above: str) -> Iterator[str]:
+        """The addresses of the children below an address that are noted as those of a supervisor."""
+        return self._noted.below(above)
+
+    def erase(self, path: str, *, below: bool) -> asyncio.Future[None] | None:
         """Forget all about an address where nobody lives; with `below`, also about all addresses below it.
+
+        Returns:
+            None: it is done. A future: it goes on, a few addresses at a time.
 
         Raises:
             HoldfastError: the store refused. What is left is erased when it is opened again.
         """
         if not below:
             self._erase(path)
-            return
-        self.journal.note(ERASING, path.encode())
-        self._erase_tree(path)
+            self.quarantine.forget(path)
+            return None
+        erased = self.erasures.erase(path)
+        if not erased.done():
+            return self.node.loop.create_task(_over(erased), context=self.node.base_context.copy())
+        erased.result()
+        return None
 
-    def _erase_tree(self, top: str) -> None:
-        for path in (top, *self.known(top)):
-            self._erase(path)
-        for key in self.journal.notes(child_key(top, "")):
-            self.journal.note(key, None)
-        self.journal.note(ERASING, None)
+    def erasing(self, path: str) -> asyncio.Future[None] | None:
+        """The erasure that has to be over before a life may begin at this address, if there is one."""
+        erased = self.erasures.at(path)
+        return None if erased is None else self.node.loop.create_task(_over(erased))
+
+    def forget(self, path: str) -> bool:
+        """Forget what was recorded at one address; whether anything was."""
+        was_known = self.knows(path)
+        self._erase(path)
+        return was_known
 
     def _erase(self, path: str) -> None:
         if path in self._stored and path not in self._switches:
             self._tell_stored(path, ERASED)
-        self.journal.erase(path)  # First: if the store refuses, nothing is forgotten here either.
+        if not self.addresses.is_lent(path):  # Else the store has there what was recorded of one that has moved away.
+            self.journal.erase(path)  # First: if the store refuses, nothing is forgotten here either.
         self.addresses.erased(path)
-        self.quarantine.forget(path)
         self._stored.discard(path)
+        self._known.discard(path)
         self._blamed.discard(path)
         self.planted.pop(path, None)
         switch = self._switches.pop(path, None)
@@ -344,14 +378,19 @@ class Homes:
             tell(path)
         if not below:
             return
-        prefix = f"{path}/"
-        for waiting, switch in self._switches.items():
-            if waiting.startswith(prefix):
+        for waiting in self.known(path):
+            if (switch := self._switches.get(waiting)) is not None:
                 end_wait(switch)
 
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a small fact; None forgets it."""
         self.journal.note(key, value)
+        if key.startswith(CHILDREN):
+            path = key.removeprefix(CHILDREN)
+            if value is None:
+                self._noted.discard(path)
+            else:
+                self._noted.add(path)
 
     def notes(self, prefix: str) -> dict[str, bytes]:
         """The facts whose keys begin so, oldest first."""
@@ -368,12 +407,18 @@ class Homes:
 
     def close(self) -> None:
         """Close the store, and let go of the states."""
+        self.erasures.close()
         self.recoveries.close()
         for switch in self._switches.values():
             if not switch.journal.durable and end_wait(switch):
                 drop_all(switch, "the system has ended")
             switch.images.close()
         self.journal.close()
+
+
+async def _over(erased: asyncio.Future[Erased]) -> None:
+    """Wait for an erasure, which goes on if whoever waits does not."""
+    await asyncio.shield(erased)
 
 
 def _bind(switch: Switch, chosen: Bound) -> None:

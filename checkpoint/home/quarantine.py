@@ -21,7 +21,7 @@ from ..upgrade.field_tables import as_data
 from ..upgrade.old_records import mapper_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from ...actors.kernel.cell import Cell
     from ...actors.kernel.node import Node
@@ -171,8 +171,25 @@ class Quarantine:
 
     def forget(self, address: str) -> None:
         """All that was recorded at an address has been erased."""
+        if any(one.address == address for one in self._held.values()):
+            self._forget(lambda at: at == address)
+
+    def forget_below(self, top: str, *, dry_run: bool = False) -> int:
+        """All that was recorded at an address and below it has been erased; how many messages are gone with that.
+
+        What was put aside there before, and is not any more, leaves the store as well.
+        """
+        below = f"{top}/"
+        count = sum(address == top or address.startswith(below) for address, _ in self._held)
+        if not dry_run:
+            self._forget(lambda at: at == top or at.startswith(below))
+            if self._positions:
+                self._tidy(most=0)
+        return count
+
+    def _forget(self, is_meant: Callable[[str], bool]) -> None:
         batch = Batch()
-        for one in [one for one in self._held.values() if one.address == address]:
+        for one in [one for one in self._held.values() if is_meant(one.address)]:
             self._free(one, self._journal.durable, batch)
         batch.commit(self._journal)
 
@@ -210,9 +227,9 @@ class Quarantine:
             batch.add(PLACE, ("free", one.address, one.id), self._positions)
             batch.after.append(self._tidy)
 
-    def _tidy(self) -> None:
+    def _tidy(self, most: int = MOST_ENTRIES) -> None:
         """Write what is left anew when much has come and gone."""
-        if len(self._positions) < MOST_ENTRIES:
+        if len(self._positions) < most:
             return
         left = msgspec.msgpack.encode(list(self._held.values()))
         try:

@@ -14,8 +14,9 @@ from ...actors.exit_reasons import ExitReason, unpack_exit
 from ...actors.kernel.address_host import AddressHost
 from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.lifecycle import HERE, NEAR
-from ...actors.persistence import child_key
+from ...actors.persistence import CHILDREN
 from ...actors.process.wire import frames
+from ..address_tree import AddressTree
 from ..method import Method
 from ..protocol import (
     Begin,
@@ -99,12 +100,15 @@ class GuestKeeper:
     def __init__(self, guest: Guest) -> None:
         self._guest = guest
         self._notes: dict[str, bytes] = {}
-        self._known: set[str] = set()
+        self._known, self._noted = AddressTree(), AddressTree()
 
     def learn(self, notes: dict[str, bytes], known: list[str]) -> None:
         """Take in what the root has kept of the addresses of this process so far."""
         self._notes.update(notes)
-        self._known.update(known)
+        for path in known:
+            self._known.add(path)
+        for key in notes:
+            self._noted.add(key.removeprefix(CHILDREN))
 
     def _say(self, what: str, path: str, **data: Any) -> None:
         root = self._guest.node.root
@@ -115,28 +119,42 @@ class GuestKeeper:
         """Whether anything was ever recorded at this address, and not erased since."""
         return path in self._known
 
+    def has_recorded(self, path: str) -> bool:
+        """Whether anything is recorded at this address or below it, or noted of a child of a supervisor there."""
+        return self._known.has(path) or any(True for _ in self._noted.below(path))
+
+    def erasing(self, path: str) -> None:
+        """Return None: the root has a life there wait, or refuses it."""
+
     def begins(self, path: str) -> None:
         """Something is recorded there from now on."""
         self._known.add(path)
 
     def erase(self, path: str, *, below: bool) -> asyncio.Future[None]:
         """Have the root forget what was recorded there."""
-        prefix = f"{path}/"
-        known = {one for one in self._known if one == path or (below and one.startswith(prefix))}
-        notes = self.notes(child_key(path, "")) if below else {}
-        self._known -= known
-        for note in notes:
-            del self._notes[note]
-        key, done = self._guest.acceptance()
+        known = [path] if path in self._known else []
+        notes: dict[str, bytes] = {}
+        if below:
+            known += self._known.below(path)
+            notes = {key: self._notes[key] for one in self._noted.below(path) if (key := f"{CHILDREN}{one}")}
+        for one in known:
+            self._known.discard(one)
+        for key in notes:
+            self._forget_note(key)
+        answer, done = self._guest.acceptance()
         done.add_done_callback(lambda done: self._erased(done, known, notes))
-        self._say("erase", path, below=below, answer=key)
+        self._say("erase", path, below=below, answer=answer)
         return done
 
-    def _erased(self, done: asyncio.Future[None], known: set[str], notes: dict[str, bytes]) -> None:
+    def _forget_note(self, key: str) -> None:
+        self._notes.pop(key, None)
+        self._noted.discard(key.removeprefix(CHILDREN))
+
+    def _erased(self, done: asyncio.Future[None], known: list[str], notes: dict[str, bytes]) -> None:
         """The root has answered; what its store has refused to forget is known as before."""
         if not done.cancelled() and done.exception() is not None:
-            self._known |= known
-            self._notes = notes | self._notes
+            later, self._notes = self._notes, {}
+            self.learn(notes | later, known)
 
     def roll_back(self, path: str, why: str) -> asyncio.Future[None]:
         """Have the root let its next life begin with an older snapshot."""
@@ -160,10 +178,10 @@ class GuestKeeper:
 
     def note(self, key: str, value: bytes | None) -> None:
         """Keep the fact that a supervisor has a child; None forgets it."""
-        self._notes.pop(key, None)
+        self._forget_note(key)
         if value is not None:
-            self._notes[key] = value
-        self._say("note", key.removeprefix("child "), value=value)
+            self.learn({key: value}, [])
+        self._say("note", key.removeprefix(CHILDREN), value=value)
 
     def notes(self, prefix: str) -> dict[str, bytes]:
         """The facts whose keys begin so, oldest first."""

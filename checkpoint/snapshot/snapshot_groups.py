@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ...actors.errors import HoldfastError
+from ..addresses import is_at
 from ..journal import Entry, Saved
 from .snapshot_record import FORMAT, Meta, outlasting
 
@@ -100,6 +101,17 @@ class Groups:
         if self._homes.journal.noted(_key(name)) is None:
             raise NoSuchGroup(name)
         self._homes.journal.note(_key(name), None)
+
+    def forget_below(self, top: str, dry_run: bool = False) -> int:
+        """Remove the group snapshots with a member at an address or below it: how many that were, or (`dry_run`) are.
+
+        Raises:
+            HoldfastError: the store refused.
+        """
+        meant = [name for name in self.names() if any(is_at(path, top) for path in self.members(name))]
+        for name in [] if dry_run else meant:
+            self.forget(name)
+        return len(meant)
 
     def replace(self, name: str) -> None:
         """Have the next lives at its addresses begin at the cut. Nobody may live there now.

@@ -22,7 +22,7 @@ from .entry_chains import MODULUS, Chain
 from .open_store import INSERT, Store
 from .read_back import ChainReader, dropped_by
 from .row_codec import CHUNK, PLACE, pack_positions, snapshot_digest
-from .sealing import SEALED_KIND, drops_place, entry_sealer, note_name, note_row, snapshot_place
+from .sealing import SEALED_KIND, drops_place, entry_sealer, note_row, snapshot_place
 
 _FEW: Final = 128  # More entries at a time, or more bytes, are worth a transaction of their own.
 _SMALL: Final = 64 << 10
@@ -334,12 +334,19 @@ class SqliteJournal:
             if address not in self._store.contents.chains:
                 self.forget_blocks(address, self.packs(address))  # of a snapshot that was never cut
                 return
+            files: list[str] | None = None
             with self._store.transaction(note=True) as db:
                 # From here on it is gone; if we die before the rest is done, the next opening does it.
                 chain = self._store.contents.chains.pop(address)
                 chain.path = None
-                chain.write(db, self._cipher)
-        self._finish_erase(chain)
+                if len(chain.positions) <= CHUNK:
+                    files = self._remove_chain(chain, db)
+                else:
+                    chain.write(db, self._cipher)
+        if files is None:
+            self._finish_erase(chain)
+        else:
+            self._store.remove_files(files)
         if self._packs.names(address):
             self._store.sync_rows()
         self._packs.erase(address)
@@ -394,13 +401,19 @@ class SqliteJournal:
                 raise store.translate(error) from error
 
     def _finish_erase(self, chain: Chain) -> None:
-        while chain.positions:
+        while len(chain.positions) > CHUNK:
             self._remove(chain, chain.positions[:CHUNK])
         with self._store.transaction(note=True) as db:
-            owned = db.execute("SELECT id FROM snapshots WHERE address = ?", (chain.id,)).fetchall()
-            files = self._delete_snapshots(db, [number for (number,) in owned])
-            db.execute("DELETE FROM addresses WHERE id = ?", (chain.id,))
+            files = self._remove_chain(chain, db)
         self._store.remove_files(files)
+
+    def _remove_chain(self, chain: Chain, db: sqlite3.Connection) -> list[str]:
+        """Remove all rows of an address; return the files to be removed once that is committed."""
+        if chain.positions:
+            self._remove_rows(chain, db, chain.positions[:])
+        files = self._delete_snapshots(db, chain.kept)
+        db.execute("DELETE FROM addresses WHERE id = ?", (chain.id,))
+        return files
 
     def addresses(self) -> list[str]:
         """Every address that has something stored, sorted."""
@@ -416,11 +429,16 @@ class SqliteJournal:
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a small named fact; see `Journal`."""
         with self._store.transaction(len(value or b""), note=True) as db:
-            db.execute("DELETE FROM notes WHERE name = ?", (note_name(self._cipher, key),))
-            self._store.contents.notes.pop(key, None)
+            contents = self._store.contents
+            contents.notes.pop(key, None)
+            row = contents.note_rows.pop(key, None)
+            if row is not None:
+                db.execute("DELETE FROM notes WHERE key = ?", (row,))
             if value is not None:
-                db.execute("INSERT INTO notes VALUES (NULL, ?, ?, ?)", note_row(self._cipher, key, value))
-                self._store.contents.notes[key] = value
+                kept = db.execute("INSERT INTO notes VALUES (NULL, ?, ?, ?)", note_row(self._cipher, key, value))
+                contents.notes[key] = value
+                assert kept.lastrowid is not None
+                contents.note_rows[key] = kept.lastrowid
 
     def noted(self, key: str) -> bytes | None:
         """The fact of that name, or `None`."""

@@ -80,6 +80,7 @@ class StoreContents:
     notes: dict[str, bytes]
     last: int  # newest position ever handed out
     live: int  # rows in `entries`
+    note_rows: dict[str, int] = field(default_factory=dict[str, int])  # where each note stands
 
     def take_in(self, rows: Sequence[Row], path: str) -> None:
         """Take in what is in the log of the store at `path`.
@@ -138,7 +139,8 @@ class StoreScan:
             self._tell(DamagedStore(self._path, None, None, reason))
         known = {chain.path: chain for chain in chains.values() if chain.path is not None}
         erased = [chain for chain in chains.values() if chain.path is None]
-        return StoreContents(known, erased, self._notes(), last, total)
+        notes, rows = self._notes()
+        return StoreContents(known, erased, notes, last, total, rows)
 
     def _addresses(self) -> dict[int, Chain]:
         chains: dict[int, Chain] = {}
@@ -171,17 +173,18 @@ class StoreScan:
             total += 1
         return position, total
 
-    def _notes(self) -> dict[str, bytes]:
+    def _notes(self) -> tuple[dict[str, bytes], dict[str, int]]:
         notes: dict[str, bytes] = {}
-        for name, value, crc in self._db.execute("SELECT name, value, crc FROM notes ORDER BY key"):
+        rows: dict[str, int] = {}
+        for row, name, value, crc in self._db.execute("SELECT key, name, value, crc FROM notes ORDER BY key"):
             try:
                 known, data = read_note(NoCipher() if is_hidden(name) else self._cipher, name, value, crc)
             except ValueError as error:
                 self._tell(DamagedStore(self._path, None, None, str(error)))
                 continue
             if not is_hidden(name):
-                notes[known] = data
-        return notes
+                notes[known], rows[known] = data, row
+        return notes, rows
 
     def _verify(self, chain: Chain) -> None:
         """Note the damage if entries are missing anywhere but at the end."""

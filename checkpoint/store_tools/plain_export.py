@@ -33,6 +33,8 @@ from ..store_key import StoreKey, read_store_key
 from .store_view import StoreView, open_view, stamp
 
 Record = dict[str, Any]
+HISTORY: Final = "history "
+"""How the names of the notes begin that have past events."""
 _NAMES: Final[dict[str, tuple[str, ...]]] = {
     "out": ("turn", "input", "outputs", "since"),
     "end": ("turn", "input", "status", "outputs", "state", "reply"),
@@ -97,7 +99,7 @@ class _Export:
         except DamagedStore as error:
             self._damages.append(error)
         for name, value in contents.notes.items():
-            yield {"record": "note", "name": name, "value": _text(value)}
+            yield {"record": "note", "name": name, "value": _note(name, value)}
         at = {key.decode(): name.removeprefix(KEY) for name, key in contents.notes.items() if name.startswith(KEY)}
         chains = {chain.id: chain for chain in contents.chains.values()}
         addresses = {chain.id: at.get(key, key) for key, chain in contents.chains.items()}
@@ -273,6 +275,16 @@ def _damage(error: HoldfastError, address: str | None = None) -> Record:
         where = address if address is not None else error.address
         return {"record": "damage", "problem": error.reason, "address": where, "position": error.position}
     return {"record": "damage", "problem": str(error), "address": address, "position": None}
+
+
+def _note(name: str, data: bytes) -> Any:
+    """What a note says; past events are packed together."""
+    if name.startswith(HISTORY):
+        try:
+            return as_plain(msgpack.unpackb(data, strict_map_key=False))
+        except (ValueError, msgpack.UnpackException):
+            pass  # It is printed as it is.
+    return _text(data)
 
 
 def _text(data: bytes) -> Any:

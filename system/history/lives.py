@@ -120,6 +120,11 @@ class LivesByAddress:
     def __len__(self) -> int:
         return len(self._known)
 
+    def forget(self, top: str) -> None:
+        """Forget the lives of an address, and of those below it."""
+        for path in [path for path in self._known if path == top or path.startswith(f"{top}/")]:
+            del self._known[path]
+
     def apply(self, event: PastEvent) -> None:
         """Learn what an event says of the lives at its address."""
         learn = LEARN.get(event.kind)

@@ -8,10 +8,12 @@ from heapq import merge
 from typing import TYPE_CHECKING
 
 from ...actors.events import ActorKilled, ActorStarted, ChildStopped, ChildTerminated, Event, LogLine, Restful
+from ...checkpoint.addresses import is_at
 from ..last_lines.followers import Followers
 from ..last_lines.line_memory import LineMemory
 from .authors import author
 from .counted_work import COUNTED, count_work
+from .forgetting import telling_of
 from .lives import LivesByAddress
 from .past_event import UNKEPT, PastEvent, Plain, plain_fields, shortened
 from .tracks import BOUNDS, EventTrack, TrackName, track_of
@@ -149,6 +151,32 @@ class HistoryRecorder:
     def _later(self, seconds: float, call: Callable[[], None]) -> asyncio.TimerHandle:
         """In nobody's name: whoever told the event may be an actor in its turn."""
         return self._node.loop.call_later(seconds, call, context=self._node.base_context.copy())
+
+    def forget(self, top: str, dry_run: bool = False) -> int:
+        """Forget the past of an address, and of those below it: how many events that were.
+
+        Args:
+            top: the address.
+            dry_run: only count them.
+
+        Raises:
+            HoldfastError: the store refused; it may be tried again.
+        """
+        events = {event.number: event for event in self.after(-1)}
+        if self._writer is not None:
+            events.update((event.number, event) for event in self._writer.stored())
+        numbers = telling_of(events.values(), top)
+        if dry_run:
+            return len(numbers)
+        if self._writer is not None:
+            self._writer.forget(lambda event: event.number in numbers)
+        for track in self._tracks.values():
+            track.ring.forget(lambda event: event.number in numbers)
+        self.lives.forget(top)
+        self.lines.forget(top)
+        for path in [path for path in self._expected if is_at(path, top)]:
+            del self._expected[path]
+        return len(numbers)
 
     # -- giving out -------------------------------------------------------------------------------------------------
 

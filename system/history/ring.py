@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Generic, Protocol, TypeVar
 
 MOST_RUNS = 16
@@ -93,6 +93,16 @@ class EventRing(Generic[N]):
         self._bytes += size
         if len(self._events) > self._most or self._bytes > self._most_bytes:
             self.shrink(self._most_bytes)
+
+    def forget(self, is_meant: Callable[[N], bool]) -> None:
+        """Drop those that are meant."""
+        kept: deque[tuple[N, int]] = deque()
+        for one in self._events:
+            if is_meant(one[0]):
+                self.gone.add(one[0].number)
+            else:
+                kept.append(one)
+        self._events, self._bytes = kept, sum(size for _, size in kept)
 
     def shrink(self, most_bytes: int) -> None:
         """Drop the oldest ones beyond so many bytes; the newest one stays."""

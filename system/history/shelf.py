@@ -60,6 +60,23 @@ class EventShelf:
                 part.append(packed.popleft())
             self._put_part(part, part_bytes)
 
+    def forget(self, notes: Mapping[str, bytes], is_meant: Callable[[PastEvent], bool]) -> None:
+        """Write those of these notes anew that have an event which is meant, without it.
+
+        Raises:
+            HoldfastError: the store refuses; it may be tried again.
+        """
+        for name in sorted(notes):
+            events = events_in({name: notes[name]})
+            left = [msgspec.Raw(msgspec.msgpack.encode(event)) for event in events if not is_meant(event)]
+            if len(left) == len(events):
+                continue
+            data = msgspec.msgpack.encode(left)
+            self._write(name, data)
+            self._sizes = deque((one, len(data) if one == name else size) for one, size in self._sizes)
+            if name == f"{self._prefix}{self._next:012d}":
+                self._open, self._open_bytes = left, sum(map(len, left))
+
     def _put_part(self, part: list[msgspec.Raw], part_bytes: int) -> None:
         """Write the open note anew, with more in it; when it is full, the next one is opened."""
         name = f"{self._prefix}{self._next:012d}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Protocol
 
 from ...actors.errors import HoldfastError
@@ -62,7 +62,7 @@ class HistoryWriter:
     """
 
     def __init__(self, node: Node, store: NoteStore) -> None:
-        self._node = node
+        self._node, self._store = node, store
         self._shelves = {
             name: EventShelf(prefix(name), store.notes(prefix(name)), store.note, bounds.stored_bytes)
             for name, bounds in BOUNDS.items()
@@ -83,6 +83,22 @@ class HistoryWriter:
             loop = self._node.loop
             delay = max(0.0, self._due - loop.time())
             self._timer = loop.call_later(delay, self._write, context=self._node.base_context.copy())
+
+    def stored(self) -> list[PastEvent]:
+        """What the store has, and what it is to have soon."""
+        return [*stored(self._store), *self._unwritten]
+
+    def forget(self, is_meant: Callable[[PastEvent], bool]) -> None:
+        """Have the store forget the events that are meant.
+
+        Raises:
+            HoldfastError: it refuses; it may be tried again.
+        """
+        left = [event for event in self._unwritten if not is_meant(event)]
+        self._unwritten.clear()
+        self._unwritten.extend(left)
+        for name, shelf in self._shelves.items():
+            shelf.forget(self._store.notes(prefix(name)), is_meant)
 
     def _write(self) -> None:
         self._timer = None

@@ -138,9 +138,17 @@ class LineMemory:
                 self._bytes += ring.bytes - before
         fewest = limits.addresses if len(rings) <= limits.addresses else FILLED * limits.addresses
         while (self._bytes > most or len(rings) > fewest) and len(rings) > 1:
-            _, ring = rings.popitem(last=False)
-            self._bytes -= ring.bytes + ADDRESS_BYTES
-            self._forgotten.add(ring.oldest, ring.newest, ring.gone.count + len(ring))
+            self._forget(next(iter(rings)))
+
+    def forget(self, top: str) -> None:
+        """Forget the lines of an address, and of those below it."""
+        for address in [one for one in self._rings if one == top or one.startswith(f"{top}/")]:
+            self._forget(address)
+
+    def _forget(self, address: str) -> None:
+        ring = self._rings.pop(address)
+        self._bytes -= ring.bytes + ADDRESS_BYTES
+        self._forgotten.add(ring.oldest, ring.newest, ring.gone.count + len(ring))
 
     # -- giving out -------------------------------------------------------------------------------------------------
 

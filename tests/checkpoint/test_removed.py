@@ -138,8 +138,8 @@ CHECKS = {
     ),
     "nothing waits below who was removed": Check(
         "checkpoint/home/homes.py",
-        "            if waiting.startswith(prefix):\n",
-        "            if False:\n",
+        "        for waiting in self.known(path):\n",
+        "        for waiting in ():\n",
         BETWEEN,
         "test_who_is_told_something_after_a_stop_by_order and removed",
     ),

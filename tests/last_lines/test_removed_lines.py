@@ -56,7 +56,7 @@ CHECKS = {
     ),
     "addresses that are forgotten leave a count": Check(
         "system/last_lines/line_memory.py",
-        "            self._forgotten.add(ring.oldest, ring.newest, ring.gone.count + len(ring))\n",
+        "        self._forgotten.add(ring.oldest, ring.newest, ring.gone.count + len(ring))\n",
         "",
         MEMORY,
         "test_of_addresses_that_are_forgotten_it_is_told_that_there_were_lines",
