@@ -690,11 +690,15 @@ def keep(worker: Worker, frame: frames.Command) -> None:
         elif problem is not None:
             node.emit(StoreRefused(path, str(problem)))
 
+    def ended(done: asyncio.Future[None]) -> None:
+        if not done.cancelled():
+            over(_problem(done.result))
+
     problem = _problem(tell)
     if goes_on is None:
         over(problem)
     else:
-        goes_on.add_done_callback(lambda done: None if done.cancelled() else over(_problem(done.result)))
+        goes_on.add_done_callback(ended)
 
 
 def _problem(work: Callable[[], None]) -> HoldfastError | None:

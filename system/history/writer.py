@@ -63,7 +63,7 @@ class HistoryWriter:
 
     def __init__(self, node: Node, store: NoteStore) -> None:
         self._node, self._store = node, store
-        self._shelves = {
+        self._shelves: dict[TrackName, EventShelf] = {
             name: EventShelf(prefix(name), store.notes(prefix(name)), store.note, bounds.stored_bytes)
             for name, bounds in BOUNDS.items()
         }
