@@ -660,7 +660,7 @@ class Supervisor(Inquiries):
         if known is not None and known.state != STOPPED:
             return known.cell.ref if known.cell is not None else None
         if known is None:
-            self._check_free(spec)
+            await self._check_free(spec)
         one = known or Child(spec, candidate=message.candidate)
         return await self._start_by_hand(one, self._enlist, self._unlist, fresh=message.fresh)
 
@@ -702,7 +702,7 @@ class Supervisor(Inquiries):
         """A child that another supervisor has had is ours from now on; `declared`: with the mechanism it began with."""
         self._children[one.spec.id] = one
 
-    def _check_free(self, spec: ChildSpec) -> None:
+    async def _check_free(self, spec: ChildSpec) -> None:
         """Refuse a child whose id is known."""
         known = self._children.get(spec.id)
         if known is not None:

@@ -21,7 +21,7 @@ from ...ftm.group.protected import ProtectionStatus, protection_of
 from ...supervision.children import STOPPED
 from ...supervision.intensity import recent_restarts
 from ...supervision.spec import ChildSpec
-from ...supervision.supervisor import Supervisor
+from ...supervision.supervisor import Supervisor, listed_at
 from .lives import WITH_THE_ROOT, PastLife, is_fault
 from .pages import answer, question
 from .past_event import PastEvent, content, message_type, shortened
@@ -203,6 +203,7 @@ class Evidence(msgspec.Struct, frozen=True):
         memory: of its own process, if its limits bound that.
         waiting: what waits in its mailbox.
         silence: that its process has not answered.
+        awaited: the address for which its start waits, because it is bound to it; "" if it does not wait so.
     """
 
     address: str
@@ -225,6 +226,7 @@ class Evidence(msgspec.Struct, frozen=True):
     memory: ProcessMemory | None = None
     waiting: Waiting | None = None
     silence: Silence | None = None
+    awaited: str = ""
 
     def ago(self, at: float) -> str:
         """A moment as people say it: how long ago, or the time of day if that is long."""
@@ -309,7 +311,16 @@ def collect(
         None if cell is None else _memory(cell),
         None if cell is None else _waiting(cell),
         told.silence,
+        _awaited(node, address),
     )
+
+
+def _awaited(node: Node, address: str) -> str:
+    """The address for which the start of a child waits, as far as its supervisor lives in this process."""
+    above, _, name = address.rpartition("/")
+    supervisor = node.find(above)
+    one = None if supervisor is None else (listed_at(supervisor) or {}).get(name)
+    return "" if one is None else one.awaited
 
 
 def _known_at_home(status: Status | None, cell: Cell | None) -> Status | None:

@@ -278,6 +278,15 @@ def _restarting(evidence: Evidence) -> list[str]:
     return [f"{evidence.address} has no life at the moment: it waits for its next start, or is being recovered."]
 
 
+def _start_waits(evidence: Evidence) -> list[str]:
+    """Its start waits for somebody to whom its spec binds it."""
+    if not evidence.awaited:
+        return []
+    return [
+        f"{evidence.address} is to start as soon as somebody lives at {evidence.awaited}: its spec binds it to that."
+    ]
+
+
 def _waits(evidence: Evidence) -> list[str]:
     """Its turn waits for an answer, or for something else."""
     status = evidence.status
@@ -408,6 +417,7 @@ RULES: dict[str, Rule] = {
     "the root was killed": _root_ended,
     "quarantine": _quarantine,
     "recovery fails": _recovery_fails,
+    "its start waits": _start_waits,
     "suspended": _suspended,
     "restarting": _restarting,
     "its process does not answer": _silent,
