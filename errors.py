@@ -38,6 +38,7 @@ from .actors.errors import (
     UnsavableValue,
     WaitTimeout,
     WrongActor,
+    WrongLoop,
     WrongThread,
 )
 from .actors.kernel.bindings import Unbound
@@ -170,5 +171,6 @@ __all__ = [
     "WaitTimeout",
     "WrongActor",
     "WrongStoreKey",
+    "WrongLoop",
     "WrongThread",
 ]

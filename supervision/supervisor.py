@@ -392,7 +392,8 @@ class Supervisor(Inquiries):
         node = self.ctx._cell.node
         if not is_reported(one.spec.restart, reason):
             if one.spec.restart == "transient" and one.cell is not None:
-                tell_stopped(one.cell, one.cell.path, "its work is done")
+                because = f"it has ended with {reason}" if one.spec.is_supervisor else "its work is done"
+                tell_stopped(one.cell, one.cell.path, because)
         elif node.events.has_listeners:
             allowed, period = self._flags.intensity, self._flags.period
             restarts = len(recent_restarts(self._restarts, node.loop.time(), period))

@@ -51,6 +51,8 @@ MOST_TEXT = 300
 """Characters of an error that a sentence quotes."""
 LONG_TURN = 1.0
 """Seconds from which on a turn, or the wait of a message, is worth a sentence."""
+MADE_GOOD = (*GAVE_UP_KINDS, "RecoveryFailed")
+"""Events that a life which begins behind them makes good."""
 DEEPER_KINDS = (*GAVE_UP_KINDS, "ChildRestarted", "JournalFull", "MessageQuarantined", "RecoveryFailed", "ReplicaLost")
 """Events further below a supervisor of which it tells, too."""
 CHILD_KINDS = ("ChildRestarted", "JournalFull", "MessageQuarantined", "RecoveryFailed", "ReplicaLost", "StopOverdue")
@@ -297,7 +299,9 @@ def collect(
         [put_aside(one) for one in quarantined],
         recorder.is_in_storm,
         Below(
-            answer(recorder, question(f"{literal(address)}/*", kinds=CHILD_KINDS, limit=MOST)).events,
+            _not_over(
+                recorder, answer(recorder, question(f"{literal(address)}/*", kinds=CHILD_KINDS, limit=MOST)).events
+            ),
             children,
             _ended_below(recorder, address, children),
         ),
@@ -363,7 +367,18 @@ def _ended_below(recorder: HistoryRecorder, address: str, children: list[ChildNo
 def _deeper(recorder: HistoryRecorder, address: str) -> list[PastEvent]:
     """What weighs much of that which happened further below."""
     events = answer(recorder, question(f"{literal(address)}/*/*/**", kinds=DEEPER_KINDS, limit=MOST)).events
-    return [event for event in events if not _is_part(event.address, address)]
+    return _not_over(recorder, [event for event in events if not _is_part(event.address, address)])
+
+
+def _not_over(recorder: HistoryRecorder, events: list[PastEvent]) -> list[PastEvent]:
+    """The events, without those that a life behind them has made good."""
+    return [event for event in events if event.kind not in MADE_GOOD or not _is_over(recorder, event)]
+
+
+def _is_over(recorder: HistoryRecorder, event: PastEvent) -> bool:
+    """Whether a life has begun at the address since, and has not ended by a fault."""
+    lives = recorder.lives.at(event.address)
+    return bool(lives) and (lives[-1].started or 0.0) > event.at and not is_fault(lives[-1])
 
 
 def _is_part(path: str, address: str) -> bool:
