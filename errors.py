@@ -39,6 +39,7 @@ from .actors.errors import (
     UnsavableValue,
     WaitTimeout,
     WrongActor,
+    WrongLoop,
     WrongThread,
 )
 from .actors.kernel.bindings import Unbound
@@ -172,5 +173,6 @@ __all__ = [
     "WaitTimeout",
     "WrongActor",
     "WrongStoreKey",
+    "WrongLoop",
     "WrongThread",
 ]

@@ -8,7 +8,8 @@ HoldfastError
 │   ├── BadMessage       a field cannot be coded, or has the wrong type, or the frame is too large
 │   ├── AskDeadlock      the receiver waits, directly or not, for this very asker
 │   ├── ActorRestarting  the receiver is between two lives, and the asker did not want to wait
-│   └── WrongThread      called from another thread than the system's
+│   ├── WrongThread      called from another thread than the system's
+│   └── WrongLoop        called from another event loop than the system's
 ├── AskTimeout           no reply before the deadline (`handled` says whether the turn may have run)
 ├── AskFailed            the receiver ended in the middle of the turn
 ├── RemoteCrash          the receiver's handler raised
@@ -219,6 +220,16 @@ class WrongThread(
     thread: str
 
 
+class WrongLoop(
+    SendError,
+    text="{actor} was called from another event loop than that of its system, and nothing was sent: have both in one "
+    "loop (with pytest-asyncio, by the same loop_scope)",
+):
+    """An actor was called from an event loop in its thread that is not its system's, as tests may have several."""
+
+    actor: str
+
+
 class AskTimeout(HoldfastError):
     """No reply before the deadline.
 
@@ -390,6 +401,9 @@ class StartFailed(HoldfastError, text="{actor} could not be started: {reason}"):
     actor: str
     reason: str
 
+    def __init__(self, actor: str, reason: str = "") -> None:
+        super().__init__(actor, reason.removeprefix(f"{actor} could not be started: "))  # Said once is enough.
+
 
 class StartIgnored(StartFailed):
     """An actor did not want to be started (it raised `Ignore`): to a supervisor that is no failure."""
@@ -503,10 +517,11 @@ class UnsavableValue(
     problem: str
 
 
-class DamagedValue(HoldfastError, text="a saved value cannot be read: {problem}; use an older one"):
+class DamagedValue(HoldfastError, text="a saved value cannot be read: {problem}; {remedy}"):
     """Saved bytes that cannot be read: cut short, altered, of another format, or of a class that is no longer there."""
 
     problem: str
+    remedy: str = "use an older snapshot"
 
 
 class StoreError(HoldfastError):

@@ -142,6 +142,18 @@ class OrderHeld(Event, frozen=True, eq=False):
     seconds: float
 
 
+class BindingAwaited(Event, frozen=True, eq=False):
+    """Children that come back with their dynamic supervisor wait for somebody to whom their specs bind them.
+
+    Told once of each `target`, after five seconds: so many `children` wait, for so many `seconds`. They start when
+    somebody lives at that address.
+    """
+
+    target: str
+    children: int
+    seconds: float
+
+
 class AutoShutdown(Event, frozen=True, eq=False):
     """A supervisor ends because its significant children have."""
 

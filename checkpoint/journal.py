@@ -42,21 +42,25 @@ SafeAt: TypeAlias = Literal["append", "sync"]
 
 
 class StoreInUse(StoreError):
-    """A live process has the store open: stop it, or open with `takeover=True`.
+    """A live process has the store open: stop it, or open with `takeover=True`, if it is another one.
 
     Attributes:
         path: of the store.
         pid: of that process; 0 if it cannot be seen from here.
         owner: what it calls itself, if it is on another machine.
+        is_here: whether it is the very process that wants to open it.
     """
 
     path: str
     pid: int
     owner: str = ""
+    is_here: bool = False
 
     def __str__(self) -> str:
         if self.owner:
             return f"store {self.path} is in use: {self.owner} leads; stop it, or wait for it with standby='warm'"
+        if self.is_here:
+            return f"store {self.path} is open in this very process: end the system that has it, or use another store"
         if not self.pid:
             return f"store {self.path} is open in a process that cannot be seen from here (another container?): stop it"
         return f"store {self.path} is open in process {self.pid}: stop it, or open with takeover=True, which kills it"

@@ -1,23 +1,52 @@
-"""Children that are bound to somebody who is still starting: they wait, and circles are found.
+"""Children that are bound to somebody who is not there yet: they wait, and circles are found.
 
 Whoever waits keeps those waiting that are started behind it. If that leads back to itself, nobody in the circle can be
-up before another one is: it is told as an error, which names them all.
+up before another one is: it is told as an error, which names them all. Who comes back with a dynamic supervisor waits
+apart: it was there before, so whoever it is bound to is to come, and nobody waits for it meanwhile.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from ..actors.errors import NoSuchActor, StartFailed
 from ..actors.kernel.cell import DOWN, GONE, Cell
 from ..actors.kernel.node import Node
 from .children import STOPPED, STOPPING, Child
 
+if TYPE_CHECKING:
+    from .spec import ChildSpec
+
 LOOK_AGAIN = 0.02
 """Seconds between two looks at whether somebody is there."""
+EACH_LOOK = 1e-4
+"""More seconds between two looks for each address that is looked at."""
+TELL_AFTER = 5.0
+"""Seconds after which it is told that children that come back wait for somebody."""
 Listed = Callable[[Cell], Mapping[str, Child] | None]
 """The children of a supervisor that lives in this process; None if there is none at a cell."""
+
+
+def not_there(node: Node, path: str, spec: ChildSpec) -> str:
+    """The first address outside its own that a child needs to start, and where nobody lives; "" if there is none."""
+    needed = (to for to in _bound_to(spec) if not to.startswith(f"{path}/"))
+    return next((to for to in needed if not lives(node, to)), "")
+
+
+def lives(node: Node, path: str) -> bool:
+    """Whether somebody lives at an address, or is about to by the order of its supervisor."""
+    cell = node.find(path)
+    return cell is not None and not cell.is_dead
+
+
+def _bound_to(spec: ChildSpec) -> Iterator[str]:
+    """Where a child has to be bound before it can start, and those that its recipe starts below it."""
+    yield from (to for port, to in spec.bindings.items() if port not in spec.late)
+    if spec.is_supervisor and not spec.start.kind._is_dynamic:  # What a dynamic one starts waits apart.
+        for one in spec.below():
+            if one.autostart:
+                yield from _bound_to(one)
 
 
 class AwaitedStart(NamedTuple):
@@ -46,7 +75,7 @@ class Prospects:
         """
         node = self._node
         for port, path in one.spec.bindings.items():
-            if port in one.spec.late or node.find(path) is not None:
+            if port in one.spec.late or lives(node, path):
                 continue
             one.awaited = path
             circle = self._circle(AwaitedStart(who, path))
@@ -102,9 +131,10 @@ class Prospects:
         return []
 
     def _waiting(self, path: str, one: Child) -> Iterator[AwaitedStart]:
-        """A child that waits, or those below it that do."""
+        """A child that waits and keeps others waiting, or those below it that do."""
         if one.awaited:
-            yield AwaitedStart(path, one.awaited)
+            if not one.waits_apart:
+                yield AwaitedStart(path, one.awaited)
         elif one.cell is not None:
             for name, below in (self._listed(one.cell) or {}).items():
                 yield from self._waiting(f"{path}/{name}", below)

@@ -47,6 +47,7 @@ class Child:
     candidate: int = 0  # as whose candidate it was started; 0: it is none
     noted: Any = None  # what its supervisor's journal says of it, if that is known
     awaited: str = ""  # the address that its start waits for, because its spec binds it to that
+    waits_apart: bool = False  # and nobody waits for its start
 
     @property
     def is_running(self) -> bool:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, ClassVar
 
 from ..actors import exit_reasons
 from ..actors.errors import HoldfastError, SpecError, type_name
-from ..actors.events import ChildStartFailed, StoreRefused
+from ..actors.events import BindingAwaited, ChildStartFailed, StoreRefused
 from ..actors.exit_reasons import SHUTDOWN, ExitReason
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Start, on
@@ -22,6 +23,7 @@ from ..actors.kernel.cell import DOWN, GONE, Cell
 from ..actors.persistence import child_key
 from ..actors.process.resource_limits import Limits
 from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
+from .awaited import EACH_LOOK, LOOK_AGAIN, TELL_AFTER, lives, not_there
 from .children import STARTING, Child, StartRow, complete, tell_ended_with
 from .noted import FIELDS, Noted, OfTemplate, filled, first_noted, pack_noted, renewed, unpack_noted
 from .rules import Rule
@@ -71,12 +73,39 @@ class DynamicSupervisor(Supervisor):
             except HoldfastError as error:  # It stays in the journal: perhaps its class is only not there today.
                 node.emit(ChildStartFailed(f"{self.ctx.path}/{name}", str(error)))
         self._children.update((one.spec.id, one) for one in come)
-        row = StartRow(come, STARTING)
+        waiting = await self._come_back(come)
+        if waiting:
+            self._errand(self._come_back_later(waiting))
+
+    async def _come_back(self, come: list[Child]) -> list[Child]:
+        """Start those that were there before; returns those of them to whom somebody is missing that they need."""
+        row, waiting = StartRow(come, STARTING), list[Child]()
         while (one := row.next()) is not None:
+            one.awaited = not_there(self.ctx._cell.node, self._path_of(one), one.spec)
+            one.waits_apart = bool(one.awaited)
+            if one.awaited:
+                waiting.append(one)
+                continue
             try:
                 await self._come_up_in(row, one)
             except HoldfastError as error:  # One that fails must not keep the others from coming back.
                 self._again(one, exit_reasons.crash(error))
+        return [one for one in waiting if one.row is row]
+
+    async def _come_back_later(self, waiting: list[Child]) -> None:
+        """Start those that were there before as soon as those are there to whom they are bound."""
+        node, told = self.ctx._cell.node, set[str]()
+        begun = node.loop.time()
+        while waiting:
+            needed = Counter(one.awaited for one in waiting)
+            await asyncio.sleep(LOOK_AGAIN + EACH_LOOK * len(needed))
+            waiting = [one for one in waiting if one.row is not None]  # Else it was stopped.
+            if any(lives(node, path) for path in needed):
+                waiting = await self._come_back(waiting)
+            elif (seconds := node.loop.time() - begun) >= TELL_AFTER:
+                for path in needed.keys() - told:
+                    node.emit(BindingAwaited(self.ctx.path, path, needed[path], seconds))
+                told |= needed.keys()
 
     async def _lose(self, name: str) -> None:
         """A child is over whose id nobody will use again: whoever waits for it is told, what was recorded is erased."""
@@ -229,13 +258,21 @@ class DynamicSupervisor(Supervisor):
             if not is_known and name not in self._children and name not in (self.ctx._cell.children or ()):
                 return name
 
-    def _check_free(self, spec: ChildSpec) -> None:
-        known = self._children.get(spec.id)
+    async def _check_free(self, spec: ChildSpec) -> None:
+        known = await self._come_so_far(spec.id)
         if known is not None:
             raise AlreadyStarted(spec.id, self.ctx._cell.node.cell_at(f"{self.ctx.path}/{spec.id}").ref)
         most = self._flags.max_children
         if most is not None and len(self._children) >= most:
             raise MaxChildren(most)
+
+    async def _come_so_far(self, name: str) -> Child | None:
+        """A child, if there is one; if it comes back, when it has its address: what is said there then waits for it."""
+        while True:
+            known = self._children.get(name)
+            if known is None or known.cell is not None or known.row is None:
+                return known
+            await asyncio.sleep(LOOK_AGAIN)
 
     # -- ending -----------------------------------------------------------------------------------------------------
 

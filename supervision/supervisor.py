@@ -406,7 +406,8 @@ class Supervisor(Inquiries):
         node = self.ctx._cell.node
         if not is_reported(one.spec.restart, reason):
             if one.spec.restart == "transient" and one.cell is not None:
-                tell_stopped(one.cell, one.cell.path, "its work is done")
+                because = f"it has ended with {reason}" if one.spec.is_supervisor else "its work is done"
+                tell_stopped(one.cell, one.cell.path, because)
         elif node.events.has_listeners:
             allowed, period = self._flags.intensity, self._flags.period
             restarts = len(recent_restarts(self._restarts, node.loop.time(), period))
@@ -674,7 +675,7 @@ class Supervisor(Inquiries):
         if known is not None and known.state != STOPPED:
             return known.cell.ref if known.cell is not None else None
         if known is None:
-            self._check_free(spec)
+            await self._check_free(spec)
         one = known or Child(spec, candidate=message.candidate)
         if message.unless_stopped and not spec.autostart:
             self._enlist(one)
@@ -719,7 +720,7 @@ class Supervisor(Inquiries):
         """A child that another supervisor has had is ours from now on; `declared`: with the mechanism it began with."""
         self._children[one.spec.id] = one
 
-    def _check_free(self, spec: ChildSpec) -> None:
+    async def _check_free(self, spec: ChildSpec) -> None:
         """Refuse a child whose id is known."""
         known = self._children.get(spec.id)
         if known is not None:

@@ -13,6 +13,7 @@ from ..actors.errors import portable
 from ..actors.events import (
     ActorCrashed,
     AutoShutdown,
+    BindingAwaited,
     ChildStartFailed,
     ChildTerminated,
     ConnectionLimited,
@@ -267,6 +268,7 @@ WRITTEN: dict[type, tuple[int, str]] = {
     StopOverdue: (logging.ERROR, "stop overdue"),
     OrderHeld: (logging.WARNING, "order held"),
     TrustBreached: (logging.ERROR, "trust breached"),
+    BindingAwaited: (logging.WARNING, "binding awaited"),
     AutoShutdown: (logging.INFO, "auto shutdown"),
     SupervisorGaveUp: (logging.ERROR, "supervisor gave up"),
     ProcessDied: (logging.WARNING, "process died"),

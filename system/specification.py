@@ -22,11 +22,11 @@ from ..actors.events import Event
 from ..actors.kernel.actor import Start
 from ..actors.process.wire.start_codec import pack_data, unpack_data
 from ..checkpoint.addresses import is_at
+from ..supervision.awaited import not_there
 from ..supervision.children import Child
 from ..supervision.respec import rebuilt
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor
-from ..supervision.supervisor_changes import everything
 from .script import find_only_here
 
 if TYPE_CHECKING:
@@ -191,9 +191,7 @@ class Specifications:
                 del self._loaded[address]  # It stays in the store: its class may come back.
                 node.emit(SpecificationNotKept(address, str(error)))
                 continue
-            below = f"{address}/"
-            led = [path for one in everything((spec,)) for port, path in one.bindings.items() if port not in one.late]
-            if all(path.startswith(below) or node.find(path) is not None for path in led):
+            if not not_there(node, address, spec):
                 del self._loaded[address]
                 self._added.add(address)
                 self.brought.add(address)

@@ -63,7 +63,7 @@ def on(
     Args:
         kind: the message class; the method's return type must be the reply it declares.
         readonly: the handler changes no state, so a replay may leave it out, and asks are answered while another turn
-            rests (`ctx.sleep`, `ctx.wait_for`).
+            rests (`ctx.sleep`, `ctx.wait_for`), or has an effect out (`ctx.effect`).
         to_thread: the handler, a plain `def`, blocks: it is run in a worker thread. The actor handles nothing else
             meanwhile. In it, `self.ctx` and refs' `tell` work, and what has to be awaited does not.
         supersedes: the handler overwrites all that it wrote for an earlier message with the same key, and reads

@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable, Coroutine, Generator
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-from ..errors import WrongThread
+from ..errors import WrongLoop, WrongThread
 from ..ordered import Ordered
 from . import lifecycle, mailbox
 from .envelope import LEAVE, Item
@@ -39,6 +39,7 @@ RUNNERS = 8
 
 T = TypeVar("T")
 Coroutine_ = types.CoroutineType
+running_loop = asyncio._get_running_loop
 
 
 class RunLoop:
@@ -72,9 +73,12 @@ class RunLoop:
         Raises:
             WrongThread: by a `tell` from another thread, which nobody would notice before the loop wakes by itself. It
                 is found here, where it costs nothing while actors are busy; what it has queued is taken back.
+            WrongLoop: by whoever runs in another loop of this thread; found in the same place.
         """
         if get_ident() != self.thread:
-            self._take_back()
+            raise WrongThread(self._take_back(), threading.current_thread().name)
+        if not self.loop.is_running() and running_loop() is not None:
+            raise WrongLoop(self._take_back())
         self.awake = True
         self.loop.call_soon(self._drain)
 
@@ -121,14 +125,15 @@ class RunLoop:
             if self._idlers and not self.turns_held:
                 self._tell_idlers()
 
-    def _take_back(self) -> None:
+    def _take_back(self) -> str:
+        """Take back what was queued just now; returns whose mailbox it was in."""
         if not self.ready:
-            raise WrongThread("the system", threading.current_thread().name)
+            return "the system"
         cell = self.ready.pop()
         cell.scheduled = False
         if cell.queue:
             mailbox.take_back(cell, cell.queue)
-        raise WrongThread(cell.path, threading.current_thread().name)
+        return cell.path
 
     def is_own_thread(self) -> bool:
         """Whether this is the thread that the actors of the node run in."""

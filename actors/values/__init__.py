@@ -115,7 +115,7 @@ def decode_value(
     (1, 2.0, True, None)
     >>> decode_value(b"")
     Traceback (most recent call last):
-    holdfast.actors.errors.DamagedValue: a saved value cannot be read: it is cut short; use an older one
+    holdfast.actors.errors.DamagedValue: a saved value cannot be read: it is cut short; use an older snapshot
     """
     return _read(
         data, lambda buffers: Decoder(buffers, imports=imports, shared=shared, refs=refs), is_checked=not imports

@@ -38,7 +38,11 @@ def find_class(name: str, *, imports: bool = True) -> type:
         for part in qualname.split("."):
             found = cast(object, vars(found)[part])
     except BaseException as error:  # A module may raise anything, and whoever asks for it may be a supervisor.
-        raise DamagedValue(f"class {name} is not there ({type(error).__name__}: {error})") from error
+        alias = f"if it was renamed, leave an alias `{qualname} = NewName` in {module}"
+        raise DamagedValue(
+            f"class {name} is not there ({type(error).__name__}: {error})",
+            f"{alias}: inside of a state `@hf.renamed` is not looked at",
+        ) from error
     if not isinstance(found, type):
         raise DamagedValue(f"{name} is no class")
     return found

@@ -225,7 +225,9 @@ class TurnRows:
             HoldfastError: the store takes nothing now.
         """
         home, life = self._home, self._home.life
-        if not life.is_released or life.port is None or home.intake.bound is not None or home.calls.rests.wanted:
+        if not life.is_released or life.port is None or home.intake.bound is not None:
+            return False
+        if home.calls.rests.wanted or home.calls.long:
             return False
         commits = home.journal.commits
         last = home.intake.last

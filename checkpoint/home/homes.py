@@ -410,7 +410,7 @@ class Homes:
         self.erasures.close()
         self.recoveries.close()
         for switch in self._switches.values():
-            if not switch.journal.durable and end_wait(switch):
+            if end_wait(switch) and not switch.journal.durable:  # Else the next program has it.
                 drop_all(switch, "the system has ended")
             switch.images.close()
         self.journal.close()

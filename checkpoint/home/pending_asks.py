@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
 ACCEPTED = Came(REPLY, "", msgspec.msgpack.encode(None))
 
 
+SHORT = 0.05
+"""Seconds that asks which change nothing wait for an effect: one that is out for longer keeps them waiting no more."""
 MARK = "ask "
 """How the origin of an input begins that somebody's recorded turn has asked; the asker is its sender."""
 
@@ -167,6 +170,7 @@ class PendingCalls:
         sends: sends and publications of its own turns whose receivers have no room yet.
         rests: moments and messages that its own turns wait for.
         effects: effects of its turn in hand that are out.
+        long: those of them for which asks that change nothing do not wait.
         later: asks of others that are to be answered later, by input.
         owed: the same as read back from the store: asker and origin.
     """
@@ -177,6 +181,8 @@ class PendingCalls:
         self.sends: set[tuple[int, int]] = set()
         self.rests = LongWaits(home)
         self.effects: dict[tuple[int, int], TurnRest] = {}
+        self.long: set[tuple[int, int]] = set()
+        self._look: asyncio.TimerHandle | None = None
         self.later: dict[int, Ask] = {}
         self.owed: dict[int, tuple[str, str]] = {}
 
@@ -258,10 +264,23 @@ class PendingCalls:
         place = turn, out.k
         if place not in self.effects:  # Else it is done again by a later life.
             if self.effects and next(iter(self.effects))[0] != turn:
+                self.long.clear()
                 self.effects.clear()  # An earlier turn has ended without waiting for them.
             self.effects[place] = TurnRest("effect", out.to, self._home.node.clock.wall())
         if self._home.life.port is not None:
             self._home.life.port.to_life(Perform(turn, out.k, self._home.life.token))
+        self.long.discard(place)
+        if self._look is None:
+            self._look = self._home.node.loop.call_later(SHORT, self._look_whether_long, place)
+
+    def _look_whether_long(self, place: tuple[int, int]) -> None:
+        """See whether an effect has been out for so long that asks which change nothing are answered beside it."""
+        self._look = None
+        if place in self.effects:
+            self.long.add(place)
+            self.rests.show(self._home.ledger.open.values())
+        elif self.effects:
+            self._look = self._home.node.loop.call_later(SHORT, self._look_whether_long, next(iter(self.effects)))
 
     def performed(self, record: Performed) -> None:
         """An effect of the turn in hand has come to something; what it comes to later, or once more, is of no use."""
@@ -297,6 +316,7 @@ class PendingCalls:
         own = batch if batch is not None else Batch()
         ask = self.asks.pop((turn, k), None)
         self.effects.pop((turn, k), None)
+        self.long.discard((turn, k))
         kept = self._home.ledger.note_outcome(turn, k, answer)
         if kept is not None:
             if self._home.journal.durable:
@@ -315,6 +335,10 @@ class PendingCalls:
             ask.is_over, ask.future = True, OVER
         self.asks.clear()
         self.effects.clear()
+        self.long.clear()
+        if self._look is not None:
+            self._look.cancel()
+            self._look = None
         self.sends.clear()
         self.rests.abandon()
 

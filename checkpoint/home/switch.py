@@ -279,7 +279,7 @@ class Switch:
             if source.ask is not None and port.begins:
                 source.ask.started = True
             port.take(source)
-        if rests.wanted:
+        if rests.wanted or self.calls.long:
             rests.show((source,))
 
     def changes_nothing(self, source: Input) -> bool:

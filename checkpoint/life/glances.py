@@ -1,4 +1,4 @@
-"""Asks that change nothing, answered beside a turn that rests: the actor handles nothing else, perhaps for days."""
+"""Asks that change nothing, answered beside a turn that rests, or has an effect out: nothing else is handled then."""
 
 from __future__ import annotations
 
@@ -63,14 +63,14 @@ class GlanceContext:
 
 
 def answer_beside(life: Life, feed: Feed) -> None:
-    """Answer an ask beside the turn in hand, if that still rests, and if the handler does no more than look.
+    """Answer an ask beside the turn in hand, if that still waits, and if the handler does no more than look.
 
     Else nothing has happened, and it waits for its turn as everything else; so does what raises.
     """
     cell, context = life.cell, life.cell.context
     more, actor = cell.more, cell.actor
     turn = None if more is None else more.turn
-    if life.stage.is_over or not life.is_live or not life.waits.resting or context is None or actor is None:
+    if life.stage.is_over or not life.is_live or not life.waits.is_open or context is None or actor is None:
         return
     if more is None or turn is None or turn.killed or turn.then is not None or more.suspended:
         return
@@ -78,6 +78,7 @@ def answer_beside(life: Life, feed: Feed) -> None:
     context, ctx = context.copy(), actor.ctx
     context.run(current.set, standing)
     actor.ctx = standing
+    begun = 0 if life.page is None else life.page[0]
     if life.page is not None:
         life.page[0] = feed.id + 1  # If the process dies of it.
     try:
@@ -87,7 +88,7 @@ def answer_beside(life: Life, feed: Feed) -> None:
     finally:
         actor.ctx = ctx
         if life.page is not None:
-            life.page[0] = 0
+            life.page[0] = begun
     life.drop_queued(feed.id)
     life.port.to_home(Glanced(feed.id, answer))
 

@@ -6,10 +6,10 @@ import asyncio
 import dataclasses
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
+from ...actors.effects import EffectCall
 from ..durable_timers import said_by
 
 if TYPE_CHECKING:
-    from ...actors.effects import EffectCall
     from ...actors.exit_reasons import ExitReason
     from ...actors.kernel.envelope import Item
     from ...actors.kernel.message import Message
@@ -148,6 +148,12 @@ class TurnWaits:
         """Whether all that the turn in hand waits for at home are answers that do not come before others live again."""
         places = [place for place, (future, _) in self.outcomes.items() if not future.done()]
         return bool(places) and self.stranded.issuperset(places)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the turn in hand rests, or has an effect out, so that its state can be looked at beside it."""
+        effects = (future for future, kind in self.outcomes.values() if isinstance(kind, EffectCall))
+        return self.resting > 0 or not all(future.done() for future in effects)
 
     def rested(self) -> None:
         """Something has come that a turn has waited for, perhaps an earlier one."""

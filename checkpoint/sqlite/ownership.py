@@ -115,7 +115,7 @@ class StoreClaim:
             if pidfd is None:
                 return
             if not takeover or pid == os.getpid():
-                raise StoreInUse(self.path, pid)
+                raise StoreInUse(self.path, pid, is_here=pid == os.getpid())
             try:
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)
             except PermissionError as error:

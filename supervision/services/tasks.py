@@ -165,7 +165,10 @@ class Tasks:
         isolation: Isolation = "task",
         shutdown: Shutdown = PATIENCE,
     ) -> Job[Any]:
-        """Start a job to be awaited later, or asked for its outcome, or ended. What `run` raises, `await job` does."""
+        """Start a job to be awaited later, or asked for its outcome, or ended. What `run` raises, `await job` does.
+
+        This is no coroutine, unlike `spawn`: the job is returned at once, and `await job` waits for its outcome.
+        """
         return self._begin(function, args, linked, isolation, shutdown)
 
     async def spawn(
@@ -178,8 +181,10 @@ class Tasks:
     ) -> ActorRef[Actor]:
         """Fire and forget: a job that outlives its caller, and is restarted by its spec ("transient": when it fails).
 
+        This is a coroutine, unlike `start`: `ref = await tasks.spawn(...)` waits until the job is there.
+
         Returns:
-            Its ref, to watch, stop or kill it.
+            A ref to the job, to watch, stop or kill it; its outcome is not told.
         """
         spec = self._spec(function, args, isolation, shutdown, restart=restart, is_awaited=False)
         return await self._ask_start(spec)

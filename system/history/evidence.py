@@ -21,7 +21,7 @@ from ...ftm.group.protected import ProtectionStatus, protection_of
 from ...supervision.children import STOPPED
 from ...supervision.intensity import recent_restarts
 from ...supervision.spec import ChildSpec
-from ...supervision.supervisor import Supervisor
+from ...supervision.supervisor import Supervisor, listed_at
 from .lives import WITH_THE_ROOT, PastLife, is_fault
 from .pages import answer, question
 from .past_event import PastEvent, content, message_type, shortened
@@ -51,6 +51,8 @@ MOST_TEXT = 300
 """Characters of an error that a sentence quotes."""
 LONG_TURN = 1.0
 """Seconds from which on a turn, or the wait of a message, is worth a sentence."""
+MADE_GOOD = (*GAVE_UP_KINDS, "RecoveryFailed")
+"""Events that a life which begins behind them makes good."""
 DEEPER_KINDS = (*GAVE_UP_KINDS, "ChildRestarted", "JournalFull", "MessageQuarantined", "RecoveryFailed", "ReplicaLost")
 """Events further below a supervisor of which it tells, too."""
 CHILD_KINDS = ("ChildRestarted", "JournalFull", "MessageQuarantined", "RecoveryFailed", "ReplicaLost", "StopOverdue")
@@ -203,6 +205,7 @@ class Evidence(msgspec.Struct, frozen=True):
         memory: of its own process, if its limits bound that.
         waiting: what waits in its mailbox.
         silence: that its process has not answered.
+        awaited: the address for which its start waits, because it is bound to it; "" if it does not wait so.
     """
 
     address: str
@@ -225,6 +228,7 @@ class Evidence(msgspec.Struct, frozen=True):
     memory: ProcessMemory | None = None
     waiting: Waiting | None = None
     silence: Silence | None = None
+    awaited: str = ""
 
     def ago(self, at: float) -> str:
         """A moment as people say it: how long ago, or the time of day if that is long."""
@@ -295,7 +299,9 @@ def collect(
         [put_aside(one) for one in quarantined],
         recorder.is_in_storm,
         Below(
-            answer(recorder, question(f"{literal(address)}/*", kinds=CHILD_KINDS, limit=MOST)).events,
+            _not_over(
+                recorder, answer(recorder, question(f"{literal(address)}/*", kinds=CHILD_KINDS, limit=MOST)).events
+            ),
             children,
             _ended_below(recorder, address, children),
         ),
@@ -309,7 +315,16 @@ def collect(
         None if cell is None else _memory(cell),
         None if cell is None else _waiting(cell),
         told.silence,
+        _awaited(node, address),
     )
+
+
+def _awaited(node: Node, address: str) -> str:
+    """The address for which the start of a child waits, as far as its supervisor lives in this process."""
+    above, _, name = address.rpartition("/")
+    supervisor = node.find(above)
+    one = None if supervisor is None else (listed_at(supervisor) or {}).get(name)
+    return "" if one is None else one.awaited
 
 
 def _known_at_home(status: Status | None, cell: Cell | None) -> Status | None:
@@ -352,7 +367,18 @@ def _ended_below(recorder: HistoryRecorder, address: str, children: list[ChildNo
 def _deeper(recorder: HistoryRecorder, address: str) -> list[PastEvent]:
     """What weighs much of that which happened further below."""
     events = answer(recorder, question(f"{literal(address)}/*/*/**", kinds=DEEPER_KINDS, limit=MOST)).events
-    return [event for event in events if not _is_part(event.address, address)]
+    return _not_over(recorder, [event for event in events if not _is_part(event.address, address)])
+
+
+def _not_over(recorder: HistoryRecorder, events: list[PastEvent]) -> list[PastEvent]:
+    """The events, without those that a life behind them has made good."""
+    return [event for event in events if event.kind not in MADE_GOOD or not _is_over(recorder, event)]
+
+
+def _is_over(recorder: HistoryRecorder, event: PastEvent) -> bool:
+    """Whether a life has begun at the address since, and has not ended by a fault."""
+    lives = recorder.lives.at(event.address)
+    return bool(lives) and (lives[-1].started or 0.0) > event.at and not is_fault(lives[-1])
 
 
 def _is_part(path: str, address: str) -> bool:

@@ -8,11 +8,12 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from ...ftm.group.protected import ProtectionStatus
-from .evidence import LONG_TURN, MOST_TEXT, Evidence, PutAside, messages_text, seconds_text
+from .evidence import GAVE_UP_KINDS, LONG_TURN, MOST_TEXT, Evidence, PutAside, messages_text, seconds_text
 from .lives import CLEAN, PastLife, is_fault
 from .past_event import PastEvent
 from .raised import raised_at
 from .why_children import (
+    NEWS,
     deeper_trouble,
     ended_children,
     moving_children,
@@ -28,6 +29,9 @@ MANY = 100
 """Messages in a mailbox that are worth a sentence."""
 MUCH = 0.6
 """The part of the memory that a process may have from which on it is worth a sentence."""
+
+ROUNDED = 1.0
+"""Seconds by which the end of a supervisor may be told of later than its reason for it."""
 
 Rule = Callable[[Evidence], list[str]]
 
@@ -190,6 +194,9 @@ def _ended_by_others(evidence: Evidence) -> list[str]:
     if life is None or not life.by or life.reason_kind in ("FailedOver", "RootKilled", "SystemStopped"):
         return []
     if life.by == evidence.address:
+        event = _own_end(evidence)
+        if event is not None and (life.started or 0.0) <= event.at <= (life.ended or evidence.now) + ROUNDED:
+            return []  # It is told why: `_gave_up`.
         return [f"{evidence.address} ended by itself {_ago(evidence, life)}: {life.because}."]
     because = f": {life.because}" if life.because else ""
     fault = "" if life.reason_kind in CLEAN or life.reason_kind == "Killed" else f" ({_fault(life)})"
@@ -214,19 +221,43 @@ def _given_up_above(evidence: Evidence) -> list[str]:
 
 
 def _gave_up(evidence: Evidence) -> list[str]:
-    """It is a supervisor, and has given up itself."""
-    event = _newest(evidence, "SupervisorGaveUp")
+    """It is a supervisor, and has given up itself, or ended because its significant children had."""
+    event = _own_end(evidence)
     if event is None:
         return []
     child, reason = event.fields.get("child"), str(event.fields.get("reason"))[:MOST_TEXT]
-    return [f"{evidence.address} gave up {evidence.ago(event.at)}: its child {child} had failed too often ({reason})."]
+    ago, since = evidence.ago(event.at), _runs_since(evidence)
+    then = "" if since is None or since < event.at else f", and was started again {evidence.ago(since)}"
+    if event.kind == "AutoShutdown":
+        return [f"{evidence.address} ended {ago}{then}, by its `auto_shutdown`: its child {child} ended ({reason})."]
+    return [f"{evidence.address} gave up {ago}{then}: its child {child} had failed too often ({reason})."]
+
+
+def _own_end(evidence: Evidence) -> PastEvent | None:
+    """The newest event of a supervisor that has ended itself with all below it."""
+    return next((event for event in reversed(evidence.events) if event.kind in GAVE_UP_KINDS), None)
+
+
+def _runs_since(evidence: Evidence) -> float | None:
+    """When the life at the address began, if one goes on. (The root's own is as old as its program.)"""
+    if not evidence.is_there:
+        return None
+    if evidence.lives and not evidence.lives[-1].is_over:
+        return evidence.lives[-1].started
+    begun, life = _newest(evidence, "SystemStarted"), _last_ended(evidence)
+    return None if begun is None or (life is not None and begun.at < (life.ended or 0.0)) else begun.at
 
 
 def _root_ended(evidence: Evidence) -> list[str]:
     life = _last_ended(evidence)
     if life is None or life.reason_kind != "RootKilled":
         return []
-    return [f"{evidence.address} ended {_ago(evidence, life)} because {life.reason}; what it had in hand was cut off."]
+    since, ended = _runs_since(evidence), f"{_ago(evidence, life)} because {life.reason}"
+    if since is None:
+        return [f"{evidence.address} ended {ended}; what it had in hand was cut off."]
+    if evidence.now - since > NEWS:
+        return []
+    return [f"{evidence.address} runs; it was started {evidence.ago(since)}, for its life before had ended {ended}."]
 
 
 # -- recovery ---------------------------------------------------------------------------------------------------------
@@ -276,6 +307,15 @@ def _restarting(evidence: Evidence) -> list[str]:
     if status is None or status.state != "restarting":
         return []
     return [f"{evidence.address} has no life at the moment: it waits for its next start, or is being recovered."]
+
+
+def _start_waits(evidence: Evidence) -> list[str]:
+    """Its start waits for somebody to whom its spec binds it."""
+    if not evidence.awaited:
+        return []
+    return [
+        f"{evidence.address} is to start as soon as somebody lives at {evidence.awaited}: its spec binds it to that."
+    ]
 
 
 def _waits(evidence: Evidence) -> list[str]:
@@ -408,6 +448,7 @@ RULES: dict[str, Rule] = {
     "the root was killed": _root_ended,
     "quarantine": _quarantine,
     "recovery fails": _recovery_fails,
+    "its start waits": _start_waits,
     "suspended": _suspended,
     "restarting": _restarting,
     "its process does not answer": _silent,

@@ -81,4 +81,4 @@ def test_errors_can_be_rebuilt_and_say_where(error: HoldfastError) -> None:
     again = type(error)(*error.args)
     assert str(again) == str(error)
     assert vars(again) == vars(error)
-    assert all(str(argument) in str(error) for argument in error.args if argument is not None)
+    assert all(str(argument) in str(error) for argument in error.args if argument is not None and argument is not False)

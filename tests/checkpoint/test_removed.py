@@ -89,7 +89,7 @@ CHECKS = {
     ),
     "what has waited in vain is a dead letter": Check(
         "checkpoint/home/homes.py",
-        "            if not switch.journal.durable and end_wait(switch):\n",
+        "            if end_wait(switch) and not switch.journal.durable:",
         "            if False:\n",
         BETWEEN,
         "test_without_a_store_what_waits_is_a_dead_letter_when_the_program_ends",

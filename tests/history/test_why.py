@@ -46,6 +46,9 @@ CRASHES = [
     life(n, 990.0 + n, "ZeroDivisionError: by zero", "Crash", traceback=TRACE, restarts=n, allowed=3) for n in (1, 2, 3)
 ]
 
+PastLife = hf.system.PastLife
+ROOT_KILLED = life(1, 990.0, "the process of the root was killed", "RootKilled", by="the program")
+
 NO_WORD = f"The process of {AT} (pid 7) has not answered within 5.0 s"
 
 CASES: dict[str, tuple[dict[str, Any], str]] = {
@@ -160,9 +163,42 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         {"events": [told("SupervisorGaveUp", child="b", reason="KeyError: 7")]},
         f"{AT} gave up 10 s ago: its child b had failed too often (KeyError: 7).",
     ),
+    "ended by `auto_shutdown`": (
+        {
+            "lives": [life(1, 990.1, "shutdown", "Shutdown", by=AT, because="it has ended with shutdown")],
+            "events": [told("AutoShutdown", child="b", reason="normal")],
+        },
+        f"{AT} ended 10 s ago, by its `auto_shutdown`: its child b ended (normal).",
+    ),
+    "gave up, and runs again": (
+        {
+            "is_there": True,
+            "lives": [life(1, 990.1, "shutdown: x", "Shutdown", by=AT, because="x"), PastLife(2, started=995.0)],
+            "events": [told("SupervisorGaveUp", child="b", reason="KeyError: 7")],
+        },
+        f"{AT} gave up 10 s ago, and was started again 5.0 s ago: its child b had failed too often (KeyError: 7).",
+    ),
     "root killed": (
-        {"lives": [life(1, 990.0, "the process of the root was killed", "RootKilled", by="the program"), life(1)]},
+        {"lives": [ROOT_KILLED]},
         f"{AT} ended 10 s ago because the process of the root was killed; what it had in hand was cut off.",
+    ),
+    "root killed, and it runs again": (
+        {"is_there": True, "lives": [ROOT_KILLED, PastLife(1, started=998.0)]},
+        (
+            f"{AT} runs; it was started 2.0 s ago, for its life before had ended 10 s ago because the process of "
+            "the root was killed."
+        ),
+    ),
+    "root killed, and the root itself runs again": (
+        {"is_there": True, "lives": [ROOT_KILLED], "events": [told("SystemStarted", at=997.0)]},
+        (
+            f"{AT} runs; it was started 3.0 s ago, for its life before had ended 10 s ago because the process of "
+            "the root was killed."
+        ),
+    ),
+    "root killed long ago": (
+        {"now": 9_000.0, "is_there": True, "lives": [ROOT_KILLED, PastLife(1, started=998.0)], "status": status()},
+        f"{AT} is running, in life 2, and nothing is wrong as far as is known.",
     ),
     "quarantine": (
         {"quarantined": [PutAside(AT, "shop.Pay", 3, 990.0)]},
@@ -193,6 +229,10 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     "suspended": (
         {"status": status("suspended", queued=7)},
         f"{AT} is suspended: it handles nothing, and 7 messages wait, until `resume`.",
+    ),
+    "its start waits": (
+        {"awaited": "/app/desk"},
+        f"{AT} is to start as soon as somebody lives at /app/desk: its spec binds it to that.",
     ),
     "restarting": (
         {"status": status("restarting")},

@@ -1,6 +1,7 @@
 """What `why` says of real systems, whose actors fail for each cause in turn."""
 
 import asyncio
+import dataclasses
 import os
 import re
 import signal
@@ -456,3 +457,31 @@ async def test_replicas(system: hf.ActorSystem) -> None:
     assert "It is whole again, for r1 came back " in text
     assert text.endswith("r1 follows, r2 leads, epoch 2.")
     assert any(life.by == "failover" for life in system.lives(ref))
+
+
+async def test_a_supervisor_that_gave_up_or_shut_itself_down_has_not_done_its_work(system: hf.ActorSystem) -> None:
+    one = worker("one", restart="transient", significant=True)
+    shop = hf.supervisor("shop", children=[one], intensity=0, auto_shutdown="any_significant", restart="transient")
+    for name, order in (("gives-up", Do("crash")), ("shuts-down", Do("stop"))):
+        with system.events() as events:
+            ref = await system.start(dataclasses.replace(shop, id=name))
+            system.ref(f"/app/{name}/one", Worker).tell(order)
+            async with asyncio.timeout(20.0):
+                while not any(isinstance(event, hf.events.ChildStopped) for event in events.take()):
+                    await asyncio.sleep(0.01)
+        text = await said(system, ref)
+        wanted = "gave up" if name == "gives-up" else "by its `auto_shutdown`: its child one ended"
+        assert wanted in text
+        assert "ended by itself" not in text
+
+
+async def test_who_gave_up_below_and_runs_again_is_in_no_trouble(system: hf.ActorSystem) -> None:
+    inner = hf.supervisor("inner", children=[worker("one")], intensity=0)
+    await system.start(hf.supervisor("shop", children=[inner]))
+    with system.events() as events:
+        system.ref("/app/shop/inner/one", Worker).tell(Do("crash"))
+        await events.until(hf.events.SupervisorGaveUp)
+        while (await events.until(hf.events.ActorStarted)).address != "/app/shop/inner/one":
+            continue
+    await until(lambda: system._history.lives.at("/app/shop/inner/one")[-1].started)  # type: ignore[union-attr]
+    assert "gave up" not in await said(system, "/app")

@@ -36,7 +36,53 @@ CHANGED = "tests/supervision/test_changed_children.py"
 
 DYNAMIC = "tests/supervision/test_dynamic.py"
 
+BOUND = "tests/supervision/test_come_back_bound.py"
+GLANCES = "tests/effects/test_glances_at_effects.py"
+TEXTS = "tests/system/test_texts.py"
+
 CHECKS = {
+    "who comes back waits for whom it is bound to": Check(
+        "supervision/dynamic.py",
+        "            if one.awaited:\n",
+        "            if False:\n",
+        BOUND,
+        "in_the_next_program and other",
+    ),
+    "nobody lives where a recorded actor is between two programs or lives": Check(
+        "supervision/awaited.py",
+        "    return cell is not None and not cell.is_dead\n",
+        "    return cell is not None\n",
+        BOUND,
+        "supervisor_is_restarted and later",
+    ),
+    "who is started again by request is told of when it has its address": Check(
+        "supervision/dynamic.py",
+        "            if known is None or known.cell is not None or known.row is None:\n",
+        "            if True:\n",
+        BOUND,
+        "program_of_the_book",
+    ),
+    "the page of a turn with an effect out is put back behind a question": Check(
+        "checkpoint/life/glances.py",
+        "            life.page[0] = begun\n",
+        "            life.page[0] = 0\n",
+        GLANCES,
+        "held_against_its_turn",
+    ),
+    "nothing is written to a store that the system has closed": Check(
+        "checkpoint/home/homes.py",
+        "            if end_wait(switch) and not switch.journal.durable:",
+        "            if not switch.journal.durable and end_wait(switch):",
+        TEXTS,
+        "comes_after_the_end and True-recovery1-task",
+    ),
+    "another event loop of the thread is refused": Check(
+        "actors/kernel/loop.py",
+        "        if not self.loop.is_running() and running_loop() is not None:\n",
+        "        if False:\n",
+        "tests/system/test_threads.py",
+        "another_event_loop_of_the_thread and tell",
+    ),
     "who is up is answered ahead of those that are still to be started": Check(
         "supervision/errands.py",
         "            if starts:",
@@ -760,7 +806,7 @@ CHECKS = {
     ),
     "nobody waits for whom a transaction has bound it to": Check(
         "supervision/awaited.py",
-        "            if port in one.spec.late or node.find(path) is not None:\n",
+        "            if port in one.spec.late or lives(node, path):\n",
         "            if node.find(path) is not None:\n",
         KEPT,
         "test_a_binding_that_a_transaction_has_made_outlives_the_supervisor and last and task",
@@ -773,9 +819,9 @@ CHECKS = {
         "test_what_is_bound_to_a_later_one_hinders_no_transaction",
     ),
     "the next root does not wait for what transactions have bound": Check(
-        "system/specification.py",
-        "for port, path in one.bindings.items() if port not in one.late]\n",
-        "for port, path in one.bindings.items()]\n",
+        "supervision/awaited.py",
+        "    yield from (to for port, to in spec.bindings.items() if port not in spec.late)\n",
+        "    yield from spec.bindings.values()\n",
         KEPT,
         "test_what_is_bound_to_a_later_one_hinders_no_transaction",
     ),

@@ -280,3 +280,30 @@ async def test_what_a_closed_loop_never_did_is_not_waited_for(call: str) -> None
         await in_thread(handed_over.wait)
         ended.close()
     assert await calling == "ActorStopped"
+
+
+@pytest.mark.parametrize("call", ["tell", "ask", "send"])
+def test_another_event_loop_of_the_thread_is_told_so(call: str) -> None:
+    with asyncio.Runner() as first, asyncio.Runner() as second:
+        system = hf.ActorSystem("app", log=False)
+        first.run(system.__aenter__())
+        book = first.run(system.start(hf.child("book", hf.start(Notebook))))
+
+        async def calls() -> None:
+            if call == "tell":
+                book.tell(Note(1, 1))
+            else:
+                await (book.ask(Noted()) if call == "ask" else book.send(Note(1, 1)))
+
+        async def elsewhere() -> None:
+            with pytest.raises(hf.errors.WrongLoop, match="/app/book was called from another event loop"):
+                await calls()
+
+        async def here() -> list[tuple[int, int]]:
+            return await book.ask(Noted())
+
+        second.run(elsewhere())
+        assert first.run(here()) == []  # Nothing of it has come.
+        book.tell(Note(2, 2))  # While no loop runs, it is as in a callback of its own.
+        assert first.run(here()) == [(2, 2)]
+        first.run(system.shutdown())
