@@ -539,12 +539,21 @@ def _id(one: FarAnswer) -> FarId:
 
 
 class KeptMessage(NamedTuple):
-    """A message for an address whose home is not open yet; `positions`: where in the journal it stands."""
+    """A message for an address whose home is not open yet.
+
+    Attributes:
+        name: of its type.
+        body: encoded.
+        sender: the address that has told it.
+        positions: where in the journal it stands.
+        is_earlier: whether a program before this one has kept it.
+    """
 
     name: str
     body: bytes
     sender: str
     positions: list[int]
+    is_earlier: bool = False
 
 
 class Rejoin:
@@ -569,16 +578,19 @@ class Rejoin:
 
     def read(self, home: Switch, position: int, origin: str, name: str, body: bytes, sender: str) -> None:
         """Take a message that was kept up again, from the journal of its receiver."""
-        self.kept_for(home.path).setdefault(origin, KeptMessage(name, body, sender, [])).positions.append(position)
+        kept = self.kept_for(home.path).setdefault(origin, KeptMessage(name, body, sender, [], is_earlier=True))
+        if position not in kept.positions:  # It stands there already if a start before this one has failed.
+            kept.positions.append(position)
 
     def kept_for(self, path: str) -> dict[str, KeptMessage]:
         """What is kept for an address, by origin."""
         return self._kept.setdefault(path, {})
 
     def _hand_over(self, home: Switch) -> None:
-        """What was kept for an address becomes inputs, each once: the journal may have it as one already."""
+        """What was kept for an address becomes inputs, oldest first, each once: the journal may have it as one already."""
         known = {(source.sender, source.origin) for source in home.ledger.handled_and_open()}
-        for origin, kept in self._kept.pop(home.path, {}).items():
+        messages = self._kept.pop(home.path, {}).items()  # What the journal had was read behind what came since.
+        for origin, kept in sorted(messages, key=lambda one: not one[1].is_earlier):
             home.ledger.drop(kept.positions)
             is_ask = origin.startswith(MARK)
             own = " ".join(origin.split(" ", 2)[:2]) if is_ask else origin
