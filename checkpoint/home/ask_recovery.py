@@ -565,15 +565,16 @@ class Rejoin:
         self._kept: dict[str, dict[str, KeptMessage]] = {}  # by address, and by who has told it in which output
 
     def keep(self, home: Switch, origin: str, out: Out, sender: str, batch: Batch) -> bool:
-        """Keep what a turn of `home` tells to an address that this program has not opened yet; False if it has."""
-        if not self._homes.is_unopened(out.to):
+        """Keep what a turn of `home` tells to who was not started by this program yet; False if somebody was."""
+        to = self._homes.addresses.now(out.to)  # A ref may know it by an address that it has left.
+        if not self._homes.is_unopened(to):
             return False
-        kept = self.kept_for(out.to)[origin] = KeptMessage(out.name, out.body, sender, [])
+        kept = self.kept_for(to)[origin] = KeptMessage(out.name, out.body, sender, [])
         shape = home.shapes.now(out.name) if home.journal.durable else None
         if shape is not None:  # Its journal may have the table of an older program.
-            batch.add(out.to, shape_entry(out.name, shape), [])
+            batch.add(to, shape_entry(out.name, shape), [])
         if home.journal.durable:
-            batch.add(out.to, ("kept", origin, *kept[:3]), kept.positions)
+            batch.add(to, ("kept", origin, *kept[:3]), kept.positions)
         return True
 
     def read(self, home: Switch, position: int, origin: str, name: str, body: bytes, sender: str) -> None:
@@ -650,7 +651,7 @@ class Rejoin:
         if self._homes.far.asks_again(home, turn, key, out):
             return True
         ask = self._asks.get((home.path, turn, out.k))
-        if ask is None and not self._homes.knows(out.to):
+        if ask is None and not self._homes.knows(self._homes.addresses.now(out.to)):
             return False  # Whoever was asked keeps no journal.
         ask = ask or self._of(home.path, turn, out.k)  # Its receiver's home is not open yet.
         source = home.ledger.open.get(key)

@@ -63,6 +63,25 @@ def test_what_an_earlier_program_has_kept_comes_first(kind: str, how: str, tmp_p
     )
 
 
+@pytest.mark.parametrize("verb", ["tell", "send"])
+def test_who_has_moved_is_told_under_its_old_address_before_it_is_started(verb: str, tmp_path: Path) -> None:
+    store, begin = tmp_path / "app.db", [["sender", "s0", "task"]]
+    receivers = [["supervisor", name, "task"] for name in SUPERVISORS]
+    program(store, [*begin, *receivers])
+    program(store, [*receivers, ["move", "r1", "south"]])
+    program(store, [*begin, ["say", "s0", "r1", verb, 3], ["kill"]])
+    judge(program(store, [*begin, ["say", "s0", "r1", verb, 3], *receivers, ["tell all", ["s0"]]]), is_lossless=True)
+
+
+def test_who_is_answered_by_another_program_when_the_ask_had_timed_out_starts_again(tmp_path: Path) -> None:
+    store, begin, receiver = tmp_path / "app.db", [["sender", "s0", "task"]], [["supervisor", "north", "task"]]
+    program(store, [*begin, *receiver])
+    program(store, [*receiver, *begin, ["end supervisor", "north"], ["say", "s0", "r0", "ask", 2], ["kill"]])
+    program(store, [*receiver, ["wait", 0.1], ["kill"]])  # It answers into the journal of who is not there.
+    last = [*begin, *receiver, ["supervisor", "south", "task"], ["tell all", ["s0"]]]
+    judge(program(store, last), is_lossless=True)
+
+
 class Plan:
     """The steps of some programs, drawn by a seed."""
 
