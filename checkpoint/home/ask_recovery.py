@@ -588,7 +588,7 @@ class Rejoin:
         return self._kept.setdefault(path, {})
 
     def _hand_over(self, home: Switch) -> None:
-        """What was kept for an address becomes inputs, oldest first, each once: the journal may have it as one already."""
+        """What was kept for an address becomes inputs, oldest first, and each once: the journal may have it as one."""
         known = {(source.sender, source.origin) for source in home.ledger.handled_and_open()}
         messages = self._kept.pop(home.path, {}).items()  # What the journal had was read behind what came since.
         for origin, kept in sorted(messages, key=lambda one: not one[1].is_earlier):

@@ -151,7 +151,7 @@ class Regrouping(StagedWork):
         await self._certify(system)
         others = self._others(system)
         self._senders.settle(others)
-        standing = self._senders.find_restless(others, self._held(system))
+        standing = self._senders.find_standing(others, self._held(system))
         waits = self._senders.waits_for(one for one in others if one not in standing) or self._unsteady(system)
         self._kept_from_rest = waits
         if waits:  # Perhaps for what those here have to answer.
@@ -171,13 +171,12 @@ class Regrouping(StagedWork):
         already: nobody stands still for long while another one's turn has not ended.
         """
         loop, end, longest = system._node.loop, math.inf, max(MOVED_WITHIN, self._draft.timeout)
-        standing = self._senders.standing()
         while late := [(one, rest) for one, rest in self._coming_to_rest(system) if not rest.is_waiting]:
             await self._let_go(system)  # This may take long.
             waiting = [(one, rest) for one, rest in late if said_of_turn(one.living(system._node))]
             for one, rest in waiting or late:
                 rest.aim(system, functools.partial(system._moves.pause, one.living(system._node), longest))
-            stands_still = bool(standing) or any(rest.is_waiting for rest in self._rests.values())
+            stands_still = bool(self._senders.standing()) or any(rest.is_waiting for rest in self._rests.values())
             end = min(end, loop.time() + self._patience) if stands_still else math.inf
             if loop.time() >= end:
                 await self._try_again_later(system)
@@ -185,9 +184,7 @@ class Regrouping(StagedWork):
             stirs = [future for _, rest in late for future in rest.stirs]
             within = max(0.0, end - loop.time()) if stands_still else None
             await asyncio.wait(stirs, timeout=within, return_when=asyncio.FIRST_COMPLETED)
-        if any(has_begun(one.living(system._node)) for one, _ in self._resting(system)) or any(
-            one.switch.ledger.released for one, _ in standing
-        ):
+        if any(has_begun(one.living(system._node)) for one, _ in self._coming_to_rest(system)):
             await self._try_again_later(system)
             return False
         return True

@@ -66,7 +66,7 @@ class Senders:
                 self._first.setdefault(switch, switch.turn)
                 life.port.to_life(SnapshotNow(urgent=True))  # also if it is suspended
 
-    def find_restless(self, others: Iterable[Switch], held: Collection[Switch]) -> Collection[Switch]:
+    def find_standing(self, others: Iterable[Switch], held: Collection[Switch]) -> Collection[Switch]:
         """Those that stand still for the commit; `held` are not ours to hold, for another step does."""
         for switch in others:
             cell = switch.cell
