@@ -65,13 +65,6 @@ CHECKS = {
         "tests/system/test_moves_under_load.py",
         "comes_to_its_end and task-recorded-a",
     ),
-    "who stands still goes on when the move is given up": Check(
-        "system/transaction/reparenting.py",
-        "[self._senders.go_on(), *(rest.give_up() for rest in self._rests.values())],",
-        "[rest.give_up() for rest in self._rests.values()],",
-        "tests/system/test_moves_under_load.py",
-        "go_on_after_a_move_that_is_given_up",
-    ),
     "who keeps its address need not come to rest": Check(
         "system/transaction/reparenting.py",
         "addressed(self._top) if self._is_readdressed(system) else ():",
