@@ -544,12 +544,21 @@ def _id(one: FarAnswer) -> FarId:
 
 
 class KeptMessage(NamedTuple):
-    """A message for an address whose home is not open yet; `positions`: where in the journal it stands."""
+    """A message for an address whose home is not open yet.
+
+    Attributes:
+        name: of its type.
+        body: encoded.
+        sender: the address that has told it.
+        positions: where in the journal it stands.
+        is_earlier: whether a program before this one has kept it.
+    """
 
     name: str
     body: bytes
     sender: str
     positions: list[int]
+    is_earlier: bool = False
 
 
 class Rejoin:
@@ -561,29 +570,33 @@ class Rejoin:
         self._kept: dict[str, dict[str, KeptMessage]] = {}  # by address, and by who has told it in which output
 
     def keep(self, home: Switch, origin: str, out: Out, sender: str, batch: Batch) -> bool:
-        """Keep what a turn of `home` tells to an address that this program has not opened yet; False if it has."""
-        if not self._homes.is_unopened(out.to):
+        """Keep what a turn of `home` tells to who was not started by this program yet; False if somebody was."""
+        to = self._homes.addresses.now(out.to)  # A ref may know it by an address that it has left.
+        if not self._homes.is_unopened(to):
             return False
-        kept = self.kept_for(out.to)[origin] = KeptMessage(out.name, out.body, sender, [])
+        kept = self.kept_for(to)[origin] = KeptMessage(out.name, out.body, sender, [])
         shape = home.shapes.now(out.name) if home.journal.durable else None
         if shape is not None:  # Its journal may have the table of an older program.
-            batch.add(out.to, shape_entry(out.name, shape), [])
+            batch.add(to, shape_entry(out.name, shape), [])
         if home.journal.durable:
-            batch.add(out.to, ("kept", origin, *kept[:3]), kept.positions)
+            batch.add(to, ("kept", origin, *kept[:3]), kept.positions)
         return True
 
     def read(self, home: Switch, position: int, origin: str, name: str, body: bytes, sender: str) -> None:
         """Take a message that was kept up again, from the journal of its receiver."""
-        self.kept_for(home.path).setdefault(origin, KeptMessage(name, body, sender, [])).positions.append(position)
+        kept = self.kept_for(home.path).setdefault(origin, KeptMessage(name, body, sender, [], is_earlier=True))
+        if position not in kept.positions:  # It stands there already if a start before this one has failed.
+            kept.positions.append(position)
 
     def kept_for(self, path: str) -> dict[str, KeptMessage]:
         """What is kept for an address, by origin."""
         return self._kept.setdefault(path, {})
 
     def _hand_over(self, home: Switch) -> None:
-        """What was kept for an address becomes inputs, each once: the journal may have it as one already."""
+        """What was kept for an address becomes inputs, oldest first, and each once: the journal may have it as one."""
         known = {(source.sender, source.origin) for source in home.ledger.handled_and_open()}
-        for origin, kept in self._kept.pop(home.path, {}).items():
+        messages = self._kept.pop(home.path, {}).items()  # What the journal had was read behind what came since.
+        for origin, kept in sorted(messages, key=lambda one: not one[1].is_earlier):
             home.ledger.drop(kept.positions)
             is_ask = origin.startswith(MARK)
             own = " ".join(origin.split(" ", 2)[:2]) if is_ask else origin
@@ -643,7 +656,7 @@ class Rejoin:
         if self._homes.far.asks_again(home, turn, key, out):
             return True
         ask = self._asks.get((home.path, turn, out.k))
-        if ask is None and not self._homes.knows(out.to):
+        if ask is None and not self._homes.knows(self._homes.addresses.now(out.to)):
             return False  # Whoever was asked keeps no journal.
         ask = ask or self._of(home.path, turn, out.k)  # Its receiver's home is not open yet.
         source = home.ledger.open.get(key)

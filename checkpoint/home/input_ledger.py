@@ -584,7 +584,10 @@ class InputLedger:
             case ("got", turn, k, kind, name, body, *order):
                 self.positions_of(turn).append(position)
                 answer = Came(kind, name, body, *order)
-                self._take_outcome(turn, k, self._placed(turn, answer) if answer.nth == AT_ITS_END else answer)
+                if answer.nth != AT_ITS_END:
+                    self._take_outcome(turn, k, answer)
+                elif (turn, k) not in self.outcomes:  # Else its time had run out: that is what the turn has seen.
+                    self._take_outcome(turn, k, self._placed(turn, answer))
                 self.waits.lasts |= turn > self.turn and kind.startswith(TIMED)
             case ("stop", *said):
                 self.end_with(EndWanted(*said) if said else None).append(position)

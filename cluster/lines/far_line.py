@@ -686,8 +686,8 @@ class FarLine(Peer):
         """The actor here that something is for; None if it is not there yet, but may be soon: `then` is called then."""
         path = self.connection.names.from_wire(to)
         homes = self._owner.homes
-        if homes is not None and homes.is_unopened(path):
-            homes.far.when_opened(path, then)
+        if homes is not None and homes.is_unopened(now := homes.addresses.now(path)):
+            homes.far.when_opened(now, then)
             return None
         cell = self.node.find(path)
         if (cell is None or cell.is_dead) and self._owner.await_actor(path, then):

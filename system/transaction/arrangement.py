@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from ...actors.kernel.node import Node
     from ..system import ActorSystem
     from .handing import Handing
+    from .senders import Senders
     from .succession import Succession
 
 
@@ -50,6 +51,10 @@ class Arrangement:
         """Of each child that is moved, how it is given to a supervisor, or by one, in another process."""
         self.successions: list[Succession] = []
         """The supervisors that begin anew, from above."""
+        self.regrouped: list[DraftPlace] = []
+        """Those that get another supervisor, or whose own begin anew, with all below them."""
+        self.senders: Senders | None = None
+        """Who is held because it goes on sending; None: no address changes."""
         self.step = ""
         """The step that is in the way, or has failed."""
 

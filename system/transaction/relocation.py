@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 from collections.abc import Callable, Coroutine
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from ...actors.kernel.cell import Cell
 from ...actors.migration.move import CommitGate
@@ -22,6 +22,7 @@ from .draft import rules
 from .operation import StagedWork
 
 if TYPE_CHECKING:
+    from ...actors.kernel.node import Node
     from ...ftm.group.probation import Probation
     from ..system import ActorSystem
     from .draft import DraftPlace
@@ -30,10 +31,18 @@ MOVED_WITHIN = 60.0
 """Seconds that a life may take to move at least; the transaction gives up first, at its own time limit."""
 
 
+class Inhabited(Protocol):
+    """Where an actor lives, whichever life it is in."""
+
+    def living(self, node: Node) -> Cell:
+        """The cell that lives there now. Raises NoSuchActor."""
+        ...
+
+
 class Gated:
     """A change of one live actor that waits, when all is ready, for the commit; until then it can be given up."""
 
-    def __init__(self, place: DraftPlace, text: str) -> None:
+    def __init__(self, place: Inhabited, text: str) -> None:
         self._place, self._text = place, text
         self.task: asyncio.Task[Any] | None = None
         self._cell: Cell | None = None  # of the actor, as it is while this is done

@@ -17,20 +17,20 @@ from typing import TYPE_CHECKING, ClassVar
 from ...actors.errors import ControlFailed, HoldfastError
 from ...actors.kernel.ref import Target
 from ...checkpoint.home.recorded_home import said_of_turn, switch_of
-from ...checkpoint.home.switch import Switch
-from ...checkpoint.protocol import SnapshotNow
 from ...supervision.children import STOPPED, UP
 from .arrangement import busy, child_of
 from .draft import Draft, DraftPlace, is_elsewhere
 from .handing import UNKNOWN, Handing, check_handed, check_handing, is_far
 from .living import OnSharedWork
 from .operation import Operation, StagedWork, text_of, wrong
-from .relocation import MOVED_WITHIN, Gated
+from .relocation import MOVED_WITHIN, Gated, Inhabited
+from .senders import Senders
 from .structure import check_child, check_not_uniform
 from .succession import Elsewhere, NewSupervisor, Succession, check_succession
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
+    from ...checkpoint.home.switch import Switch
     from ...ftm.bricks.sealed_frames import MovedCertificates
     from ..system import ActorSystem
 
@@ -106,7 +106,9 @@ class Regrouping(StagedWork):
 
     def __init__(self, top: DraftPlace, draft: Draft) -> None:
         self._top, self._draft = top, draft
-        self._asked: dict[Switch, int] = {}  # who was asked for a snapshot, behind which turn
+        draft.arrangement.regrouped.append(top)
+        self._senders = draft.arrangement.senders = draft.arrangement.senders or Senders()
+        self._kept_from_rest = ""  # what has kept it from coming to rest when that was tried last
         self._rests: dict[DraftPlace, Gated] = {}
         self._certificates: dict[DraftPlace, MovedCertificates] = {}
         self._handings: list[tuple[DraftPlace, Handing]] = []
@@ -147,7 +149,11 @@ class Regrouping(StagedWork):
         for _, handing in self._moved:
             await handing.prepare(system)
         await self._certify(system)
-        waits = bool(self._others_settle(system)) or bool(self._unsteady(system))
+        others = self._others(system)
+        self._senders.settle(others)
+        standing = self._senders.find_standing(others, self._held(system))
+        waits = self._senders.waits_for(one for one in others if one not in standing) or self._unsteady(system)
+        self._kept_from_rest = waits
         if waits:  # Perhaps for what those here have to answer.
             await self._go_on(system)
         if waits or not await self._rest(system) or self._why_not_moved(system):
@@ -165,12 +171,12 @@ class Regrouping(StagedWork):
         already: nobody stands still for long while another one's turn has not ended.
         """
         loop, end, longest = system._node.loop, math.inf, max(MOVED_WITHIN, self._draft.timeout)
-        while late := [(one, rest) for one, rest in self._resting(system) if not rest.is_waiting]:
+        while late := [(one, rest) for one, rest in self._coming_to_rest(system) if not rest.is_waiting]:
             await self._let_go(system)  # This may take long.
             waiting = [(one, rest) for one, rest in late if said_of_turn(one.living(system._node))]
             for one, rest in waiting or late:
                 rest.aim(system, functools.partial(system._moves.pause, one.living(system._node), longest))
-            stands_still = any(rest.is_waiting for rest in self._rests.values())
+            stands_still = bool(self._senders.standing()) or any(rest.is_waiting for rest in self._rests.values())
             end = min(end, loop.time() + self._patience) if stands_still else math.inf
             if loop.time() >= end:
                 await self._try_again_later(system)
@@ -178,20 +184,21 @@ class Regrouping(StagedWork):
             stirs = [future for _, rest in late for future in rest.stirs]
             within = max(0.0, end - loop.time()) if stands_still else None
             await asyncio.wait(stirs, timeout=within, return_when=asyncio.FIRST_COMPLETED)
-        if any(has_begun(one.living(system._node)) for one, _ in self._resting(system)):
+        if any(has_begun(one.living(system._node)) for one, _ in self._coming_to_rest(system)):
             await self._try_again_later(system)
             return False
         return True
 
     async def _try_again_later(self, system: ActorSystem) -> None:
         """Let all of them go on, for as long as some have stood still."""
+        self._senders.try_again_later()
         await self._go_on(system)
         await asyncio.sleep(self._patience)
         self._patience *= 2
 
     async def _go_on(self, system: ActorSystem) -> None:
         """Those at rest go on, and those that were to come to rest need not."""
-        await asyncio.gather(*(rest.give_up() for _, rest in self._resting(system)))
+        await asyncio.gather(self._senders.go_on(), *(rest.give_up() for _, rest in self._resting(system)))
 
     async def _let_go(self, system: ActorSystem) -> None:
         """Supervisors that have stood down go on."""
@@ -266,28 +273,32 @@ class Regrouping(StagedWork):
                 self._rests[one] = Gated(one, f"pause of {one.path}")
         return list(self._rests.items())
 
+    def _coming_to_rest(self, system: ActorSystem) -> list[tuple[Inhabited, Gated]]:
+        """Those of the actor and all below it that rest, and the senders that do."""
+        return [*self._resting(system), *self._senders.standing()]
+
     def _unsteady(self, system: ActorSystem) -> str:
         """Why replicas that are to rest cannot hear of another address just now."""
         cells = [one.now(system._node) for one, _ in self._resting(system)]
         found = [cell.path for cell in cells if cell is not None and not cell.host.place.is_steady(cell)]
         return f"a replica of {found[0]} is being replaced" if found else ""
 
-    def _others_settle(self, system: ActorSystem) -> str:
-        """Why the others are not so far that addresses can change; they are asked for what is missing."""
+    def _others(self, system: ActorSystem) -> list[Switch]:
+        """The homes of the others, if addresses change: what they have sent must not be sent again."""
         if not self._is_readdressed(system):
-            return ""
+            return []
         # Those that are reworked are saved at the commit.
         reworked = [place for place in self._draft.places() if place.rework is not None]
         own = [place.now(system._node) for place in (*reworked, *(one for one, _ in self._resting(system)))]
         settled = {switch_of(cell) for cell in own if cell is not None}
-        others = [switch for switch in system._homes if switch not in settled]
-        settle_senders(others, self._asked)
-        late = next(filter(is_unsettled, others), None)
-        if late is None:
-            return ""
-        said = "" if late.cell is None else said_of_turn(late.cell)
-        why = f"{late.path} may have to repeat what it has sent, so its next snapshot is waited for"
-        return f"{why}; {said}" if said else why
+        return [switch for switch in system._homes if switch not in settled]
+
+    def _held(self, system: ActorSystem) -> set[Switch]:
+        """The homes of those that steps hold: nobody else can."""
+        regrouped = (one for top in self._draft.arrangement.regrouped for one in addressed(top))
+        changed = (one for one in self._draft.places() if one.rework is not None or one.relocation is not None)
+        cells = (one.now(system._node) for one in (*regrouped, *changed))
+        return {switch for cell in cells if cell is not None and (switch := switch_of(cell)) is not None}
 
     @property
     def waits_for(self) -> str:
@@ -300,13 +311,16 @@ class Regrouping(StagedWork):
             return ""
         if why := self._why_not_moved(system):
             return why
-        if why := self._others_settle(system) or self._unsteady(system):
+        others = self._others(system)
+        self._senders.settle(others)
+        if why := self._senders.waits_for(others) or self._unsteady(system):
             return why
         for resting, rest in self._resting(system):
             cell = resting.living(system._node)
             switch = switch_of(cell)
             if not rest.is_waiting:
-                return f"{cell.path} is not at rest"
+                waits = f": {self._kept_from_rest}" if self._kept_from_rest else ""
+                return f"{cell.path} is not at rest{waits}"
             if has_begun(cell):
                 return f"{cell.path} is at rest before a turn that it has begun"
             if switch is not None and switch.method.replays and not is_saved(switch):
@@ -325,11 +339,13 @@ class Regrouping(StagedWork):
         return ""
 
     def commit(self, system: ActorSystem) -> None:
+        self._senders.open()
         for rest in self._rests.values():
             rest.open()
 
     async def finish(self, system: ActorSystem) -> None:
         try:
+            await self._senders.gone_on()
             for _, handing in self._handings:
                 await handing.finish(system)
             for rest in self._rests.values():
@@ -346,7 +362,7 @@ class Regrouping(StagedWork):
             for works in (
                 [succession.let_go(system) for succession in self._successions],
                 [succession.give_up(system) for succession in self._successions],
-                [rest.give_up() for rest in self._rests.values()],
+                [self._senders.go_on(), *(rest.give_up() for rest in self._rests.values())],
                 [handing.release(system) for _, handing in self._handings],
             ):
                 done = await asyncio.gather(*works, return_exceptions=True)
@@ -419,14 +435,6 @@ async def successors(draft: Draft, place: DraftPlace, new: DraftPlace, *, is_giv
     return found
 
 
-def is_unsettled(switch: Switch) -> bool:
-    """Whether what it has sent may be sent again, to be compared."""
-    ledger, method = switch.ledger, switch.method
-    if not (method.replays or method.snapshots):  # Protected, without recovery: only the turn in hand is made again.
-        return ledger.is_sending
-    return ledger.has_sent
-
-
 def is_saved(switch: Switch) -> bool:
     """Whether a replay would compare nothing: all that it has done is in its snapshot."""
     compared = any(turn.digests or turn.reply or turn.state for turn in switch.turns.values())
@@ -440,12 +448,3 @@ def has_begun(cell: Cell) -> bool:
     """
     switch = switch_of(cell)
     return switch is not None and bool(switch.ledger.released)
-
-
-def settle_senders(homes: Iterable[Switch], asked: dict[Switch, int]) -> None:
-    """Have recorded actors take a snapshot, so that no replay sends to an address of before; each turn once."""
-    for switch in homes:
-        life = switch.life
-        if is_unsettled(switch) and asked.get(switch) != switch.turn and life.port is not None and life.is_released:
-            asked[switch] = switch.turn
-            life.port.to_life(SnapshotNow(urgent=True))  # also if it is suspended

@@ -22,8 +22,30 @@ IN_HAND = "tests/checkpoint/test_diverging_in_hand.py"
 SMALL_DISK = "tests/checkpoint/sqlite/test_small_disk.py"
 CLOCKS_SET = "tests/effects/test_clocks_set.py"
 BETWEEN = "tests/checkpoint/test_between_lives.py"
+ORDER = "tests/checkpoint/test_order.py"
 
 CHECKS = {
+    "what an earlier program has kept comes first": Check(
+        "checkpoint/home/ask_recovery.py",
+        "sorted(messages, key=lambda one: not one[1].is_earlier):",
+        "messages:",
+        ORDER,
+        "has_kept_comes_first and task-end",
+    ),
+    "what is told under an address that was left is kept": Check(
+        "checkpoint/home/ask_recovery.py",
+        "to = self._homes.addresses.now(out.to)  #",
+        "to = out.to  #",
+        ORDER,
+        "told_under_its_old_address and tell",
+    ),
+    "a turn has one outcome of an ask, whoever else writes another": Check(
+        "checkpoint/home/input_ledger.py",
+        "elif (turn, k) not in self.outcomes:  # Else",
+        "else:  # Else",
+        ORDER,
+        "had_timed_out_starts_again",
+    ),
     "a wait of so many seconds goes by a clock that nobody sets": Check(
         "checkpoint/long_waits.py",
         "left = when - (clock.wall() if is_moment else clock.passed())",
@@ -187,8 +209,8 @@ CHECKS = {
     ),
     "what nobody knew the place of is behind all others": Check(
         "checkpoint/home/input_ledger.py",
-        "self._placed(turn, answer) if answer.nth == AT_ITS_END else answer",
-        "answer",
+        "self._take_outcome(turn, k, self._placed(turn, answer))",
+        "self._take_outcome(turn, k, answer)",
         RACES,
         "test_outcomes_have_their_places_in_the_journal",
     ),
@@ -656,8 +678,8 @@ CHECKS = {
     ),
     "what was kept for somebody who was not up is in the journal": Check(
         "checkpoint/home/ask_recovery.py",
-        "        if home.journal.durable:\n            batch.add(out.to",
-        "        if False:\n            batch.add(out.to",
+        "        if home.journal.durable:\n            batch.add(to",
+        "        if False:\n            batch.add(to",
         "tests/effects/test_long_waits.py",
         "test_what_is_told_to_somebody_who_is_not_started",
     ),

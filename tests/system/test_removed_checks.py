@@ -104,6 +104,13 @@ CHECKS = {
         RESTING,
         "who_is_protected_is_moved and pbr-sleep",
     ),
+    "who goes on sending stands still for the commit": Check(
+        "system/transaction/senders.py",
+        "        return switch.turn > first and is_saved and is_unsettled(switch)\n",
+        "        return False\n",
+        "tests/system/test_moves_under_load.py",
+        "comes_to_its_end and task-recorded-a",
+    ),
     "who keeps its address need not come to rest": Check(
         "system/transaction/reparenting.py",
         "addressed(self._top) if self._is_readdressed(system) else ():",
@@ -155,7 +162,7 @@ CHECKS = {
     ),
     "who is at rest before a turn that it has begun goes on": Check(
         "system/transaction/reparenting.py",
-        "        if any(has_begun(one.living(system._node)) for one, _ in self._resting(system)):\n",
+        "        if any(has_begun(one.living(system._node)) for one, _ in self._coming_to_rest(system)):\n",
         "        if False:\n",
         RESTING,
         "while_its_supervisor_leaves",
@@ -679,7 +686,7 @@ CHECKS = {
         "test_who_is_bound_to_it",
     ),
     "nobody waits for a snapshot of who takes none": Check(
-        "system/transaction/reparenting.py",
+        "system/transaction/senders.py",
         "    if not (method.replays or method.snapshots):",
         "    if False:",
         TIES,
