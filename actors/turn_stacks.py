@@ -73,6 +73,11 @@ def waits_at(work: Coroutine[Any, Any, Any]) -> str:
     return found
 
 
+def awaited_by(work: Coroutine[Any, Any, Any]) -> Iterator[Any]:
+    """A coroutine and those that it awaits, outermost first; last what is none."""
+    return (at for at, _, _ in _awaited(work))
+
+
 def _awaited(work: Coroutine[Any, Any, Any]) -> Iterator[tuple[Any, CodeType | None, FrameType | None]]:
     """A coroutine and what it awaits, outermost first, each with its code and frame; last what has no code."""
     at: Any = work

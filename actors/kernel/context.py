@@ -18,6 +18,7 @@ from ..seconds import check_seconds
 from . import links, mailbox
 from .blocking_handlers import is_async
 from .cell import TurnRest
+from .circles import end_circle, may_wait_for
 from .envelope import (
     NO_DEADLINE,
     Ask,
@@ -63,7 +64,7 @@ class Borrowed(list["Ask"]):
 class ActorContext:
     """An actor's view of the runtime. It belongs to one life: after that life's end it refuses to send."""
 
-    __slots__ = ("_asking", "_cell", "_closed", "_owes", "_random", "_token", "_turn")
+    __slots__ = ("_asked", "_asking", "_cell", "_closed", "_owes", "_random", "_token", "_turn")
 
     _may_fail_fast: ClassVar[bool] = True
     """Whether an ask may end by what the receiver happens to be doing; a replay could not repeat that."""
@@ -76,6 +77,7 @@ class ActorContext:
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
         self._closed = False
+        self._asked: Cell | None = None  # whom it has asked last
         self._asking: Any = None
         self._turn = 0
         self._random: random.Random | None = None
@@ -158,7 +160,10 @@ class ActorContext:
             await accepted
 
     def _ask(self, cell: Cell, message: Message[R], timeout: float) -> asyncio.Future[R]:
-        """Ask from this actor: the chain of waiting turns goes along, so that a circle is refused at once."""
+        """Ask from this actor: the chain of waiting turns goes along, so that a circle is refused at once.
+
+        If others wait for this turn that are in no such chain, they are looked for as soon as this turn waits, too.
+        """
         self._alive()
         if type(message) not in cell.table:
             cell.require(message)
@@ -175,6 +180,9 @@ class ActorContext:
         except BaseException:
             future.cancel()
             raise
+        self._asked = cell
+        if cell.more is not None and cell.more.turn is not None and may_wait_for(cell, self._cell):
+            node.loop.call_soon(end_circle, ask)
         return in_next_pass(future) if future.done() else future
 
     def _chain(self) -> Chain:
@@ -192,6 +200,11 @@ class ActorContext:
         if more is None or more.turn is None:  # Its last turn has ended: nobody waits here.
             return False
         return self._asking is self._item and (self.path, self._turn) in chain
+
+    def _whom(self, reply: Any) -> str:
+        """The address of the actor that was asked for this reply; "" if no ask of this actor waits for it."""
+        asks = self._cell.node.deadlines.waiting()
+        return next((ask.to.path for ask in asks if ask.future is reply and ask.sender is self._cell), "")
 
     def _is_left_behind(self) -> bool:
         """Whether a background task asks, and something else than in its turn is being handled now."""
