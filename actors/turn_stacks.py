@@ -1,22 +1,32 @@
-"""Stacks of suspended turns and of background work, as text: what each of them waits for."""
+"""What suspended turns and background work wait for: their stacks as text, and circles of turns that ask each other.
+
+Turns in a circle have begun by themselves: else the chain of an ask tells of it (`ActorContext._turn_in`).
+"""
 
 from __future__ import annotations
 
+import gc
 import linecache
 import sys
+import types
 from collections.abc import Coroutine, Iterator
 from types import CodeType, FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
-from .kernel.envelope import message_in
+from .errors import AskDeadlock
+from .kernel.envelope import Ask, message_in
 
 if TYPE_CHECKING:
     from .kernel.cell import Cell
+    from .kernel.loop import Suspended
 
 OURS = __name__.partition(".")[0]
 """The package whose frames are not the user's."""
 DRIVEN = "driven_turn"
 """The local in which a generator of ours holds the coroutine that it sends to by hand: Python sees no await there."""
+LONGEST: Final = 16
+"""Turns in the longest circle that is looked for when an ask is made."""
+EXITS: Final = frozenset({"__exit__", "__aexit__"})
 
 
 def blocked_below(top: Cell) -> str:
@@ -73,11 +83,6 @@ def waits_at(work: Coroutine[Any, Any, Any]) -> str:
     return found
 
 
-def awaited_by(work: Coroutine[Any, Any, Any]) -> Iterator[Any]:
-    """A coroutine and those that it awaits, outermost first; last what is none."""
-    return (at for at, _, _ in _awaited(work))
-
-
 def _awaited(work: Coroutine[Any, Any, Any]) -> Iterator[tuple[Any, CodeType | None, FrameType | None]]:
     """A coroutine and what it awaits, outermost first, each with its code and frame; last what has no code."""
     at: Any = work
@@ -94,3 +99,61 @@ def _awaited(work: Coroutine[Any, Any, Any]) -> Iterator[tuple[Any, CodeType | N
                 return
         yield at, code, frame
         at = frame.f_locals.get(DRIVEN) if inner is None and frame is not None else inner
+
+
+def may_wait_for(cell: Cell, other: Cell) -> bool:
+    """Whether the turn at `cell` may wait for the one at `other`, by whom each actor in between has asked last."""
+    at: Cell | None = cell
+    for _ in range(LONGEST):
+        if at is None or at is other:
+            break
+        more, ctx = at.more, at.ctx
+        at = ctx._asked if ctx is not None and more is not None and more.turn is not None else None
+    return at is other
+
+
+def end_circle(ask: Ask) -> None:
+    """If the asker's turn and those that wait for it stand in a circle, fail the ask in it that would run out first.
+
+    That one cannot be answered in time any more. Nothing is failed if one of the turns may be waiting for something
+    else as well, or no longer than some `with` block lets it.
+    """
+    row: list[Ask] = []
+    cell: Cell = ask.sender
+    while not row or cell is not ask.sender:
+        following = _awaited_of(cell)
+        if following is None or len(row) == LONGEST:
+            return
+        row.append(following)
+        cell = following.to
+    first = min(range(len(row)), key=lambda at: row[at].deadline)
+    refused = row[first]
+    refused.deadline = 0.0  # It stands in a mailbox: it is not run there.
+    refused.fail(
+        AskDeadlock(refused.to.path, tuple(one.sender.path for one in reversed(row[first + 1 :] + row[: first + 1])))
+    )
+
+
+def _awaited_of(cell: Cell) -> Ask | None:
+    """The ask that the turn in hand waits for, and for nothing else; None if there is none that has not begun."""
+    more, ctx = cell.more, cell.ctx
+    if more is None or more.turn is None or ctx is None or ctx._asked is None or not ctx._may_fail_fast:
+        return None
+    future = more.turn.waiting
+    for item in ctx._asked.queue or ():
+        if isinstance(item, Ask) and item.future is future and item.sender is cell and item.to is ctx._asked:
+            return None if item.is_done or _may_be_cut_short(more.turn) else item
+    return None
+
+
+def _may_be_cut_short(turn: Suspended) -> bool:
+    """Whether a coroutine of a suspended turn is inside a `with` block, such as `asyncio.timeout`.
+
+    The way out of the block is on the stack of its coroutine, where Python's collector finds it.
+    """
+    kinds = (types.MethodType, types.BuiltinMethodType, types.FunctionType)
+    return any(
+        isinstance(held, kinds) and held.__name__ in EXITS
+        for work, _, _ in _awaited(turn.coroutine)
+        for held in gc.get_referents(work)
+    )

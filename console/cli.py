@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import select
 import signal
 import sys
 
@@ -24,7 +23,7 @@ def app() -> None:
             commands()
         finally:
             sys.stdout.flush()
-    except SystemExit as end:  # So typer ends a command whose output is not read.
+    except SystemExit as end:  # So typer and rich end a command whose output is not read.
         if isinstance(end.__context__, BrokenPipeError):
             end_unread()
         raise
@@ -40,14 +39,9 @@ def app() -> None:
 
 
 def end_unread() -> None:
-    """End the process by SIGPIPE, if it is the output that nobody reads any more."""
-    look = select.poll()
-    for stream in (sys.__stdout__, sys.__stderr__):
-        if stream is not None:
-            look.register(stream.fileno(), 0)
-    if any(seen & select.POLLERR for _, seen in look.poll(0)):
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-        os.kill(os.getpid(), signal.SIGPIPE)
+    """End the process by SIGPIPE."""
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    os.kill(os.getpid(), signal.SIGPIPE)
 
 
 def missing_extra(missing: ModuleNotFoundError) -> str:

@@ -15,10 +15,10 @@ from ..effects import EffectCall, Isolation, Retry, effect_of
 from ..errors import ActorStopped, AskDeadlock, HoldfastError, SpecError, remote_crash
 from ..exit_reasons import NORMAL, ExitReason
 from ..seconds import check_seconds
+from ..turn_stacks import end_circle, may_wait_for
 from . import links, mailbox
 from .blocking_handlers import is_async
 from .cell import TurnRest
-from .circles import end_circle, may_wait_for
 from .envelope import (
     NO_DEADLINE,
     Ask,

@@ -170,7 +170,11 @@ class Before(Brick):
                 codec.decode(reply_type(type(message)), body)
         except (BadMessage, msgspec.MsgspecError) as error:
             problem = error.problem if isinstance(error, BadMessage) else str(error)
-            return self.refuse(work, request, NoReply(f"{type(self).__name__} of {self.ctx.path}", request.feed.name.replace(":", "."), problem))
+            return self.refuse(
+                work,
+                request,
+                NoReply(f"{type(self).__name__} of {self.ctx.path}", request.feed.name.replace(":", "."), problem),
+            )
         return self._end(work, request, Answer(REPLY, "", body))
 
     def refuse(self, work: Work, request: Request, error: HoldfastError) -> Work:
