@@ -59,7 +59,8 @@ class StoreInUse(StoreError):
             return f"store {self.path} is in use: {self.owner} leads; stop it, or wait for it with standby='warm'"
         if not self.pid:
             return f"store {self.path} is open in a process that cannot be seen from here (another container?): stop it"
-        return f"store {self.path} is open in process {self.pid}: stop it, or open with takeover=True, which kills it"
+        how = "open with takeover=True (holdfast run --takeover), which kills it"
+        return f"store {self.path} is open in process {self.pid}: stop it, or {how}"
 
 
 class DamagedStore(StoreError):

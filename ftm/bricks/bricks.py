@@ -164,10 +164,11 @@ class Before(Brick):
         taken back.
         """
         codec, message = self._standing.node.codec, self.message_of(request)
+        kind: type[Message[Any]] = type(message)
         try:
             body = codec.encode(reply, self._standing.address)
             if message is not None:
-                codec.decode(reply_type(type(message)), body)
+                codec.decode(reply_type(kind), body)
         except (BadMessage, msgspec.MsgspecError) as error:
             problem = error.problem if isinstance(error, BadMessage) else str(error)
             return self.refuse(
