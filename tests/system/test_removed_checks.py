@@ -39,21 +39,21 @@ DYNAMIC = "tests/supervision/test_dynamic.py"
 
 CHECKS = {
     "who may end its wait otherwise closes no circle of asks": Check(
-        "actors/turn_stacks.py",
+        "actors/kernel/context.py",
         "item.is_done or _may_be_cut_short(more.turn)",
         "item.is_done",
         CIRCLES,
         "nobody_is_refused_who_may_get_on and within",
     ),
     "who does not wait for the reply closes no circle of asks": Check(
-        "actors/turn_stacks.py",
+        "actors/kernel/context.py",
         "item.future is future and item.sender",
         "item.sender",
         CIRCLES,
         "nobody_is_refused_who_may_get_on and one_of_two",
     ),
     "an ask that was refused for its circle is not run later": Check(
-        "actors/turn_stacks.py",
+        "actors/kernel/context.py",
         "    refused.deadline = 0.0  # It",
         "    # It",
         CIRCLES,
