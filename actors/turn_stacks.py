@@ -5,9 +5,9 @@ from __future__ import annotations
 import linecache
 import sys
 from collections.abc import Coroutine, Iterator
-from types import CodeType, FrameType
 from typing import TYPE_CHECKING, Any
 
+from .kernel.context import awaited
 from .kernel.envelope import message_in
 
 if TYPE_CHECKING:
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
 OURS = __name__.partition(".")[0]
 """The package whose frames are not the user's."""
-DRIVEN = "driven_turn"
-"""The local in which a generator of ours holds the coroutine that it sends to by hand: Python sees no await there."""
 
 
 def blocked_below(top: Cell) -> str:
@@ -47,7 +45,7 @@ def _of(cell: Cell) -> Iterator[str]:
 
 def stack_of(work: Coroutine[Any, Any, Any]) -> Iterator[str]:
     """Where a coroutine waits, outermost first, as in a traceback; behind the last one, for what."""
-    for at, code, frame in _awaited(work):
+    for at, code, frame in awaited(work):
         if code is None:
             yield f"    waits for {at!r}"
         elif frame is not None:
@@ -63,7 +61,7 @@ def waits_at(work: Coroutine[Any, Any, Any]) -> str:
     It is the innermost that is neither of this package nor of Python's library; "" if there is none.
     """
     found = ""
-    for _, code, frame in _awaited(work):
+    for _, code, frame in awaited(work):
         if code is None or frame is None:
             continue
         package = str(frame.f_globals.get("__name__", "")).partition(".")[0]
@@ -71,21 +69,3 @@ def waits_at(work: Coroutine[Any, Any, Any]) -> str:
             source = linecache.getline(code.co_filename, frame.f_lineno).strip()
             found = f"{code.co_filename.rpartition('/')[2]}:{frame.f_lineno}" + (f", {source}" if source else "")
     return found
-
-
-def _awaited(work: Coroutine[Any, Any, Any]) -> Iterator[tuple[Any, CodeType | None, FrameType | None]]:
-    """A coroutine and what it awaits, outermost first, each with its code and frame; last what has no code."""
-    at: Any = work
-    while at is not None:
-        frame: FrameType | None
-        code: CodeType
-        match at:
-            case object(cr_frame=frame, cr_code=code, cr_await=inner):
-                pass
-            case object(gi_frame=frame, gi_code=code, gi_yieldfrom=inner):
-                pass
-            case _:
-                yield at, None, None
-                return
-        yield at, code, frame
-        at = frame.f_locals.get(DRIVEN) if inner is None and frame is not None else inner

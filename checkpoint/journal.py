@@ -63,7 +63,8 @@ class StoreInUse(StoreError):
             return f"store {self.path} is open in this very process: end the system that has it, or use another store"
         if not self.pid:
             return f"store {self.path} is open in a process that cannot be seen from here (another container?): stop it"
-        return f"store {self.path} is open in process {self.pid}: stop it, or open with takeover=True, which kills it"
+        how = "open with takeover=True (holdfast run --takeover), which kills it"
+        return f"store {self.path} is open in process {self.pid}: stop it, or {how}"
 
 
 class DamagedStore(StoreError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 
 EXTRA = {"rich", "textual", "typer"}
@@ -12,22 +13,35 @@ EXTRA = {"rich", "textual", "typer"}
 def app() -> None:
     """Run the command line; without its extra, say what to install instead of showing a traceback.
 
-    Nor is there a traceback of a fault of the command itself, unless HOLDFAST_TRACEBACK is set.
+    Nor is there a traceback of a fault of the command itself, unless HOLDFAST_TRACEBACK is set. If nobody reads the
+    output any more, as behind `head`, the command ends by SIGPIPE, as others do: no exit status of its own says that.
     """
     try:
         from .commands import commands
 
-        commands()
+        try:
+            commands()
+        finally:
+            sys.stdout.flush()
+    except SystemExit as end:  # So typer and rich end a command whose output is not read.
+        if isinstance(end.__context__, BrokenPipeError):
+            end_unread()
+        raise
     except ModuleNotFoundError as missing:
         sys.exit(missing_extra(missing))
-    except BrokenPipeError:  # Whoever reads it has enough, as `head` has.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
     except Exception as error:
+        if isinstance(error, BrokenPipeError):
+            end_unread()
         if os.environ.get("HOLDFAST_TRACEBACK"):
             raise
         hint = "HOLDFAST_TRACEBACK=1 shows where"
         sys.exit(f"holdfast: this is a fault of the command, {type(error).__name__}: {error} ({hint})")
+
+
+def end_unread() -> None:
+    """End the process by SIGPIPE."""
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    os.kill(os.getpid(), signal.SIGPIPE)
 
 
 def missing_extra(missing: ModuleNotFoundError) -> str:

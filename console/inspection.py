@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -9,6 +10,8 @@ import msgspec
 from ..actors.errors import type_name
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import cell_kind
+from ..checkpoint.method import Method
+from ..checkpoint.recovery_file import METHODS
 from ..ftm.replica.replica import Replica
 from ..supervision.intensity import recent_restarts
 from ..supervision.spec import ChildSpec
@@ -66,7 +69,17 @@ def _spec_words(spec: object) -> dict[str, Any]:
         return {}
     said = {name: getattr(spec, name) for name in ("restart", "shutdown", "isolation", "start_timeout")}
     given = {name: getattr(spec, name) for name in ("recovery", "mailbox", "backoff", "limits", "mechanism")}
-    return said | {name: str(value) for name, value in given.items() if value is not None}
+    return said | {name: _set_words(value) for name, value in given.items() if value is not None}
+
+
+def _set_words(value: object) -> str:
+    """A setting as text: of a method, its name and what differs from its defaults."""
+    if not isinstance(value, Method):
+        return str(value)
+    default = METHODS[value.name]() if value.name in METHODS else value
+    names = (field.name for field in dataclasses.fields(value))
+    changed = [name for name in names if getattr(value, name) != getattr(default, name)]
+    return f"{value.name}({', '.join(f'{name}={getattr(value, name)!r}' for name in changed)})"
 
 
 def _supervises(cell: Cell) -> dict[str, Any] | None:

@@ -54,6 +54,18 @@ class NotRunningHere(HoldfastError, text="process {pid} does not run {system}: {
     why: str
 
 
+class NotEnded(
+    HoldfastError,
+    text="{path} has not ended within {seconds:g} s{turn}; it has been told to, and is restarted when it gets to that; "
+    "`holdfast restart --kill` ends it at once",
+):
+    """A life was told to end in good order, and has not ended so far."""
+
+    path: str
+    seconds: float
+    turn: str
+
+
 class NotUpYet(
     HoldfastError,
     text="{path} has ended ({reason}), and its next life is not up within {seconds:g} s: it waits for {above}, "

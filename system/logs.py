@@ -352,6 +352,8 @@ def describe(event: Event, *, payloads: bool = False) -> Fields:
             fields[name] = {key: round(one, 6) if isinstance(one, float) else one for key, one in value.items()}
         elif isinstance(value, (int, float)):
             fields[name] = value
+        elif isinstance(value, tuple) and all(isinstance(one, str) for one in value):
+            fields[name] = list(value)
         else:
             fields[name] = str(value)
     return fields

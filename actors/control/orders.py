@@ -474,10 +474,11 @@ def status_of(cell: Cell) -> Status:
 
 
 def turns_of(cell: Cell) -> list[object]:
-    """At how many looks an actor in this process had something new in hand, and what its turn rests in: plain data."""
+    """At how many looks an actor here had something new in hand, what its turn rests in, and who owes it a reply."""
     return [
         cell.extra().belongings.take_look(cell.host.work(cell).mark),
         [list(rest) for rest in cell.host.rests(cell)],
+        cell.host.awaits(cell),
     ]
 
 

@@ -93,8 +93,13 @@ class Home:
             return []
         return [rest for item, rest in begun.values() if item is more.turn.item]
 
+    def awaits(self, cell: Cell) -> str:
+        """The address of the actor for whose reply alone the turn in hand waits; "" if there is none that is known."""
+        more, ctx = cell.more, cell.ctx
+        return "" if more is None or more.turn is None or ctx is None else ctx._whom(more.turn.waiting)
+
     def ask_turns(self, cell: Cell) -> None:
-        """Have its process tell of its turns, for the next `work` and `rests`; nothing to do where they are known."""
+        """Have its process tell of its turns, for the next `work`, `rests` and `awaits`; nothing where all is known."""
 
     def mailbox(self, cell: Cell) -> Capacity | None:
         """How full the mailbox is; None if it takes any number of messages."""
@@ -309,6 +314,9 @@ class AddressHost:
 
     def rests(self, cell: Cell) -> list[TurnRest]:
         return self.home.rests(cell)
+
+    def awaits(self, cell: Cell) -> str:
+        return self.home.awaits(cell)
 
     def ask_turns(self, cell: Cell) -> None:
         self.home.ask_turns(cell)

@@ -132,8 +132,12 @@ class Host(Protocol):
         """What the turn in hand waits for that is no other actor's work, as far as is known in this process."""
         ...
 
+    def awaits(self, cell: Cell) -> str:
+        """The address of the actor for whose reply alone the turn in hand waits; "" if there is none that is known."""
+        ...
+
     def ask_turns(self, cell: Cell) -> None:
-        """Have its process tell of its turns, for the next `work` and `rests`; nothing to do where they are known."""
+        """Have its process tell of its turns, for the next `work`, `rests` and `awaits`; nothing where all is known."""
         ...
 
     def mailbox(self, cell: Cell) -> Capacity | None:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import math
 import random
+import types
 import uuid
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from contextvars import ContextVar, copy_context
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, TypeVarTuple, cast, overload
+from types import CodeType, FrameType
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, TypeVar, TypeVarTuple, cast, overload
 
 from ..effects import EffectCall, Isolation, Retry, effect_of
 from ..errors import ActorStopped, AskDeadlock, HoldfastError, SpecError, remote_crash
@@ -38,6 +41,7 @@ from .topics import NOT_TAKEN, publish
 if TYPE_CHECKING:
     from .actor import Actor, Start
     from .cell import Cell
+    from .loop import Suspended
     from .ref import ActorRef
 
 A = TypeVar("A", bound="Actor")
@@ -48,6 +52,12 @@ Ts = TypeVarTuple("Ts")
 
 begun_in: ContextVar[Any] = ContextVar("begun_in", default=None)
 """In a background task: what was being handled when it was created. That turn may wait for it, a later one does not."""
+
+DRIVEN = "driven_turn"
+"""The local in which a generator of ours holds the coroutine that it sends to by hand: Python sees no await there."""
+LONGEST: Final = 16
+"""Turns in the longest circle that is looked for when an ask is made."""
+EXITS: Final = frozenset({"__exit__", "__aexit__"})
 
 
 class StashError(HoldfastError, text="{why}"):
@@ -63,7 +73,7 @@ class Borrowed(list["Ask"]):
 class ActorContext:
     """An actor's view of the runtime. It belongs to one life: after that life's end it refuses to send."""
 
-    __slots__ = ("_asking", "_cell", "_closed", "_owes", "_random", "_token", "_turn")
+    __slots__ = ("_asked", "_asking", "_cell", "_closed", "_owes", "_random", "_token", "_turn")
 
     _may_fail_fast: ClassVar[bool] = True
     """Whether an ask may end by what the receiver happens to be doing; a replay could not repeat that."""
@@ -76,6 +86,7 @@ class ActorContext:
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
         self._closed = False
+        self._asked: Cell | None = None  # whom it has asked last
         self._asking: Any = None
         self._turn = 0
         self._random: random.Random | None = None
@@ -158,7 +169,10 @@ class ActorContext:
             await accepted
 
     def _ask(self, cell: Cell, message: Message[R], timeout: float) -> asyncio.Future[R]:
-        """Ask from this actor: the chain of waiting turns goes along, so that a circle is refused at once."""
+        """Ask from this actor: the chain of waiting turns goes along, so that a circle is refused at once.
+
+        If others wait for this turn that are in no such chain, they are looked for as soon as this turn waits, too.
+        """
         self._alive()
         if type(message) not in cell.table:
             cell.require(message)
@@ -175,6 +189,9 @@ class ActorContext:
         except BaseException:
             future.cancel()
             raise
+        self._asked = cell
+        if cell.more is not None and cell.more.turn is not None and may_wait_for(cell, self._cell):
+            node.loop.call_soon(end_circle, ask)
         return in_next_pass(future) if future.done() else future
 
     def _chain(self) -> Chain:
@@ -192,6 +209,11 @@ class ActorContext:
         if more is None or more.turn is None:  # Its last turn has ended: nobody waits here.
             return False
         return self._asking is self._item and (self.path, self._turn) in chain
+
+    def _whom(self, reply: Any) -> str:
+        """The address of the actor that was asked for this reply; "" if no ask of this actor waits for it."""
+        asks = self._cell.node.deadlines.waiting()
+        return next((ask.to.path for ask in asks if ask.future is reply and ask.sender is self._cell), "")
 
     def _is_left_behind(self) -> bool:
         """Whether a background task asks, and something else than in its turn is being handled now."""
@@ -764,3 +786,79 @@ def waits_for(asker: ActorContext, cell: Cell, chain: Chain) -> bool:
     if ctx is asker:
         return asker._in_turn() and not asker._is_left_behind()
     return ctx is not None and ctx._turn_in(chain)
+
+
+def awaited(work: Coroutine[Any, Any, Any]) -> Iterator[tuple[Any, CodeType | None, FrameType | None]]:
+    """A coroutine and what it awaits, outermost first, each with its code and frame; last what has no code."""
+    at: Any = work
+    while at is not None:
+        frame: FrameType | None
+        code: CodeType
+        match at:
+            case object(cr_frame=frame, cr_code=code, cr_await=inner):
+                pass
+            case object(gi_frame=frame, gi_code=code, gi_yieldfrom=inner):
+                pass
+            case _:
+                yield at, None, None
+                return
+        yield at, code, frame
+        at = frame.f_locals.get(DRIVEN) if inner is None and frame is not None else inner
+
+
+def may_wait_for(cell: Cell, other: Cell) -> bool:
+    """Whether the turn at `cell` may wait for the one at `other`, by whom each actor in between has asked last."""
+    at: Cell | None = cell
+    for _ in range(LONGEST):
+        if at is None or at is other:
+            break
+        more, ctx = at.more, at.ctx
+        at = ctx._asked if ctx is not None and more is not None and more.turn is not None else None
+    return at is other
+
+
+def end_circle(ask: Ask) -> None:
+    """If the asker's turn and those that wait for it stand in a circle, fail the ask in it that would run out first.
+
+    That one cannot be answered in time any more. Nothing is failed if one of the turns may be waiting for something
+    else as well, or no longer than some `with` block lets it.
+    """
+    row: list[Ask] = []
+    cell: Cell = ask.sender
+    while not row or cell is not ask.sender:
+        following = _awaited_of(cell)
+        if following is None or len(row) == LONGEST:
+            return
+        row.append(following)
+        cell = following.to
+    first = min(range(len(row)), key=lambda at: row[at].deadline)
+    refused = row[first]
+    refused.deadline = 0.0  # It stands in a mailbox: it is not run there.
+    refused.fail(
+        AskDeadlock(refused.to.path, tuple(one.sender.path for one in reversed(row[first + 1 :] + row[: first + 1])))
+    )
+
+
+def _awaited_of(cell: Cell) -> Ask | None:
+    """The ask that the turn in hand waits for, and for nothing else; None if there is none that has not begun."""
+    more, ctx = cell.more, cell.ctx
+    if more is None or more.turn is None or ctx is None or ctx._asked is None or not ctx._may_fail_fast:
+        return None
+    future = more.turn.waiting
+    for item in ctx._asked.queue or ():
+        if isinstance(item, Ask) and item.future is future and item.sender is cell and item.to is ctx._asked:
+            return None if item.is_done or _may_be_cut_short(more.turn) else item
+    return None
+
+
+def _may_be_cut_short(turn: Suspended) -> bool:
+    """Whether a coroutine of a suspended turn is inside a `with` block, such as `asyncio.timeout`.
+
+    The way out of the block is on the stack of its coroutine, where Python's collector finds it.
+    """
+    kinds = (types.MethodType, types.BuiltinMethodType, types.FunctionType)
+    return any(
+        isinstance(held, kinds) and held.__name__ in EXITS
+        for work, _, _ in awaited(turn.coroutine)
+        for held in gc.get_referents(work)
+    )

@@ -408,7 +408,8 @@ class Suspended:
     )
 
     def __init__(self, cell: Cell, item: Any, coroutine: Any, waiting: Any, runner: Runner) -> None:
-        self.cell, self.item, self.coroutine, self.waiting, self.runner = cell, item, coroutine, waiting, runner
+        self.cell, self.item, self.coroutine, self.runner = cell, item, coroutine, runner
+        self.waiting = waiting  # the future that it waits for
         self.killed = self.is_left = False  # (left: cancelled, and it does not matter how it ends)
         ctx = cell.ctx  # Of this life: the cell may have another one before its coroutine ends.
         self.marked = ctx if ctx is not None and ctx._marks_waits else None  # who is told when it waits, and goes on
@@ -512,8 +513,7 @@ class Runner(Coroutine[Any, Any, None]):
 
     def _take_over(self, turn: Suspended) -> Any:
         self._call, self._context = None, turn.cell.context
-        waiting, turn.waiting = turn.waiting, None
-        return waiting
+        return turn.waiting
 
     def _step(self, turn: Suspended, context: Context, step: Callable[[Any], Any], value: Any) -> Any:
         """Step a started coroutine inside its actor's context; what it waits for is handed to the running task."""
@@ -531,6 +531,7 @@ class Runner(Coroutine[Any, Any, None]):
         if marked is not None:
             marked._turn_waits()  # If it was killed, nobody closes it.
         if not is_over:
+            turn.waiting = waiting
             return waiting
         self._turn = self._context = None
         self._loop.turn_over(turn, error)

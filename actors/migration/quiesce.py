@@ -253,6 +253,9 @@ class Transit:
     def rests(self, cell: Cell) -> list[TurnRest]:
         return []
 
+    def awaits(self, cell: Cell) -> str:
+        return ""
+
     def ask_turns(self, cell: Cell) -> None:
         pass
 

@@ -48,6 +48,7 @@ class OwnTurns(NamedTuple):
 
     seen: int = 0
     rests: tuple[TurnRest, ...] = ()
+    awaits: str = ""
 
 
 class Outlet:
@@ -409,6 +410,10 @@ class FlightHome(WorkerHome):
     def rests(self, cell: Cell) -> list[TurnRest]:
         outlet: Outlet | None = cell.extra().outlet
         return [] if outlet is None else list(outlet.own_turns.rests)
+
+    def awaits(self, cell: Cell) -> str:
+        outlet: Outlet | None = cell.extra().outlet
+        return "" if outlet is None else outlet.own_turns.awaits
 
     def ask_turns(self, cell: Cell) -> None:
         outlet: Outlet | None = cell.extra().outlet

@@ -279,6 +279,10 @@ class RecordedContext(ActorContext):
         life.release()
         return future
 
+    def _whom(self, reply: Any) -> str:
+        outcomes = self.recorded.waits.outcomes.values()
+        return next((of.actor for future, of in outcomes if future is reply and isinstance(of, Asked)), "")
+
     def forward(self, to: ActorRef[Any]) -> None:
         fed = self._item
         if not self._in_turn() or not isinstance(fed, Fed):

@@ -252,7 +252,7 @@ def protect(
     Exit status 0: done. 1: refused, nothing was done. 2: no system answers, or neither mechanisms nor --off are given.
     """
     if bool(mechanisms) == off:
-        raise typer.BadParameter("give mechanisms, such as pbr, or --off")
+        raise typer.BadParameter(f"give mechanisms, such as pbr, or --off{', not both' if off else ''}")
     with reached("protect", system, socket) as remote:
         rows = meant_rows(remote, [path])
         stack = tuple(mechanisms) if mechanisms else None

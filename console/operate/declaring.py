@@ -27,6 +27,10 @@ def plan(
 
     Exit status 0: it can be done, or nothing is to be done. 1: it cannot be done. 2: no file, or no system.
     """
+    if tree.suffix == ".py":
+        raise ended(
+            "plan", f"{tree}: a script is for `holdfast apply --dry-run`; a plan is made of a tree (.toml)", UNUSABLE
+        )
     text = _read("plan", tree)
     with reached("plan", system, socket) as remote:
         change = asyncio.run(remote.declare(text, str(tree), dry_run=True))

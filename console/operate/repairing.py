@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
 from ..wire import RepairVerb
 from .reaching import Json, Socket, System, reached, show_json
 from .remembering import print_lines
+
+STANCES: Final = ("off", "advise", "ask", "on")
 
 repair = typer.Typer(
     name="repair",
@@ -77,8 +79,10 @@ def set_stance(
 ) -> None:
     """Say how far repair goes from now on: off, advise, ask or on. A restart of the program forgets it.
 
-    Exit status 0: done. 1: there is no such stance, or no repair runs. 2: no system answers.
+    Exit status 0: done. 1: no repair runs. 2: there is no such stance, or no system answers.
     """
+    if stance not in STANCES:
+        raise typer.BadParameter(f"{stance!r} is none of {', '.join(STANCES)}")
     _ordered("set", (stance,), system, socket, as_json)
 
 

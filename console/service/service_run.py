@@ -210,6 +210,7 @@ def run(
             "--key-file", envvar="HOLDFAST_STORE_KEY_FILE", help="Of an encrypted store: the file with its key."
         ),
     ] = None,
+    takeover: Annotated[bool, typer.Option("--takeover", help="Kill the process that has the store open.")] = False,
     probes: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Where /livez and /readyz are answered over HTTP.")
     ] = None,
@@ -228,7 +229,9 @@ def run(
 
     try:
         chosen: Durability | None = durability  # type: ignore[assignment]  # it is looked at where it is used
-        system = ActorSystem(name, store=store, store_key=key_file, durability=chosen, recovery=recovery)
+        system = ActorSystem(
+            name, store=store, store_key=key_file, durability=chosen, recovery=recovery, takeover=takeover
+        )
         run_loop(serve(program, system, probes))
     except HoldfastError as error:
         raise ended("run", error, FAILED) from error

@@ -112,11 +112,12 @@ class RuntimeObserver(Observer):
     """Says who gets on, answers, keeps up, ends again and again, whose mailbox is full, and who waits for whom.
 
     An actor is late if asks of it were not answered in time, or if others wait for it longer than the longest turn it
-    was seen to need, four times over. So it is if messages wait that it was only told; but then it may rest, in a sleep
-    or an effect of its own (`ctx.sleep`, `ctx.effect`). Who is late because it waits for another one is not accused:
-    the last one in that row is, also if a mailbox only grows because each turn waits for it. If the row leads back to
-    its beginning, all in the circle are. Whether an actor answers is said only if it was asked. What is said against
-    one is taken back when it is true again, and else is unknown `time_to_live` seconds after the last reason for it.
+    was seen to need, four times over; and so are all whose turns have waited for each other in a circle for `patience`.
+    An actor is late as well if messages wait that it was only told; but then it may rest, in a sleep or an effect of
+    its own (`ctx.sleep`, `ctx.effect`). Who is late because it waits for another one is not accused: the last one in
+    that row is, also if a mailbox only grows because each turn waits for it. If the row leads back to its beginning,
+    all in the circle are. Whether an actor answers is said only if it was asked. What is said against one is taken back
+    when it is true again, and else is unknown `time_to_live` seconds after the last reason for it.
 
     Args:
         actors: component to address; it may change, and what is in it at a look is looked at.
@@ -213,6 +214,9 @@ class RuntimeObserver(Observer):
                 for atom in (progress(component), replies(component), room(component), keeps_up(component)):
                     if component not in self._loops:
                         self.verdict(atom, None)
+        for circle in self._circles(waits, shown, now):
+            waits |= {component: {following} for component, following in circle.items()}
+            shown |= {component: shown[component]._replace(is_late=True, is_asked=True) for component in circle}
         self._tell(shown, waits)
         if self._node.clock.is_monotonic:
             self._rests_until = now + (time.thread_time() - began) * SHARE
@@ -231,6 +235,30 @@ class RuntimeObserver(Observer):
                 waits.setdefault(asker, set()).add(callee)
                 self._asked.setdefault(asker, set()).add(callee)
         return waits, since
+
+    def _circles(self, waits: Mapping[str, set[str]], shown: Mapping[str, _Shown], now: float) -> list[dict[str, str]]:
+        """Who waits for whom where it leads back: each one's turn has stood for long, and waits for nothing else."""
+        left = {component: {to for to in of_it if to in waits} for component, of_it in waits.items()}
+        while ends := {component for component, of_it in left.items() if not of_it}:
+            left = {component: of_it - ends for component, of_it in left.items() if of_it}
+        after: dict[str, str] = {}
+        for component in left:
+            cell = self._node.find(self._actors[component])
+            if component not in shown or cell is None or now - self._seen(component).since <= self._patience:
+                continue
+            awaited = cell.host.awaits(cell)
+            after.update((component, to) for to in left[component] if self._actors[to] == awaited)
+            cell.host.ask_turns(cell)  # for the next look
+        circles: list[dict[str, str]] = []
+        while after:
+            at, row = next(iter(after)), dict[str, str]()
+            while at in after:
+                row[at] = after.pop(at)
+                at = row[at]
+            if at in row:
+                first = list(row).index(at)
+                circles.append(dict(list(row.items())[first:]))
+        return circles
 
     def _take_failures(self, names: Mapping[str, str]) -> None:
         failed, self._failed = self._failed, []

@@ -47,7 +47,7 @@ from .choice import CaseView, choose, components_of, problem_for
 from .executor import DONE, SKIPPED, UNVERIFIED, Executor, Result
 from .ledger import Ledger, Memory
 from .outlook import OURS, Outlook
-from .ping import answers
+from .ping import answers, looked_at
 from .policy import Policy, check_stance
 from .story import about, sentence
 
@@ -524,10 +524,17 @@ class Repairer(Actor):
         """Leave components alone from now on, and say so to everybody."""
         names = tuple(name for name in components if name not in self._memory.given_up)
         self._memory.given_up |= dict.fromkeys(names, why)
+        suspended = {name: at for name in names if (at := self._addresses.get(name)) and await self._is_suspended(at)}
         symptoms, seconds = self._outlook.diagnosis.symptoms, self.now() - case.began
-        plan = tuple(self._for_people(case, names))
+        plan = tuple(self._for_people(case, [name for name in names if name not in suspended]))
+        plan += tuple(f"holdfast resume {address}" for address in suspended.values())
         self.ctx._cell.node.emit(say.RepairGaveUp(self.ctx.path, names, why, plan))
         await self._tell(say.GaveUp(case.number, names, symptoms, why, tuple(case.actions), seconds, plan))
+
+    async def _is_suspended(self, address: str) -> bool:
+        """Whether an actor is suspended by order."""
+        seen = await looked_at(self.ctx._cell.node, address, self._policy.caution.ping)
+        return seen is not None and seen.state == "suspended"
 
     def _for_people(self, case: Case, names: Iterable[str]) -> Iterator[str]:
         """What a person should try: what repair was not to do or has not tried, and whose word it all rests on."""

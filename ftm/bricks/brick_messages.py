@@ -78,6 +78,17 @@ class RequestDropped(Refusal):
         )
 
 
+class NoReply(
+    Refusal,
+    text="{brick} has ended {message} with what is no reply to it: {problem}; mend the brick; it was not handled",
+):
+    """A brick of the mechanism has answered this request itself, and not as the message declares its reply."""
+
+    brick: str
+    message: str
+    problem: str
+
+
 class ReplyEvicted(
     Refusal, text="request {number} to {path} was handled, but its reply is not kept any more: ask for what it has done"
 ):

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
-from ...actors.errors import HoldfastError, type_name
+from ...actors.errors import BadMessage, HoldfastError, type_name
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.bindings import Binding
 from ...actors.kernel.envelope import ReplyHandle
-from ...actors.kernel.message import Message, Refusal
+from ...actors.kernel.message import Message, Refusal, reply_type
 from ...actors.kernel.ref import current
 from ...checkpoint.protocol import (
     DROPPED,
@@ -33,7 +33,19 @@ from ...checkpoint.protocol import (
     Snapshot,
     TurnEnd,
 )
-from .brick_messages import FORWARDED, Beside, Done, Inward, Outward, PartEnded, Request, StaleLeader, Taken, Work
+from .brick_messages import (
+    FORWARDED,
+    Beside,
+    Done,
+    Inward,
+    NoReply,
+    Outward,
+    PartEnded,
+    Request,
+    StaleLeader,
+    Taken,
+    Work,
+)
 from .letters import FOREVER as FOREVER
 from .peer_channel import AGAIN, Inbox, Posting
 
@@ -146,9 +158,25 @@ class Before(Brick):
         return cell.node.codec.message_in(cell, feed.name, feed.body)
 
     def answer(self, work: Work, request: Request, reply: object) -> Work:
-        """End one request here with this reply; it is computed nowhere. Returns the batch without it."""
-        node = self._standing.node
-        return self._end(work, request, Answer(REPLY, "", node.codec.encode(reply, self._standing.address)))
+        """End one request here with this reply; it is computed nowhere. Returns the batch without it.
+
+        If the reply is not of the type that the message declares, its asker gets `NoReply`, and a new mechanism is
+        taken back.
+        """
+        codec, message = self._standing.node.codec, self.message_of(request)
+        kind: type[Message[Any]] = type(message)
+        try:
+            body = codec.encode(reply, self._standing.address)
+            if message is not None:
+                codec.decode(reply_type(kind), body)
+        except (BadMessage, msgspec.MsgspecError) as error:
+            problem = error.problem if isinstance(error, BadMessage) else str(error)
+            return self.refuse(
+                work,
+                request,
+                NoReply(f"{type(self).__name__} of {self.ctx.path}", request.feed.name.replace(":", "."), problem),
+            )
+        return self._end(work, request, Answer(REPLY, "", body))
 
     def refuse(self, work: Work, request: Request, error: HoldfastError) -> Work:
         """End one request here: whoever has asked gets the error. Returns the batch without it."""
@@ -242,6 +270,8 @@ class Proceed(Brick):
     def _take(self, work: Work) -> None:
         if self._refuses() or self._knows(work):
             return
+        if len({one.feed.id for one in work.requests}) < len(work.requests):  # It would be handled twice.
+            raise HoldfastError(f"{self.ctx.path}: a brick before it has handed on a request twice; mend the brick")
         self._standing.server.note_batch(work)
         self._works.append(work)
         self.go_on()

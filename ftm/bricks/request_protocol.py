@@ -31,6 +31,7 @@ from .brick_messages import (
     Follow,
     Inward,
     Lead,
+    NoReply,
     PartEnded,
     ReplyEvicted,
     Request,
@@ -71,6 +72,7 @@ if TYPE_CHECKING:
     from .standing import Standing
 
 
+NO_REPLY = message_name(NoReply)
 CANARY = -1
 """The number of a batch without requests that only shows whether all bricks let it pass."""
 
@@ -185,7 +187,8 @@ class RequestProtocol(Transfer):
         standing = self._standing
         if self._refuses():
             return Taken()
-        standing.log.add(standing.entries(done.ends))
+        # What ended with no reply was not handled: the stack before, if it comes back, is asked for it.
+        standing.log.add(standing.entries([end for end in done.ends if end.answer.name != NO_REPLY]))
         for end in done.ends:
             standing.inside.pop(end.id, None)
         if self._marker is not None:

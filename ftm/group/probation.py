@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from ...actors.errors import HoldfastError
 from ...actors.kernel.message import message_name
-from ..bricks.brick_messages import RequestDropped
+from ..bricks.brick_messages import NoReply, RequestDropped
 from ..bricks.replica_orders import Computes, Doing
 from ..events import MechanismSettled
 from ..model.mechanism import NOTHING
@@ -36,7 +36,11 @@ LOOK_EVERY: Final = 1.0
 """Seconds between two looks at how it does."""
 LONGEST_PAUSE: Final = 60.0
 """Seconds until going back is tried again, if it could not be; doubled each time, from one second on."""
-DROPPED: Final = message_name(RequestDropped)
+MISUSES: Final = {
+    message_name(RequestDropped): "its bricks have let a request fall",
+    message_name(NoReply): "its bricks have ended a request with what is no reply to it",
+}
+"""Errors that say of bricks how they have ended a request wrongly."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -162,19 +166,21 @@ class Probation:
             self._group.place.begin_going_back()
 
     def drops(self, end: TurnEnd) -> bool:
-        """A brick has ended a request itself: whether that is asked of the stack before, since it was let fall.
+        """A brick has ended a request itself: whether that is asked of the stack before, since it was ended wrongly.
 
         One that may have run is asked of another replica alone: what came of it is known there, or was never.
         """
         replicas, name = self._group.replicas, self._group.membership.primary
-        if self.is_over or end.answer.name != DROPPED:
+        why = MISUSES.get(end.answer.name)
+        if self.is_over or why is None:
             return False
         error = replicas.node.codec.decode_error(end.answer.kind, end.answer.name, end.answer.body)
-        why = "its bricks have let a request fall"
         life = 0 if name is None else self._group.membership.members.get(name, 0)
         if name is not None and not self.why:
             replicas.at_fault(name, why)
             self._take_from(name, life, why)
+        if isinstance(error, NoReply):
+            return True
         if not isinstance(error, RequestDropped):
             return False
         if error.may_have_run and name is not None and replicas.is_well(name) and replicas.backups():

@@ -1,5 +1,7 @@
 """The command line: what it says when it cannot do what it is asked, and its exit status."""
 
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -7,6 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+import holdfast as hf
 from holdfast.console import cli
 from holdfast.console.commands import commands
 
@@ -78,3 +81,27 @@ def test_an_option_out_of_range_is_refused(option: tuple[str, str]) -> None:
     result = demo(*option)
     assert result.exit_code == UNUSABLE
     assert option[0] in result.stderr
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["coverage"], ["store", "stats"], ["store", "export"], ["store", "verify"], ["store", "export", "--help"]],
+    ids=" ".join,
+)
+async def test_a_command_whose_output_nobody_reads_ends_by_sigpipe(tmp_path: Path, command: list[str]) -> None:
+    """No exit status of the command's own says that: 1 would say that a good store is damaged."""
+    path = tmp_path / "app.db"
+    async with hf.ActorSystem("t", log=False, store=f"sqlite:{path}"):
+        pass
+    arguments = [*command, str(path)] if command[0] == "store" else command
+    reader, writer = os.pipe()
+    os.close(reader)
+    ended = subprocess.run(
+        [sys.executable, "-m", "holdfast.console.cli", *arguments],
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        check=False,
+        timeout=120,
+    )
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (-signal.SIGPIPE, b"")

@@ -288,6 +288,47 @@ async def test_a_restart_keeps_what_is_recorded_and_what_waits(named: hf.ActorSy
     assert await waiting == 7
 
 
+class Hang(hf.Message): ...
+
+
+class Hangs(Counter):
+    @hf.on(Hang)
+    async def hang(self, message: Hang) -> None:
+        await asyncio.Event().wait()
+
+
+async def test_a_restart_of_who_hangs_says_in_which_turn_it_is_and_what_ends_it(named: hf.ActorSystem) -> None:
+    one = await named.start(hf.child("hangs", hf.start(Hangs)))
+    one.tell(Hang())
+    status, _, errors = await holdfast("restart", "/app/hangs", "--yes", "--timeout", 0.5)
+    assert status == FAILED
+    assert (
+        "/app/hangs has not ended within 0.5 s, for its turn of tests.console.test_operate.Hang has run for" in errors
+    )
+    assert "await asyncio.Event().wait()" in errors
+    assert "`holdfast restart --kill` ends it at once" in errors
+    assert (await holdfast("restart", "/app/hangs", "--yes", "--kill"))[0] == DONE
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("protect", "/app/left/a", "pbr", "--off"), "not both"),
+        (("repair", "set", "nonsense"), "'nonsense' is none of off, advise, ask, on"),
+        (("plan", "small.py"), "a script is for `holdfast apply --dry-run`"),
+    ],
+    ids=lambda one: one if isinstance(one, str) else one[0],
+)
+async def test_a_wrong_word_is_told_and_is_status_2(named: hf.ActorSystem, words: tuple[str, ...], said: str) -> None:
+    status, _, errors = await holdfast(*words)
+    assert (status, said in " ".join(errors.replace("│", " ").split())) == (UNUSABLE, True)
+
+
+async def test_inspect_shows_of_a_method_what_differs_from_its_defaults(named: hf.ActorSystem) -> None:
+    await named.start(hf.child("kept", hf.start(Counter), recovery=hf.hybrid(interval=7.0)))
+    assert "spec recovery: hybrid(interval=7.0)\n" in (await holdfast("inspect", "/app/kept"))[1]
+
+
 async def test_a_restart_that_would_end_the_supervisor_is_refused(named: hf.ActorSystem) -> None:
     await named.start(hf.supervisor("strict", intensity=0, children=[hf.child("x", hf.start(Counter))]))
     status, _, errors = await holdfast("restart", "/app/strict/x", "--yes")

@@ -19,9 +19,17 @@ BOARD = "tests/diagnosis/board/test_board.py"
 FLOW = "tests/diagnosis/observers/test_flow.py"
 FOREIGN = "tests/diagnosis/foreign/test_foreign.py"
 
+CIRCLES = "tests/diagnosis/observers/test_circles.py"
 KINDS = "tests/diagnosis/observers/test_kinds.py"
 
 CHECKS = {
+    "who does something else is in no circle": Check(
+        "diagnosis/observers/runtime.py",
+        " for to in left[component] if self._actors[to] == awaited)",
+        " for to in left[component])",
+        CIRCLES,
+        "does_something_else",
+    ),
     "a recorded actor has in hand what its home says": Check(
         "checkpoint/home/journal_home.py",
         "        return Work(mark, source is not None, None if turn is None else turn.since, has_answered)\n",

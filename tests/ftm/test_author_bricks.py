@@ -11,13 +11,13 @@ import pytest
 import holdfast as hf
 from holdfast.checkpoint.protocol import Outcome
 from holdfast.ftm.alarms import RequestsDropped
-from holdfast.ftm.bricks.brick_messages import Done, ReplyEvicted, RequestDropped, Work
+from holdfast.ftm.bricks.brick_messages import Done, NoReply, ReplyEvicted, RequestDropped, Work
 from holdfast.ftm.bricks.bricks import After, Before, Proceed
 from holdfast.ftm.model.mechanism import Mechanism, Role
 from tests.ftm.accounts import Account, Add, Counter, Pay, Purse, Tags
 from tests.ftm.campaign import whole
 
-REFUSED, ANSWERED, DROPPED = -1, -2, -3
+REFUSED, ANSWERED, DROPPED, MISANSWERED = -1, -2, -3, -4
 """Amounts that the brick does something about."""
 
 
@@ -35,6 +35,8 @@ class Guard(Before):
                     work = self.refuse(work, one, TooMuch(amount=message.amount))
                 case -2:
                     work = self.answer(work, one, 77)
+                case -4:
+                    work = self.answer(work, one, "many")
                 case -3 if self.mechanism.whole:
                     return None
                 case -3:
@@ -101,6 +103,15 @@ async def test_a_request_that_a_brick_lets_fall_fails_and_is_told(system: hf.Act
             await ref.ask(Add(1, DROPPED), timeout=60)
         (told,) = [one for one in events.take() if isinstance(one, RequestsDropped)]
     assert (told.address, told.numbers.isdecimal()) == (ref.path, True)
+    assert await ref.ask(Add(2)) == 1
+    assert await ref.ask(Tags()) == [2]
+
+
+async def test_a_brick_that_ends_a_request_with_no_reply_of_its_type_is_named(system: hf.ActorSystem) -> None:
+    stack = hf.ftm.compose(Guarding(), hf.ftm.PBR())
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=stack))
+    with pytest.raises(NoReply, match=r"^Guard of \S+ has ended tests.ftm.accounts.Add with what is no reply to it"):
+        await ref.ask(Add(1, MISANSWERED))
     assert await ref.ask(Add(2)) == 1
     assert await ref.ask(Tags()) == [2]
 

@@ -173,6 +173,57 @@ async def test_a_request_that_is_dropped_is_served_by_the_stack_before(
     assert stack(ref) == (below[0].name,)
 
 
+class Misanswers(Before):
+    """Ends requests of an amount with what is no reply to them."""
+
+    async def before(self, work: Work) -> Work:
+        for one in work.requests:
+            if isinstance(self.message_of(one), Add):
+                work = self.answer(work, one, "no number")
+        return work
+
+
+class Repeats(Before):
+    """Hands on its requests twice."""
+
+    async def before(self, work: Work) -> Work:
+        return Work(work.epoch, work.config, work.number, [*work.requests, *work.requests], work.go)
+
+
+@dataclasses.dataclass(frozen=True)
+class Misanswering(Dropping):
+    name: ClassVar[str] = "misanswering"
+    roles: ClassVar[dict[str, Role]] = {"leader": Role(before=Misanswers), "other": Role()}
+
+
+@dataclasses.dataclass(frozen=True)
+class Repeating(Dropping):
+    name: ClassVar[str] = "repeating"
+    roles: ClassVar[dict[str, Role]] = {"leader": Role(before=Repeats), "other": Role()}
+
+
+@pytest.mark.parametrize("below", [PBR(), LFR(), TR()], ids=lambda one: one.name)
+@pytest.mark.parametrize(
+    ("bad", "why"),
+    [(Misanswering(), "what is no reply to it"), (Repeating(), "handed on a request twice")],
+    ids=lambda one: one.name if isinstance(one, Mechanism) else "",
+)
+async def test_bricks_that_end_or_hand_on_a_request_wrongly_are_taken_back(
+    system: hf.ActorSystem, bad: Mechanism, why: str, below: Mechanism
+) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=below))
+    load = Load(ref)
+    await load.reached(20)
+    async with system.transaction(timeout=60) as change:
+        change.protect(ref, (bad, *stack(ref)))
+    outcome = await taken_back(change)
+    assert why in outcome.why
+    await load.reached(20)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    assert stack(ref) == (below.name,)
+
+
 class Waits(hf.system.Operation):
     """A step whose end waits until it is known what comes of the change that another one makes."""
 

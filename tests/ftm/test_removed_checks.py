@@ -17,6 +17,20 @@ RANDOM_HOOKS = "tests/ftm/test_random_hooks.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 AUTHORS = "tests/ftm/test_author_bricks.py"
 CHECKS = {
+    "a request that is handed on twice is not computed twice": Check(
+        "ftm/bricks/bricks.py",
+        "        if len({one.feed.id for one in work.requests}) < len(work.requests):",
+        "        if False:",
+        "tests/ftm/test_probation.py",
+        "hand_on_a_request_wrongly and repeating",
+    ),
+    "what ended with no reply is asked of the stack before": Check(
+        "ftm/bricks/request_protocol.py",
+        "[end for end in done.ends if end.answer.name != NO_REPLY]",
+        "done.ends",
+        "tests/ftm/test_probation.py",
+        "hand_on_a_request_wrongly and misanswering and tr",
+    ),
     "a join that was given up before it began is not begun": Check(
         "ftm/bricks/state_transfer.py",
         "            if standing.other.told != told:\n",

@@ -29,6 +29,7 @@ UPGRADE = "tests/system/upgrade/test_check_upgrade.py"
 COLLECTIONS = "tests/system/test_full_collections.py"
 ORDERS = "tests/effects/test_orders_while_resting.py"
 RESTING = "tests/effects/test_moves_while_resting.py"
+CIRCLES = "tests/actors/test_circles.py"
 LINKS = "tests/actors/test_links.py"
 TURNS = "tests/supervision/test_turn_timeout.py"
 EFFECTS = "tests/effects/test_effect_processes.py"
@@ -82,6 +83,26 @@ CHECKS = {
         "        if False:\n",
         "tests/system/test_threads.py",
         "another_event_loop_of_the_thread and tell",
+    "who may end its wait otherwise closes no circle of asks": Check(
+        "actors/kernel/context.py",
+        "item.is_done or _may_be_cut_short(more.turn)",
+        "item.is_done",
+        CIRCLES,
+        "nobody_is_refused_who_may_get_on and within",
+    ),
+    "who does not wait for the reply closes no circle of asks": Check(
+        "actors/kernel/context.py",
+        "item.future is future and item.sender",
+        "item.sender",
+        CIRCLES,
+        "nobody_is_refused_who_may_get_on and one_of_two",
+    ),
+    "an ask that was refused for its circle is not run later": Check(
+        "actors/kernel/context.py",
+        "    refused.deadline = 0.0  # It",
+        "    # It",
+        CIRCLES,
+        "are_found_at_once",
     ),
     "who is up is answered ahead of those that are still to be started": Check(
         "supervision/errands.py",

@@ -47,7 +47,8 @@ class Worker(hf.Actor):
                     raise ValueError("something of ours does not work") from None
             case ["both", address]:
                 await asyncio.sleep(0.05)
-                await self.ctx.find(address, Worker).ask(Go("", message.timeout), timeout=message.timeout)
+                async with asyncio.timeout(60.0):  # Not refused at once: it may end before.
+                    await self.ctx.find(address, Worker).ask(Go("", message.timeout), timeout=message.timeout)
             case ["freeze"]:
                 await asyncio.Event().wait()
             case ["crash"]:

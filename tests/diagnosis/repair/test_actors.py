@@ -422,4 +422,5 @@ async def test_who_is_suspended_by_order_is_not_restarted(shop: Shop) -> None:
     await shop.system.suspend(shop.part("feed"))
     over = await shop.hear(GaveUp)
     assert "shop/feed was suspended by order" in over.why
+    assert [one for one in over.plan if "feed" in one] == [f"holdfast resume {shop.part('feed').path}"]
     assert "restart_child(shop/feed)" not in shop.done()
