@@ -83,6 +83,7 @@ CHECKS = {
         "        if False:\n",
         "tests/system/test_threads.py",
         "another_event_loop_of_the_thread and tell",
+    ),
     "who may end its wait otherwise closes no circle of asks": Check(
         "actors/kernel/context.py",
         "item.is_done or _may_be_cut_short(more.turn)",
