@@ -64,7 +64,7 @@ CHECKS: dict[str, Check] = {
     ),
     "the outcome of an ask is stored with its turn's end": Check(
         "checkpoint/home/ask_recovery.py",
-        'batch.add(FAR, ("answered", *msgspec.structs.astuple(one)), self._positions)',
+        'batch.add(FAR, ("answered", *msgspec.structs.astuple(one)), place)',
         "pass",
         CONNECTIONS,
         "another_program_leads",
