@@ -47,6 +47,7 @@ class CommitLanes:
     """What was submitted, from its submission to its effect.
 
     Attributes:
+        is_all_slow: whether the store is safe only when it is synced: nothing is quick then.
         synced_paths: homes that want what they submit to be synced.
         quick_paths: homes that want less than that.
         last_slow: the last submission of a home in the slow lane.
@@ -57,6 +58,7 @@ class CommitLanes:
         submitted, written, synced: numbers in the slow lane, up to which this is so.
     """
 
+    is_all_slow: bool = False
     synced_paths: set[str] = dataclasses.field(default_factory=set)
     quick_paths: set[str] = dataclasses.field(default_factory=set)
     last_slow: dict[str, int] = dataclasses.field(default_factory=dict)
@@ -87,14 +89,14 @@ class CommitLanes:
 
     def _is_slow(self, submission: Submission) -> bool:
         if not self.quick_paths:
-            return True
+            return self.is_all_slow or bool(self.synced_paths)
         paths, synced = self.synced_paths, self.synced
         return any(path in paths or self.last_slow.get(path, 0) > synced for path, _ in submission.entries)
 
     def submit(self, submission: Submission) -> None:
         """Put a submission in its lane: whoever has something in the slow one stays there with all that follows."""
         number = 0
-        if self.synced_paths and self._is_slow(submission):
+        if self._is_slow(submission):
             self.submitted = number = self.submitted + 1
             if self.quick_paths:
                 for path, _ in submission.entries:

@@ -175,16 +175,18 @@ class KeptMail:
         is_system: whether it is known for good, as a system is that there has been a line to.
         answers: by the names of the asks.
         outs: messages that it has not accepted yet, by what sent them, oldest first.
+        unsafe: those of them whose turns are not safe yet: nobody is sent them.
         size: of these messages, in bytes.
         told: how full that was when it was last told: not at all, half, or at its limit.
     """
 
-    __slots__ = ("answers", "is_system", "outs", "size", "told")
+    __slots__ = ("answers", "is_system", "outs", "size", "told", "unsafe")
 
     def __init__(self) -> None:
         self.is_system = False
         self.answers: dict[FarId, FarAnswer] = {}
         self.outs: dict[str, FarOut] = {}
+        self.unsafe: set[str] = set()
         self.size = self.told = 0
 
     def add(self, out: FarOut) -> None:
@@ -206,6 +208,7 @@ class KeptMail:
         """Keep nothing more."""
         self.answers.clear()
         self.outs.clear()
+        self.unsafe.clear()
         self.size = self.told = 0
 
 
@@ -324,7 +327,7 @@ class FarMail:
             self._open = {one: until for one, until in self._open.items() if until > now}
 
     def is_open(self, which: FarId) -> bool:
-        """Whether its outcome will come: the receiver has it."""
+        """Whether its outcome will come: the receiver has it, or it waits to be safe."""
         return which in self._open or self._homes.rejoin.has(*which)
 
     def goes_on(self, ask: Ask | None) -> bool:
@@ -338,17 +341,20 @@ class FarMail:
         return None if one is None else Answer(one.kind, one.name, one.body)
 
     def answered(self, which: FarId, answer: Answer, batch: Batch) -> None:
-        """It has its outcome, which is safe behind the batch."""
-        self._open.pop(which, None)
+        """It has its outcome, which is safe behind the batch: until then it is not done again if it comes again."""
+        self._open[which] = math.inf
         one = FarAnswer(*which, answer.kind, answer.name, bytes(answer.body))
+        place: list[int] = []  # What is written anew has it only when it is safe: until then its entry stays.
 
         def safe() -> None:
+            self._open.pop(which, None)
             self._of(which.asker).answers[which] = one
+            self._positions += place
             self.deliver(which, answer)
             self._tidy()
 
         if self._homes.journal.durable:
-            batch.add(FAR, ("answered", *msgspec.structs.astuple(one)), self._positions)
+            batch.add(FAR, ("answered", *msgspec.structs.astuple(one)), place)
         batch.after.append(safe)
 
     def settled(self, which: FarId) -> None:
@@ -431,13 +437,19 @@ class FarMail:
             self._tell_kept(system, mail, 2)
             return True
         mail.add(kept)
+        mail.unsafe.add(origin)
         if 2 * len(mail.outs) >= limits.kept or 2 * mail.size >= limits.kept_bytes:
             self._tell_kept(system, mail, 1)
         if self._homes.journal.durable:
             batch.add(FAR, ("out", *msgspec.structs.astuple(kept)), self._positions)
-        send = self.sender.tell
-        batch.after.append(lambda: send(kept, again=False))
+        batch.after.append(lambda: self._send(mail, kept))
         return True
+
+    def _send(self, mail: KeptMail, out: FarOut) -> None:
+        """Send a message whose turn is safe now, unless it was dropped meanwhile."""
+        mail.unsafe.discard(out.origin)
+        if self.sender is not None and out.origin in mail.outs:
+            self.sender.tell(out, again=False)
 
     def _tell_kept(self, system: str, mail: KeptMail, level: int) -> None:
         """Tell, once, how much is kept for a system: from half of the limit on (1), and at the limit (2)."""
@@ -498,9 +510,9 @@ class FarMail:
         return True
 
     def outs(self, system: str) -> list[FarOut]:
-        """What is kept for a system, oldest first."""
+        """What is kept for a system and may be sent, oldest first."""
         mail = self._mail.get(system)
-        return [] if mail is None else list(mail.outs.values())
+        return [] if mail is None else [out for out in mail.outs.values() if out.origin not in mail.unsafe]
 
     def when_opened(self, path: str, then: Callable[[], None]) -> None:
         """Have something done when the home of a recorded address that nobody was started at yet is open."""

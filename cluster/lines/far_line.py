@@ -72,6 +72,8 @@ COMMANDS: Final = frozenset(
     ("monitor", "demonitor", "link", "unlink", "exit", "down", "subscribe", "unsubscribe", "settled", "limited")
 )  # fmt: skip
 """What one system may want of the actors of another one."""
+ENDS: Final = frozenset(("exit", "down"))
+"""How one system tells another that an actor has ended."""
 SPEAKER: Final = {
     "monitor": "watcher", "demonitor": "watcher", "link": "peer", "unlink": "peer", "exit": "source", "down": "source"
 }  # fmt: skip
@@ -388,6 +390,8 @@ class FarLine(Peer):
         Raises:
             Unreachable: it has not answered for long, and nobody waits for what the frame comes to.
         """
+        if self.is_closing and isinstance(frame, frames.Command) and frame.verb in ENDS:
+            return  # The program ends, and nobody says that its actors do: the end of the line is NoConnection there.
         if self.is_closed and isinstance(frame, (frames.Reply, frames.Failure, frames.Command)):
             return  # Nobody is there who would care.
         if self.is_closed or (self.is_lost and isinstance(frame, (frames.Tell, frames.Offer, frames.Publish))):

@@ -11,6 +11,7 @@ from tests.removing import Check, as_tests
 LINES = "tests/cluster/test_lines.py"
 GREEDY = "tests/cluster/test_greedy_clients.py"
 CONNECTIONS = "tests/cluster/test_connections.py"
+STOPS = "tests/cluster/test_stops_in_good_order.py"
 
 CHECKS: dict[str, Check] = {
     "an item that comes again is not taken again": Check(
@@ -62,9 +63,44 @@ CHECKS: dict[str, Check] = {
         CONNECTIONS,
         "another_program_leads",
     ),
+    "what has an outcome that is not safe yet is not done again": Check(
+        "checkpoint/home/ask_recovery.py",
+        "        self._open[which] = math.inf\n",
+        "",
+        STOPS,
+        "before_the_receiver_has_it_safely",
+    ),
+    "what is told to another system is not sent before its turn is safe": Check(
+        "checkpoint/home/ask_recovery.py",
+        "        mail.unsafe.add(origin)\n",
+        "",
+        STOPS,
+        "leaves_when_the_turn_is_safe",
+    ),
+    "an outcome is in the store until what is written anew has it": Check(
+        "checkpoint/home/ask_recovery.py",
+        'batch.add(FAR, ("answered", *msgspec.structs.astuple(one)), place)',
+        'batch.add(FAR, ("answered", *msgspec.structs.astuple(one)), self._positions)',
+        STOPS,
+        "each_order_is_charged_once",
+    ),
+    "nobody is told that a message is accepted before the log has it": Check(
+        "checkpoint/group_commit.py",
+        'CommitLanes(is_all_slow=engine.safe_at == "sync")',
+        "CommitLanes()",
+        STOPS,
+        "forgets_it_when",
+    ),
+    "a program that ends says of no actor that it does": Check(
+        "cluster/lines/far_line.py",
+        "if self.is_closing and isinstance(frame, frames.Command) and frame.verb in ENDS:",
+        "if False:",
+        STOPS,
+        "no_end_of_its_actors",
+    ),
     "the outcome of an ask is stored with its turn's end": Check(
         "checkpoint/home/ask_recovery.py",
-        'batch.add(FAR, ("answered", *msgspec.structs.astuple(one)), self._positions)',
+        'batch.add(FAR, ("answered", *msgspec.structs.astuple(one)), place)',
         "pass",
         CONNECTIONS,
         "another_program_leads",
