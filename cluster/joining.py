@@ -15,7 +15,7 @@ from ..actors.errors import HoldfastError, SpecError
 from ..checkpoint.engine_calls import Called
 from ..checkpoint.journal import DamagedStore, StoreEngine, StoreFailed, StoreInUse
 from ..checkpoint.store_key import StoreKey, read_store_key
-from ..checkpoint.store_opening import open_journal
+from ..checkpoint.store_opening import open_journal, systems_in
 from .leadership import LeaderElsewhere, Leading, Patience, Standby, give_up, lead, leader_name
 from .log_records import DamagedLog
 from .log_writer import Deposed
@@ -222,6 +222,22 @@ def open_store(
         return await join(store, "tool", None, settings or {}, is_new=is_new, key=key, patience=TOOL_SECONDS, **nobody)
 
     return Called(asyncio.run(joined()))
+
+
+def other_systems(store: StoreEngine, source: str, dest: str) -> str:
+    """Of which systems a store is that is to be copied to servers, if they are not those of that name there.
+
+    Args:
+        store: open.
+        source: its name; one on servers may go wherever the same name is.
+        dest: where it is to be copied.
+    """
+    if not is_replicated(dest):
+        return ""
+    name = urlsplit(dest).path.strip("/")
+    systems = systems_in(store)
+    is_theirs = name in systems or (is_replicated(source) and urlsplit(source).path.strip("/") == name)
+    return "" if is_theirs else ", ".join(sorted(systems))
 
 
 def is_same_store(one: str, other: str) -> bool:

@@ -209,6 +209,12 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         return "leader" if is_shared else "alone"
 
     @property
+    def store_name(self) -> str:
+        """Where it keeps what it records, without what stands behind a question mark; empty if that is in memory."""
+        store = self._options.store
+        return store.partition("?")[0] if isinstance(store, str) else "" if store is None else type(store).__name__
+
+    @property
     def leader(self) -> str:
         """The machine and process of the program that leads while this one stands by; an empty text otherwise."""
         standing = self._servers.standing
@@ -218,7 +224,9 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
 
     async def __aenter__(self) -> ActorSystem:
         if self._running is not None:
-            raise HoldfastError(f"system {self.name!r} was entered already; make a new one")
+            raise HoldfastError(
+                f"system {self.name!r} was entered already; make a new one (`served` and `Service` enter it themselves)"
+            )
         check_is_program("ActorSystem")
         options = self._options
         file = options.read_recovery_file()

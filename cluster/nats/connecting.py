@@ -44,6 +44,18 @@ class NotEncrypted(nats.errors.Error):
     """The server offers no encryption: nothing was sent."""
 
 
+class EncryptedProtocol(asyncio.StreamReaderProtocol):
+    """Has a connection closed when its other end is: one that is encrypted cannot be half open.
+
+    That of asyncio asks for it to be left open, which asyncio then warns of at each end of a connection.
+    """
+
+    def eof_received(self) -> bool:
+        """False: it is closed, too."""
+        super().eof_received()
+        return False
+
+
 class EncryptedTransport(TcpTransport):
     """A connection that writes nothing before it is encrypted."""
 
@@ -64,7 +76,15 @@ class EncryptedTransport(TcpTransport):
         self, uri: str | ParseResult, ssl_context: ssl.SSLContext, buffer_size: int, connect_timeout: int
     ) -> None:
         """Encrypt the connection; see `Transport`."""
-        await super().connect_tls(uri, ssl_context, buffer_size, connect_timeout)
+        assert self._io_writer is not None
+        reader, loop = asyncio.StreamReader(), asyncio.get_running_loop()
+        protocol = EncryptedProtocol(reader)
+        host = uri if isinstance(uri, str) else uri.hostname
+        started = loop.start_tls(self._io_writer.transport, protocol, ssl_context, server_hostname=host)
+        transport = await asyncio.wait_for(started, connect_timeout)
+        if transport is None:
+            raise ConnectionResetError("the connection was closed while it was being encrypted")
+        self._io_reader, self._io_writer = reader, asyncio.StreamWriter(transport, protocol, reader, loop)
         self._is_encrypted = True
 
     def write(self, payload: bytes) -> None:

@@ -73,11 +73,14 @@ async def test_a_leader_whose_log_is_gone_ends_and_says_what_has_happened(nats1:
         if how == "made anew":
             await streams.add_stream(stream_settings(SubjectNames(name), 1)[0])
 
-    with pytest.raises(hf.errors.StoreFailed, match="is gone from the servers: somebody has deleted or emptied it"):
+    async def led() -> None:
         async with asyncio.timeout(PATIENCE), system_on(nats1, name) as system:
             await (await system.start(account())).ask(Gain(1))
             await with_streams(nats1, name, strike)
             await asyncio.Event().wait()
+
+    with pytest.raises(hf.errors.StoreFailed, match="is gone from the servers: somebody has deleted or emptied it"):
+        await led()
 
 
 @pytest.mark.parametrize("how", ["deleted", "emptied"])
