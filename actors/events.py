@@ -399,9 +399,18 @@ class StandingBy(Event, frozen=True, eq=False):
 
 
 class ServersSilent(Event, frozen=True, eq=False):
-    """The servers of the store do not answer a program that waits to lead, and why. Told anew each 30 s of it."""
+    """The servers of the store do not answer a program that waits to lead, or that leads, and why.
+
+    A leader tells it after a few seconds, in which servers may elect one of them. It is told anew each 30 s.
+    """
 
     reason: str
+
+
+class ServersAnswer(Event, frozen=True, eq=False):
+    """The servers of the store answer again, after so many `seconds`: told if `ServersSilent` was told before."""
+
+    seconds: float
 
 
 class LeadershipTaken(Event, frozen=True, eq=False):

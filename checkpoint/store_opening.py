@@ -41,6 +41,11 @@ UNFINISHED: Final = "copy that was not finished"
 """The fact that a store has while something is copied into it."""
 
 
+def systems_in(journal: Journal) -> set[str]:
+    """The names of the systems of which a store has something."""
+    return {address.split("/")[1] for address in journal.addresses() if address.startswith("/")}
+
+
 def check_system(journal: Journal, system: str) -> None:
     """Refuse a store that another system has filled: under this name nothing of it would come back.
 
@@ -49,7 +54,7 @@ def check_system(journal: Journal, system: str) -> None:
     """
     if journal.noted(UNFINISHED) is not None:
         raise SpecError("store", "it is a copy that was never finished: make it again, by `holdfast store copy`")
-    names = {address.split("/")[1] for address in journal.addresses() if address.startswith("/")}
+    names = systems_in(journal)
     if names and system not in names:
         known = ", ".join(map(repr, sorted(names)))
         raise SpecError("store", f"it has what was recorded in the system {known}, and nothing of {system!r}")

@@ -72,6 +72,8 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 CHOICES: Final[dict[str, tuple[str, ...]]] = {"standby": get_args(Standby), "durability": get_args(Durability)}
 """Keys with a few possible values."""
+KINDS: Final = {"replicas": "the number 1 or 3", "insecure": "true or false"}
+"""What the value of a key has to be, unless that is a text."""
 
 
 def read_configuration(path: Path | None = None, environ: Mapping[str, str] = os.environ) -> Configuration:
@@ -192,7 +194,8 @@ def _value(kind: type[msgspec.Struct], key: str, value: object, place: str, *, s
     """
     known = _keys(kind)
     if key not in known:
-        raise SpecError(place, f"there is no key {key!r}{_near(key, known)}; there are {', '.join(known)}")
+        there = ", ".join(known) + (" and the table [nats]" if kind is Configuration else "")
+        raise SpecError(place, f"there is no key {key!r}{_near(key, known)}; there are {there}")
     if key in CHOICES and value not in CHOICES[key]:
         raise SpecError(place, f"{key} must be one of {', '.join(map(repr, CHOICES[key]))}, not {value!r}")
     if value is None or value == "":
@@ -201,7 +204,7 @@ def _value(kind: type[msgspec.Struct], key: str, value: object, place: str, *, s
     try:
         return msgspec.convert(value, hint, strict=strict)
     except msgspec.ValidationError as error:
-        raise SpecError(place, f"{key}: {error}") from error
+        raise SpecError(place, f"{key} must be {KINDS.get(key, 'a text')}, not {value!r}") from error
 
 
 def _near(word: str, known: Iterable[str]) -> str:

@@ -15,20 +15,21 @@ from ..actors.errors import HoldfastError, SpecError
 from ..checkpoint.engine_calls import Called
 from ..checkpoint.journal import DamagedStore, StoreEngine, StoreFailed, StoreInUse
 from ..checkpoint.store_key import StoreKey, read_store_key
-from ..checkpoint.store_opening import open_journal
-from .leadership import LeaderElsewhere, Patience, Standby, give_up, lead, leader_name
+from ..checkpoint.store_opening import open_journal, systems_in
+from .leadership import LeaderElsewhere, Leading, Patience, Standby, give_up, lead, leader_name
 from .log_records import DamagedLog
 from .log_writer import Deposed
-from .ports import Engine, Unanswered
+from .ports import Engine, LogGone, Unanswered
 from .replicated_journal import ReplicatedJournal
 from .sealed_engine import sealed
 from .servers import JoinLoop, Servers, servers_of
+from .silence import Silence
 
 T = TypeVar("T")
 TOOL_SECONDS: Final = 30.0
 """How long a tool waits for servers that take nothing."""
-SILENT_SECONDS: Final = 30.0
-"""How often a program that waits says that the servers do not answer."""
+BEARABLE_SECONDS: Final = 3.0
+"""How long servers may be silent before a leader says so: so long they may take to elect one of them."""
 
 
 def is_replicated(store: object) -> bool:
@@ -48,7 +49,9 @@ async def join(
     *,
     waits: Callable[[str], None],
     silent: Callable[[str], None],
+    answered: Callable[[float], None],
     deposed: Callable[[Deposed], None],
+    gone: Callable[[StoreFailed], None],
     is_new: bool = True,
     key: StoreKey | None = None,
     patience: float = math.inf,
@@ -61,8 +64,11 @@ async def join(
         standby: how to wait while another program leads; `None` does not.
         settings: how the servers are reached, see `access_of`.
         waits: told who leads, on the running loop, each time that this changes.
-        silent: told on the running loop why no server answers, at once and each SILENT_SECONDS, while that is so.
+        silent: told on the running loop why no server answers, and each SILENT_SECONDS, while that is so: at once while
+            this program waits, and after BEARABLE_SECONDS when it leads.
+        answered: told on the running loop after how many seconds they answer again.
         deposed: told on the running loop that another program leads.
+        gone: told on the running loop that the log is not on the servers any more.
         is_new: whether it is made if it is not there.
         key: encrypts what is kept there, see `read_store_key`.
         patience: seconds after which a `sync` of which the servers take nothing fails.
@@ -80,12 +86,19 @@ async def join(
     loop, me = asyncio.get_running_loop(), leader_name()
     thread = servers.engine_loop(f"holdfast {system}")
     opened: list[Engine] = []  # filled in there: whoever is cancelled here would not get to know of it
-    unanswered = NowAndThen(lambda problem: _tell(loop, silent, problem))
+
+    def silence(moment: float = 0.0) -> Silence:
+        return Silence(
+            lambda problem: _tell(loop, silent, problem), lambda after: _tell(loop, answered, after), moment=moment
+        )
+
+    waiting = silence()
     patient = Patience(waits=standby is not None)
 
     async def connect() -> Engine:
         attempt = functools.partial(_open_sealed, servers, secret, is_new=is_new)
-        opened.append(await patient.answered(attempt, unanswered))
+        opened.append(await patient.answered(attempt, waiting.unanswered))
+        waiting.answered()
         return opened[0]
 
     def told(leader: str) -> None:
@@ -94,11 +107,20 @@ async def join(
     def lost(error: Exception) -> None:
         if isinstance(error, Deposed):
             _tell(loop, deposed, error)
+        elif isinstance(error, LogGone):
+            _tell(loop, gone, StoreFailed(opened[0].name, str(error)))
+
+    async def led() -> Leading:
+        leading = await lead(engine, me, standby=standby, waits=told, unanswered=waiting.unanswered)
+        waiting.answered()
+        return leading
 
     try:
         engine = await thread.run(connect())
-        leading = await thread.run(lead(engine, me, standby=standby, waits=told, unanswered=unanswered))
-        journal = ReplicatedJournal(engine, thread, leading, lost=lost, patience=patience)
+        leading = await thread.run(led())
+        journal = ReplicatedJournal(
+            engine, thread, leading, lost=lost, silence=silence(BEARABLE_SECONDS), patience=patience
+        )
         if patience == math.inf:  # A tool reads all, one after another.
             await _fetch_all(journal, thread)
     except BaseException as error:
@@ -139,6 +161,8 @@ def _of_store(error: BaseException, name: str) -> HoldfastError | None:
             return StoreInUse(name, 0, error.leader)
         case Unanswered():
             return StoreFailed(name, error.problem)
+        case LogGone():
+            return StoreFailed(name, str(error))
         case DamagedLog():
             return DamagedStore(name, None, None, str(error))
         case _:
@@ -159,25 +183,6 @@ async def _let_go(opened: list[Engine], me: str) -> None:
 def _tell(loop: asyncio.AbstractEventLoop, call: Callable[[T], None], what: T) -> None:
     with contextlib.suppress(RuntimeError):  # That loop has ended.
         loop.call_soon_threadsafe(call, what)
-
-
-class NowAndThen:
-    """Passes on what it is told, but not more often than each SILENT_SECONDS. Only for a running loop.
-
-    Args:
-        tell: whom it is passed on to.
-    """
-
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell = tell
-        self._next = 0.0
-
-    def __call__(self, what: str) -> None:
-        """Pass it on, if the last time is long enough ago."""
-        now = asyncio.get_running_loop().time()
-        if now >= self._next:
-            self._next = now + SILENT_SECONDS
-            self._tell(what)
 
 
 def open_store(
@@ -213,10 +218,26 @@ def open_store(
         """Nobody waits here to whom it would matter."""
 
     async def joined() -> ReplicatedJournal:
-        told = {"waits": pass_over, "silent": pass_over, "deposed": pass_over}
-        return await join(store, "tool", None, settings or {}, is_new=is_new, key=key, patience=TOOL_SECONDS, **told)
+        nobody = dict.fromkeys(("waits", "silent", "answered", "deposed", "gone"), pass_over)
+        return await join(store, "tool", None, settings or {}, is_new=is_new, key=key, patience=TOOL_SECONDS, **nobody)
 
     return Called(asyncio.run(joined()))
+
+
+def other_systems(store: StoreEngine, source: str, dest: str) -> str:
+    """Of which systems a store is that is to be copied to servers, if they are not those of that name there.
+
+    Args:
+        store: open.
+        source: its name; one on servers may go wherever the same name is.
+        dest: where it is to be copied.
+    """
+    if not is_replicated(dest):
+        return ""
+    name = urlsplit(dest).path.strip("/")
+    systems = systems_in(store)
+    is_theirs = name in systems or (is_replicated(source) and urlsplit(source).path.strip("/") == name)
+    return "" if is_theirs else ", ".join(sorted(systems))
 
 
 def is_same_store(one: str, other: str) -> bool:

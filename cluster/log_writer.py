@@ -17,6 +17,7 @@ from typing import Final, NamedTuple, TypeVar
 from ..actors.errors import HoldfastError
 from .log_records import BASE, CHANGES, EPOCH, DamagedLog, RecordMaker, decode_epoch, encode_changes, read_part
 from .ports import Engine, LogRecord, OutOfTurn, Unanswered
+from .silence import Silence
 from .store_contents import Change, MemoryContents
 
 MOST_BYTES: Final = 256 << 10
@@ -61,6 +62,7 @@ class LogWriter:
         engine: keeps the log.
         maker: of the leader's epoch.
         grown: bytes that the log has beside the newest base.
+        silence: told when what is written is not answered, and when it is.
         written: told how many of the writes that were submitted stand in the log.
         want_base: called when it is worth writing all that lives anew: to submit that.
 
@@ -75,10 +77,11 @@ class LogWriter:
         maker: RecordMaker,
         *,
         grown: int,
+        silence: Silence,
         written: Callable[[int], None],
         want_base: Callable[[], None],
     ) -> None:
-        self._engine, self._maker = engine, maker
+        self._engine, self._maker, self._silence = engine, maker, silence
         self._written, self._want_base = written, want_base
         self._queue: deque[LogWrite] = deque()
         self._work = asyncio.Event()
@@ -92,6 +95,11 @@ class LogWriter:
         self._base: Iterator[bytes] | None = None  # its further parts
         self._base_begins = 0
         self._is_base_wanted = False
+
+    @property
+    def after(self) -> int:
+        """The number of the last record that this leader knows to stand in the log."""
+        return self._maker.after
 
     # -- from the journal -------------------------------------------------------------------------------------------
 
@@ -138,7 +146,7 @@ class LogWriter:
         Raises:
             Deposed: another leads.
         """
-        found = await behind(self._engine, self._maker.after)
+        found = await behind(self._engine, self._maker.after, self._silence.unanswered)
         if found is not None:
             raise _deposed(found, self._maker.epoch)
 
@@ -203,8 +211,8 @@ class LogWriter:
     async def _append(self, record: bytes) -> None:
         """Append one record behind the last one, as long as it takes."""
         self.asked = asyncio.get_running_loop().time()
-        stands = await append_behind(self._engine, record, self._maker.after)
-        self.asked = math.inf
+        stands = await append_behind(self._engine, record, self._maker.after, unanswered=self._unanswered)
+        self._taken()
         if not isinstance(stands, int):
             raise _deposed(stands, self._maker.epoch)
         self._maker.after = stands
@@ -213,23 +221,43 @@ class LogWriter:
 
     async def _insist(self, call: Callable[[str, bytes], Awaitable[None]], name: str, data: bytes) -> None:
         self.asked = asyncio.get_running_loop().time()
-        await insist(lambda: call(name, data))
+        await insist(lambda: call(name, data), self._unanswered)
+        self._taken()
+
+    def _unanswered(self, problem: str) -> None:
+        self._silence.unanswered(problem, self.asked)
+
+    def _taken(self) -> None:
         self.asked = math.inf
+        self._silence.answered()
 
 
-async def insist(call: Callable[[], Awaitable[T]]) -> T:
-    """Call again and again until the engine answers."""
+def pass_over(problem: str) -> None:
+    """Tell nobody why there is no answer."""
+
+
+async def insist(call: Callable[[], Awaitable[T]], unanswered: Callable[[str], None] = pass_over) -> T:
+    """Call again and again until the engine answers; `unanswered` is told each time why it does not."""
     pause = FIRST_PAUSE
     while True:
         try:
             return await call()
-        except Unanswered:
+        except Unanswered as error:
+            unanswered(error.problem)
             await asyncio.sleep(pause)
             pause = min(2 * pause, LONGEST_PAUSE)
 
 
-async def append_behind(engine: Engine, record: bytes, after: int, patience: float = math.inf) -> int | LogRecord:
+async def append_behind(
+    engine: Engine,
+    record: bytes,
+    after: int,
+    patience: float = math.inf,
+    unanswered: Callable[[str], None] = pass_over,
+) -> int | LogRecord:
     """Append a record behind the one with the number `after`, however long it takes, up to so many seconds.
+
+    `unanswered` is told each time why the engine does not answer.
 
     Returns:
         Its number; or, if another one stands there for good, that one.
@@ -242,11 +270,12 @@ async def append_behind(engine: Engine, record: bytes, after: int, patience: flo
     while True:
         try:
             return await engine.log.append(record, after)
-        except Unanswered:
+        except Unanswered as error:
             if loop.time() > until:
                 raise
+            unanswered(error.problem)
         except OutOfTurn:
-            found = await behind(engine, after)
+            found = await behind(engine, after, unanswered)
             if found is not None:
                 return found.sequence if found.data == record else found
         await asyncio.sleep(pause)  # Nothing there may be a stale answer, of one who has not come so far.
@@ -262,7 +291,7 @@ def _deposed(found: LogRecord, epoch: int) -> Deposed | DamagedLog:
     return Deposed(epoch, part.epoch, leader)
 
 
-async def behind(engine: Engine, after: int) -> LogRecord | None:
+async def behind(engine: Engine, after: int, unanswered: Callable[[str], None] = pass_over) -> LogRecord | None:
     """The record that stands behind the one with that number, if the engine shows any now."""
 
     async def read() -> LogRecord | None:
@@ -273,4 +302,4 @@ async def behind(engine: Engine, after: int) -> LogRecord | None:
         finally:
             await reader.close()
 
-    return await insist(read)
+    return await insist(read, unanswered)

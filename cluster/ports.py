@@ -40,6 +40,16 @@ class OutOfTurn(HoldfastError, text="the log goes on from another record than {a
     after: int
 
 
+class LogGone(
+    HoldfastError,
+    text="{log} is gone from the servers: somebody has deleted or emptied it there; copy a backup into a new store "
+    "(`holdfast store copy`), or have the system begin with nothing (`holdfast nats remove`)",
+):
+    """What stood in the log does not stand there any more: nothing that is written now would belong to it."""
+
+    log: str
+
+
 class LogRecord(NamedTuple):
     """One record of a log.
 
@@ -85,7 +95,7 @@ class Log(Protocol):
         """The last record, as a majority knows it; `None` if the log is empty.
 
         Raises:
-            Unanswered: the engine cannot be reached.
+            Unanswered: the engine cannot be reached. LogGone: it answers that there is no such log.
         """
         ...
 

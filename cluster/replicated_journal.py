@@ -26,7 +26,8 @@ from ..checkpoint.snapshot.shared_blocks import Segment
 from .engine_thread import EngineLoop, end_tasks
 from .leadership import Leading
 from .log_writer import FIRST_PAUSE, LONGEST_PAUSE, Deposed, LogWrite, LogWriter, insist
-from .ports import Engine, Unanswered
+from .ports import Engine, LogGone, Unanswered
+from .silence import Silence
 from .store_contents import Change
 from .write_progress import BlobsUnderWay, Tell, WriteProgress
 
@@ -40,6 +41,10 @@ CLOSE_SECONDS: Final = 5.0
 """How long a journal that is closed waits for what is not in the log yet."""
 READ_SECONDS: Final = 30.0
 """How long a read of something large waits for the engine."""
+LOOK_SECONDS: Final = 2.0
+"""How often it is looked whether the log answers while nothing is written."""
+MOST_MISSES: Final = 2
+"""Looks in a row that have to miss what was written last, before the log is gone: one may be an old answer."""
 _ENTRY_BYTES: Final = 60  # about, beside its bodies
 
 
@@ -61,6 +66,7 @@ class ReplicatedJournal:
         loop: on which the engine's work runs.
         leading: what this leader begins with.
         lost: told, on the engine's loop, why nothing can be written any more: another leads, or the log is damaged.
+        silence: told when the log does not answer, and when it does again.
         patience: seconds in which the engine must have taken something when somebody waits for it in `sync`, so that a
             tool ends when the servers are away; a system waits for them.
     """
@@ -76,6 +82,7 @@ class ReplicatedJournal:
         leading: Leading,
         *,
         lost: Callable[[HoldfastError], None] = lambda error: None,
+        silence: Silence | None = None,
         patience: float = math.inf,
     ) -> None:
         self.path = engine.name
@@ -92,6 +99,7 @@ class ReplicatedJournal:
         self._is_open = True
         self._is_awake = False
         self._keeper = leading.keeper
+        self._silence = silence or Silence(lambda problem: None, lambda seconds: None)
         loop.wait(self._begin(leading))
 
     async def _begin(self, leading: Leading) -> None:
@@ -99,6 +107,7 @@ class ReplicatedJournal:
             self._engine,
             leading.maker,
             grown=leading.grown,
+            silence=self._silence,
             written=self._take_written,
             want_base=self._want_base,
         )
@@ -128,7 +137,13 @@ class ReplicatedJournal:
 
     async def _lead(self) -> None:
         """Write, keep the lease and tidy up, until the journal is closed or another leads."""
-        works = (self._writer.run(), self._writer.drop_freed(), self._keep_lease(), self._drop_orphans())
+        works = (
+            self._writer.run(),
+            self._writer.drop_freed(),
+            self._keep_lease(),
+            self._watch_log(),
+            self._drop_orphans(),
+        )
         tasks = [asyncio.ensure_future(work) for work in works]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
@@ -148,6 +163,34 @@ class ReplicatedJournal:
 
     async def _keep_lease(self) -> None:
         await self._keeper.run(hold=self._writer.hold, go_on=self._writer.go_on, look=lambda: self._queue(LogWrite()))
+
+    async def _watch_log(self) -> None:
+        """See now and then, while nothing comes into the log, whether it answers, and has what was written last.
+
+        Raises:
+            LogGone: it has not.
+        """
+        loop, writer = asyncio.get_running_loop(), self._writer
+        steps, misses = writer.steps, 0
+        while True:
+            await asyncio.sleep(LOOK_SECONDS)
+            if writer.steps != steps:
+                steps, misses = writer.steps, 0
+                continue
+            asked, after = loop.time(), writer.after
+            try:
+                last = await self._engine.log.last()
+                gone = None if last is not None and last.sequence >= after else LogGone(f"the log of {self.path}")
+            except LogGone as error:
+                gone = error
+            except Unanswered as error:
+                self._silence.unanswered(error.problem, asked)
+                continue
+            misses = misses + 1 if gone is not None else 0
+            if gone is not None and misses >= MOST_MISSES:
+                raise gone
+            if gone is None and writer.asked == math.inf:
+                self._silence.answered()
 
     async def _drop_orphans(self) -> None:
         """Remove what earlier leaders have kept beside the log and nothing in it refers to."""

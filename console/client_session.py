@@ -107,6 +107,7 @@ class ClientSession:
                     "pid": os.getpid(),
                     "role": system.role,
                     "leader": system.leader,
+                    "store": system.store_name,
                     "since": self._since,
                     "actors": len(system.tree()),
                 }

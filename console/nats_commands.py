@@ -1,4 +1,4 @@
-"""The `holdfast nats` commands: write the files of servers on which systems may rely, and check servers that run."""
+"""The `holdfast nats` commands: write the files of servers for systems, check servers that run, remove a store."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import msgspec
 import typer
 
 from ..actors.errors import HoldfastError, SpecError
+from ..cluster.configuration import read_configuration
 from ..cluster.nats.server_check import check_store
 from ..cluster.nats.server_file import ServerPlan, TlsFiles, write_server_files
 from .operate.reaching import FAILED, UNUSABLE, Json, printable, show_json
@@ -46,8 +47,7 @@ def config(
         plans = _plans(host or ["127.0.0.1"], (port, cluster_port, monitor_port), store_dir, tls)
         files = write_server_files(folder, plans, system, force=force)
     except (HoldfastError, OSError) as error:
-        typer.echo(f"holdfast nats config: {error}", err=True)
-        raise typer.Exit(UNUSABLE) from error
+        raise _ended("config", error) from error
     for file in files:
         typer.echo(printable(str(file)))
 
@@ -65,8 +65,7 @@ def check(
     try:
         found = asyncio.run(check_store(store, seconds=seconds))
     except HoldfastError as error:
-        typer.echo(f"holdfast nats check: {error}", err=True)
-        raise typer.Exit(UNUSABLE) from error
+        raise _ended("check", error) from error
     if as_json:
         show_json(msgspec.to_builtins(found))
     else:
@@ -76,6 +75,42 @@ def check(
             typer.echo("ok: what is acknowledged there stays")
     if not all(one.is_warning for one in found):
         raise typer.Exit(FAILED)
+
+
+@nats.command()
+def remove(
+    store: Annotated[str, typer.Argument(help="As in ActorSystem(store=...): nats://HOST,HOST/SYSTEM?nkey=FILE")],
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Remove all that a system has recorded on its servers, for good. No program may lead it.
+
+    How servers are reached is said in their address, or by holdfast.toml and the environment.
+
+    Exit status 0: nothing of it is there any more. 1: not confirmed. 2: a program leads the system, no server answers,
+    or STORE is not valid.
+    """
+    from ..cluster.nats.access import access_of  # only now: it imports the library
+
+    try:
+        settings = read_configuration().nats.told()
+        name = access_of(store, settings).name
+        if not yes:
+            typer.confirm(f"Remove all that is recorded at {printable(name)}, for good?", abort=True)
+        from ..cluster.nats.store_removal import remove_store
+
+        gone = asyncio.run(remove_store(store, settings))
+    except HoldfastError as error:
+        raise _ended("remove", error) from error
+    for one in gone:
+        typer.echo(f"removed {one}")
+    if not gone:
+        typer.echo("there was nothing")
+
+
+def _ended(command: str, error: Exception) -> typer.Exit:
+    """Tell what has gone wrong; some errors say themselves of which command that is."""
+    typer.echo(f"holdfast nats {command}: {str(error).removeprefix(f'nats {command}: ')}", err=True)
+    return typer.Exit(UNUSABLE)
 
 
 def _tls(certificate: str | None, key: str | None, ca: str | None) -> TlsFiles | None:

@@ -30,7 +30,7 @@ from ..checkpoint.store_tools import (
     verify_store,
 )
 from ..cluster.configuration import read_configuration
-from ..cluster.joining import is_same_store, open_store
+from ..cluster.joining import is_same_store, open_store, other_systems
 from ..system.stored_erasure import erase_stored
 from .operate.reaching import Yes, confirm
 
@@ -41,7 +41,24 @@ store = typer.Typer(
     name="store", help="Look after a store: verify it, copy it, bring a copy back.", no_args_is_help=True
 )
 
-StorePath = Annotated[Path, typer.Argument(help="The database of a store: app.db, as in store='sqlite:app.db'.")]
+
+def _file(path: Path) -> Path:
+    """A path, if it is not the address of servers.
+
+    Raises:
+        BadParameter: it is one.
+    """
+    if path.parts[:1] in (("nats:",), ("tls:",)):
+        problem = (
+            "this is for a store in a file: copy the one on servers into a file (holdfast store copy), and take that"
+        )
+        raise typer.BadParameter(problem)
+    return path
+
+
+StorePath = Annotated[
+    Path, typer.Argument(help="The database of a store: app.db, as in store='sqlite:app.db'.", callback=_file)
+]
 KeyFile = Annotated[
     Path | None,
     typer.Option(
@@ -236,7 +253,7 @@ def _erased(found: Erased) -> str:
 @store.command()
 def backup(
     path: StorePath,
-    dest: Annotated[Path, typer.Argument(help="The database of the copy, which must not be there.")],
+    dest: Annotated[Path, typer.Argument(help="The database of the copy, which must not be there.", callback=_file)],
     check: Annotated[bool, typer.Option("--verify/--no-verify", help="Verify the copy when it is made.")] = True,
     key_file: KeyFile = None,
     as_json: Json = False,
@@ -253,8 +270,10 @@ def backup(
 
 @store.command()
 def restore(
-    path: Annotated[Path, typer.Argument(metavar="BACKUP", help="The database of the backup; it stays as it is.")],
-    dest: Annotated[Path, typer.Argument(help="The database to be made, which must not be there.")],
+    path: Annotated[
+        Path, typer.Argument(metavar="BACKUP", help="The database of the backup; it stays as it is.", callback=_file)
+    ],
+    dest: Annotated[Path, typer.Argument(help="The database to be made, which must not be there.", callback=_file)],
     key_file: KeyFile = None,
     as_json: Json = False,
 ) -> None:
@@ -271,6 +290,9 @@ def copy(
     dest: Annotated[str, typer.Argument(metavar="DEST", help="The same, of a store that has nothing yet.")],
     key_file: KeyFile = None,
     new_key_file: NewKeyFile = None,
+    other_name: Annotated[
+        bool, typer.Option("--other-name", help="Copy to a place on servers that is named after another system.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Copy what one store has into another one, between a file and servers, both ways, and compare the two.
@@ -279,7 +301,7 @@ def copy(
     --new-key-file. How servers are reached is said in their address, or by holdfast.toml and the environment.
 
     Exit status 0: done. 2: STORE is not there, one of them is open, damaged or cannot be reached, or DEST has something
-    already.
+    already or is another system's.
     """
     from ..cluster.store_copy import copy_store
 
@@ -290,6 +312,10 @@ def copy(
             raise NotCopied(*names, "both are one store", "name another one as DEST")
         with contextlib.ExitStack() as stack:
             first = stack.enter_context(contextlib.closing(open_store(source, settings, is_new=False, key=key_file)))
+            theirs = other_systems(first, source, dest)
+            if theirs and not other_name:  # Before anything is made there.
+                problem = f"that is the place of another system, and what is copied is of {theirs}"
+                raise NotCopied(*names, problem, "name the place of that one, or give --other-name")
             second = stack.enter_context(contextlib.closing(open_store(dest, settings, key=new_key_file)))
             made = copy_store(first, second, names=names)
     except HoldfastError as error:

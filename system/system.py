@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args, overload
 
 from ..actors.control.drain import drain as drain_queue
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, StoreError, TreeFailed
-from ..actors.events import EventStream, LeadershipTaken, RecoveryTableUnused, ServersSilent, StandingBy
+from ..actors.events import EventStream, LeadershipTaken, RecoveryTableUnused, ServersAnswer, ServersSilent, StandingBy
 from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, pack_exit
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
@@ -31,7 +31,7 @@ from ..actors.process.worker_pool import Workers
 from ..checkpoint.engine_calls import Called
 from ..checkpoint.home.homes import Homes
 from ..checkpoint.home.journal_home import JournalHome
-from ..checkpoint.journal import Journal, StaleEpoch, StoreEngine
+from ..checkpoint.journal import Journal, StaleEpoch, StoreEngine, StoreFailed
 from ..checkpoint.method import Durability
 from ..checkpoint.places.far_parent import FarParent
 from ..checkpoint.places.life_here import recorded_here
@@ -47,6 +47,7 @@ from ..cluster.lines.inflow import DEFAULT_LIMITS, ConnectionLimits
 from ..cluster.lines.lines import Lines, Transport, new_boot
 from ..cluster.log_writer import Deposed
 from ..cluster.servers import Servers
+from ..cluster.silence import Silence
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.children import tell_stopped
 from ..supervision.patience import end_within, told_if_held
@@ -67,6 +68,7 @@ from .portal import ThreadPortal
 from .recorded import Recorded
 from .recovery import RecoveryTree
 from .script import load_script
+from .servers_seen import ServersSeen
 from .specification import Specifications
 from .system_connection import serve
 from .transaction.transaction import Transaction, Transactions
@@ -126,7 +128,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             not say, and their key variables.
 
     Leaving the context stops all actors, newest first. If the root supervisor gives up, the body is cancelled and
-    TreeFailed is raised; LeadershipLost, if another program has come to lead the system.
+    TreeFailed is raised; LeadershipLost, if another program has come to lead the system; StoreFailed, if what it had
+    recorded was removed from its servers.
     """
 
     def __init__(
@@ -174,14 +177,14 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             recovery_hooks=recovery_hooks,
             recovery=recovery,
         )
-        self._standing: StandingBy | None = None  # what was told last of another program that leads
+        self._servers = ServersSeen()
         self._sink: LogSink | None = None
         self._history: HistoryRecorder | None = None
         self._running: Node | None = None
         self._root: Cell | None = None
         self._body: asyncio.Task[Any] | None = None
         self._closing: asyncio.Task[None] | None = None
-        self._failure: TreeFailed | LeadershipLost | None = None
+        self._failure: TreeFailed | LeadershipLost | StoreFailed | None = None
         self._stopping: set[asyncio.Task[None]] = set()
         self._transactions = Transactions()
         self._transport: Transport | None = None
@@ -200,21 +203,30 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         The tree runs only in one that leads, or that is alone because its store is not on several machines.
         """
         if self._root is None:
-            return "waiting" if self._standing is None else "standby"
+            return "waiting" if self._servers.standing is None else "standby"
         store = self._options.store
         is_shared = isinstance(store, Servers) or (isinstance(store, str) and is_replicated(store))
         return "leader" if is_shared else "alone"
 
     @property
+    def store_name(self) -> str:
+        """Where it keeps what it records, without what stands behind a question mark; empty if that is in memory."""
+        store = self._options.store
+        return store.partition("?")[0] if isinstance(store, str) else "" if store is None else type(store).__name__
+
+    @property
     def leader(self) -> str:
         """The machine and process of the program that leads while this one stands by; an empty text otherwise."""
-        return "" if self._standing is None or self._root is not None else self._standing.leader
+        standing = self._servers.standing
+        return "" if standing is None or self._root is not None else standing.leader
 
     # -- life -------------------------------------------------------------------------------------------------------
 
     async def __aenter__(self) -> ActorSystem:
         if self._running is not None:
-            raise HoldfastError(f"system {self.name!r} was entered already; make a new one")
+            raise HoldfastError(
+                f"system {self.name!r} was entered already; make a new one (`served` and `Service` enter it themselves)"
+            )
         check_is_program("ActorSystem")
         options = self._options
         file = options.read_recovery_file()
@@ -279,7 +291,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             )
             if (at := options.reached_at) is not None:
                 waits = options.standby is not None
-                self._transport = await serve(self._lines, at, options.nats, waits=waits, silent=self._silent)
+                silence = Silence(self._silent, self._answered)
+                self._transport = await serve(self._lines, at, options.nats, waits=waits, silence=silence)
         except BaseException as error:  # Nobody is in the body yet who would hear of a failure, or end what has begun.
             await self.__aexit__(type(error), error, error.__traceback__)
             raise
@@ -300,7 +313,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
 
     @property
     def has_failed(self) -> bool:
-        """Tell whether the root supervisor gave up, or another program has come to lead in its place."""
+        """Tell whether the root supervisor gave up, another program leads in its place, or its log is gone."""
         return self._failure is not None
 
     def store_problem(self, *, for_good: bool = False) -> str:
@@ -311,7 +324,10 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         """
         journal = self._homes.journal
         error = journal.stopped if for_good else journal.stopped or journal.blocked
-        return f"the store takes nothing: {error}" if error is not None else ""
+        if error is not None:
+            return f"the store takes nothing: {error}"
+        silent = None if for_good else self._servers.silent
+        return f"the store takes nothing: its servers do not answer: {silent.reason}" if silent is not None else ""
 
     async def _open_store(self, node: Node) -> StoreEngine:
         """The journal of the store; of one on several machines, once this program leads the system."""
@@ -327,7 +343,9 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             options.nats.told(),
             waits=self._stands_by,
             silent=self._silent,
+            answered=self._answered,
             deposed=self._deposed,
+            gone=self._gone,
             key=options.store_key,
         )
         node.emit(LeadershipTaken(where, journal.epoch))
@@ -335,8 +353,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
 
     def _stands_by(self, leader: str) -> None:
         """Another program leads, and the start waits until this one does."""
-        self._standing = StandingBy(f"/{self.name}", leader)
-        self._node.emit(self._standing)
+        self._servers.standing = StandingBy(f"/{self.name}", leader)
+        self._node.emit(self._servers.standing)
 
     def _refuse_deposed(self, error: BaseException | None, engine: StoreEngine) -> None:
         """Raise LeadershipLost, if the store has refused something because another program leads."""
@@ -344,15 +362,26 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             raise LeadershipLost(self.name, "another program", error.current) from error
 
     def _silent(self, reason: str) -> None:
-        """The servers do not answer, and the start waits for them."""
-        self._node.emit(ServersSilent(f"/{self.name}", reason))
+        """The servers do not answer."""
+        self._servers.silent = ServersSilent(f"/{self.name}", reason)
+        self._node.emit(self._servers.silent)
+
+    def _answered(self, seconds: float) -> None:
+        """The servers answer again, after so many seconds."""
+        self._servers.silent = None
+        self._node.emit(ServersAnswer(f"/{self.name}", seconds))
+
+    def _gone(self, failure: StoreFailed) -> None:
+        """What was recorded is not on the servers any more: the tree ends, and the body hears of it."""
+        if self._closing is None:
+            self._fail(failure)
 
     def _deposed(self, by: Deposed) -> None:
         """Another program leads: the tree ends, and the body hears of it."""
         if self._closing is None:
             self._fail(LeadershipLost(self.name, by.leader, by.current))
 
-    def _fail(self, failure: TreeFailed | LeadershipLost) -> None:
+    def _fail(self, failure: TreeFailed | LeadershipLost | StoreFailed) -> None:
         self._failure = failure
         if self._body is not None:
             self._body.cancel()

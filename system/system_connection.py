@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
@@ -18,13 +17,13 @@ from ..actors.seconds import check_seconds
 from ..actors.values.path_parts import check_path_part
 from ..checkpoint.home.ask_recovery import PASSING
 from ..cluster.configuration import NatsSettings
-from ..cluster.joining import NowAndThen
 from ..cluster.leadership import Patience
 from ..cluster.lines.calls import LineCaller, LineGate
 from ..cluster.lines.far_line import FindName
 from ..cluster.lines.lines import Lines, Transport, new_boot
 from ..cluster.ports import Unanswered
 from ..cluster.servers import Servers, servers_of
+from ..cluster.silence import Silence
 
 if TYPE_CHECKING:
     from .system import ActorSystem
@@ -223,9 +222,7 @@ def connect(
     return SystemConnection(servers, system, within, timeout)
 
 
-async def serve(
-    lines: Lines, at: str | Servers, settings: NatsSettings, *, waits: bool, silent: Callable[[str], None]
-) -> Transport:
+async def serve(lines: Lines, at: str | Servers, settings: NatsSettings, *, waits: bool, silence: Silence) -> Transport:
     """Have this system reached at its servers.
 
     Args:
@@ -233,7 +230,7 @@ async def serve(
         at: the servers.
         settings: how they are reached.
         waits: until they answer, however long that takes.
-        silent: told why they do not, each time.
+        silence: told why they do not, and when they do.
 
     Raises:
         SpecError: the address cannot be read. Unanswered: no server can be reached for a moment, and nobody is to wait.
@@ -250,4 +247,6 @@ async def serve(
             raise
         return transport
 
-    return await Patience(waits=waits).answered(listening, NowAndThen(silent))
+    transport = await Patience(waits=waits).answered(listening, silence.unanswered)
+    silence.answered()
+    return transport

@@ -97,7 +97,8 @@ class SnapshotSchedule:
             if not future.done():
                 future.set_exception(CheckpointFailed(home.path, why))
                 future.exception()  # Whoever wished may be gone.
-        home.node.emit(SnapshotFailed(home.path, why))
+        if not home.homes.journal.engine.has_failed():  # What has ended the store tells more.
+            home.node.emit(SnapshotFailed(home.path, why))
 
     def restarted(self) -> None:
         """Another life begins: what was asked of the last one will not come."""

@@ -343,15 +343,24 @@ class Lines:
                 if quiet > FORGET_SECONDS:
                     self.drop(far)
                     continue
-                if far.line is not None and (waits := far.line.stuck_for(STUCK_SECONDS, MOST_WAITING)):
-                    self.overrun(far, f"it does not take what it is sent: {waits} bytes wait for it")
-                    continue
-                if far.unaccepted_for() > STUCK_SECONDS:  # Whoever has published it waits for that.
-                    self.overrun(far, "it neither accepts nor refuses what it is sent")
+                if problem := _stuck(far):
+                    if quiet > SILENT_SECONDS:  # It cannot be reached, which is not more than it may.
+                        loop.call_soon(self._end, far)
+                    else:
+                        self.overrun(far, problem)
                     continue
             if quiet > SILENT_SECONDS:
                 far.lose()
             far.say()
+
+
+def _stuck(far: FarLine) -> str:
+    """Why what another program is sent does not go on; an empty text if it does."""
+    if far.line is not None and (waits := far.line.stuck_for(STUCK_SECONDS, MOST_WAITING)):
+        return f"it does not take what it is sent: {waits} bytes wait for it"
+    if far.unaccepted_for() > STUCK_SECONDS:  # Whoever has published it waits for that.
+        return "it neither accepts nor refuses what it is sent"
+    return ""
 
 
 def _system(path: str) -> str:

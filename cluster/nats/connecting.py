@@ -19,7 +19,7 @@ from urllib.parse import ParseResult
 import nats.errors
 from nats.aio.client import Client, Srv
 from nats.aio.transport import TcpTransport
-from nats.js.errors import APIError
+from nats.js.errors import APIError, NoStreamResponseError
 from nats.js.errors import Error as JetStreamError
 
 from ..engine_thread import end_tasks
@@ -44,6 +44,18 @@ class NotEncrypted(nats.errors.Error):
     """The server offers no encryption: nothing was sent."""
 
 
+class EncryptedProtocol(asyncio.StreamReaderProtocol):
+    """Has a connection closed when its other end is: one that is encrypted cannot be half open.
+
+    That of asyncio asks for it to be left open, which asyncio then warns of at each end of a connection.
+    """
+
+    def eof_received(self) -> bool:
+        """False: it is closed, too."""
+        super().eof_received()
+        return False
+
+
 class EncryptedTransport(TcpTransport):
     """A connection that writes nothing before it is encrypted."""
 
@@ -64,7 +76,15 @@ class EncryptedTransport(TcpTransport):
         self, uri: str | ParseResult, ssl_context: ssl.SSLContext, buffer_size: int, connect_timeout: int
     ) -> None:
         """Encrypt the connection; see `Transport`."""
-        await super().connect_tls(uri, ssl_context, buffer_size, connect_timeout)
+        assert self._io_writer is not None
+        reader, loop = asyncio.StreamReader(), asyncio.get_running_loop()
+        protocol = EncryptedProtocol(reader)
+        host = uri if isinstance(uri, str) else uri.hostname
+        started = loop.start_tls(self._io_writer.transport, protocol, ssl_context, server_hostname=host)
+        transport = await asyncio.wait_for(started, connect_timeout)
+        if transport is None:
+            raise ConnectionResetError("the connection was closed while it was being encrypted")
+        self._io_reader, self._io_writer = reader, asyncio.StreamWriter(transport, protocol, reader, loop)
         self._is_encrypted = True
 
     def write(self, payload: bytes) -> None:
@@ -138,7 +158,7 @@ class SystemClient(Client):
             connecting.result()
         for refusal in self.refusals.values():
             raise AccessRefused(self.access.name, *refusal)
-        raise Unanswered(self.access.name, self._silence())
+        raise Unanswered(self.access.name, self.silence())
 
     async def probe(self, *, is_node: bool) -> None:
         """Whether this program's key is one for the system: of a node, or of one who may look.
@@ -148,7 +168,7 @@ class SystemClient(Client):
         """
         names = SubjectNames(self.access.system)
         wanted = (names.log, names.lease) if is_node else (names.lease,)
-        with answering(self.access.name):
+        with answering(self.access.name, self):
             asked = [await self.subscribe(subject) for subject in wanted]
             await self.flush(int(ANSWER_SECONDS))  # It overtakes the two above, which are in a queue.
             await self.flush(int(ANSWER_SECONDS))  # Before it answers this the server has refused them, if it does.
@@ -343,7 +363,7 @@ class SystemClient(Client):
             return self._hung_up[self._tried] >= HANG_UPS
         return isinstance(error, ssl.SSLError)
 
-    def _silence(self) -> str:
+    def silence(self) -> str:
         """Why nobody answers, in words."""
         servers = ", ".join(one.partition("://")[2] for one in self.access.servers)
         whys = dict.fromkeys(self._failures.values())
@@ -364,8 +384,8 @@ def _failure(error: Exception, said: str) -> str:
 
 
 @contextlib.contextmanager
-def answering(name: str) -> Generator[None, None, None]:
-    """Whatever means that nobody knows is `Unanswered`.
+def answering(name: str, client: Client) -> Generator[None, None, None]:
+    """Whatever means that nobody knows is `Unanswered`, with the server that was asked, or all if none is there.
 
     Raises:
         Unanswered: the server has not answered, or has answered that it cannot do that now.
@@ -373,5 +393,18 @@ def answering(name: str) -> Generator[None, None, None]:
     try:
         yield
     except (nats.errors.Error, JetStreamError, TimeoutError, OSError) as error:
-        said = error.description if isinstance(error, APIError) else str(error)
-        raise Unanswered(name, said or type(error).__name__) from error
+        raise Unanswered(name, why_unanswered(error, client)) from error
+
+
+def why_unanswered(error: Exception, client: Client) -> str:
+    """Why there was no answer, and which server has not given one."""
+    if isinstance(client, SystemClient) and not client.is_connected:
+        return client.silence()
+    url = client.connected_url
+    where = "the server" if url is None else f"the server {url.hostname}:{url.port}"
+    if isinstance(error, NoStreamResponseError):
+        return f"{where} says that nobody keeps this stream now"
+    if isinstance(error, TimeoutError):
+        return f"{where} has not answered in time; it may wait for others to elect a leader"
+    said = error.description if isinstance(error, APIError) else str(error)
+    return f"{where} says: {said or type(error).__name__}"

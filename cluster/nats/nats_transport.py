@@ -74,7 +74,7 @@ class NatsTransport:
             raise
 
     async def _listen(self, at: str, taken: Callable[[Msg], Awaitable[None]]) -> None:
-        with answering(self._name):
+        with answering(self._name, self._client):
             await self._client.subscribe(at, cb=taken)
             await self._client.flush(int(ANSWER_SECONDS))
 

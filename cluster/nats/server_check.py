@@ -31,6 +31,8 @@ LEAST_BYTES: Final = 1024 * 1024
 """Messages of this size must be taken: parts of records are smaller, with some room."""
 _PAUSE: Final = 0.1
 _ENGINE: Final = "NATS"
+NO_STREAM: Final = 10059
+"""What the API says of a stream that is not there."""
 _NOT_ENABLED: Final = (10039, 10076)
 """Answers of the API where JetStream is off, for the account or for the server."""
 
@@ -155,6 +157,15 @@ class _Info(msgspec.Struct):
     error: _ApiError | None = None
 
 
+class _StreamState(msgspec.Struct):
+    messages: int = 0
+    last_seq: int = 0
+
+
+class _StreamInfo(_Info):
+    state: _StreamState | None = None
+
+
 class _ListedStream(msgspec.Struct):
     config: StreamSetting
 
@@ -175,8 +186,52 @@ async def check_server(client: Client, access: NatsAccess, *, seconds: float = 5
     """
     from .connecting import answering  # which imports the library
 
-    with answering(access.name):
+    with answering(access.name, client):
         return problems_of(await look_at(client, access, seconds=seconds), access)
+
+
+async def lost_log(client: Client, access: NatsAccess, *, seconds: float = 5.0) -> ServerProblem | None:
+    """What is wrong if the log of a system is gone and something else of it is there: that is no new system.
+
+    The streams of a new one are made with that of the log first, so they are asked for in the other order. A lease
+    alone may come before the first record of a log.
+
+    Raises:
+        Unanswered: a server has not answered in time, or has no leader now.
+    """
+    from .system_streams import SubjectNames
+
+    names = SubjectNames(access.system)
+    until = monotonic() + MOMENT_SECONDS
+    while True:
+        others = {name: await _state(client, name, seconds) for name in (names.lease_stream, names.blob_stream)}
+        there = [name for name, state in others.items() if state is not None]
+        log, blobs = await _state(client, names.log_stream, seconds), others[names.blob_stream]
+        if log is not None and (log.messages or not (log.last_seq or (blobs is not None and blobs.last_seq))):
+            return None
+        if log is None and not there:
+            return None
+        if monotonic() >= until:
+            break
+        await asyncio.sleep(_PAUSE)  # Servers that have just begun may not know of it yet.
+    gone = "is gone" if log is None else "is empty"
+    problem = f"it {gone}, and {' and '.join(there)} of the same system is there: somebody has removed what it recorded"
+    at = f"{access.name}?..."
+    remedy = (
+        f"bring it back with a copy of the servers' disks; or remove the rest with `holdfast nats remove '{at}'`, and "
+        "copy a backup there (`holdfast store copy`), or begin with nothing"
+    )
+    return ServerProblem(f"the stream {names.log_stream}", problem, remedy)
+
+
+async def _state(client: Client, stream: str, seconds: float) -> _StreamState | None:
+    """What a stream has; None if there is no such stream."""
+    found = await _asked(client, f"STREAM.INFO.{stream}", _StreamInfo, {}, seconds)
+    if found.error is not None and found.error.err_code == NO_STREAM:
+        return None
+    if refused := _refusal(found):
+        raise Unanswered(_ENGINE, refused)
+    return found.state or _StreamState()
 
 
 async def refuse_unsafe(client: Client, access: NatsAccess, *, seconds: float = 5.0) -> list[ServerProblem]:
@@ -213,9 +268,19 @@ async def check_store(store: str, *, seconds: float = 5.0) -> list[ServerProblem
     try:
         await client.enter(seconds)
         await client.probe(is_node=False)
-        return await client.unless_denied(check_server(client, client.access, seconds=seconds))
+        return await client.unless_denied(_check_all(client, client.access, seconds))
     finally:
         await client.close()
+
+
+async def _check_all(client: Client, access: NatsAccess, seconds: float) -> list[ServerProblem]:
+    """What is wrong with servers and streams, and with what stands there."""
+    from .connecting import answering
+
+    with answering(access.name, client):
+        seen = await look_at(client, access, seconds=seconds)
+        lost = await lost_log(client, access, seconds=seconds) if seen.has_jetstream else None
+    return problems_of(seen, access) + ([lost] if lost is not None else [])
 
 
 async def look_at(client: Client, access: NatsAccess, *, seconds: float = 5.0) -> Seen:
@@ -427,9 +492,15 @@ async def _asked(client: Client, what: str, kind: type[T], wanted: dict[str, int
             raise
         except TimeoutError as error:
             if left <= 1.0:
-                raise Unanswered(_ENGINE, f"no answer to {what} in {seconds} s; may this user ask?") from error
+                raise Unanswered(_ENGINE, f"{_server(client)} has not answered {what} for {seconds:g} s") from error
         except Error as error:
-            raise Unanswered(_ENGINE, f"{what}: {error}") from error
+            raise Unanswered(_ENGINE, f"{_server(client)}: {what}: {error}") from error
+
+
+def _server(client: Client) -> str:
+    """The server that a client is connected to, or was."""
+    url = client.connected_url
+    return "the server" if url is None else f"the server {url.hostname}:{url.port}"
 
 
 def _read(data: bytes, kind: type[T]) -> T:

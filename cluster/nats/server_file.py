@@ -34,7 +34,7 @@ _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _HOST: Final = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9._-]*[A-Za-z0-9_])?\.?")
 
 
-class FileExists(HoldfastError, text="{path} is there already: give another folder, or force it to be written anew"):
+class FileExists(HoldfastError, text="{path} is there already: give another folder, or --force, which writes it anew"):
     """A server file would replace one that somebody may have changed by hand."""
 
     path: str

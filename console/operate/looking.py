@@ -51,12 +51,12 @@ def ls(as_json: Json = False) -> None:
         return
     if not systems:
         typer.echo(f"{NOBODY}; {OF_ITS_OWN}", err=True)
-    lines = [("NAME", "NODE", "PID", "ROLE", "SINCE", "ACTORS")]
+    lines = [("NAME", "NODE", "PID", "ROLE", "SINCE", "ACTORS", "STORE")]
     lines += [
-        (one.name, one.node or "?", str(one.pid), one.role_text, _when(one.since), _count(one.actors))
+        (one.name, one.node or "?", str(one.pid), one.role_text, _when(one.since), _count(one.actors), one.store or "-")
         for one in systems
     ]
-    widths = [max(len(line[column]) for line in lines) for column in range(6)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
     for line in lines if systems else []:
         typer.echo("  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip())
 

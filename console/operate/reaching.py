@@ -64,6 +64,7 @@ class RunningProgram(msgspec.Struct, frozen=True):
     leader: str | None = None
     since: float | None = None
     actors: int | None = None
+    store: str | None = None
 
     @property
     def role_text(self) -> str:

@@ -33,7 +33,16 @@ if TYPE_CHECKING:
     from ...checkpoint.home.quarantine import QuarantinedMessage
     from .recorder import HistoryRecorder
 
-STORE_KINDS = ("JournalBlocked", "JournalFull", "JournalGoesOn", "JournalStopped", "HistoryNotKept")
+STORE_KINDS = (
+    "HistoryNotKept",
+    "JournalBlocked",
+    "JournalFull",
+    "JournalGoesOn",
+    "JournalStopped",
+    "LeadershipTaken",
+    "ServersAnswer",
+    "ServersSilent",
+)
 """Events that say how the store is."""
 GAVE_UP_KINDS = ("SupervisorGaveUp", "AutoShutdown")
 """Events of supervisors that end with all below them."""

@@ -426,6 +426,13 @@ def _store(evidence: Evidence) -> list[str]:
                 said[event.kind] = f"The store stopped taking anything {evidence.ago(event.at)}: {reason}."
             case "JournalStopped":
                 said[event.kind] = f"The store failed {evidence.ago(event.at)}, and nothing is accepted: {reason}."
+            case "ServersAnswer" | "LeadershipTaken":
+                said.pop("ServersSilent", None)
+            case "ServersSilent":
+                first = said.get(
+                    event.kind, f"The servers of the store have not answered (told {evidence.ago(event.at)})"
+                )
+                said[event.kind] = f"{first.partition(', and')[0]}, and nothing is accepted: {reason}."
             case "JournalFull" if event.address == evidence.address:
                 said[event.kind] = (
                     f"Its journal became full {evidence.ago(event.at)}, and it accepts nothing: "

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.checkpoint.snapshot.state_image import LARGE, Imager, read_image
+from holdfast.checkpoint.sqlite import SqliteJournal
 from tests.checkpoint.image_player import CELLS, MANY, Canvas, Digest, Paint, Spoil, Write
 from tests.checkpoint.players import start, until
 from tests.checkpoint.strikes import NEVER, event, strike
@@ -225,3 +227,29 @@ def test_an_image_with_any_byte_of_its_head_damaged_is_refused_or_reads_the_same
     for size in (0, 5, 9, 30, len(data) - 1):
         with pytest.raises(hf.HoldfastError):
             read_image(data[:size])
+
+
+class LostStore(SqliteJournal):
+    """Another program has come to own it."""
+
+    is_lost = False
+
+    def cut(self, address: str, snapshot: bytes, drop: Any, *, turn: int, keep: int = 2) -> None:
+        if self.is_lost:
+            raise hf.errors.StaleEpoch(self.path, epoch=1, current=2)
+        super().cut(address, snapshot, drop, turn=turn, keep=keep)
+
+    def has_failed(self) -> bool:
+        return self.is_lost
+
+
+async def test_a_store_that_was_lost_is_not_told_of_by_each_snapshot(tmp_path: Path) -> None:
+    store = LostStore(str(tmp_path / "app.db"))
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        ref = await canvas(system, "task", 100)
+        with system.events() as stream:
+            store.is_lost = True
+            with pytest.raises(hf.errors.CheckpointFailed, match="another opening owns it"):
+                await system.checkpoint(ref, timeout=20.0)
+            assert not any(isinstance(one, hf.events.SnapshotFailed) for one in stream.take())
+        store.is_lost = False

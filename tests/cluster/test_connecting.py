@@ -11,6 +11,7 @@ from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
 from time import monotonic
 
+import msgspec
 import pytest
 
 import holdfast as hf
@@ -92,6 +93,26 @@ async def test_nothing_is_sent_to_a_server_without_encryption(nats1: NatsServers
         with pytest.raises(AccessRefused, match="offers no TLS"):
             await check_store(store)
         assert bytes(heard) == b""
+
+
+@pytest.mark.asyncio(loop_factories=["asyncio"])  # which is the one that warns
+async def test_the_end_of_an_encrypted_connection_is_no_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    servers = NatsServers(tmp_path / "servers", tls=certificates(tmp_path))
+    (tmp_path / "servers").mkdir()
+    await servers.start()
+    client = SystemClient(servers.access(servers.new_system()))
+    try:
+        await client.enter(PATIENCE)
+        servers.kill(0)
+        await until(lambda: not client.is_connected)
+        await servers.restart(0)
+        await until(lambda: client.is_connected)
+        assert "eof_received" not in caplog.text
+    finally:
+        await client.close()
+        servers.close()
 
 
 async def test_a_server_that_comes_back_without_encryption_is_told_nothing(tmp_path: Path) -> None:
@@ -236,6 +257,40 @@ async def test_a_server_that_has_refused_is_asked_again(own_nats1: NatsServers) 
         own_nats1.reload(0, lambda text: whole)
         await until(lambda: client.is_connected)
         await client.probe(is_node=True)
+    finally:
+        await client.close()
+
+
+async def test_a_role_may_have_two_keys_for_a_while(own_nats1: NatsServers, tmp_path: Path) -> None:
+    """The entry of the new one is written below the old one, and the server takes up its file."""
+    system, seed = own_nats1.new_system(), new_seed()
+    old, new = public_key(seed_file(own_nats1.folder, system, UserRole.NODE).read_text()), public_key(seed)
+    file = tmp_path / "new.nk"
+    file.touch(0o600)
+    file.write_text(seed)
+    client = SystemClient(own_nats1.access(system))
+    access = msgspec.structs.replace(own_nats1.access(system), nkey=str(file))
+
+    def with_both(text: str) -> str:
+        begin = text.index(f"{{ nkey: {old}")
+        entry = text[begin : text.index("{ nkey: ", begin + 1)]
+        return text[:begin] + entry + entry.replace(old, new) + text[begin + len(entry) :]
+
+    try:
+        await client.enter(PATIENCE)
+        own_nats1.reload(0, with_both)
+        async with asyncio.timeout(PATIENCE):
+            while True:
+                other = SystemClient(access)
+                try:
+                    await other.enter(PATIENCE)
+                    break
+                except AccessRefused:  # The server has not taken up its file yet.
+                    await asyncio.sleep(0.05)
+        await other.probe(is_node=True)
+        await other.close()
+        await client.probe(is_node=True)
+        assert client.stats["reconnects"] == 0
     finally:
         await client.close()
 

@@ -299,6 +299,26 @@ def test_who_takes_nothing_of_what_it_is_told_loses_its_line() -> None:
     run(work)
 
 
+@pytest.mark.parametrize("is_there", [True, False])
+def test_who_cannot_be_reached_is_not_blamed_for_what_it_does_not_take(is_there: bool) -> None:
+    async def work(reach: Reach) -> None:
+        async with reach.bank() as system:
+            evil = Hostile(reach, "evil")
+            await evil.greet()
+            evil.send(frames.Command("/evil/ear", "subscribe", {"topic": "/news"}))
+            await asyncio.sleep(0.1)
+            beats = asyncio.ensure_future(evil.beat(takes=True)) if is_there else None
+            events = system.events()
+            async with asyncio.timeout(60.0):
+                await system.publish("/news", News("x"))
+            assert any(isinstance(event, ConnectionLimited) for event in events.take()) is is_there
+            assert system.lines.at("evil") is None
+            if beats is not None:
+                beats.cancel()
+
+    run(work)
+
+
 @pytest.mark.parametrize("takes", [False, True], ids=["takes nothing", "accepts nothing"])
 def test_who_takes_nothing_of_what_is_published_holds_nobody_up_for_long(takes: bool) -> None:
     async def work(reach: Reach) -> None:

@@ -1,4 +1,4 @@
-"""`holdfast nats config` and `holdfast nats check`, as a user runs them."""
+"""`holdfast nats config`, `check` and `remove`, and `holdfast store` with servers, as a user runs them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ import pytest
 from nats.js.api import StorageType
 from typer.testing import CliRunner, Result
 
+import holdfast as hf
 from holdfast.cluster.nats.server_file import UserRole
 from holdfast.cluster.nats.system_streams import SubjectNames, stream_settings
 from holdfast.console.commands import commands
 from tests.cluster.servers import NatsServers, free_ports, server_binary
+from tests.cluster.shelves import Put, Shelf
 
 
 def nats(*arguments: str) -> Result:
@@ -35,7 +37,7 @@ def test_the_files_are_such_that_a_server_takes_them(tmp_path: Path) -> None:
         assert f'listen: "127.0.0.1:{4222 + number}"' in file.read_text()
     again = nats("config", str(folder), "--system", "app")
     assert again.exit_code == 2
-    assert "is there already" in again.output
+    assert "nats-1.conf is there already: give another folder, or --force" in again.output
 
 
 @pytest.mark.parametrize(
@@ -50,6 +52,54 @@ def test_a_plan_that_does_not_work_is_refused(tmp_path: Path, arguments: list[st
     done = nats("config", str(tmp_path), "--system", "app", *arguments)
     assert done.exit_code == 2
     assert problem in done.output
+    assert done.output.count("nats config:") == 1
+
+
+async def _fill(store: str) -> None:
+    async with hf.ActorSystem("shop", store=store, log=False) as system:
+        await (await system.start(hf.child("shelf", hf.start(Shelf), recovery=hf.hybrid()))).ask(Put("one"))
+
+
+async def _lines_in(store: str) -> int:
+    async with hf.ActorSystem("shop", store=store, log=False) as system:
+        return await (await system.start(hf.child("shelf", hf.start(Shelf), recovery=hf.hybrid()))).ask(Put("more"))
+
+
+def test_a_store_is_removed_when_nobody_leads_and_that_is_confirmed(nats1: NatsServers) -> None:
+    store = nats1.store(nats1.new_system())
+    asyncio.run(_fill(store))
+
+    async def led() -> Result:
+        async with hf.ActorSystem("shop", store=store, log=False):
+            return await asyncio.to_thread(nats, "remove", store, "--yes")
+
+    in_use = asyncio.run(led())
+    assert (in_use.exit_code, "is in use" in in_use.output) == (2, True), in_use.output
+    asked = CliRunner().invoke(commands, ["nats", "remove", store], input="n\n")
+    assert (asked.exit_code, "nkey" in asked.output) == (1, False)
+    assert asyncio.run(_lines_in(store)) == 2
+    removed = nats("remove", store, "--yes")
+    assert (removed.exit_code, removed.output.count("removed hf-app")) == (0, 3), removed.output
+    assert nats("remove", store, "--yes").output == "there was nothing\n"
+    assert asyncio.run(_lines_in(store)) == 1
+
+
+def test_a_store_is_not_copied_to_the_place_of_another_system(nats1: NatsServers, tmp_path: Path) -> None:
+    file, store = f"sqlite:{tmp_path / 'shop.db'}", nats1.store(nats1.new_system())
+    asyncio.run(_fill(file))
+    refused = CliRunner().invoke(commands, ["store", "copy", file, store])
+    assert (refused.exit_code, "that is the place of another system" in refused.output) == (2, True), refused.output
+    assert nats("remove", store, "--yes").output == "there was nothing\n"
+    assert CliRunner().invoke(commands, ["store", "copy", file, store, "--other-name"]).exit_code == 0
+    assert asyncio.run(_lines_in(store)) == 2
+
+
+@pytest.mark.parametrize("command", ["verify", "stats", "export", "compact", "backup", "restore", "rekey"])
+def test_a_command_for_files_says_what_is_for_servers(command: str, tmp_path: Path) -> None:
+    dest = [str(tmp_path / "copy.db")] if command in ("backup", "restore", "rekey") else []
+    done = CliRunner().invoke(commands, ["store", command, "nats://127.0.0.1/shop?nkey=shop.nk", *dest])
+    assert done.exit_code == 2
+    assert "this is for a store in a file" in done.output
 
 
 def test_servers_are_checked(nats1: NatsServers) -> None:

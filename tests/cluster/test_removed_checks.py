@@ -36,7 +36,7 @@ CHECKS = {
     ),
     "a program that begins to lead waits for servers that are silent while it opens its lines": Check(
         "system/system_connection.py",
-        "await Patience(waits=waits).answered(listening, NowAndThen(silent))",
+        "await Patience(waits=waits).answered(listening, silence.unanswered)",
         "await listening()",
         "tests/cluster/test_simulated_fleet.py",
         "begins_to_lead_waits_for_servers",

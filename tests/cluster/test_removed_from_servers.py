@@ -13,6 +13,8 @@ CHECK = "tests/cluster/test_server_check.py"
 FILE = "tests/cluster/test_server_file.py"
 CONNECTING = "tests/cluster/test_connecting.py"
 COPY = "tests/cluster/test_store_copy.py"
+GONE = "tests/cluster/test_servers_gone.py"
+COMMANDS = "tests/cluster/test_nats_commands.py"
 CONFIGURATION = "tests/cluster/test_configuration.py"
 
 CHECKS = {
@@ -246,6 +248,62 @@ CHECKS = {
         "                    if False:",
         COPY,
         "test_what_is_not_there_is_not_copied",
+    ),
+    "what is left of a system without its log is no new one": Check(
+        "cluster/nats/nats_engine.py",
+        "        if lost is not None:",
+        "        if False:",
+        GONE,
+        "what_is_left_of_a_system",
+    ),
+    "a check tells of a log that is gone": Check(
+        "cluster/nats/server_check.py",
+        "+ ([lost] if lost is not None else [])",
+        "+ []",
+        GONE,
+        "what_is_left_of_a_system",
+    ),
+    "a log that was made and not begun is no lost one": Check(
+        "cluster/nats/server_check.py",
+        "(log.messages or not (log.last_seq or (blobs is not None and blobs.last_seq)))",
+        "log.messages",
+        GONE,
+        "first_start_that_was_cut_off",
+    ),
+    "a leader whose log is gone ends": Check(
+        "cluster/replicated_journal.py",
+        "            if gone is not None and misses >= MOST_MISSES:",
+        "            if False:",
+        GONE,
+        "leader_whose_log_is_gone",
+    ),
+    "a leader whose servers are away is not ready": Check(
+        "system/system.py",
+        "        silent = None if for_good else self._servers.silent",
+        "        silent = None",
+        GONE,
+        "leader_whose_servers_are_away",
+    ),
+    "a store that somebody leads is not removed": Check(
+        "cluster/nats/store_removal.py",
+        "        if await lease.acquire(leader_name()) is None:",
+        "        if False:",
+        COMMANDS,
+        "a_store_is_removed_when_nobody_leads",
+    ),
+    "a store is removed when that is confirmed": Check(
+        "console/nats_commands.py",
+        "        if not yes:",
+        "        if False:",
+        COMMANDS,
+        "a_store_is_removed_when_nobody_leads",
+    ),
+    "a store is not copied to the place of another system": Check(
+        "console/store_commands.py",
+        "            if theirs and not other_name:",
+        "            if False:",
+        COMMANDS,
+        "not_copied_to_the_place_of_another_system",
     ),
     "a store is not copied into itself": Check(
         "console/store_commands.py",

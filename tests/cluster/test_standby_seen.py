@@ -78,13 +78,16 @@ async def until_role(pid: int, role: str) -> None:
             await asyncio.sleep(0.05)
 
 
-async def test_programs_are_listed_by_role_and_the_one_that_runs_the_tree_is_taken(programs: Programs) -> None:
+async def test_programs_are_listed_by_role_and_the_one_that_runs_the_tree_is_taken(
+    programs: Programs, store: str
+) -> None:
     leader, standby = (process.pid for process in programs.processes)
     status, output, _ = await holdfast("ls")
     lines = {int(line.split()[2]): line for line in output.splitlines()[1:]}
     assert (status, len(lines)) == (0, 2)
     assert f"  standby of {socket.gethostname()}, process {leader}  " in lines[standby]
     assert "  leader  " in lines[leader]
+    assert lines[leader].endswith(f"  {store.partition('?')[0]}")
     status, output, _ = await holdfast("tree", "--json")
     assert (status, json.loads(output)["pid"]) == (0, leader)
     status, output, errors = await holdfast("--node", "standby", "tree")
