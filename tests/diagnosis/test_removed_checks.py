@@ -298,8 +298,8 @@ CHECKS = {
     ),
     "that a turn rests in a process is known at the root": Check(
         "diagnosis/observers/runtime.py",
-        "            cell.host.ask_turns(cell)  # for the next look\n",
-        "",
+        "            cell.host.ask_turns(cell)  # for the next look\n        is_at",
+        "        is_at",
         KINDS,
         "rests_in_its_turn_in_a_process and plain",
     ),
