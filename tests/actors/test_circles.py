@@ -90,7 +90,8 @@ async def not_at_all(reply: Awaitable[int]) -> int:
 
 
 async def one_of_two(reply: asyncio.Future[int]) -> int:
-    await asyncio.wait([reply, asyncio.create_task(asyncio.sleep(0.5))], return_when=asyncio.FIRST_COMPLETED)
+    late: asyncio.Future[Any] = asyncio.create_task(asyncio.sleep(0.5))
+    await asyncio.wait([reply, late], return_when=asyncio.FIRST_COMPLETED)
     return -1
 
 
@@ -179,4 +180,4 @@ async def test_who_is_in_a_thread_is_no_part_of_a_circle(system: hf.ActorSystem)
             return -2
 
     blocks, peer = await ring(system, hf.start(Blocks), hf.start(Peer))
-    assert await asyncio.gather(peer.ask(Begin()), blocks.ask(Glance())) == ["1", -2]
+    assert list(await asyncio.gather(peer.ask(Begin()), blocks.ask(Glance()))) == ["1", -2]

@@ -117,9 +117,12 @@ class Sender(hf.Actor):
 
 
 def sender(name: str, kind: str) -> hf.ChildSpec:
-    own: dict[str, Any] = {"process": {"isolation": "process"}, "pbr": {"mechanism": hf.ftm.PBR()}}.get(kind, {})
-    if kind == "lfr":
-        own = {"mechanism": hf.ftm.LFR()}
+    kinds: dict[str, dict[str, Any]] = {
+        "process": {"isolation": "process"},
+        "pbr": {"mechanism": hf.ftm.PBR()},
+        "lfr": {"mechanism": hf.ftm.LFR()},
+    }
+    own = kinds.get(kind, {})
     return hf.child(name, hf.start(Sender, name), recovery=hf.hybrid(interval=0.1), **own)
 
 

@@ -78,7 +78,7 @@ def test_who_is_answered_by_another_program_when_the_ask_had_timed_out_starts_ag
     program(store, [*begin, *receiver])
     program(store, [*receiver, *begin, ["end supervisor", "north"], ["say", "s0", "r0", "ask", 2], ["kill"]])
     program(store, [*receiver, ["wait", 0.1], ["kill"]])  # It answers into the journal of who is not there.
-    last = [*begin, *receiver, ["supervisor", "south", "task"], ["tell all", ["s0"]]]
+    last: Steps = [*begin, *receiver, ["supervisor", "south", "task"], ["tell all", ["s0"]]]
     judge(program(store, last), is_lossless=True)
 
 
@@ -116,9 +116,9 @@ class Plan:
             waiting = waiting[: draw.randint(1, len(waiting))]
         for _ in range(draw.randint(4, 14)):
             if waiting and (not up or draw.random() < 0.35):
-                one = waiting.pop()
-                steps.append(one)
-                up.append(one[1])
+                begun = waiting.pop()
+                steps.append(begun)
+                up.append(begun[1])
                 continue
             senders = [name for name in up if name in self.senders]
             above = [name for name in up if name in SUPERVISORS and name not in ended]

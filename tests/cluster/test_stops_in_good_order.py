@@ -133,7 +133,7 @@ def shop_on(fleet: SimFleet) -> Callable[[SimProgram], Coroutine[Any, Any, None]
     return shop
 
 
-async def booked_at(connection: hf.SystemConnection) -> list[str]:
+async def booked_at(connection: hf.system.SystemConnection) -> list[str]:
     """What the ledger has booked."""
     (booked,) = await connection.ref("/bank/ledger", Ledger).ask(Books(), timeout=600.0)
     return booked

@@ -51,7 +51,10 @@ async def run(*arguments: str) -> tuple[int, str]:
 
 def problems(system: hf.ActorSystem) -> list[str]:
     """What went wrong in this program."""
-    return [event.text for event in system.history("/app/**", kinds=[kind.__name__ for kind in SILENT]).events]
+    return [
+        f"{event.kind} {event.address} {event.fields}"
+        for event in system.history("/app/**", kinds=[kind.__name__ for kind in SILENT]).events
+    ]
 
 
 @pytest.mark.parametrize("where", PLACES)
