@@ -190,6 +190,18 @@ class Silence(msgspec.Struct, frozen=True):
     is_stopped: bool
 
 
+class OwnProcess(msgspec.Struct, frozen=True):
+    """The process of an actor.
+
+    Attributes:
+        memory: what it takes, if the limits of the actor bound that.
+        silence: that it has not answered.
+    """
+
+    memory: ProcessMemory | None = None
+    silence: Silence | None = None
+
+
 class Evidence(msgspec.Struct, frozen=True):
     """All that is known about an address at one moment.
 
@@ -211,9 +223,8 @@ class Evidence(msgspec.Struct, frozen=True):
         deeper: whoever is further below, at any depth, as far as this process knows.
         own_allowance: what it allows itself, if it is a supervisor that answers.
         protection: its mechanisms and replicas, if somebody lives there.
-        memory: of its own process, if its limits bound that.
+        process: what is known of its own process.
         waiting: what waits in its mailbox.
-        silence: that its process has not answered.
         awaited: the address for which its start waits, because it is bound to it; "" if it does not wait so.
     """
 
@@ -234,9 +245,8 @@ class Evidence(msgspec.Struct, frozen=True):
     deeper: Below = Below()
     own_allowance: Allowance | None = None
     protection: ProtectionStatus | None = None
-    memory: ProcessMemory | None = None
+    process: OwnProcess = OwnProcess()
     waiting: Waiting | None = None
-    silence: Silence | None = None
     awaited: str = ""
 
     def ago(self, at: float) -> str:
@@ -321,9 +331,8 @@ def collect(
         ),
         _own_allowance(told.overview),
         None if cell is None else protection_of(cell),
-        None if cell is None else _memory(cell),
+        OwnProcess(None if cell is None else _memory(cell), told.silence),
         None if cell is None else _waiting(cell),
-        told.silence,
         _awaited(node, address),
     )
 

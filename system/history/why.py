@@ -337,7 +337,7 @@ def _waits(evidence: Evidence) -> list[str]:
 
 def _silent(evidence: Evidence) -> list[str]:
     """Its process does not answer what every loop that runs answers at once."""
-    silence = evidence.silence
+    silence = evidence.process.silence
     if silence is None:
         return []
     process = f"The process of {evidence.address} (pid {silence.pid})"
@@ -368,7 +368,7 @@ def _mailbox(evidence: Evidence) -> list[str]:
 
 def _memory(evidence: Evidence) -> list[str]:
     """Its process has nearly as much memory as it may."""
-    memory = evidence.memory
+    memory = evidence.process.memory
     if memory is None or memory.resident_bytes < MUCH * memory.allowed_bytes:
         return []
     has, may = memory.resident_bytes / 1e6, memory.allowed_bytes / 1e6
