@@ -12,6 +12,7 @@ from holdfast.system.history.evidence import (
     ChildNow,
     Evidence,
     Outstanding,
+    OwnProcess,
     ProcessMemory,
     PutAside,
     Silence,
@@ -62,11 +63,19 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         f"{AT} does not say how it is, and the history knows of nothing that is wrong.",
     ),
     "its process is stopped": (
-        {"is_there": True, "lives": [life(1)], "silence": Silence(7, 5.0, is_stopped=True)},
+        {
+            "is_there": True,
+            "lives": [life(1)],
+            "process": OwnProcess(process=OwnProcess(silence=Silence(7, 5.0, is_stopped=True))),
+        },
         f"The process of {AT} (pid 7) is stopped, as by SIGSTOP: SIGCONT lets it go on.",
     ),
     "its process is silent": (
-        {"is_there": True, "lives": [life(1)], "silence": Silence(7, 5.0, is_stopped=False)},
+        {
+            "is_there": True,
+            "lives": [life(1)],
+            "process": OwnProcess(process=OwnProcess(silence=Silence(7, 5.0, is_stopped=False))),
+        },
         f"{NO_WORD}: its event loop does not run, or the machine is very busy.",
     ),
     "gone": ({"lives": [life(1)]}, f"Nobody lives at {AT} any more, and how its last life ended is not known."),
@@ -371,14 +380,19 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a child that is suspended": ({"below": Below(now=[ChildNow("a", "suspended")])}, "Its child a is suspended."),
     "little memory is left": (
-        {"memory": ProcessMemory(250_000_000, 300_000_000)},
+        {"process": OwnProcess(ProcessMemory(250_000_000, 300_000_000))},
         (
             "Its process has 250 MB of memory, and is ended at 300 MB: if that goes on growing, look at what its "
             "state holds (`holdfast inspect --state`)."
         ),
     ),
     "much memory is left": (
-        {"memory": ProcessMemory(100_000_000, 300_000_000), "is_there": True, "lives": [life(1)], "status": status()},
+        {
+            "process": OwnProcess(ProcessMemory(100_000_000, 300_000_000)),
+            "is_there": True,
+            "lives": [life(1)],
+            "status": status(),
+        },
         f"{AT} is running, in life 2, and nothing is wrong as far as is known.",
     ),
     "what waits": (
