@@ -66,7 +66,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         {
             "is_there": True,
             "lives": [life(1)],
-            "process": OwnProcess(process=OwnProcess(silence=Silence(7, 5.0, is_stopped=True))),
+            "process": OwnProcess(silence=Silence(7, 5.0, is_stopped=True)),
         },
         f"The process of {AT} (pid 7) is stopped, as by SIGSTOP: SIGCONT lets it go on.",
     ),
@@ -74,7 +74,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         {
             "is_there": True,
             "lives": [life(1)],
-            "process": OwnProcess(process=OwnProcess(silence=Silence(7, 5.0, is_stopped=False))),
+            "process": OwnProcess(silence=Silence(7, 5.0, is_stopped=False)),
         },
         f"{NO_WORD}: its event loop does not run, or the machine is very busy.",
     ),
