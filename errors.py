@@ -172,7 +172,7 @@ __all__ = [
     "UntrustedFile",
     "WaitTimeout",
     "WrongActor",
-    "WrongStoreKey",
     "WrongLoop",
+    "WrongStoreKey",
     "WrongThread",
 ]

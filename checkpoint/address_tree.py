@@ -11,6 +11,8 @@ class AddressTree:
     >>> tree = AddressTree(["/app/a", "/app/a/b/c", "/app/ab"])
     >>> sorted(tree.below("/app/a")), tree.has("/app/a/b"), "/app/a/b" in tree
     (['/app/a/b/c'], True, False)
+    >>> sorted(tree.below("")) == ["/app/a", "/app/a/b/c", "/app/ab"]
+    True
     """
 
     __slots__ = ("_below", "_paths")
@@ -31,14 +33,15 @@ class AddressTree:
     def add(self, path: str) -> None:
         """Add an address; once is enough."""
         self._paths.add(path)
-        while (above := path.rpartition("/")[0]) and path not in self._below.get(above, ()):
+        while path and path not in self._below.get(above := path.rpartition("/")[0], ()):
             self._below.setdefault(above, {})[path] = None
             path = above
 
     def discard(self, path: str) -> None:
         """Take an address out, if it is there."""
         self._paths.discard(path)
-        while not self.has(path) and (above := path.rpartition("/")[0]):
+        while path and not self.has(path):
+            above = path.rpartition("/")[0]
             siblings = self._below.get(above, {})
             siblings.pop(path, None)
             if not siblings:

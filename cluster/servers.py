@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 from collections.abc import Coroutine, Mapping
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
 from ..actors.errors import SpecError
+from ..actors.events import ServersSilent, StandingBy
 from .engine_thread import EngineLoop, EngineThread
 from .ports import Engine
 
@@ -23,6 +25,19 @@ class JoinLoop(EngineLoop, Protocol):
     def run(self, work: Coroutine[Any, Any, T]) -> asyncio.Future[T]:
         """Run a coroutine on that loop, for somebody on the running one; to cancel the future cancels it."""
         ...
+
+
+@dataclasses.dataclass(slots=True)
+class ServersSeen:
+    """What was told last of the servers of a store.
+
+    Attributes:
+        standing: that another program leads.
+        silent: why they do not answer, while that is so.
+    """
+
+    standing: StandingBy | None = None
+    silent: ServersSilent | None = None
 
 
 @runtime_checkable

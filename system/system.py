@@ -46,7 +46,7 @@ from ..cluster.leadership import LeadershipLost, Standby
 from ..cluster.lines.inflow import DEFAULT_LIMITS, ConnectionLimits
 from ..cluster.lines.lines import Lines, Transport, new_boot
 from ..cluster.log_writer import Deposed
-from ..cluster.servers import Servers
+from ..cluster.servers import Servers, ServersSeen
 from ..cluster.silence import Silence
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.children import tell_stopped
@@ -68,7 +68,6 @@ from .portal import ThreadPortal
 from .recorded import Recorded
 from .recovery import RecoveryTree
 from .script import load_script
-from .servers_seen import ServersSeen
 from .specification import Specifications
 from .system_connection import serve
 from .transaction.transaction import Transaction, Transactions
@@ -210,7 +209,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
 
     @property
     def store_name(self) -> str:
-        """Where it keeps what it records, without what stands behind a question mark; empty if that is in memory."""
+        """Return where it keeps what it records, without what stands behind a question mark; empty: in memory."""
         store = self._options.store
         return store.partition("?")[0] if isinstance(store, str) else "" if store is None else type(store).__name__
 

@@ -65,6 +65,7 @@ ADVICE: Final[dict[str, TroubleAdvice]] = {
     ),
     "recovery fails": TroubleAdvice(ILL, "Mend what it tells, then restart it.", ("restart",)),
     "suspended": TroubleAdvice(ODD, "Resume it, when you are done.", ("resume",)),
+    "its start waits": TroubleAdvice(ODD, "Start the actor to whom it is bound, or mend the address in its spec."),
     "restarting": TroubleAdvice(ODD, "Wait; if it does not come back, its history says why."),
     "its process does not answer": TroubleAdvice(
         ILL, "Have the process go on, or end it: its supervisor restarts the actor.", ("kill",)

@@ -16,13 +16,12 @@ from ...system.recovery import RecoverySupervisor
 from ...system.transaction.arrangement import Arrangement
 from ...system.transaction.change import Change
 from ...system.transaction.draft import Draft, DraftPlace, is_elsewhere
-from ...system.transaction.living import ReplaceActorCode
+from ...system.transaction.living import Bind, RegisterName, ReplaceActorCode, Unbind, UnregisterName
 from ...system.transaction.mechanisms import Isolate, Protect
 from ...system.transaction.operation import Operation
 from ...system.transaction.reparenting import Reparent
 from ...system.transaction.running import Respecify, StartAgain, StopChild
 from ...system.transaction.structure import AddChild, RemoveActor, Reorder, SetFlags
-from ...system.transaction.wiring import Bind, RegisterName, Unbind, UnregisterName
 from ..overview import is_far
 from ..trust import Needed, trusted_imports
 from .tree_file import TreeFile

@@ -11,12 +11,12 @@ from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.ref import Target
 from ...supervision.spec import ChildSpec, Isolation, Strategy
 from . import living
+from .living import Bind, RegisterName, Unbind, UnregisterName
 from .mechanisms import Isolate, OnProtection, Protect, Update
 from .operation import Operation, Step, text_of
 from .reparenting import Reparent
 from .running import Respecify, StartAgain, StopChild
 from .structure import AddChild, RemoveActor, Reorder, SetFlags, named_spec
-from .wiring import Bind, RegisterName, Unbind, UnregisterName
 
 if TYPE_CHECKING:
     from ...ftm.events import MechanismSettled

@@ -255,7 +255,7 @@ CHECKS = {
         "test_each_difference_is_one_step_and_state_is_kept",
     ),
     "who is unbound may be started before its target": Check(
-        "system/transaction/wiring.py",
+        "system/transaction/living.py",
         "            owner.spec = dataclasses.replace(owner.spec, bindings=left)",
         "            pass",
         DECLARE,

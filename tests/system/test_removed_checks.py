@@ -820,14 +820,14 @@ CHECKS = {
         "test_who_is_stopped_stays_so",
     ),
     "what a transaction has bound is in the spec": Check(
-        "system/transaction/wiring.py",
+        "system/transaction/living.py",
         "        rebind(owner, self._port, target.path)\n",
         "        pass\n",
         KEPT,
         "test_a_binding_that_a_transaction_has_made_outlives_the_supervisor and other and task",
     ),
     "what a transaction has unbound is not in the spec": Check(
-        "system/transaction/wiring.py",
+        "system/transaction/living.py",
         "        rebind(owner, self._port, None)\n",
         "        pass\n",
         KEPT,

@@ -42,6 +42,7 @@ def logs(path: Path) -> list[Path]:
 
 def left(journal: SqliteJournal, name: str = "left") -> Path:
     """The files as a kill would leave them now, elsewhere."""
+    journal._store._wal.join()  # A kill leaves one instant: nothing may move from file to file while they are copied.
     folder = Path(journal.path).parent
     copy = folder.parent / f"{folder.name}-{name}"
     shutil.rmtree(copy, ignore_errors=True)
