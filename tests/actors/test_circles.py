@@ -46,7 +46,7 @@ class Peer(hf.Actor):
         return self.heard
 
 
-async def ring(system: hf.ActorSystem, *peers: hf.Start[Peer]) -> list[hf.ActorRef[Peer]]:
+async def ring(system: hf.ActorSystem, *peers: hf.Start[Any]) -> list[hf.ActorRef[Peer]]:
     refs = [await system.start(hf.child(f"p{n}", peer)) for n, peer in enumerate(peers)]
     async with system.transaction() as change:
         for ref, other in zip(refs, (*refs[1:], refs[0]), strict=True):
