@@ -23,7 +23,7 @@ from .ports import Engine, LogGone, Unanswered
 from .replicated_journal import ReplicatedJournal
 from .sealed_engine import sealed
 from .servers import JoinLoop, Servers, servers_of
-from .silence import Silence
+from .silence import SilenceOfServers
 
 T = TypeVar("T")
 TOOL_SECONDS: Final = 30.0
@@ -87,8 +87,8 @@ async def join(
     thread = servers.engine_loop(f"holdfast {system}")
     opened: list[Engine] = []  # filled in there: whoever is cancelled here would not get to know of it
 
-    def silence(moment: float = 0.0) -> Silence:
-        return Silence(
+    def silence(moment: float = 0.0) -> SilenceOfServers:
+        return SilenceOfServers(
             lambda problem: _tell(loop, silent, problem), lambda after: _tell(loop, answered, after), moment=moment
         )
 

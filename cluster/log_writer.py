@@ -17,7 +17,7 @@ from typing import Final, NamedTuple, TypeVar
 from ..actors.errors import HoldfastError
 from .log_records import BASE, CHANGES, EPOCH, DamagedLog, RecordMaker, decode_epoch, encode_changes, read_part
 from .ports import Engine, LogRecord, OutOfTurn, Unanswered
-from .silence import Silence
+from .silence import SilenceOfServers
 from .store_contents import Change, MemoryContents
 
 MOST_BYTES: Final = 256 << 10
@@ -77,11 +77,11 @@ class LogWriter:
         maker: RecordMaker,
         *,
         grown: int,
-        silence: Silence,
+        silence: SilenceOfServers,
         written: Callable[[int], None],
         want_base: Callable[[], None],
     ) -> None:
-        self._engine, self._maker, self._silence = engine, maker, silence
+        self._engine, self._maker, self.silence = engine, maker, silence
         self._written, self._want_base = written, want_base
         self._queue: deque[LogWrite] = deque()
         self._work = asyncio.Event()
@@ -146,7 +146,7 @@ class LogWriter:
         Raises:
             Deposed: another leads.
         """
-        found = await behind(self._engine, self._maker.after, self._silence.unanswered)
+        found = await behind(self._engine, self._maker.after, self.silence.unanswered)
         if found is not None:
             raise _deposed(found, self._maker.epoch)
 
@@ -225,11 +225,11 @@ class LogWriter:
         self._taken()
 
     def _unanswered(self, problem: str) -> None:
-        self._silence.unanswered(problem, self.asked)
+        self.silence.unanswered(problem, self.asked)
 
     def _taken(self) -> None:
         self.asked = math.inf
-        self._silence.answered()
+        self.silence.answered()
 
 
 def pass_over(problem: str) -> None:

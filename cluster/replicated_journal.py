@@ -27,7 +27,7 @@ from .engine_thread import EngineLoop, end_tasks
 from .leadership import Leading
 from .log_writer import FIRST_PAUSE, LONGEST_PAUSE, Deposed, LogWrite, LogWriter, insist
 from .ports import Engine, LogGone, Unanswered
-from .silence import Silence
+from .silence import SilenceOfServers
 from .store_contents import Change
 from .write_progress import BlobsUnderWay, Tell, WriteProgress
 
@@ -82,7 +82,7 @@ class ReplicatedJournal:
         leading: Leading,
         *,
         lost: Callable[[HoldfastError], None] = lambda error: None,
-        silence: Silence | None = None,
+        silence: SilenceOfServers | None = None,
         patience: float = math.inf,
     ) -> None:
         self.path = engine.name
@@ -99,15 +99,14 @@ class ReplicatedJournal:
         self._is_open = True
         self._is_awake = False
         self._keeper = leading.keeper
-        self._silence = silence or Silence(lambda problem: None, lambda seconds: None)
-        loop.wait(self._begin(leading))
+        loop.wait(self._begin(leading, silence or SilenceOfServers(lambda problem: None, lambda seconds: None)))
 
-    async def _begin(self, leading: Leading) -> None:
+    async def _begin(self, leading: Leading, silence: SilenceOfServers) -> None:
         self._writer = LogWriter(
             self._engine,
             leading.maker,
             grown=leading.grown,
-            silence=self._silence,
+            silence=silence,
             written=self._take_written,
             want_base=self._want_base,
         )
@@ -184,13 +183,13 @@ class ReplicatedJournal:
             except LogGone as error:
                 gone = error
             except Unanswered as error:
-                self._silence.unanswered(error.problem, asked)
+                writer.silence.unanswered(error.problem, asked)
                 continue
             misses = misses + 1 if gone is not None else 0
             if gone is not None and misses >= MOST_MISSES:
                 raise gone
             if gone is None and writer.asked == math.inf:
-                self._silence.answered()
+                writer.silence.answered()
 
     async def _drop_orphans(self) -> None:
         """Remove what earlier leaders have kept beside the log and nothing in it refers to."""

@@ -10,7 +10,7 @@ SILENT_SECONDS: Final = 30.0
 """How often it is said that the servers do not answer."""
 
 
-class Silence:
+class SilenceOfServers:
     """Takes in what was asked of servers in vain, and that they have answered. Only for a running loop.
 
     Args:
@@ -38,7 +38,7 @@ class Silence:
             self._silent(problem)
 
     def answered(self) -> None:
-        """They have answered."""
+        """The servers have answered something just now."""
         if self._since is None:
             return
         since, self._since = self._since, None

@@ -47,7 +47,7 @@ from ..cluster.lines.inflow import DEFAULT_LIMITS, ConnectionLimits
 from ..cluster.lines.lines import Lines, Transport, new_boot
 from ..cluster.log_writer import Deposed
 from ..cluster.servers import Servers, ServersSeen
-from ..cluster.silence import Silence
+from ..cluster.silence import SilenceOfServers
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.children import tell_stopped
 from ..supervision.patience import end_within, told_if_held
@@ -290,7 +290,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             )
             if (at := options.reached_at) is not None:
                 waits = options.standby is not None
-                silence = Silence(self._silent, self._answered)
+                silence = SilenceOfServers(self._silent, self._answered)
                 self._transport = await serve(self._lines, at, options.nats, waits=waits, silence=silence)
         except BaseException as error:  # Nobody is in the body yet who would hear of a failure, or end what has begun.
             await self.__aexit__(type(error), error, error.__traceback__)

@@ -23,7 +23,7 @@ from ..cluster.lines.far_line import FindName
 from ..cluster.lines.lines import Lines, Transport, new_boot
 from ..cluster.ports import Unanswered
 from ..cluster.servers import Servers, servers_of
-from ..cluster.silence import Silence
+from ..cluster.silence import SilenceOfServers
 
 if TYPE_CHECKING:
     from .system import ActorSystem
@@ -222,7 +222,9 @@ def connect(
     return SystemConnection(servers, system, within, timeout)
 
 
-async def serve(lines: Lines, at: str | Servers, settings: NatsSettings, *, waits: bool, silence: Silence) -> Transport:
+async def serve(
+    lines: Lines, at: str | Servers, settings: NatsSettings, *, waits: bool, silence: SilenceOfServers
+) -> Transport:
     """Have this system reached at its servers.
 
     Args:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ...actors.kernel.node import Node
     from ..system import ActorSystem
     from .handing import Handing
-    from .senders import Senders
+    from .senders import OtherSenders
     from .succession import Succession
 
 
@@ -53,7 +53,7 @@ class Arrangement:
         """The supervisors that begin anew, from above."""
         self.regrouped: list[DraftPlace] = []
         """Those that get another supervisor, or whose own begin anew, with all below them."""
-        self.senders: Senders | None = None
+        self.senders: OtherSenders | None = None
         """Who is held because it goes on sending; None: no address changes."""
         self.step = ""
         """The step that is in the way, or has failed."""

@@ -24,7 +24,7 @@ from .handing import UNKNOWN, Handing, check_handed, check_handing, is_far
 from .living import OnSharedWork
 from .operation import Operation, StagedWork, text_of, wrong
 from .relocation import MOVED_WITHIN, Gated, Inhabited
-from .senders import Senders
+from .senders import OtherSenders
 from .structure import check_child, check_not_uniform
 from .succession import Elsewhere, NewSupervisor, Succession, check_succession
 
@@ -107,7 +107,7 @@ class Regrouping(StagedWork):
     def __init__(self, top: DraftPlace, draft: Draft) -> None:
         self._top, self._draft = top, draft
         draft.arrangement.regrouped.append(top)
-        self._senders = draft.arrangement.senders = draft.arrangement.senders or Senders()
+        self._senders = draft.arrangement.senders = draft.arrangement.senders or OtherSenders()
         self._kept_from_rest = ""  # what has kept it from coming to rest when that was tried last
         self._rests: dict[DraftPlace, Gated] = {}
         self._certificates: dict[DraftPlace, MovedCertificates] = {}

@@ -48,7 +48,7 @@ class Standstill(Gated):
         return (self.task is not None and self.task.done()) or super().is_waiting
 
 
-class Senders:
+class OtherSenders:
     """Recorded actors that are not changed by a transaction, and what they have sent meanwhile."""
 
     def __init__(self) -> None:
