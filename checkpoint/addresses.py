@@ -15,7 +15,7 @@ from ..actors.kernel.cell import Cell
 from .engine_calls import Called
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from ..actors.kernel.node import Node
     from .journal import Journal
@@ -64,6 +64,14 @@ class Addresses:
     def now(self, path: str) -> str:
         """The address that an actor has now which is known by this one: the same, unless it has moved."""
         return renamed(self._left, path) if self._left else path
+
+    def known_as(self, path: str) -> Iterator[str]:
+        """All addresses that lead to whom this one leads to."""
+        now = self.now(path)
+        yield now
+        for was, at in self._left.items():
+            if is_at(now, at):
+                yield was + now[len(at) :]
 
     def left_below(self, above: str) -> list[str]:
         """The addresses below another one whose actors live elsewhere now."""

@@ -105,10 +105,11 @@ class PacedReplay:
 def is_as_before(home: Switch, out: Out, digest: int) -> bool:
     """Whether a replayed output is the one of a digest but for what may have changed since.
 
-    Its binding leads elsewhere now, or its class has other fields, or another name. It is taken for the same if its
-    class has lost a field, or one has another type: how it was coded cannot be known then.
+    Its binding leads elsewhere now, its receiver has moved, or its class has other fields, or another name. It is taken
+    for the same if its class has lost a field, or one has another type: how it was coded cannot be known then.
     """
-    receivers = (out.to, *home.node.led.get(home.path, {}).get(out.to, ()))
+    led = home.node.led.get(home.path, {}).get(out.to, ())
+    receivers = (out.to, *led, *home.homes.addresses.known_as(out.to))
 
     def is_same(name: str, body: bytes) -> bool:
         made = (msgspec.structs.replace(out, to=to, name=name, body=body).digest() for to in receivers)

@@ -73,6 +73,24 @@ def test_who_has_moved_is_told_under_its_old_address_before_it_is_started(verb: 
     judge(program(store, [*begin, ["say", "s0", "r1", verb, 3], *receivers, ["tell all", ["s0"]]]), is_lossless=True)
 
 
+@pytest.mark.parametrize("first", ["sender", "receiver"])
+@pytest.mark.parametrize("moved", ["before", "after"])
+@pytest.mark.parametrize("verb", ["tell", "send", "ask"])
+def test_a_replay_knows_a_receiver_by_each_address_that_it_has_had(
+    verb: str, moved: str, first: str, tmp_path: Path
+) -> None:
+    store, begin = tmp_path / "app.db", [["sender", "s0", "task"]]
+    receivers: Steps = [["supervisor", name, "task"] for name in SUPERVISORS]
+    move: Steps = [*receivers, ["move", "r2", "north"], ["kill"]]
+    if moved == "before":
+        program(store, move)
+    program(store, [*begin, *receivers, ["say", "s0", "r2", verb, 2], ["kill"]])
+    if moved == "after":
+        program(store, move)
+    both = [*begin, *receivers] if first == "sender" else [*receivers, *begin]
+    judge(program(store, [*both, ["tell all", ["s0"]]]), is_lossless=True)
+
+
 def test_who_is_answered_by_another_program_when_the_ask_had_timed_out_starts_again(tmp_path: Path) -> None:
     store, begin, receiver = tmp_path / "app.db", [["sender", "s0", "task"]], [["supervisor", "north", "task"]]
     program(store, [*begin, *receiver])

@@ -39,6 +39,13 @@ CHECKS = {
         ORDER,
         "told_under_its_old_address and tell",
     ),
+    "a replay knows a receiver by all its addresses": Check(
+        "checkpoint/home/replay.py",
+        "(out.to, *led, *home.homes.addresses.known_as(out.to))",
+        "(out.to, *led)",
+        ORDER,
+        "each_address and tell-after-receiver",
+    ),
     "a turn has one outcome of an ask, whoever else writes another": Check(
         "checkpoint/home/input_ledger.py",
         "elif (turn, k) not in self.outcomes:  # Else",
