@@ -48,6 +48,7 @@ class CommitLanes:
 
     Attributes:
         is_all_slow: whether the store is safe only when it is synced: nothing is quick then.
+        is_synced: whether homes want what they submit to be synced if they do not say what they want.
         synced_paths: homes that want what they submit to be synced.
         quick_paths: homes that want less than that.
         last_slow: the last submission of a home in the slow lane.
@@ -59,6 +60,7 @@ class CommitLanes:
     """
 
     is_all_slow: bool = False
+    is_synced: bool = False
     synced_paths: set[str] = dataclasses.field(default_factory=set)
     quick_paths: set[str] = dataclasses.field(default_factory=set)
     last_slow: dict[str, int] = dataclasses.field(default_factory=dict)
@@ -88,10 +90,10 @@ class CommitLanes:
         self.last_slow = {paths.get(path, path): number for path, number in self.last_slow.items()}
 
     def _is_slow(self, submission: Submission) -> bool:
-        if not self.quick_paths:
+        if not self.quick_paths or not (self.synced_paths or self.is_synced):
             return self.is_all_slow or bool(self.synced_paths)
-        paths, synced = self.synced_paths, self.synced
-        return any(path in paths or self.last_slow.get(path, 0) > synced for path, _ in submission.entries)
+        paths, synced = self.quick_paths, self.synced  # What is kept for who is not known yet may have to be synced.
+        return any(path not in paths or self.last_slow.get(path, 0) > synced for path, _ in submission.entries)
 
     def submit(self, submission: Submission) -> None:
         """Put a submission in its lane: whoever has something in the slow one stays there with all that follows."""

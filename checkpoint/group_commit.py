@@ -77,7 +77,7 @@ class Commits:
         self.durability: Durability = durability if engine.durable else "memory"
         self.wake_handler: Callable[[], None] | None = None  # has the message handler come, if there is one
         self._loop, self._emit, self._where = loop, emit, where
-        self._lanes = CommitLanes(is_all_slow=engine.safe_at == "sync")
+        self._lanes = CommitLanes(engine.safe_at == "sync", self.durability == "fsync")
         self._context = contextvars.copy_context()
         self._is_awake = self._is_running = False
         self._overdue: asyncio.TimerHandle | None = None

@@ -160,6 +160,21 @@ async def test_each_has_its_own_lane_but_never_overtakes_itself(engine: Any) -> 
         assert done == ["quick", "other", "both", "behind both", "quick again"]
 
 
+@pytest.mark.parametrize("default", ["os", "fsync"])
+async def test_what_is_kept_for_somebody_who_is_not_started_may_have_to_be_synced(engine: Any, default: Any) -> None:
+    done: list[str] = []
+    async with opened(engine, durability=default) as commits:
+        commits.want("/quick", "os")
+        if default == "os":
+            commits.want("/slow", "fsync")
+        commits.submit(Effect("told", done, ["/quick", "/not started"]))
+        await ticks()
+        assert done == []
+        engine.let_sync.set()
+        await commits.settled()
+        assert done == ["told"]
+
+
 async def test_without_room_what_can_be_refused_is_and_the_rest_waits(engine: Any) -> None:
     done: list[str] = []
     events: list[Any] = []

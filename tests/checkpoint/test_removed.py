@@ -1068,6 +1068,13 @@ CHECKS = {
         "tests/checkpoint/test_commits.py",
         "test_each_has_its_own_lane",
     ),
+    "what is kept for who is not known yet may have to be synced": Check(
+        "checkpoint/commit_lanes.py",
+        "        return any(path not in paths or",
+        "        return any(path in self.synced_paths or",
+        "tests/checkpoint/test_commits.py",
+        "test_what_is_kept_for_somebody",
+    ),
     "fsync: the journal is on the disk": Check(
         "checkpoint/sqlite/wal.py",
         "        os.fdatasync(self._file())\n",
