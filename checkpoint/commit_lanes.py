@@ -90,8 +90,10 @@ class CommitLanes:
         self.last_slow = {paths.get(path, path): number for path, number in self.last_slow.items()}
 
     def _is_slow(self, submission: Submission) -> bool:
-        if not self.quick_paths or not (self.synced_paths or self.is_synced):
+        if not self.quick_paths:
             return self.is_all_slow or bool(self.synced_paths)
+        if not (self.synced_paths or self.is_synced):
+            return False
         paths, synced = self.quick_paths, self.synced  # What is kept for who is not known yet may have to be synced.
         return any(path not in paths or self.last_slow.get(path, 0) > synced for path, _ in submission.entries)
 

@@ -86,8 +86,8 @@ CHECKS: dict[str, Check] = {
     ),
     "nobody is told that a message is accepted before the log has it": Check(
         "checkpoint/group_commit.py",
-        'CommitLanes(is_all_slow=engine.safe_at == "sync")',
-        "CommitLanes()",
+        'CommitLanes(engine.safe_at == "sync", self.durability == "fsync")',
+        'CommitLanes(False, self.durability == "fsync")',
         STOPS,
         "forgets_it_when",
     ),
