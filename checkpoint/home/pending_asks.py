@@ -71,6 +71,7 @@ class SwitchAsk(RelayedAsk, eq=False):
     turn: int = 0
     k: int = 0
     asked: str = ""  # the type of the message, if it is known
+    is_stranded: bool = False  # who is to answer has been stopped, and does so in its next life
     settled: Callable[[], None] | None = None  # called when its outcome is safe
 
     @classmethod
@@ -115,6 +116,7 @@ class SwitchAsk(RelayedAsk, eq=False):
 
     def strand(self) -> None:
         """Who is to answer has been stopped, and does so in its next life: a turn that is told to stop is left then."""
+        self.is_stranded = True
         if self.switch is not None and not self.is_over and self.switch.life.port is not None:
             self.switch.life.port.to_life(Stranded(self.turn, self.k))
 
@@ -258,6 +260,10 @@ class PendingCalls:
     def waits_for_answer(self) -> bool:
         """Whether the turn in hand has asked somebody who has not answered yet."""
         return any(turn > self._home.ledger.turn for turn, _ in self.asks)
+
+    def stranded(self) -> list[int]:
+        """Outputs of the turn in hand that are asks of somebody who has been stopped, and answers when it is back."""
+        return [k for (turn, k), ask in self.asks.items() if turn > self._home.ledger.turn and ask.is_stranded]
 
     def order(self, turn: int, out: Out) -> None:
         """Have the present life perform an effect: all that precedes it is safe."""

@@ -160,11 +160,13 @@ class Withdraw(Message[bool]):
 
     The reply is False if more than that is out: nothing has happened then. What is given back is sent again.
     `number`: the input that the turn handles; a follower that is not there yet has nothing to give back.
+    `stranded`: its outputs that are asks whose receivers have been stopped: who waits for their next lives rests, too.
     """
 
     epoch: int
     config: int
     number: int
+    stranded: list[int]
 
 
 class ReplicaBeat(Message):

@@ -457,7 +457,7 @@ class RequestProtocol(Transfer):
     async def _give_back(self, handle: ReplyHandle[bool], message: Withdraw) -> None:
         self._is_leaving = True
         try:
-            has_left = await self._has_given_back(message.number)
+            has_left = await self._has_given_back(message.number, message.stranded)
             if has_left:  # Home sends all of it again; what has not begun here would be run without its knowing.
                 self._held.clear()
             handle.reply(has_left)
@@ -467,14 +467,14 @@ class RequestProtocol(Transfer):
             self._is_leaving = False
             self._go_on()
 
-    async def _has_given_back(self, number: int) -> bool:
+    async def _has_given_back(self, number: int, stranded: list[int]) -> bool:
         standing, server = self._standing, self._standing.server
         life = server.life
         if life is None or life.feed is None:
             return self._current is None or not standing.leads
         if not standing.leads and life.feed.id != number:
             return True  # It has yet to end what is at home already: nobody would send it that again.
-        if standing.leads and not (server.state.has_access and life.only_rests):
+        if standing.leads and not (server.state.has_access and life.only_rests(stranded)):
             return False
         await server.withdraw()
         if not standing.leads:

@@ -47,7 +47,7 @@ from .probation import UNJUDGED, Probation
 from .proxy import Proxy, TakeAll
 from .reconfiguration import CannotAdapt, Reconfiguration, names_for
 from .replicas import fault_of
-from .steering import bind, give_order
+from .steering import LOOK_AGAIN, bind, give_order, leave_resting
 from .transient_homes import UNKEPT, TransientHome, is_unkept
 
 if TYPE_CHECKING:
@@ -487,13 +487,19 @@ class GroupPlace(Place):
         self._ending = lifecycle.outside_turn(cell, self._finish(cell, group, reason), "stop", context)
 
     async def _finish(self, cell: Cell, group: Group, reason: ExitReason) -> None:
-        """A last snapshot, then `on_stop`, by whoever leads; if that one dies of it, so be it."""
+        """A last snapshot, then `on_stop`, by whoever leads; if that one dies of it, so be it.
+
+        Behind the turn in hand, or before it, if it rests, for that may be for days: the next life goes on with that.
+        """
         ended: ExitReason = KILLED
-        known, replicas = group.membership, group.replicas
+        known, replicas, quiet = group.membership, group.replicas, group.quiet()
         while known.primary is not None or known.leading is not None:
             primary, epoch = known.primary, known.epoch
             if primary is None or group.delivery.inside:
                 await asyncio.sleep(0.005)  # Another one is being told to lead, or knows more than the home.
+                continue
+            if not (await asyncio.wait((quiet,), timeout=LOOK_AGAIN))[0]:
+                await leave_resting(group)
                 continue
             try:
                 await replicas.ask(primary, Finish(epoch, dict(pack_exit(reason))), FINISHED_WITHIN)

@@ -87,16 +87,21 @@ def give_again(cell: Cell, call: QueuedOrder) -> None:
 async def past_resting_turns(group: Group, future: asyncio.Future[Any]) -> None:
     """Wait for a future that ends when nothing is inside: whatever turn rests meanwhile is left, and sent again."""
     while not (await asyncio.wait((future,), timeout=LOOK_AGAIN))[0]:
-        if group.switch.calls.rests.is_busy:
-            # Whoever waits may give up; what the replicas have left is sent again all the same.
-            await asyncio.shield(asyncio.ensure_future(_withdraw(group)))
+        await leave_resting(group)
+
+
+async def leave_resting(group: Group) -> None:
+    """Have the turn that is inside left if it only rests: it is sent again when something may go in."""
+    if group.switch.calls.rests.is_busy or group.switch.calls.stranded():
+        # Whoever waits may give up; what the replicas have left is sent again all the same.
+        await asyncio.shield(asyncio.ensure_future(_withdraw(group)))
 
 
 async def _withdraw(group: Group) -> None:
     """Have the replicas leave it, the one that leads first: it knows whether more than that is out."""
     known, replicas = group.membership, group.replicas
     primary, members = known.primary, replicas.well()
-    order = Withdraw(known.epoch, group.adaptation.config, group.switch.ledger.begun)
+    order = Withdraw(known.epoch, group.adaptation.config, group.switch.ledger.begun, group.switch.calls.stranded())
     if primary is None or not await _has_left(group, primary, order):
         return
     await asyncio.gather(*(_has_left(group, name, order) for name in members if name != primary))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Collection, Coroutine
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from ...actors.kernel.cell import Cell
@@ -133,12 +133,12 @@ class ServerLife(Life):
         made.recorded = self
         return made
 
-    @property
-    def only_rests(self) -> bool:
-        """Whether the turn in hand waits for moments or messages, and nothing that would end with this life is out."""
+    def only_rests(self, stranded: Collection[int]) -> bool:
+        """Whether the turn in hand waits for moments, messages or these asks, and nothing else of this life is out."""
         waits = self.waits
-        out = sum(not future.done() for future, _ in waits.outcomes.values())
-        return 0 < waits.resting == out and not (self.pipes or self.has_begun_tasks)
+        out = [k for (turn, k), (future, _) in waits.outcomes.items() if not future.done()]
+        resting = waits.resting + sum(k in stranded for k in out)
+        return 0 < resting == len(out) and not (self.pipes or self.has_begun_tasks)
 
     def rewind(self, turn: int, stash: list[Fed], returned: dict[int, Fed]) -> None:
         """Go on from after an earlier turn: what was run since is run again, or something else is."""

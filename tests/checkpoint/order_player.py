@@ -6,6 +6,7 @@ Senders number what they say, each for itself, and receivers keep in which order
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import signal
@@ -85,7 +86,8 @@ class Sender(hf.Actor):
                 case "tell":
                     to.tell(said)
                 case "send":
-                    await to.send(said)
+                    with contextlib.suppress(hf.ActorStopped):  # Who was stopped by order takes nothing.
+                        await to.send(said)
                 case "publish":
                     await self.ctx.publish(TOPIC, said)
                 case _:

@@ -355,10 +355,19 @@ async def test_a_reply_that_was_promised_to_a_recorded_turn_is_given_by_the_next
         assert await has_seen(system, "a", "promised:kept") == ["begun", "promised:kept"]
 
 
+MECHANISMS: dict[str, dict[str, Any]] = {
+    "pbr": {"mechanism": hf.ftm.PBR()},
+    "lfr": {"mechanism": hf.ftm.LFR()},
+    "tmr": {"mechanism": hf.ftm.TMR()},
+    "tr": {"mechanism": hf.ftm.TR()},
+}
+
+
+@pytest.mark.parametrize("name", MECHANISMS)
 @pytest.mark.parametrize("verb", ["tell", "ask"])
-async def test_behind_a_mechanism_it_waits_as_well(verb: str, tmp_path: Path) -> None:
-    gate, mechanism = tmp_path / "gate", {"mechanism": hf.ftm.PBR()}
-    async with running(team(a={**mechanism, "shutdown": 3.0}, b=mechanism)) as system:
+async def test_behind_a_mechanism_it_waits_as_well(verb: str, name: str, tmp_path: Path) -> None:
+    gate, mechanism = tmp_path / "gate", MECHANISMS[name]
+    async with running(team(a={**mechanism, "shutdown": 60.0}, b=mechanism)) as system:
         has_ended = await speaks(system, gate, *steps_of(verb))
         ending = asyncio.ensure_future(restarted(system))
         await until(has_ended, IN_TIME)

@@ -250,6 +250,27 @@ def test_so_it_does_without_recovery(stack: str) -> None:
         stroll(seed, stack, None)
 
 
+@pytest.mark.parametrize("stack", STACKS)
+def test_who_rests_is_stopped_at_once_and_rests_on_in_its_next_life(stack: str) -> None:
+    @simulate(latency=(0.0, 0.005), seed=FIRST)
+    async def rest(system: GuardedSystem, simulation: Simulation) -> None:
+        recovery = hf.hybrid(interval=0.05)
+        spec = hf.child("walker", hf.start(Walker), recovery=recovery, mechanism=STACKS[stack], shutdown=600.0)
+        walker = await system.start(spec)
+        await walker.send(Go(["sleep", "wait", "effect"], "walk"))
+        await walker.send(Count())
+        await asyncio.sleep(1.0)
+        for _ in range(3):
+            begun = asyncio.get_running_loop().time()
+            await system.ref("/app", hf.Supervisor).ask(hf.RestartChild("walker", running=True), IN_TIME)
+            assert asyncio.get_running_loop().time() - begun < 60.0, "it has waited for a turn that rests"
+        await walker.send(Call("back"))
+        tale = await walker.ask(Tale(), IN_TIME)
+        assert tale == {"done": ["walk: call back, walk.2", "1 before"], "missed": [], "steps": [3]}
+
+    rest()
+
+
 def test_what_was_said_before_the_mechanisms_changed_is_waited_for_by_nobody() -> None:
     """The brick that had said it had ended, and what it had begun with it: whoever waited for that was cancelled."""
     stroll(48, "lfr", None, schedule=37)
