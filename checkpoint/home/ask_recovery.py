@@ -27,7 +27,7 @@ from ..inputs import Batch, Input
 from ..protocol import AT_ITS_END, MESSAGE, Answer, Out, came
 from ..schema import shape_entry
 from .input_ledger import outcome_entry
-from .pending_asks import MARK, OVER, SwitchAsk
+from .pending_asks import MARK, OVER, SwitchAsk, origin_of, since
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -72,8 +72,11 @@ class RejoinedAsk(SwitchAsk, eq=False):
         homes.rejoin.forget(self)
         if switch is not None:
             self.switch = switch
-            if self.turn <= switch.ledger.turn or (self.turn, self.k) in switch.ledger.outcomes:
-                self.is_over, self.future = True, OVER  # That turn has had another outcome, and does not wait.
+            ledger = switch.ledger
+            is_another = self.since and self.since != since(ledger.open.get(ledger.begun))
+            if is_another or self.turn <= ledger.turn or (self.turn, self.k) in ledger.outcomes:
+                # That turn has had another outcome, and does not wait; or who has asked was removed.
+                self.is_over, self.future = True, OVER
             else:
                 super().give(answer, batch)
         elif not self.is_over:
@@ -424,10 +427,12 @@ class FarMail:
 
     # -- what is told to other systems ------------------------------------------------------------------------------
 
-    def keeps(self, origin: str, out: Out, sender: str, batch: Batch) -> bool:
-        """Keep what a turn tells an actor of another system that lasts, and send it when that is safe."""
-        if self.sender is None or not self._lasts(out.to):
-            return False
+    def lasts(self, path: str) -> bool:
+        """Whether what a turn tells, or asks, an actor at this address goes to another system that lasts."""
+        return self.sender is not None and self._lasts(path)
+
+    def keep(self, origin: str, out: Out, sender: str, batch: Batch) -> None:
+        """Keep what a turn tells an actor of another system, and send it when that is safe."""
         kept = FarOut(origin, out.to, out.name, bytes(out.body), sender)
         mail, system = self._of(out.to), _system(out.to)
         node, limits = self._homes.node, self.limits
@@ -435,7 +440,7 @@ class FarMail:
             problem = f"{len(mail.outs)} messages ({mail.size} bytes) are kept for /{system} already"
             node.dead_letter(node.cell_at(out.to), Parcel(out.name, kept.body), problem, node.cell_at(sender))
             self._tell_kept(system, mail, 2)
-            return True
+            return
         mail.add(kept)
         mail.unsafe.add(origin)
         if 2 * len(mail.outs) >= limits.kept or 2 * mail.size >= limits.kept_bytes:
@@ -443,7 +448,6 @@ class FarMail:
         if self._homes.journal.durable:
             batch.add(FAR, ("out", *msgspec.structs.astuple(kept)), self._positions)
         batch.after.append(lambda: self._send(mail, kept))
-        return True
 
     def _send(self, mail: KeptMail, out: FarOut) -> None:
         """Send a message whose turn is safe now, unless it was dropped meanwhile."""
@@ -503,7 +507,7 @@ class FarMail:
             return False
         source = home.ledger.open.get(key)
         chain = ((home.path, key), *(source.chain if source is not None else ()))
-        ask = SwitchAsk.made(home, turn, out, chain, home.node.cell_at(out.to))
+        ask = SwitchAsk.made(home, turn, out, chain, home.node.cell_at(out.to), source)
         home.calls.asks[turn, out.k] = ask
         home.node.deadlines.add(ask)
         self.sender.ask(ask, again=True)
@@ -578,7 +582,7 @@ class Rejoin:
 
     def __init__(self, homes: Homes) -> None:
         self._homes = homes
-        self._asks: dict[tuple[str, int, int], RejoinedAsk] = {}
+        self._asks: dict[tuple[str, int, int, int], RejoinedAsk] = {}
         self._kept: dict[str, dict[str, KeptMessage]] = {}  # by address, and by who has told it in which output
 
     def keep(self, home: Switch, origin: str, out: Out, sender: str, batch: Batch) -> bool:
@@ -636,42 +640,42 @@ class Rejoin:
             source.ask, source.chain = ask, ask.chain
             ask.to, ask.started = home.cell, True
 
-    def _of(self, asker: str, turn: int, k: int) -> RejoinedAsk:
+    def _of(self, asker: str, turn: int, k: int, when: int) -> RejoinedAsk:
         asker = self._homes.addresses.now(asker)
-        ask = self._asks.get((asker, turn, k))
+        ask = self._asks.get((asker, turn, k, when))
         if ask is None or ask.is_over:
             cell = self._homes.node.cell_at(asker)
             ask = RejoinedAsk(Parcel("", b""), cell, (), 0.0, math.inf, None)
             ask.started = True  # It may have been: only its outcome will tell.
-            ask.future, ask.homes, ask.asker, ask.turn, ask.k = ask, self._homes, asker, turn, k
-            self._asks[asker, turn, k] = ask
+            ask.future, ask.homes, ask.asker, ask.turn, ask.k, ask.since = ask, self._homes, asker, turn, k, when
+            self._asks[asker, turn, k, when] = ask
         return ask
 
     def rename(self, paths: Mapping[str, str]) -> None:
         """Some who have asked have other addresses now."""
         for ask in self._asks.values():
             ask.asker = paths.get(ask.asker, ask.asker)
-        self._asks = {(ask.asker, ask.turn, ask.k): ask for ask in self._asks.values()}
+        self._asks = {(ask.asker, ask.turn, ask.k, ask.since): ask for ask in self._asks.values()}
         self._kept = {paths.get(path, path): kept for path, kept in self._kept.items()}
 
     def has(self, asker: str, turn: int, k: int) -> bool:
         """Whether the outcome of an ask from before this program began is still to come."""
-        ask = self._asks.get((asker, turn, k))
+        ask = self._asks.get((asker, turn, k, 0))
         return ask is not None and not ask.is_over
 
     def forget(self, ask: RejoinedAsk) -> None:
         """Wait no longer for an ask that has its outcome."""
-        self._asks.pop((ask.asker, ask.turn, ask.k), None)
+        self._asks.pop((ask.asker, ask.turn, ask.k, ask.since), None)
 
     def joins(self, home: Switch, turn: int, key: int, out: Out) -> bool:
         """A turn of `home` asks again what it asked before the restart: whether the answer may still come."""
         if self._homes.far.asks_again(home, turn, key, out):
             return True
-        ask = self._asks.get((home.path, turn, out.k))
+        source = home.ledger.open.get(key)
+        ask = self._asks.get((home.path, turn, out.k, since(source)))
         if ask is None and not self._homes.knows(self._homes.addresses.now(out.to)):
             return False  # Whoever was asked keeps no journal.
-        ask = ask or self._of(home.path, turn, out.k)  # Its receiver's home is not open yet.
-        source = home.ledger.open.get(key)
+        ask = ask or self._of(home.path, turn, out.k, since(source))  # Its receiver's home is not open yet.
         ask.chain = ((home.path, key), *(source.chain if source is not None else ()))
         ask.to, ask.asked = ask.to or home.node.cell_at(out.to), out.name
         ask.timeout = out.seconds
@@ -680,24 +684,24 @@ class Rejoin:
         return True
 
 
-def origin_kept(home: Switch, turn: int, key: int, out: Out) -> str:
+def origin_kept(home: Switch, turn: int, out: Out) -> str:
     """How a journal names what was told to an address that is not open: no other output has the name.
 
-    What a hook (without input, `key` is -1) tells has no number of its own.
+    A number says too little: what a hook tells has none, and who is removed and started anew counts from the beginning.
     """
-    return f"kept {home.path}|{turn}.{out.k}" + ("" if key >= 0 else f" {home.node.numbers.next_seed():x}")
+    return f"kept {home.path}|{turn}.{out.k} {home.node.numbers.next_seed():x}"
 
 
-def origin_asked(home: Switch, turn: int, out: Out) -> str:
+def origin_asked(home: Switch, turn: int, out: Out, source: Input | None) -> str:
     """The same of what was asked: the origin of the input that it becomes, and who has asked."""
-    return f"{MARK}{turn}.{out.k} {home.path}"
+    return f"{MARK}{turn}.{out.k}.{since(source)} {home.path}"
 
 
 def origin_asked_by(ask: SwitchAsk) -> str:
     """The same of an ask that was made."""
-    return f"{MARK}{ask.turn}.{ask.k} {ask.asker}"
+    return f"{origin_of(ask)} {ask.asker}"
 
 
-def _numbers(origin: str) -> tuple[int, int]:
-    turn, _, k = origin.removeprefix(MARK).partition(".")
-    return int(turn), int(k)
+def _numbers(origin: str) -> tuple[int, int, int]:
+    turn, k, *when = map(int, origin.removeprefix(MARK).split("."))
+    return turn, k, when[0] if when else 0  # An older program has noted no time.

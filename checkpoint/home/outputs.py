@@ -53,11 +53,11 @@ class Outputs:
         assert cell is not None
         match out.verb:
             case "tell":
-                self._deliver(node.cell_at(out.to), out, batch, origin_kept(home, turn, key, out))
+                self._deliver(node.cell_at(out.to), turn, out, batch)
             case "send":
                 target, sent = node.cell_at(out.to), functools.partial(home.calls.sent, turn, out.k)
                 home.calls.sends.add((turn, out.k))
-                if self._keeps(target, out, batch, origin_kept(home, turn, key, out), home.path):
+                if self._keeps(target, turn, out, batch, home.path):
                     batch.after.append(functools.partial(sent, None))
                 else:
                     self._send(target, out, batch, sent)
@@ -157,7 +157,7 @@ class Outputs:
         entry = ("op", turn, out.verb, out.to, out.name, out.body, out.seconds, out.interval, now)
         self._home.note(turn, entry, batch)
 
-    def _deliver(self, target: Cell, out: Out, batch: Batch, origin: str, sender: str | None = None) -> None:
+    def _deliver(self, target: Cell, turn: int, out: Out, batch: Batch, sender: str | None = None) -> None:
         """A message to another actor; to a recorded one, up or not, it is journaled in the same append."""
         home = self._home
         switch = switch_of(target)
@@ -175,7 +175,7 @@ class Outputs:
             except MailboxFull as error:  # Its turn has gone on: there is nobody to raise this to.
                 home.node.dead_letter(target, Parcel(out.name, out.body), str(error), cell)
             return
-        if self._keeps(target, out, batch, origin, cell.path):
+        if self._keeps(target, turn, out, batch, cell.path):
             return
 
         def send() -> None:
@@ -188,11 +188,13 @@ class Outputs:
 
         batch.after.append(send)
 
-    def _keeps(self, target: Cell, out: Out, batch: Batch, origin: str, sender: str) -> bool:
+    def _keeps(self, target: Cell, turn: int, out: Out, batch: Batch, sender: str) -> bool:
         """Whether a message is kept for another system, or for a recorded actor that was not started here yet."""
-        if out.verb != "ask" and self._home.homes.far.keeps(origin, out, sender, batch):
+        home, far = self._home, self._home.homes.far
+        if far.lasts(out.to):
+            far.keep(origin_kept(home, turn, out), out, sender, batch)
             return True
-        return target.is_dead and self._home.homes.rejoin.keep(self._home, origin, out, sender, batch)
+        return target.is_dead and home.homes.rejoin.keep(home, origin_kept(home, turn, out), out, sender, batch)
 
     def _publish(self, turn: int, out: Out, batch: Batch) -> None:
         """A message to each subscriber, when it has room; the publisher waits until the last one has accepted it."""
@@ -299,15 +301,18 @@ class Outputs:
 
     def _ask(self, turn: int, key: int, out: Out, batch: Batch) -> None:
         home = self._home
-        target = home.node.cell_at(out.to)
-        if switch_of(target) is None and self._keeps(target, out, batch, origin_asked(home, turn, out), home.path):
-            home.homes.rejoin.joins(home, turn, key, out)  # It is as if it had been asked before this program began.
-            return
-        source = home.ledger.open.get(key)
+        target, source = home.node.cell_at(out.to), home.ledger.open.get(key)
+        if target.is_dead and switch_of(target) is None:
+            origin = origin_asked(home, turn, out, source)
+            if home.homes.rejoin.keep(home, origin, out, home.path, batch):
+                home.homes.rejoin.joins(
+                    home, turn, key, out
+                )  # It is as if it had been asked before this program began.
+                return
         chain = ((home.path, key), *(source.chain if source is not None else ()))
         if out.trace:
             chain = with_tail(chain, out.trace)
-        ask = SwitchAsk.made(home, turn, out, chain, target)
+        ask = SwitchAsk.made(home, turn, out, chain, target, source)
         home.calls.asks[turn, out.k] = ask
         home.node.deadlines.add(ask)
         switch = switch_of(target)
@@ -352,7 +357,7 @@ class Outputs:
         target = home.node.cell_at(out.to)
         if source is None or ask is None:
             sender = None if source is None else source.sender
-            self._deliver(target, out, batch, origin_kept(home, turn, key, out), sender)
+            self._deliver(target, turn, out, batch, sender)
             return
         source.ask = None  # From now on it is the receiver's to answer.
         if out.trace:

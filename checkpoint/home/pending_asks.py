@@ -71,14 +71,16 @@ class SwitchAsk(RelayedAsk, eq=False):
     turn: int = 0
     k: int = 0
     asked: str = ""  # the type of the message, if it is known
+    since: int = 0  # when the message was admitted whose turn asks, in microseconds; 0: that is not known
     is_stranded: bool = False  # who is to answer has been stopped, and does so in its next life
     settled: Callable[[], None] | None = None  # called when its outcome is safe
 
     @classmethod
-    def made(cls, switch: Switch, turn: int, out: Out, chain: Any, to: Cell) -> SwitchAsk:
-        """The ask that was output (turn, k)."""
+    def made(cls, switch: Switch, turn: int, out: Out, chain: Any, to: Cell, source: Input | None) -> SwitchAsk:
+        """The ask that was output (turn, k), of the turn that handles `source`."""
         ask = cls(Parcel(out.name, out.body), switch.cell, chain, out.seconds, NO_DEADLINE, None, to)
         ask.future, ask.switch, ask.asker, ask.turn, ask.k, ask.asked = ask, switch, switch.path, turn, out.k, out.name
+        ask.since = since(source)
         return ask
 
     @property
@@ -130,9 +132,14 @@ class SwitchAsk(RelayedAsk, eq=False):
             self.switch.calls.outcome(self.turn, self.k, answer, batch)
 
 
+def since(source: Input | None) -> int:
+    """When an input was admitted: with that an ask is one, though an actor that is started anew counts from 0 again."""
+    return 0 if source is None else int(source.time * 1e6)
+
+
 def origin_of(ask: SwitchAsk) -> str:
     """How the journal of its receiver names an ask."""
-    return f"{MARK}{ask.turn}.{ask.k}"
+    return f"{MARK}{ask.turn}.{ask.k}.{ask.since}"
 
 
 def answer_ask(home: Switch, ask: Ask, answer: Answer) -> None:

@@ -60,8 +60,8 @@ class Receiver(hf.Actor):
 class Sender(hf.Actor):
     """`sent` has what must come, by receiver."""
 
-    def __init__(self, name: str) -> None:
-        self.name, self.n = name, 0
+    def __init__(self, name: str, n: int = 0) -> None:
+        self.name, self.n = name, n
         self.refs: dict[str, hf.ActorRef[Receiver]] = {}
         self.sent: dict[str, list[int]] = {}
         self.streams: list[Any] = []  # timers
@@ -118,14 +118,14 @@ class Sender(hf.Actor):
         return Said(self.name, self.n)
 
 
-def sender(name: str, kind: str) -> hf.ChildSpec:
+def sender(name: str, kind: str, n: int = 0) -> hf.ChildSpec:
     kinds: dict[str, dict[str, Any]] = {
         "process": {"isolation": "process"},
         "pbr": {"mechanism": hf.ftm.PBR()},
         "lfr": {"mechanism": hf.ftm.LFR()},
     }
     own = kinds.get(kind, {})
-    return hf.child(name, hf.start(Sender, name), recovery=hf.hybrid(interval=0.1), **own)
+    return hf.child(name, hf.start(Sender, name, n), recovery=hf.hybrid(interval=0.1), **own)
 
 
 def supervisor(name: str, kind: str) -> hf.ChildSpec:
@@ -157,6 +157,9 @@ class Program:
         match verb:
             case "sender":
                 await system.start(sender(*args))
+            case "sender anew":
+                await system.stop(system.ref(f"/app/{args[0]}", Sender))
+                await system.start(sender(*args), fresh=True)
             case "supervisor":
                 await system.start(supervisor(*args))
             case "say":

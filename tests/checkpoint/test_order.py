@@ -91,6 +91,26 @@ def test_a_replay_knows_a_receiver_by_each_address_that_it_has_had(
     judge(program(store, [*both, ["tell all", ["s0"]]]), is_lossless=True)
 
 
+@pytest.mark.parametrize("kind", ["task", "pbr"])
+@pytest.mark.parametrize("verb", ["tell", "send", "ask"])
+def test_whoever_is_removed_and_started_anew_says_other_things_than_before(
+    verb: str, kind: str, tmp_path: Path
+) -> None:
+    """The new sender counts its turns from the beginning, and its own numbers from 100 on."""
+    store, begin = tmp_path / "app.db", [["sender", "s0", kind]]
+    receivers: Steps = [["supervisor", name, "task"] for name in SUPERVISORS]
+    say: Steps = [["say", "s0", "r0", verb, 2]]
+    program(store, [*begin, *receivers, *say])
+    anew: Steps = [["sender anew", "s0", kind, 100]]
+    program(store, [*begin, *anew, *say, ["wait", 0.1], ["kill"]])
+    again: Steps = [["sender anew", "s0", kind, 200]]
+    program(store, [["sender", "s0", kind, 100], *say, *again, *say, ["wait", 0.1]])
+    said = program(store, [["sender", "s0", kind, 200], *receivers, ["tell all", ["s0"]]])
+    judge(said, is_lossless=True)
+    got = json.loads(said)[1]["r0"]["s0"]
+    assert {1, 2, 101, 102, 103, 104, 201, 202} <= set(got), f"something is missing in {got}"
+
+
 def test_who_is_answered_by_another_program_when_the_ask_had_timed_out_starts_again(tmp_path: Path) -> None:
     store, begin, receiver = tmp_path / "app.db", [["sender", "s0", "task"]], [["supervisor", "north", "task"]]
     program(store, [*begin, *receiver])

@@ -46,6 +46,20 @@ CHECKS = {
         ORDER,
         "each_address and tell-after-receiver",
     ),
+    "who is started anew tells other things than before": Check(
+        "checkpoint/home/ask_recovery.py",
+        'return f"kept {home.path}|{turn}.{out.k} {home.node.numbers.next_seed():x}"',
+        'return f"kept {home.path}|{turn}.{out.k}"',
+        ORDER,
+        "started_anew and tell-task",
+    ),
+    "who is started anew asks other things than before": Check(
+        "checkpoint/home/ask_recovery.py",
+        'return f"{MARK}{turn}.{out.k}.{since(source)} {home.path}"',
+        'return f"{MARK}{turn}.{out.k}.0 {home.path}"',
+        ORDER,
+        "started_anew and ask-task",
+    ),
     "a turn has one outcome of an ask, whoever else writes another": Check(
         "checkpoint/home/input_ledger.py",
         "elif (turn, k) not in self.outcomes:  # Else",
@@ -503,7 +517,7 @@ CHECKS = {
     ),
     "what is sent to somebody who is not started is kept": Check(
         "checkpoint/home/outputs.py",
-        "                if self._keeps(target, out, batch, origin_kept(home, turn, key, out), home.path):\n",
+        "                if self._keeps(target, turn, out, batch, home.path):\n",
         "                if False:\n",
         "tests/effects/test_long_waits.py",
         "test_what_is_told_to_somebody",
