@@ -55,6 +55,13 @@ class Holding:
         return self.inner.capacity if self.inner is not None else 0
 
     @property
+    def is_full(self) -> bool:
+        """Whether one more, that comes by no topic with a rule of its own, would be too many."""
+        rule = self._rules[""]
+        is_over = rule is not None and self._count("") >= rule.capacity
+        return is_over or (self.inner is not None and self.inner.is_full)
+
+    @property
     def overflow(self) -> str:
         """Whether a send from a recorded turn is let in and waits then."""
         rule = self._rules.get("")

@@ -25,6 +25,7 @@ from .present_life import LifePort
 from .recorded_home import switch_of
 
 if TYPE_CHECKING:
+    from ...actors.kernel.envelope import Ask
     from .switch import Switch
 
 
@@ -321,11 +322,16 @@ class Outputs:
         elif switch.waits(ask):
             ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, waiters(chain)))), batch)
         elif (bound := switch.intake.bound) is None or bound.makes_room(ask, out.name, out.body, home.path):
-            asked = switch.record(MESSAGE, out.name, out.body, home.path, batch, origin_of(ask))
-            asked.ask, asked.chain = ask, chain
-            batch.after.append(lambda: switch.admitted(asked))
+            self._record_ask(switch, ask, out, home.path, batch)
         if switch is not None and switch.intake.between is not None:
             batch.after.append(ask.strand)
+
+    def _record_ask(self, switch: Switch, ask: Ask, out: Out, sender: str | None, batch: Batch) -> None:
+        """An ask to a recorded actor, up or not, is journaled in the same append."""
+        origin = origin_of(ask) if isinstance(ask, SwitchAsk) else ""
+        asked = switch.record(MESSAGE, out.name, out.body, sender, batch, origin)
+        asked.ask, asked.chain = ask, ask.chain
+        batch.after.append(lambda: switch.admitted(asked))
 
     def _send_ask(self, key: int, target: Cell, ask: SwitchAsk) -> None:
         home, target = self._home, target.living
@@ -356,13 +362,18 @@ class Outputs:
         ask = source.ask if source is not None else None
         target = home.node.cell_at(out.to)
         if source is None or ask is None:
-            sender = None if source is None else source.sender
-            self._deliver(target, turn, out, batch, sender)
+            self._deliver(target, turn, out, batch, None if source is None else source.sender)
             return
         source.ask = None  # From now on it is the receiver's to answer.
         if out.trace:
             ask.chain = with_tail(ask.chain, out.trace)
             follow(ask)
+        switch, sender = switch_of(target), None if ask.sender is None else ask.sender.path
+        if switch is not None and not switch.waits(ask) and switch.takes_now(ask, out, sender):
+            self._record_ask(switch, ask, out, sender, batch)
+            if switch.intake.between is not None and isinstance(ask, SwitchAsk):
+                batch.after.append(ask.strand)
+            return
 
         def send() -> None:
             there = target.living
