@@ -46,6 +46,13 @@ CHECKS = {
         ORDER,
         "each_address and tell-after-receiver",
     ),
+    "an ask is handed on in the append that ends the turn": Check(
+        "checkpoint/home/outputs.py",
+        "if switch is not None and not switch.waits(ask) and switch.takes_now(ask, out, sender):",
+        "if False:",
+        "tests/checkpoint/test_forwarded.py",
+        "handed_on_is_not_lost and ask-unbounded",
+    ),
     "who is started anew tells other things than before": Check(
         "checkpoint/home/ask_recovery.py",
         'return f"kept {home.path}|{turn}.{out.k} {home.node.numbers.next_seed():x}"',
