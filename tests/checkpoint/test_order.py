@@ -41,7 +41,11 @@ def judge(said: str, *, is_lossless: bool) -> None:
     """What has come from each sender rises, and without losses all is there that had to come."""
     sent, got = json.loads(said)
     for to, name in itertools.product(RECEIVERS, sent):
-        numbers = got[to].get(name, [])
+        numbers, passed = got[to].get(name, []), got[to].get(f"{name} by the gate", [])
+        assert all(before < after for before, after in itertools.pairwise(passed)), f"{name} by the gate: {passed}"
+        if is_lossless:
+            missing = set(sent[name].get(f"{to} by the gate", ())) - set(passed)
+            assert not missing, f"{name} by the gate to {to}: {missing} are missing in {passed}"
         assert all(before < after for before, after in itertools.pairwise(numbers)), f"{name} to {to}: {numbers}"
         if is_lossless:
             missing = set(sent[name].get(to, ())) - set(numbers)
@@ -127,7 +131,7 @@ class Plan:
         self.draw = random.Random(seed)
         self.is_lossless = is_lossless
         pick = self.draw.choice
-        self.senders = {name: pick(["task", "task", "process", "pbr", "lfr"]) for name in ("s0", "s1")}
+        self.senders = {name: pick(["task", "task", "process", "pbr", "lfr"]) for name in ("s0", "s1", "gate")}
         self.supervisors = {name: pick(["task", "task", "process", "pbr"]) for name in SUPERVISORS}
         self.at = {name: path.split("/")[2] for name, path in RECEIVERS.items()}
         self.stopped = set[str]()
@@ -142,7 +146,7 @@ class Plan:
         ]
 
     def say(self, senders: list[str]) -> list[Any]:
-        verbs = ["tell", "send", "timer", *(["stream"] if self.is_lossless else ["publish", "ask"])]
+        verbs = ["tell", "send", "timer", "pass on", *(["stream"] if self.is_lossless else ["publish", "ask", "pass"])]
         draw = self.draw
         return ["say", draw.choice(senders), draw.choice(list(RECEIVERS)), draw.choice(verbs), draw.randint(1, 6)]
 
@@ -158,7 +162,7 @@ class Plan:
                 steps.append(begun)
                 up.append(begun[1])
                 continue
-            senders = [name for name in up if name in self.senders]
+            senders = [name for name in up if name in self.senders and name != "gate"]
             above = [name for name in up if name in SUPERVISORS and name not in ended]
             free = [name for name, where in self.at.items() if where in above]
             kind = draw.choice(
@@ -203,7 +207,7 @@ class Plan:
         return [
             *self.begin_all(),
             *starts,
-            ["tell all", list(self.senders)],
+            ["tell all", [name for name in self.senders if name != "gate"]],
         ]
 
 
