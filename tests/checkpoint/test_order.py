@@ -77,11 +77,10 @@ def test_who_has_moved_is_told_under_its_old_address_before_it_is_started(verb: 
     judge(program(store, [*begin, ["say", "s0", "r1", verb, 3], *receivers, ["tell all", ["s0"]]]), is_lossless=True)
 
 
-@pytest.mark.parametrize("first", ["sender", "receiver"])
-@pytest.mark.parametrize("moved", ["before", "after"])
+@pytest.mark.parametrize(("first", "moved"), [("sender", "before"), ("receiver", "after")])
 @pytest.mark.parametrize("verb", ["tell", "send", "ask"])
 def test_a_replay_knows_a_receiver_by_each_address_that_it_has_had(
-    verb: str, moved: str, first: str, tmp_path: Path
+    verb: str, first: str, moved: str, tmp_path: Path
 ) -> None:
     store, begin = tmp_path / "app.db", [["sender", "s0", "task"]]
     receivers: Steps = [["supervisor", name, "task"] for name in SUPERVISORS]
@@ -95,8 +94,7 @@ def test_a_replay_knows_a_receiver_by_each_address_that_it_has_had(
     judge(program(store, [*both, ["tell all", ["s0"]]]), is_lossless=True)
 
 
-@pytest.mark.parametrize("kind", ["task", "pbr"])
-@pytest.mark.parametrize("verb", ["tell", "send", "ask"])
+@pytest.mark.parametrize(("kind", "verb"), [("task", "tell"), ("task", "ask"), ("pbr", "send")])
 def test_whoever_is_removed_and_started_anew_says_other_things_than_before(
     verb: str, kind: str, tmp_path: Path
 ) -> None:

@@ -44,7 +44,7 @@ CHECKS = {
         "(out.to, *led, *home.homes.addresses.known_as(out.to))",
         "(out.to, *led)",
         ORDER,
-        "each_address and tell-after-receiver",
+        "each_address and tell-receiver-after",
     ),
     "an ask is handed on in the append that ends the turn": Check(
         "checkpoint/home/outputs.py",
@@ -58,14 +58,14 @@ CHECKS = {
         'return f"kept {home.path}|{turn}.{out.k} {home.node.numbers.next_seed():x}"',
         'return f"kept {home.path}|{turn}.{out.k}"',
         ORDER,
-        "started_anew and tell-task",
+        "started_anew and task-tell",
     ),
     "who is started anew asks other things than before": Check(
         "checkpoint/home/ask_recovery.py",
         'return f"{MARK}{turn}.{out.k}.{since(source)} {home.path}"',
         'return f"{MARK}{turn}.{out.k}.0 {home.path}"',
         ORDER,
-        "started_anew and ask-task",
+        "started_anew and task-ask",
     ),
     "a turn has one outcome of an ask, whoever else writes another": Check(
         "checkpoint/home/input_ledger.py",
