@@ -125,6 +125,13 @@ async def look_at(system: ActorSystem, *, parts: bool, paths: Iterable[str] | No
     return SystemLook(system.name, os.getpid(), time.monotonic(), rows, uses)
 
 
+async def silent_at_root(system: ActorSystem) -> list[str]:
+    """The children of the root for which no process answers."""
+    root = system._root
+    paths = [cell.path for cell in (root.children or {}).values()] if root is not None else []
+    return [row.path for row in (await look_at(system, parts=False, paths=paths)).rows if row.state == "silent"]
+
+
 def walk(top: Found, *, parts: bool) -> Iterator[Found]:
     """The address, and all below it, parents before children; children that do not run stand where they would."""
     waiting = [top]

@@ -536,7 +536,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         """The root supervisor is gone: if nobody asked for that, the body must hear of it."""
         if self._closing is not None or done.cancelled():
             return
-        reason, last = done.result(), self._node.gave_up
+        reason, last = done.result(), self._node.supervised.gave_up
         if isinstance(reason, Shutdown) and reason.detail:
             why = reason.detail
         else:
