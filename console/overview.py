@@ -233,7 +233,7 @@ def row_of(one: Found) -> ActorRow:
     return ActorRow(
         one.path,
         type_name(kind) if kind is not None else "",
-        status.state if status is not None else child.state if child is not None else "stopped",
+        _state_of(status, child),
         "task" if spec is None else "replicas" if spec.mechanism is not None else spec.isolation,
         one.pid,
         max(0, status.life - 1) if status is not None else 0,
@@ -247,6 +247,12 @@ def row_of(one: Found) -> ActorRow:
         kind is not None and issubclass(kind, Supervisor),
         (spec.limits.memory_bytes or 0) if spec is not None and spec.limits is not None else 0,
     )
+
+
+def _state_of(status: Status | None, child: Child | None) -> str:
+    if status is None or (child is not None and child.comes):
+        return child.state if child is not None else "stopped"
+    return status.state
 
 
 def names_of(cell: Cell | None) -> tuple[str, ...]:
