@@ -16,6 +16,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.console.service.health import Service
+from holdfast.testing import GuardedSystem, Simulation, advance, simulate
 from tests.supervision.expected_player import (
     KINDS,
     PATH,
@@ -28,6 +29,7 @@ from tests.supervision.expected_player import (
     Slow,
     Speaker,
     Starter,
+    Tell,
     add,
     come,
     guest,
@@ -123,6 +125,36 @@ async def test_what_they_are_told_meanwhile_is_kept(by: str, end: str, tmp_path:
             while await system.ref(PATH, Guest).ask(Add(0)) == 5:
                 await asyncio.sleep(0.01)
         assert await system.ref(PATH, Guest).ask(Add(0)) == 15
+
+
+@pytest.mark.parametrize("verb", [Tell, Add])
+def test_what_a_recorded_actor_says_to_them_is_said_once(verb: type[Tell | Add]) -> None:
+    """The root is killed at any moment of that: the speaker's turn and what it has said are one append."""
+    kept = hf.hybrid()
+    desk = hf.child("desk", hf.start(Desk))
+    speaker = hf.child("speaker", hf.start(Speaker), recovery=kept)
+    waiting = hf.child("guest", hf.start(Guest), recovery=kept, bindings={"desk": "/app/desk"})
+    guests = hf.dynamic("guests", journal=True, intensity=100)
+
+    @simulate(seeds=40, store="simulated")
+    async def run(system: GuardedSystem, simulation: Simulation) -> None:
+        await system.start(desk)
+        await (await system.start(guests)).ask(hf.StartChild(waiting))
+        assert await system.ref(PATH, Guest).ask(Add(5)) == 5
+        system = await simulation.crash_root()
+        await system.start(guests)
+        said = await system.start(speaker)
+        for _ in range(3):
+            await said.send(verb(10))
+        await simulation.moment(12)
+        system = await simulation.crash_root()
+        await system.start(guests)
+        await system.start(speaker)
+        await system.start(desk)
+        await advance(60.0)
+        assert await system.ref(PATH, Guest).ask(Add(0)) == 35
+
+    run()
 
 
 async def test_who_is_stopped_meanwhile_is_not_there_any_more(tmp_path: Path, file: str) -> None:

@@ -97,7 +97,14 @@ CHECKS = {
         "is_there = not target.is_dead and not is_unread(target)",
         "is_there = not target.is_dead",
         EXPECTED,
-        "told_meanwhile_is_kept and tell",
+        "said_once and Tell",
+    ),
+    "what it asks there is kept with its turn": Check(
+        "checkpoint/home/outputs.py",
+        "        if (target.is_dead or is_unread(target)) and switch_of",
+        "        if target.is_dead and switch_of",
+        EXPECTED,
+        "said_once and Add",
     ),
     "a send to an unread address is accepted when it is safe": Check(
         "checkpoint/home/journal_home.py",
