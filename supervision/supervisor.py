@@ -32,7 +32,7 @@ from .admin import (
     TerminateChild,
     opened,
 )
-from .awaited import LOOK_AGAIN, Prospects
+from .awaited import LOOK_AGAIN, Prospects, tell_wait
 from .children import (
     RECOVERING,
     RESTARTING,
@@ -45,6 +45,7 @@ from .children import (
     StartLimit,
     StartRow,
     begin_start,
+    bind_expected,
     complete,
     new_cell,
     tell_ended_with,
@@ -250,12 +251,15 @@ class Supervisor(Inquiries):
         Raises:
             StartFailed: they cannot come, or have not come within the time that the start may take.
         """
-        if one.cell is not None and one.cell.state is not GONE:
+        if one.cell is not None and one.cell.state is not GONE and not one.comes:
             return  # It has been bound: the address is there since.
         loop, who, seconds = self.ctx._cell.node.loop, self._path_of(one), one.spec.start_timeout or "infinity"
-        prospects, since = Prospects(self.ctx._cell.node, listed_at), loop.time()
+        prospects, since, told = Prospects(self.ctx._cell.node, listed_at), loop.time(), False
         try:
             while one.row is row and (missing := prospects.missing(who, one)):
+                if not told:
+                    tell_wait(self.ctx._cell)
+                    told = True
                 if not isinstance(seconds, str) and loop.time() - since >= seconds:
                     raise StartFailed(who, f"{missing}, to which it is bound, was not there within {seconds:g} s")
                 await asyncio.sleep(LOOK_AGAIN)
@@ -314,6 +318,9 @@ class Supervisor(Inquiries):
         if cell is None or cell.state is GONE:
             cell = one.cell = new_cell(self.ctx._cell, one)
             one.ignored_life = 0  # A new address counts its lives anew.
+            one.comes = False
+        elif one.comes:
+            bind_expected(self.ctx._cell, one, cell)
         return cell
 
     async def _take_name(self, one: Child, name: GivenName) -> None:
@@ -511,8 +518,8 @@ class Supervisor(Inquiries):
         one.state = STOPPED
         self._blame(one, str(reason))
         node = self.ctx._cell.node
-        node.gave_up = SupervisorGaveUp(self.ctx.path, one.spec.id, reason)
-        node.emit(node.gave_up)
+        node.supervised.gave_up = SupervisorGaveUp(self.ctx.path, one.spec.id, reason)
+        node.emit(node.supervised.gave_up)
         self.ctx.stop(told)
 
     def _blame(self, one: Child, why: str) -> None:

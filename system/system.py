@@ -536,7 +536,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         """The root supervisor is gone: if nobody asked for that, the body must hear of it."""
         if self._closing is not None or done.cancelled():
             return
-        reason, last = done.result(), self._node.gave_up
+        reason, last = done.result(), self._node.supervised.gave_up
         if isinstance(reason, Shutdown) and reason.detail:
             why = reason.detail
         else:
@@ -651,10 +651,11 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
     def ref(self, path: str, kind: type[Actor] = Actor) -> ActorRef[Any]:
         """Return a ref to the actor at an address; `kind` is its class, or a base of it, if you want the ref typed.
 
-        Between two lives of a child the address is there, and what is sent waits.
+        Between two lives of a child the address is there, and what is sent waits; so it is before the first life of one
+        that comes back with its dynamic supervisor.
 
         Raises:
-            NoSuchActor: nobody lives there, or its supervisor is between two lives itself.
+            NoSuchActor: nobody lives there nor is about to, or its supervisor is between two lives itself.
             WrongActor: another class does.
         """
         return self._node.find_ref(path, kind)

@@ -68,6 +68,9 @@ class Home:
         cell.admit(cell, item)
         return None
 
+    def expect(self, cell: Cell) -> None:
+        """The address was made ahead of its first life in this program: what is sent there waits for that."""
+
     def is_open(self, cell: Cell) -> bool:
         """Whether it lets messages through to the life at the address."""
         return True

@@ -93,6 +93,21 @@ class Ports:
     """Runs a function with its arguments in a process of its own."""
 
 
+class Supervised:
+    """What the supervisors of a node have said of themselves.
+
+    Attributes:
+        gave_up: the last one here that did.
+        waiting: those with children that have waited for somebody to whom they are bound; perhaps none waits any more.
+    """
+
+    __slots__ = ("gave_up", "waiting")
+
+    def __init__(self) -> None:
+        self.gave_up: SupervisorGaveUp | None = None
+        self.waiting = weakref.WeakSet[Cell]()
+
+
 def _since_boot() -> float:
     """Seconds since the machine was started, also those in which it has slept, where the system counts them."""
     return time.clock_gettime(time.CLOCK_BOOTTIME) if sys.platform == "linux" else monotonic()
@@ -194,7 +209,7 @@ class Node(RunLoop):
         self.remains: dict[asyncio.Future[Any], str] = {}  # what killed lives have left and is still ending: address
         self.safe: dict[str, asyncio.TimerHandle] = {}  # who is in safe state here: when that should be over
         self.led: dict[str, dict[str, set[str]]] = {}  # of who is replayed: where bindings led, by where they lead
-        self.gave_up: SupervisorGaveUp | None = None  # the last supervisor here that did
+        self.supervised = Supervised()
         self.root: Cell | None = None
         self.arbiter: Any = None  # who may act on which address, once somebody has asked for it
         self.awaited: dict[str, list[Callable[[], object]]] = {}  # what is done when somebody else has a path

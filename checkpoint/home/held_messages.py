@@ -9,13 +9,13 @@ import asyncio
 import dataclasses
 from collections import deque
 from collections.abc import Awaitable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from ...actors.errors import HoldfastError, MailboxFull
 from ...actors.events import HeldMessages
 from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.codec import Parcel
-from ...actors.kernel.envelope import Item
+from ...actors.kernel.envelope import Ask, Item
 from ...actors.kernel.mailbox import Senders, admit_gone
 from ...actors.overflow import decide
 from ..inputs import Batch, Input
@@ -26,8 +26,8 @@ from .pending_asks import SwitchAsk, turned_away
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Host
-    from ...actors.kernel.envelope import Ask
     from .capacity import HomeBound
+    from .recorded_home import RecordedHome
     from .switch import Switch
 
 MAY_LIVE_AGAIN = "its supervisor has ended, and may start it again"
@@ -333,6 +333,29 @@ def admit_between(cell: Cell, item: Any) -> None:
         item.fail(cell.stopped_error(MAY_LIVE_AGAIN))
     else:
         cell.home.admit(cell, item)
+
+
+def admit_unread(cell: Cell, item: Any) -> None:
+    """The first message to an address whose home has not been read from the store in this program: it is, now.
+
+    Raises:
+        HoldfastError: it cannot be, and the item is no ask, which fails for that reason.
+    """
+    cell.node.check_thread(cell.path)
+    home = cast("RecordedHome", cell.host.home)
+    try:
+        home.take_in(cell)
+    except HoldfastError as error:
+        if not isinstance(item, Ask):
+            raise
+        item.fail(error)
+    else:
+        cell.admit(cell, item)
+
+
+def is_unread(cell: Cell) -> bool:
+    """Whether an address was made ahead of its first life, and its home has not been read from the store."""
+    return cell.admit is admit_unread
 
 
 @dataclasses.dataclass(slots=True)

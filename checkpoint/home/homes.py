@@ -83,6 +83,18 @@ class Homes:
         Raises:
             StartFailed: the class that is to live there would misread what is recorded.
         """
+        switch = self.expecting(cell, method)
+        self.absolve(cell.path)
+        self.on_home(switch)
+        self.groups.opened(switch)
+        return switch
+
+    def expecting(self, cell: Cell, method: Method) -> Switch:
+        """The home of an address where the next life is still to begin, as `of` takes it up; it holds what comes.
+
+        Raises:
+            StartFailed: as `of`.
+        """
         path = cell.path
         switch = self._switches.get(path)
         if self.erasures.covers(path):
@@ -100,16 +112,13 @@ class Homes:
             if self.on_first is not None:
                 begin, self.on_first = self.on_first, None
                 begin()
-        self.absolve(path)
         switch.begin_at(cell, method)
         if switch.journal.durable:
             self.journal.want(path, method.durability)
-        self.on_home(switch)
         more = cell.extra()
         if more.bound is not None:
             _bind(switch, more.bound)
             more.bound = None
-        self.groups.opened(switch)
         cell.admit = switch.admit
         more.outlet = switch
         return switch

@@ -19,7 +19,7 @@ from ..life.recorded_inbox import STARTED
 from ..protocol import MESSAGE, PIPE, Answer, Hooked, Out, PipeDone
 from .admission import TurnRows
 from .ask_recovery import origin_asked, origin_kept
-from .held_messages import Inlet, inlet
+from .held_messages import Inlet, inlet, is_unread
 from .pending_asks import SwitchAsk, answer_ask, origin_of
 from .present_life import LifePort
 from .recorded_home import switch_of
@@ -195,7 +195,8 @@ class Outputs:
         if far.lasts(out.to):
             far.keep(origin_kept(home, turn, out), out, sender, batch)
             return True
-        return target.is_dead and home.homes.rejoin.keep(home, origin_kept(home, turn, out), out, sender, batch)
+        is_there = not target.is_dead and not is_unread(target)
+        return not is_there and home.homes.rejoin.keep(home, origin_kept(home, turn, out), out, sender, batch)
 
     def _publish(self, turn: int, out: Out, batch: Batch) -> None:
         """A message to each subscriber, when it has room; the publisher waits until the last one has accepted it."""
@@ -303,7 +304,7 @@ class Outputs:
     def _ask(self, turn: int, key: int, out: Out, batch: Batch) -> None:
         home = self._home
         target, source = home.node.cell_at(out.to), home.ledger.open.get(key)
-        if target.is_dead and switch_of(target) is None:
+        if (target.is_dead or is_unread(target)) and switch_of(target) is None:
             origin = origin_asked(home, turn, out, source)
             if home.homes.rejoin.keep(home, origin, out, home.path, batch):
                 home.homes.rejoin.joins(
