@@ -53,6 +53,7 @@ from ..supervision.supervisor import Supervisor
 from .history.recorder import HistoryRecorder, expect_end
 from .live_moves import Moves, check_isolation
 from .transaction.errors import TransactionFailed
+from .transaction.grants import check_orders
 from .transaction.mechanisms import Isolate
 
 if TYPE_CHECKING:
@@ -279,6 +280,8 @@ class Controls:
         cell = self._living(target)
         kind = cell_kind(cell)
         if kind is None or not issubclass(kind, Supervisor):
+            if isolation == "process":
+                check_orders(cell)
             await self._moves.move(cell, isolation, limits, timeout)
             return
         try:

@@ -17,6 +17,7 @@ from .change import Change
 from .draft import Draft, difference
 from .errors import TransactionFailed, TransactionRefused
 from .events import TransactionBegan, TransactionCommitted, TransactionRolledBack
+from .grants import look_at_grants
 from .operation import Operation
 
 if TYPE_CHECKING:
@@ -115,6 +116,7 @@ class Transaction:
         try:
             draft.check()
             system._specifications.check(draft.root)
+            look_at_grants(change.operations)
         except HoldfastError as error:
             raise TransactionRefused("the tree as it would be", said(error)) from error
         change._difference = difference(before, draft.lines())
