@@ -64,12 +64,17 @@ if TYPE_CHECKING:
 A = TypeVar("A", bound=Actor)
 
 
+STATUS_WITHIN = 1.0
+"""Seconds in which an actor says what it is at."""
+
+
 class Controls:
     """Control of live actors: tasks, processes, actors of a subtree in a process, recorded or not.
 
     Who is meant is said by a ref or an address. Each call raises ActorStopped if nobody lives there any more, and
     NoSuchActor if nobody is found at an address, AskTimeout if the actor does not come to it within `timeout`
-    seconds (it is carried out between two turns), and SpecError if that is no finite number > 0. While an actor is
+    seconds (it is carried out between two turns, and the error's `turn` says which one is in the way), and
+    SpecError if that is no finite number > 0. While an actor is
     restarted, its next life is waited for.
     """
 
@@ -174,6 +179,13 @@ class Controls:
                 cell.more.tap.attach()
             respec(cell, start)
 
+    async def _turn_in_hand(self, target: Target) -> str:
+        """The turn that an actor is in, for how long it has been, and where it waits, in words; "" if none is known."""
+        try:
+            return said_of_turn(await self.get_status(target, timeout=STATUS_WITHIN))
+        except HoldfastError:
+            return ""
+
     async def get_status(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> Status:
         """How an actor is, also while a turn of it waits for something, and between two lives."""
         cell = self._living(target)
@@ -236,7 +248,8 @@ class Controls:
     async def trace(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> EventStream:
         """Follow an actor: a stream of MessageIn, TurnBegan, TurnEnded and MessageOut. Close it when done.
 
-        It goes on over restarts and ends when the address is given up.
+        It goes on over restarts and ends when the address is given up. Of a turn that is in hand what it sends is
+        shown, and not its end.
         """
         cell = self._living(target)
         tap = tap_of(cell)
@@ -314,7 +327,7 @@ class Controls:
         done, _ = await asyncio.wait((gone,), timeout=timeout)
         if not done:
             gone.cancel()
-            raise StillEnding(cell.path, timeout)
+            raise await self._busy(cell, StillEnding(cell.path, timeout))
         return gone.result()
 
     # -- how --------------------------------------------------------------------------------------------------------
@@ -344,7 +357,7 @@ class Controls:
         done, _ = await asyncio.wait([wish], timeout=timeout)
         if not done:
             wish.cancel()
-            raise AskTimeout(cell.path, timeout, None)
+            raise await self._busy(cell, AskTimeout(cell.path, timeout, None))
         wish.result()
 
     async def _replace(self, target: Target, wanted: Order, timeout: float) -> Any:
@@ -361,7 +374,23 @@ class Controls:
         return result
 
     async def _order(self, target: Target, wanted: Order, timeout: float) -> Any:
-        return await self._moves.given(self._node.meant(target), wanted, timeout)
+        cell = self._node.meant(target)
+        try:
+            return await self._moves.given(cell, wanted, timeout)
+        except AskTimeout as late:
+            raise await self._busy(cell, late) from late
+
+    async def _busy(self, cell: Cell, late: AskTimeout) -> AskTimeout:
+        """The same error; it says which turn is in the way, and since when, if that is known."""
+        return type(late)(late.actor, late.seconds, late.handled, late.why, await self._turn_in_hand(cell.ref))
+
+
+def said_of_turn(status: Status) -> str:
+    """The turn that an actor is in, for how long it has been, and the line at which it waits; "" if it is in none."""
+    if not status.turn:
+        return ""
+    at = f" (at {status.turn_at})" if status.turn_at else ""
+    return f"its turn of {status.turn} has run for {status.turn_seconds:.0f} s{at}"
 
 
 def has_process(cell: Cell) -> bool:

@@ -99,6 +99,13 @@ class QueuedOrder(Item):
         """Whether it goes ahead of the messages."""
         return type(self.order) is not Mark
 
+    def runs_beside(self, cell: Cell) -> bool:
+        """Whether it was obeyed just now, beside the turn that waits."""
+        if not self.order.is_beside or cell.actor is None or cell.more is None or cell.more.turn is None:
+            return False
+        QueuedOrder.run(cell.actor, self)
+        return True
+
 
 def answer_bytes(value: object, path: str, verb: str) -> bytes:
     """What an order gives, as bytes that fit into one frame.

@@ -45,7 +45,7 @@ def look_at_grants(steps: Iterable[Operation]) -> None:
 
 
 def check_orders(cell: Cell) -> None:
-    """Raises CannotMove: an actor that is to live in a process of its own has given orders that it may not give there."""
+    """Raises CannotMove: an actor that is to live in a process has given orders that it may not give there."""
     if cell.host.place.is_here and (why := why_not_granted([cell], cell.path, _bound(cell))):
         raise CannotMove(cell.path, why)
 
@@ -53,8 +53,8 @@ def check_orders(cell: Cell) -> None:
 def said_of_grants(path: str, home: str, granted: list[str]) -> str:
     """To whom an actor may give orders in a process, in a sentence.
 
-    >>> said_of_grants("/app/gate", "/app/gate", [])
-    'in a process /app/gate may give orders to nobody but those below /app/gate; all other orders are refused (NotGranted)'
+    >>> said_of_grants("/a/gate", "/a/gate", [])
+    'in a process /a/gate may give orders to nobody but those below /a/gate; all other orders are refused (NotGranted)'
     """
     others = _listed(granted)
     whom = f"{others} and those below these, and to those" if others else "nobody but those"

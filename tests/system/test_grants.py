@@ -1,4 +1,4 @@
-"""Actors that give orders in the program itself, and go into a process: the change says so, refuses, or is taken back."""
+"""Actors that give orders in the program itself, and go into a process: the change says so, or it is refused."""
 
 from __future__ import annotations
 
@@ -103,7 +103,9 @@ async def test_a_dry_run_says_to_whom_it_may_give_orders_there(into: str) -> Non
         async with system.transaction(timeout=30.0, dry_run=True) as change:
             change.bind(gate, "sessions", SESSIONS)
             INTO[into](change, gate)
-        assert f"may give orders to {SESSIONS} and those below these, and to those below {home};" in change.steps[1].note
+        assert (
+            f"may give orders to {SESSIONS} and those below these, and to those below {home};" in change.steps[1].note
+        )
         assert change.steps[0].note == ""
 
 
