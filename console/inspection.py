@@ -36,7 +36,8 @@ async def inspected(system: ActorSystem, path: str, timeout: float) -> dict[str,
     row = row_of(one)
     try:
         status = await system.get_status(cell.ref, timeout=min(timeout, FAR_TIMEOUT))
-        row = as_told(row, status) if is_far(cell) else row
+        seen = {"turn": status.turn or "", "turn_seconds": status.turn_seconds}
+        row = as_told(row, status) if is_far(cell) else msgspec.structs.replace(row, **seen)
     except AskTimeout:  # Its process is blocked, or stopped: what is known here is all there is.
         status, row = status_of(cell), as_told(row, None)
     more = cell.more

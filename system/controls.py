@@ -199,7 +199,7 @@ class Controls:
         if isinstance(host, OutsideHost):
             return cast("Status", await ask_status(host.peer, cell, timeout))
         if not has_process(cell):
-            return status_of(cell)
+            return await self._of_leader(cell, timeout)
         own, worker = status_of(cell), host.place.process(cell)
         if worker is None:
             return dataclasses.replace(own, pid=0)
@@ -213,6 +213,19 @@ class Controls:
             links=own.links,
             monitors=own.monitors,
         )
+
+    async def _of_leader(self, cell: Cell, timeout: float) -> Status:
+        """The status of an actor that no process beside this one has alone; with the turn of the replica that leads."""
+        own, place = status_of(cell), cell.host.place
+        worker = place.process(cell)
+        if worker is None or not cell.host.work(cell).is_in_turn:
+            return own
+        try:
+            there = await ask_status(worker, cell, min(timeout, STATUS_WITHIN), place.known_as(cell))
+        except (ActorStopped, AskFailed, AskTimeout):  # Another one leads soon.
+            return own
+        names = ("turn", "turn_seconds", "turn_at", "turn_rests")
+        return dataclasses.replace(own, **{name: getattr(there, name) for name in names})
 
     async def protection(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> ProtectionStatus:
         """Whether an actor is protected by mechanisms now, by which, who leads, and whether a replica may die.
