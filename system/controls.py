@@ -39,6 +39,7 @@ from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import cell_kind
 from ..actors.kernel.ref import DEFAULT_TIMEOUT, Target
+from ..actors.process.grants import check_orders
 from ..actors.process.process_host import WorkerPlace
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.peer import OutsideHost
@@ -53,7 +54,6 @@ from ..supervision.supervisor import Supervisor
 from .history.recorder import HistoryRecorder, expect_end
 from .live_moves import Moves, check_isolation
 from .transaction.errors import TransactionFailed
-from .transaction.grants import check_orders
 from .transaction.mechanisms import Isolate
 
 if TYPE_CHECKING:

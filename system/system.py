@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args, overload
 
 from ..actors.control.drain import drain as drain_queue
+from ..actors.control.wait_watch import WaitWatch
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, StoreError, TreeFailed
 from ..actors.events import EventStream, LeadershipTaken, RecoveryTableUnused, ServersAnswer, ServersSilent, StandingBy
 from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, pack_exit
@@ -71,7 +72,6 @@ from .script import load_script
 from .specification import Specifications
 from .system_connection import serve
 from .transaction.transaction import Transaction, Transactions
-from .wait_watch import WaitWatch
 
 if TYPE_CHECKING:
     from opentelemetry.trace import Tracer
@@ -270,7 +270,10 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         if file is not None:
             self._patience = node.loop.call_later(PATIENCE, self._tell_unused)
         self._moves = Moves(node)
-        self._watches = LoopWatch(node, options.watch_lag, options.watch_turns), WaitWatch(self, options.watch_waits)
+        self._watches = (
+            LoopWatch(node, options.watch_lag, options.watch_turns),
+            WaitWatch(node, options.watch_waits, self._status),
+        )
         for watch in self._watches:
             watch.open()
         node.connect(

@@ -13,10 +13,9 @@ import msgspec
 from ..errors import type_name
 from ..safe_state import SafeStateChange, watch
 from ..seconds import is_seconds
-from .bindings import Binding
+from .bindings import Binding, noting
 from .blocking_handlers import in_thread
 from .envelope import Table
-from .given_orders import noting
 from .message import Message, RuntimeOrder
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from typing_extensions import TypeVar
 
 from ..errors import ActorRestarting, HoldfastError, SpecError
 from ..values.saved_refs import Addressed
+from .bindings import note_order
 from .envelope import NO_DEADLINE, Ask, in_next_pass
-from .given_orders import note_order
 from .message import Message
 
 if TYPE_CHECKING:

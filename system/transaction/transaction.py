@@ -17,7 +17,7 @@ from .change import Change
 from .draft import Draft, difference
 from .errors import TransactionFailed, TransactionRefused
 from .events import TransactionBegan, TransactionCommitted, TransactionRolledBack
-from .grants import look_at_grants
+from .mechanisms import look_at_grants
 from .operation import Operation
 
 if TYPE_CHECKING:

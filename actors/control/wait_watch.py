@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+from collections.abc import Awaitable, Callable
 from time import perf_counter
 from typing import TYPE_CHECKING, Final
 
-from ..actors.control.orders import Status
-from ..actors.errors import HoldfastError
-from ..actors.events import TurnWaits
-from ..actors.kernel.cell import GONE, Cell
+from ..errors import HoldfastError
+from ..events import TurnWaits
+from ..kernel.cell import GONE, Cell
+from .orders import Status
 
 if TYPE_CHECKING:
-    from .system import ActorSystem
+    from ..kernel.node import Node
 
 LOOKS: Final = 4
 """How often all actors are looked at within the time that a turn may wait."""
@@ -52,19 +53,20 @@ class WaitWatch:
     """Tells (TurnWaits) of turns that take longer than a limit with all that they wait for. Off unless it is asked for.
 
     Args:
-        system: whose actors.
+        node: whose actors.
         limit: seconds; None: nobody looks.
+        ask: gets the status of an actor within so many seconds, from its process if it has one.
     """
 
-    def __init__(self, system: ActorSystem, limit: float | None) -> None:
-        self._system, self._limit = system, limit
+    def __init__(self, node: Node, limit: float | None, ask: Callable[[Cell, float], Awaitable[Status]]) -> None:
+        self._node, self._limit, self._ask = node, limit, ask
         self._seen: dict[Cell, WaitSeen] = {}
         self._task: asyncio.Task[None] | None = None
 
     def open(self) -> None:
         """Begin to look."""
         if self._limit is not None:
-            node = self._system._node
+            node = self._node
             work = self._look_on(self._limit)
             self._task = node.loop.create_task(work, name="watch of waits", context=node.base_context.copy())
 
@@ -81,14 +83,14 @@ class WaitWatch:
 
     async def _overdue(self, limit: float) -> list[Cell]:
         """Look at all actors; whose turn is to be told of."""
-        root, found, seen = self._system._node.root, list[Cell](), dict[Cell, WaitSeen]()
+        root, found, seen = self._node.root, list[Cell](), dict[Cell, WaitSeen]()
         waiting, begin, number = [] if root is None else [root], perf_counter(), 0
         while waiting:
             cell = waiting.pop()
             waiting.extend((cell.children or {}).values())
             if cell.state is not GONE and (one := self._look_at(cell, limit)) is not None:
                 seen[cell] = one
-                if self._system._node.loop.time() >= one.look_at:
+                if self._node.loop.time() >= one.look_at:
                     found.append(cell)
             number += 1
             if number % STRIDE == 0 and perf_counter() - begin > SLICE:
@@ -99,7 +101,7 @@ class WaitWatch:
 
     def _look_at(self, cell: Cell, limit: float) -> WaitSeen | None:
         """The turn that an actor is in, as it was found before if it is the same; None: it is in none, or may wait."""
-        work, before, now = cell.host.work(cell), self._seen.get(cell), self._system._node.loop.time()
+        work, before, now = cell.host.work(cell), self._seen.get(cell), self._node.loop.time()
         if not work.is_in_turn or any(rest.kind in RESTS for rest in cell.host.rests(cell)):
             return None
         mark = work.mark, work.since
@@ -110,9 +112,9 @@ class WaitWatch:
         return WaitSeen(mark, since, begun + limit, limit)
 
     async def _tell(self, cell: Cell) -> None:
-        seen, node = self._seen[cell], self._system._node
+        seen, node = self._seen[cell], self._node
         try:
-            status: Status | None = await self._system.get_status(cell.ref, timeout=ANSWERS_WITHIN)
+            status: Status | None = await self._ask(cell, ANSWERS_WITHIN)
         except HoldfastError:  # Its process is blocked, or has been stopped.
             status = None
         if status is not None and status.turn is None:
