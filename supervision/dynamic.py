@@ -275,6 +275,7 @@ class DynamicSupervisor(Supervisor):
             raise AlreadyStarted(spec.id, self.ctx._cell.node.cell_at(f"{self.ctx.path}/{spec.id}").ref)
         most = self._flags.max_children
         if most is not None and len(self._children) >= most:
+            self.ctx._cell.node.numbers.no_room["children", spec.start.kind] += 1
             raise MaxChildren(most)
 
     async def _come_so_far(self, name: str) -> Child | None:

@@ -57,6 +57,7 @@ from ..actors.events import (
     TrustBreached,
     TurnsLost,
     TurnSlow,
+    TurnWaits,
 )
 from ..actors.exit_reasons import Crash
 from ..actors.kernel.envelope import Item, item_name
@@ -309,6 +310,7 @@ WRITTEN: dict[type, tuple[int, str]] = {
     SpecificationNotKept: (logging.ERROR, "specification not kept"),
     LoopLagged: (logging.WARNING, "loop lagged"),
     TurnSlow: (logging.WARNING, "turn slow"),
+    TurnWaits: (logging.WARNING, "turn waits"),
     AdaptationUndone: (logging.WARNING, "adaptation undone"),
     BackgroundWorkLost: (logging.ERROR, "background work lost"),
     Diverged: (logging.ERROR, "replica diverged"),

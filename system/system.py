@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args, overload
 
 from ..actors.control.drain import drain as drain_queue
+from ..actors.control.wait_watch import WaitWatch
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, StoreError, TreeFailed
 from ..actors.events import EventStream, LeadershipTaken, RecoveryTableUnused, ServersAnswer, ServersSilent, StandingBy
 from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, pack_exit
@@ -122,6 +123,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         watch_lag: tell (LoopLagged) when this process's event loop comes later than this many seconds.
         watch_turns: tell (TurnSlow) of turns in this process that occupy the loop for longer than this many seconds.
             For actors in processes see `Limits(hung_after=...)`.
+        watch_waits: tell (TurnWaits) of turns, wherever they run, that take longer than this many seconds with all that
+            they wait for. Nothing is ended.
         recovery_hooks: `recovery_hooks(...)`: what is called before and after the phases of every recovery.
         recovery: a recovery file (its path, or from `load_recovery`): how actors are recovered whose child specs do
             not say, and their key variables.
@@ -151,6 +154,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         takeover: bool = False,
         watch_lag: float | None = None,
         watch_turns: float | None = None,
+        watch_waits: float | None = None,
         recovery_hooks: RecoveryHooks | None = None,
         recovery: str | os.PathLike[str] | RecoveryFile | None = None,
     ) -> None:
@@ -173,6 +177,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             takeover=takeover,
             watch_lag=watch_lag,
             watch_turns=watch_turns,
+            watch_waits=watch_waits,
             recovery_hooks=recovery_hooks,
             recovery=recovery,
         )
@@ -265,8 +270,12 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         if file is not None:
             self._patience = node.loop.call_later(PATIENCE, self._tell_unused)
         self._moves = Moves(node)
-        self._watch = LoopWatch(node, options.watch_lag, options.watch_turns)
-        self._watch.open()
+        self._watches = (
+            LoopWatch(node, options.watch_lag, options.watch_turns),
+            WaitWatch(node, options.watch_waits, self._status),
+        )
+        for watch in self._watches:
+            watch.open()
         node.connect(
             Ports(
                 host_for=self._host_for,
@@ -434,7 +443,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         await self._moves.close()
         while node.remains:
             await asyncio.wait(set(node.remains))
-        self._watch.close()
+        for watch in self._watches:
+            watch.close()
         if node.cell_kinds.watcher is not None:
             self.trace_with(None)
         await self._workers.close()

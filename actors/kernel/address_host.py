@@ -217,6 +217,10 @@ class Place:
         """The process besides this one that the present life is lived in, if there is one now."""
         return None
 
+    def known_as(self, cell: Cell) -> str:
+        """The address by which that process knows who lives that life."""
+        return cell.path
+
     def replica_states(self) -> Mapping[str, str] | None:
         """How each replica that lives the life here does: "leads", "follows", "joining", "silent" or "down".
 

@@ -254,6 +254,7 @@ class Bound:
 
     def _refuse(self, cell: Cell, item: Any) -> None:
         error = MailboxFull(cell.path, self.capacity)
+        cell.node.count_no_room(cell.path)
         if isinstance(item, Ask):
             item.fail(error)
             return
@@ -261,6 +262,7 @@ class Bound:
 
     def _lose(self, cell: Cell, item: Any, displaced_by: str = "") -> None:
         message = item.message if isinstance(item, (Envelope, Ask)) else item
+        cell.node.count_no_room(cell.path)
         if isinstance(item, Ask):
             item.fail(MailboxFull(cell.path, self.capacity, displaced_by))
         sender = item.sender if isinstance(item, (Envelope, Ask)) else None

@@ -9,9 +9,10 @@ import random
 import sys
 import time
 import weakref
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from time import monotonic
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
 
 from ..errors import (
     ActorStopped,
@@ -47,6 +48,8 @@ if TYPE_CHECKING:
     from .ref import ActorRef, Target
 
 A = TypeVar("A", bound="Actor")
+NoRoom = Literal["mailbox", "journal", "children"]
+"""What is full that has no room for a message, or for a child."""
 
 SAME_CLOCK = 60.0
 """Seconds by which a loop's clock may be behind the monotonic one that it reads; the clock of a test is elsewhere."""
@@ -150,6 +153,7 @@ class Numbers:
         self._token, self._last_token = 0, sys.maxsize
         self.dead_letters = 0
         self.late_replies = 0
+        self.no_room: Counter[tuple[NoRoom, type[Actor] | None]] = Counter()
 
     def next_seed(self) -> int:
         """A seed for an actor's random generator."""
@@ -266,6 +270,11 @@ class Node(RunLoop):
         if self.events.hears_letters:
             known = item.sender.path if isinstance(item, Item) and item.sender is not None else ""
             self.events.emit(DeadLetter(cell.path, item, f"refused: {no}", known))
+
+    def count_no_room(self, path: str, where: NoRoom = "mailbox") -> None:
+        """Count a message that an actor had no room for, and that is refused or lost."""
+        cell = self.find(path)
+        self.numbers.no_room[where, None if cell is None else cell_kind(cell)] += 1
 
     # -- the tree ---------------------------------------------------------------------------------------------------
 

@@ -73,6 +73,7 @@ class HomeBound:
             self.waiting.append((ask, name, body, sender))
             return False
         error = MailboxFull(self._home.path, self.capacity)
+        self._home.node.count_no_room(self._home.path)
         if verdict == "lose":
             lose(self._home, Parcel(name, body), self._why())
         elif ask is None:
@@ -94,6 +95,7 @@ class HomeBound:
                 break
             if source.id not in (self._fed, home.ledger.begun):
                 self._behind.pop(source.id, None)
+                home.node.count_no_room(home.path)
                 lose(home, source, self._why())
                 home.end_without_turn(source, error, batch)
         batch.commit(home.journal)

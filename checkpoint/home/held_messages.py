@@ -97,6 +97,7 @@ class Holding:
     def _turn_away(self, rule: Held, ask: Ask | None, name: str, body: bytes, *, is_lost: bool) -> None:
         """Raises MailboxFull: it is a tell, and its sender is to know."""
         error = MailboxFull(self._home.path, rule.capacity)
+        self._home.node.count_no_room(self._home.path)
         if is_lost:
             self.dropped += 1
             lose(self._home, Parcel(name, body), _why(rule))
@@ -122,6 +123,7 @@ class Holding:
         mine = [source for source, by in self._counted.values() if by == topic]
         for source in mine[: len(mine) - keep]:
             self.dropped += 1
+            home.node.count_no_room(home.path)
             lose(home, source, _why(rule))
             home.end_without_turn(source, answer, batch)
         batch.commit(home.journal)

@@ -108,6 +108,12 @@ class GroupPlace(Place):
         leader = None if group is None else group.membership.primary
         return None if group is None or leader is None else group.replicas.worker_of(leader)
 
+    def known_as(self, cell: Cell) -> str:
+        """The address of the actor in the replica that leads."""
+        group = self.group
+        leader = None if group is None else group.membership.primary
+        return cell.path if group is None or leader is None else group.replicas.place(f"{leader}/server")
+
     def replica_states(self) -> dict[str, str]:
         """How each replica does; none while the actor is being recovered."""
         group = self.group

@@ -41,8 +41,52 @@ EXPECTED = "tests/supervision/test_expected.py"
 BOUND = "tests/supervision/test_come_back_bound.py"
 GLANCES = "tests/effects/test_glances_at_effects.py"
 TEXTS = "tests/system/test_texts.py"
+GRANTS = "tests/system/test_grants.py"
+HANGING = "tests/control/test_hanging_turn.py"
 
 CHECKS = {
+    "who has given orders to others does not go into a process": Check(
+        "system/transaction/transaction.py",
+        "            look_at_grants(change.operations)\n",
+        "",
+        GRANTS,
+        "stays_where_it_is and pbr-task",
+    ),
+    "orders are noted where they are carried out": Check(
+        "actors/kernel/actor.py",
+        "noting(turn) if issubclass(handles.kind, RuntimeOrder) else turn",
+        "turn",
+        GRANTS,
+        "stays_where_it_is and pbr-task",
+    ),
+    "who ends others is noted": Check(
+        "actors/kernel/ref.py",
+        "            note_order(caller._cell, self._cell)\n        self._cell.living.kill",
+        "            pass\n        self._cell.living.kill",
+        GRANTS,
+        "ended_others",
+    ),
+    "a mechanism behind which orders are refused is taken back": Check(
+        "ftm/group/probation.py",
+        "if name == NOT_GRANTED and self._was_free:",
+        "if False:",
+        GRANTS,
+        "taken_back",
+    ),
+    "a trace does not wait for a turn that waits": Check(
+        "actors/kernel/lifecycle.py",
+        "        if call.runs_beside(cell):\n",
+        "        if False:\n",
+        HANGING,
+        "in_the_middle_of_a_turn and task",
+    ),
+    "a change that a turn has kept waiting is given up without waiting for it again": Check(
+        "system/transaction/rework.py",
+        "                if self._held is None:",
+        "                if False:",
+        HANGING,
+        "test_a_transaction_says_it_too and task-suspend",
+    ),
     "who comes back waits for whom it is bound to": Check(
         "supervision/dynamic.py",
         "            if one.awaited:\n",
