@@ -23,8 +23,30 @@ SMALL_DISK = "tests/checkpoint/sqlite/test_small_disk.py"
 CLOCKS_SET = "tests/effects/test_clocks_set.py"
 BETWEEN = "tests/checkpoint/test_between_lives.py"
 ORDER = "tests/checkpoint/test_order.py"
+GIVEN_UP = "tests/checkpoint/test_given_up.py"
 
 CHECKS = {
+    "what was put aside is not handled when its asker has given up": Check(
+        "checkpoint/life/recorded_context.py",
+        "feed.is_ask, feed.chain, deadline=feed.deadline,",
+        "feed.is_ask, feed.chain,",
+        GIVEN_UP,
+        "not_served and hybrid-task-stashed",
+    ),
+    "a turn waits for no message whose asker has given up": Check(
+        "checkpoint/long_waits.py",
+        "return is_wanted and not (source.begins_by and self._home.node.clock.is_past(source.begins_by))",
+        "return is_wanted",
+        GIVEN_UP,
+        "not_served and hybrid-task-waited",
+    ),
+    "what was put aside and has begun is finished": Check(
+        "checkpoint/life/recorded_life.py",
+        "            first.feed.has_begun = True\n",
+        "",
+        GIVEN_UP,
+        "finished_in_the_next_life and hybrid-task",
+    ),
     "what an earlier program has kept comes first": Check(
         "checkpoint/home/ask_recovery.py",
         "sorted(messages, key=lambda one: not one[1].is_earlier):",
