@@ -31,6 +31,7 @@ from .quarantine import Quarantine
 from .switch import Switch
 
 if TYPE_CHECKING:
+    from ...actors.kernel.codec import Codec
     from ...actors.kernel.mailbox import Bound
     from ...actors.kernel.node import Node
 
@@ -41,6 +42,11 @@ OPENED = "opened"
 """The fact that says when the root was begun whose fencing tokens were the largest: a whole number, of seconds."""
 TOKEN_BITS = 31
 """Of the part of a fencing token that counts within a second; in front of it are whole seconds."""
+
+
+def never_again(codec: Codec, name: str, body: bytes) -> bool:
+    """Say of every message that it may be handled only once."""
+    return False
 
 
 class Homes:
@@ -54,8 +60,10 @@ class Homes:
         durability: Durability | None = None,
         file: RecoveryFile | None = None,
         hooks: RecoveryHooks | None = None,
+        bears_repetition: Callable[[Codec, str, bytes], bool] = never_again,
     ) -> None:
         self.node = node
+        self.bears_repetition = bears_repetition
         self.journal = Commits(journal, node.loop, durability=durability or "os", emit=node.emit, where=f"/{node.name}")
         self._unkept = Unkept(self.journal)
         self.addresses = Addresses(node, journal, self.find)

@@ -309,23 +309,34 @@ class Outputs:
                     home, turn, key, out
                 )  # It is as if it had been asked before this program began.
                 return
+        ask = self._made(turn, key, out, target)
+        switch = switch_of(target)
+        if switch is None:
+            batch.after.append(lambda: self._send_ask(key, target, ask))
+        elif switch.waits(ask):
+            ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, waiters(ask.chain)))), batch)
+        elif (bound := switch.intake.bound) is None or bound.makes_room(ask, out.name, out.body, home.path):
+            asked = switch.record(MESSAGE, out.name, out.body, home.path, batch, origin_of(ask))
+            asked.ask, asked.chain = ask, ask.chain
+            batch.after.append(lambda: switch.admitted(asked))
+        if switch is not None and switch.intake.between is not None:
+            batch.after.append(ask.strand)
+
+    def _made(self, turn: int, key: int, out: Out, target: Cell) -> SwitchAsk:
+        """The ask that is an output of the turn in hand, which waits for it from now on."""
+        home, source = self._home, self._home.ledger.open.get(key)
         chain = ((home.path, key), *(source.chain if source is not None else ()))
         if out.trace:
             chain = with_tail(chain, out.trace)
         ask = SwitchAsk.made(home, turn, out, chain, target, source)
         home.calls.asks[turn, out.k] = ask
         home.node.deadlines.add(ask)
-        switch = switch_of(target)
-        if switch is None:
-            batch.after.append(lambda: self._send_ask(key, target, ask))
-        elif switch.waits(ask):
-            ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, waiters(chain)))), batch)
-        elif (bound := switch.intake.bound) is None or bound.makes_room(ask, out.name, out.body, home.path):
-            asked = switch.record(MESSAGE, out.name, out.body, home.path, batch, origin_of(ask))
-            asked.ask, asked.chain = ask, chain
-            batch.after.append(lambda: switch.admitted(asked))
-        if switch is not None and switch.intake.between is not None:
-            batch.after.append(ask.strand)
+        return ask
+
+    def ask_again(self, turn: int, key: int, out: Out) -> None:
+        """Ask somebody who keeps no journal what was asked in an earlier program, and may be handled twice."""
+        target = self._home.node.cell_at(out.to)
+        self._send_ask(key, target, self._made(turn, key, out, target))
 
     def _send_ask(self, key: int, target: Cell, ask: SwitchAsk) -> None:
         home, target = self._home, target.living

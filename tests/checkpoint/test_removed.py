@@ -23,9 +23,24 @@ SMALL_DISK = "tests/checkpoint/sqlite/test_small_disk.py"
 CLOCKS_SET = "tests/effects/test_clocks_set.py"
 BETWEEN = "tests/checkpoint/test_between_lives.py"
 ORDER = "tests/checkpoint/test_order.py"
+ORDERS = "tests/checkpoint/test_restart_orders.py"
 GIVEN_UP = "tests/checkpoint/test_given_up.py"
 
 CHECKS = {
+    "what bears repetition is asked again by the next program": Check(
+        "checkpoint/home/pending_asks.py",
+        "if turn > home.ledger.turn and home.homes.bears_repetition(home.node.codec, out.name, out.body):",
+        "if False:",
+        ORDERS,
+        "end and task",
+    ),
+    "a child that would be there twice is not asked for again": Check(
+        "supervision/repeatable.py",
+        "return not start.fresh and start.id is not None",
+        "return True",
+        ORDERS,
+        "without and task",
+    ),
     "what was put aside is not handled when its asker has given up": Check(
         "checkpoint/life/recorded_context.py",
         "feed.is_ask, feed.chain, deadline=feed.deadline,",
