@@ -23,10 +23,39 @@ SMALL_DISK = "tests/checkpoint/sqlite/test_small_disk.py"
 CLOCKS_SET = "tests/effects/test_clocks_set.py"
 BETWEEN = "tests/checkpoint/test_between_lives.py"
 ORDER = "tests/checkpoint/test_order.py"
+REGISTRY = "tests/supervision/test_registry_recorded.py"
 ORDERS = "tests/checkpoint/test_restart_orders.py"
 GIVEN_UP = "tests/checkpoint/test_given_up.py"
 
 CHECKS = {
+    "a recorded holder is found when it lives again": Check(
+        "checkpoint/home/switch.py",
+        "for come in self.node.awaited.pop(self.path, ()):",
+        "for come in ():",
+        REGISTRY,
+        "ended_by_itself and hybrid",
+    ),
+    "who is erased holds nothing": Check(
+        "checkpoint/home/homes.py",
+        "        self._entries.erase(path)\n",
+        "",
+        REGISTRY,
+        "begins_with_nothing",
+    ),
+    "what an actor holds moves with it": Check(
+        "checkpoint/home/homes.py",
+        "        self._entries.rename(names)\n",
+        "",
+        REGISTRY,
+        "moves_with_it",
+    ),
+    "a recorded holder that has ended is not found": Check(
+        "supervision/services/registrar.py",
+        "return not holder.has_nobody",
+        "return not holder.is_dead",
+        REGISTRY,
+        "ended_by_itself and hybrid",
+    ),
     "what bears repetition is asked again by the next program": Check(
         "checkpoint/home/pending_asks.py",
         "if turn > home.ledger.turn and home.homes.bears_repetition(home.node.codec, out.name, out.body):",
