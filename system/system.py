@@ -52,6 +52,7 @@ from ..cluster.silence import SilenceOfServers
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.children import tell_stopped
 from ..supervision.patience import end_within, told_if_held
+from ..supervision.repeatable import bears_repetition
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor, kill_starting
@@ -247,7 +248,14 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             raise
         try:
             check_system(engine, self.name)
-            self._homes = Homes(node, engine, durability=options.durability, file=file, hooks=options.recovery_hooks)
+            self._homes = Homes(
+                node,
+                engine,
+                durability=options.durability,
+                file=file,
+                hooks=options.recovery_hooks,
+                bears_repetition=bears_repetition,
+            )
             self._specifications = Specifications(self._homes, is_kept=options.store is not None)
             self._mechanism_notes = MechanismNotes(self._homes)
             epoch = engine.epoch if engine.safe_at == "sync" else None

@@ -216,7 +216,7 @@ class Node(RunLoop):
         self.supervised = Supervised()
         self.root: Cell | None = None
         self.arbiter: Any = None  # who may act on which address, once somebody has asked for it
-        self.awaited: dict[str, list[Callable[[], object]]] = {}  # what is done when somebody else has a path
+        self.awaited: dict[str, list[Callable[[], object]]] = {}  # what is done when somebody lives at a path again
         self.on_life: Callable[[Cell], None] | None = None  # told of each life that begins, before it has a message
 
     def connect(self, ports: Ports) -> None:

@@ -307,25 +307,35 @@ class Outputs:
         if (target.is_dead or is_unread(target)) and switch_of(target) is None:
             origin = origin_asked(home, turn, out, source)
             if home.homes.rejoin.keep(home, origin, out, home.path, batch):
-                home.homes.rejoin.joins(
-                    home, turn, key, out
-                )  # It is as if it had been asked before this program began.
+                # It is as if it had been asked before this program began.
+                home.homes.rejoin.joins(home, turn, key, out)
                 return
+        ask = self._made(turn, key, out, target)
+        switch = switch_of(target)
+        if switch is None:
+            batch.after.append(lambda: self._send_ask(key, target, ask))
+        elif switch.waits(ask):
+            ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, waiters(ask.chain)))), batch)
+        elif (bound := switch.intake.bound) is None or bound.makes_room(ask, out.name, out.body, home.path):
+            self._record_ask(switch, ask, out, home.path, batch)
+        if switch is not None and switch.intake.between is not None:
+            batch.after.append(ask.strand)
+
+    def _made(self, turn: int, key: int, out: Out, target: Cell) -> SwitchAsk:
+        """The ask that is an output of the turn in hand, which waits for it from now on."""
+        home, source = self._home, self._home.ledger.open.get(key)
         chain = ((home.path, key), *(source.chain if source is not None else ()))
         if out.trace:
             chain = with_tail(chain, out.trace)
         ask = SwitchAsk.made(home, turn, out, chain, target, source)
         home.calls.asks[turn, out.k] = ask
         home.node.deadlines.add(ask)
-        switch = switch_of(target)
-        if switch is None:
-            batch.after.append(lambda: self._send_ask(key, target, ask))
-        elif switch.waits(ask):
-            ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, waiters(chain)))), batch)
-        elif (bound := switch.intake.bound) is None or bound.makes_room(ask, out.name, out.body, home.path):
-            self._record_ask(switch, ask, out, home.path, batch)
-        if switch is not None and switch.intake.between is not None:
-            batch.after.append(ask.strand)
+        return ask
+
+    def ask_again(self, turn: int, key: int, out: Out) -> None:
+        """Ask somebody who keeps no journal what was asked in an earlier program, and may be handled twice."""
+        target = self._home.node.cell_at(out.to)
+        self._send_ask(key, target, self._made(turn, key, out, target))
 
     def _record_ask(self, switch: Switch, ask: Ask, out: Out, sender: str | None, batch: Batch) -> None:
         """An ask to a recorded actor, up or not, is journaled in the same append."""

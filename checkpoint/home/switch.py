@@ -400,6 +400,8 @@ class Switch:
             bound.refill()
         self.due.on_want(self)
         self.ties.tie()
+        for come in self.node.awaited.pop(self.path, ()):
+            come()
         if holding is not None:
             holding.let_in()
 

@@ -23,8 +23,74 @@ SMALL_DISK = "tests/checkpoint/sqlite/test_small_disk.py"
 CLOCKS_SET = "tests/effects/test_clocks_set.py"
 BETWEEN = "tests/checkpoint/test_between_lives.py"
 ORDER = "tests/checkpoint/test_order.py"
+REGISTRY = "tests/supervision/test_registry_recorded.py"
+ORDERS = "tests/checkpoint/test_restart_orders.py"
+GIVEN_UP = "tests/checkpoint/test_given_up.py"
 
 CHECKS = {
+    "a recorded holder is found when it lives again": Check(
+        "checkpoint/home/switch.py",
+        "for come in self.node.awaited.pop(self.path, ()):",
+        "for come in ():",
+        REGISTRY,
+        "ended_by_itself and hybrid",
+    ),
+    "who is erased holds nothing": Check(
+        "checkpoint/home/homes.py",
+        "        self._entries.erase(path)\n",
+        "",
+        REGISTRY,
+        "begins_with_nothing",
+    ),
+    "what an actor holds moves with it": Check(
+        "checkpoint/home/homes.py",
+        "        self._entries.rename(names)\n",
+        "",
+        REGISTRY,
+        "moves_with_it",
+    ),
+    "a recorded holder that has ended is not found": Check(
+        "supervision/services/registrar.py",
+        "return not holder.has_nobody",
+        "return not holder.is_dead",
+        REGISTRY,
+        "ended_by_itself and hybrid",
+    ),
+    "what bears repetition is asked again by the next program": Check(
+        "checkpoint/home/pending_asks.py",
+        "if turn > home.ledger.turn and home.homes.bears_repetition(home.node.codec, out.name, out.body):",
+        "if False:",
+        ORDERS,
+        "end and task",
+    ),
+    "a child that would be there twice is not asked for again": Check(
+        "supervision/repeatable.py",
+        "return not start.fresh and start.id is not None",
+        "return True",
+        ORDERS,
+        "without and task",
+    ),
+    "what was put aside is not handled when its asker has given up": Check(
+        "checkpoint/life/recorded_context.py",
+        "feed.is_ask, feed.chain, deadline=feed.deadline,",
+        "feed.is_ask, feed.chain,",
+        GIVEN_UP,
+        "not_served and hybrid-task-stashed",
+    ),
+    "a turn waits for no message whose asker has given up": Check(
+        "checkpoint/long_waits.py",
+        "return is_wanted and not (source.begins_by and self._home.node.clock.is_past(source.begins_by))",
+        "return is_wanted",
+        GIVEN_UP,
+        "not_served and hybrid-task-waited",
+    ),
+    "what was put aside and has begun is finished": Check(
+        "checkpoint/life/recorded_life.py",
+        "            first.feed.has_begun = True\n",
+        "",
+        GIVEN_UP,
+        "finished_in_the_next_life and hybrid-task",
+    ),
     "what an earlier program has kept comes first": Check(
         "checkpoint/home/ask_recovery.py",
         "sorted(messages, key=lambda one: not one[1].is_earlier):",
