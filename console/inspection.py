@@ -41,6 +41,7 @@ async def inspected(system: ActorSystem, path: str, timeout: float) -> dict[str,
     return {
         "actor": msgspec.structs.asdict(row),
         "life": status.life,
+        "turn_rests": status.turn_rests,
         "bindings": dict(status.bindings),
         "links": sorted(ties.links.values()) if ties is not None else [],
         "monitors": sorted({each.watcher.path for each in ties.monitors if each.active}) if ties is not None else [],
