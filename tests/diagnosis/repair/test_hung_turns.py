@@ -11,7 +11,11 @@ from holdfast.diagnosis.engine import State
 from holdfast.diagnosis.repair import Policy, Repaired
 
 IN_TIME = 60.0
-RESTS = ["sleep", "recorded sleep", "recorded wait"]
+RESTS = [
+    pytest.param("sleep", None, id="sleep"),
+    pytest.param("sleep", hf.hybrid(), id="recorded sleep"),
+    pytest.param("wait", hf.hybrid(), id="recorded wait"),
+]
 POLICY = Policy(verify=5.0, settle=0.2, cool_down=0.2)
 
 
@@ -102,9 +106,7 @@ async def test_an_actor_whose_turn_hangs_again_is_healed_by_repair(isolation: An
 
 
 @pytest.mark.parametrize("isolation", ["task", "process"])
-@pytest.mark.parametrize(
-    ("how", "recovery"), [("sleep", None), ("sleep", hf.hybrid()), ("wait", hf.hybrid())], ids=RESTS
-)
+@pytest.mark.parametrize(("how", "recovery"), RESTS)
 async def test_a_turn_that_rests_as_it_has_said_does_not_hang(how: str, recovery: Any, isolation: Any) -> None:
     spec = hf.child("node", hf.start(Node), isolation=isolation, recovery=recovery, shutdown="brutal_kill")
     async with hf.ActorSystem("t", log=False) as system:
