@@ -17,9 +17,9 @@ from ...actors.kernel.address_host import Work
 from ...actors.kernel.cell import Cell
 from ..kept_file import read_kept, write_kept
 from ..literals import ok, word_for
+from ..own_time import OwnTime
 from .hearing import Heard, listen
 from .observer import Manner, Observer
-from .own_time import OwnTime
 
 ENOUGH: Final = 20
 """Messages after which something is known of a topic."""

@@ -319,14 +319,14 @@ CHECKS = {
         "falls_silent_is_seen and gap",
     ),
     "the time in which the loop was late is nobody's silence": Check(
-        "diagnosis/observers/own_time.py",
+        "diagnosis/own_time.py",
         "            self._late += max(0.0, self._loop.time() - self._due)\n",
         "",
         SILENT,
         "loop_itself_was_late and uvloop",
     ),
     "who asks first behind that knows it, too": Check(
-        "diagnosis/observers/own_time.py",
+        "diagnosis/own_time.py",
         "return now - self._late - max(0.0, now - self._due)",
         "return now - self._late",
         SILENT,

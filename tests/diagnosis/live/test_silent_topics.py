@@ -12,7 +12,7 @@ import holdfast as hf
 from holdfast import diagnosis
 from holdfast.diagnosis.engine import State
 from holdfast.diagnosis.observers import Baselines
-from holdfast.diagnosis.observers.own_time import OwnTime
+from holdfast.diagnosis.own_time import OwnTime
 
 PAUSE = 0.05
 
