@@ -63,6 +63,8 @@ class ActorRow(msgspec.Struct, frozen=True, array_like=True):
     is_supervisor: bool
     allowed_bytes: int = 0
     """The memory that its own process may have; 0 if nothing bounds it."""
+    rests: bool = False
+    """Whether its turn rests, as it has said: in a sleep, a wait for a message, or an effect."""
 
 
 class ProcessUse(msgspec.Struct, frozen=True, array_like=True):
@@ -246,6 +248,7 @@ def row_of(one: Found) -> ActorRow:
         spec.restart if spec is not None else "",
         kind is not None and issubclass(kind, Supervisor),
         (spec.limits.memory_bytes or 0) if spec is not None and spec.limits is not None else 0,
+        status is not None and bool(status.turn_rests),
     )
 
 
@@ -281,6 +284,7 @@ def as_told(row: ActorRow, status: Status | None) -> ActorRow:
         queued=status.queued,
         turn=status.turn or "",
         turn_seconds=status.turn_seconds,
+        rests=bool(status.turn_rests),
     )
 
 

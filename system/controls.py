@@ -17,6 +17,7 @@ from ..actors.control.orders import (
     Resume,
     Status,
     Suspend,
+    known_at_home,
     next_start,
     status_of,
 )
@@ -197,13 +198,13 @@ class Controls:
     async def _status(self, cell: Cell, timeout: float) -> Status:
         host = cell.host
         if isinstance(host, OutsideHost):
-            return cast("Status", await ask_status(host.peer, cell, timeout))
+            return known_at_home(cast("Status", await ask_status(host.peer, cell, timeout)), cell)
         if not has_process(cell):
             return await self._of_leader(cell, timeout)
         own, worker = status_of(cell), host.place.process(cell)
         if worker is None:
             return dataclasses.replace(own, pid=0)
-        there = cast("Status", await ask_status(worker, cell, timeout))
+        there = known_at_home(cast("Status", await ask_status(worker, cell, timeout)), cell)
         state = there.state if own.state == "running" else own.state
         return dataclasses.replace(
             there,

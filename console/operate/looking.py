@@ -152,7 +152,8 @@ def row_line(row: ActorRow, memory_bytes: int | None, *, is_top: bool) -> str:
         said += [f"{row.place} {row.pid or '-'}"] + ([f"{memory_bytes / 1e6:.0f} MB"] if memory_bytes else [])
     said += [typer.style(f"restarts {row.restarts}", fg="yellow")] if row.restarts else []
     said += [f"queued {row.queued}"] if row.queued else []
-    said += [f"in {printable(_short(row.turn))} for {row.turn_seconds:.1f} s"] if row.turn else []
+    at = "rests in" if row.rests else "in"
+    said += [f"{at} {printable(_short(row.turn))} for {row.turn_seconds:.1f} s"] if row.turn else []
     said += [row.recovery] if row.recovery else []
     said += [" + ".join(row.mechanism)] if row.mechanism else []
     said += [f"named {printable(', '.join(row.names))}"] if row.names else []
@@ -249,7 +250,8 @@ def inspection_lines(one: dict[str, Any]) -> Iterator[str]:
     yield f"queued: {row['queued']}"
     if row["turn"]:
         at = f", at {one['turn_at']}" if one.get("turn_at") else ""
-        yield f"turn: {row['turn']}, for {row['turn_seconds']:.1f} s{at}"
+        rests = f"; it {one['turn_rests']}" if one.get("turn_rests") else ""
+        yield f"turn: {row['turn']}, for {row['turn_seconds']:.1f} s{at}{rests}"
     yield f"recovery: {row['recovery'] or 'none'}"
     yield f"protection: {protection_text(one.get('protection'))}"
     for name in ("names", "links", "monitors"):
