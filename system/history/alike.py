@@ -59,7 +59,7 @@ TOLD_APART_BY: Mapping[type[Event], tuple[str, ...]] = MappingProxyType(
 
 @dataclasses.dataclass(slots=True)
 class AlikeEvents:
-    """How many events of one sort may still be recorded one by one, and how many were only counted since the last row."""
+    """What may still be recorded of one sort, and how many events were only counted since the last row."""
 
     quota: EventQuota
     fields: dict[str, Plain]
