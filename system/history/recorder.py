@@ -11,10 +11,10 @@ from ...actors.events import ActorKilled, ActorStarted, ChildStopped, ChildTermi
 from ...checkpoint.addresses import is_at
 from ..last_lines.followers import Followers
 from ..last_lines.line_memory import LineMemory
-from .alike import EVERY, AlikeCounter
 from .authors import author
 from .counted_work import COUNTED, count_work
 from .forgetting import telling_of
+from .intake.alike import EVERY, AlikeCounter
 from .lives import LivesByAddress
 from .past_event import UNKEPT, PastEvent, Plain, plain_fields, shortened
 from .tracks import BOUNDS, EventTrack, TrackName, track_of

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple, TypeAlias
 
+from .intake.quota import EventQuota
 from .past_event import PastEvent
-from .quota import EventQuota
 from .ring import EventRing
 
 TrackName: TypeAlias = Literal["rare", "others", "letters"]

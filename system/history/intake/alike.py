@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import TypeAlias
 
-from ...actors.events import (
+from ....actors.events import (
     DeadLetter,
     EffectRepeated,
     Event,
@@ -16,12 +16,12 @@ from ...actors.events import (
     StoreRefused,
     TurnSlow,
 )
-from ...actors.overflow import is_of_policy
-from ...checkpoint.addresses import is_at
-from ...ftm.alarms import Diverged, Masked, Objected, Outvoted, RequestsDropped, StatesDiffer
-from ...ftm.bricks.sealed_frames import FrameRefused
-from ...ftm.events import TurnHung, WrongSuspicion
-from .past_event import Plain, dotted, message_type, shortened
+from ....actors.overflow import is_of_policy
+from ....checkpoint.addresses import is_at
+from ....ftm.alarms import Diverged, Masked, Objected, Outvoted, RequestsDropped, StatesDiffer
+from ....ftm.bricks.sealed_frames import FrameRefused
+from ....ftm.events import TurnHung, WrongSuspicion
+from ..past_event import Plain, dotted, message_type, shortened
 from .quota import EventQuota
 
 Sort: TypeAlias = "tuple[type[Event], str, tuple[str, ...]]"
