@@ -475,11 +475,15 @@ class LoopLagged(Event, frozen=True, eq=False):
 
 
 class LogLine(Event, frozen=True, eq=False):
-    """A line that an actor's process wrote to its `stream`, stdout or stderr; `life` is the one that wrote it."""
+    """A line that an actor's process wrote to its `stream`, stdout or stderr; `life` is the one that wrote it.
+
+    `is_logged`: it becomes a log record, too; else the program was started with `log_lines=False`.
+    """
 
     stream: str
     text: str
     life: int = 0
+    is_logged: bool = True
 
 
 class MessageIn(Event, frozen=True, eq=False):

@@ -158,6 +158,9 @@ class LogSink:
                 self._write_start(event, self._crash_at(event.address))
             case DeadLetter():
                 self._write_letter(event)
+            case LogLine():
+                if event.is_logged:
+                    self._write(event)
             case _ if type(event) in WRITTEN:
                 self._write(event)
             case _:
@@ -228,6 +231,7 @@ class LogSink:
             return
         level, name = WRITTEN[kind]
         fields: Fields = {**self._describe(event), **more, "system": self._system}
+        fields.pop("is_logged", None)
         if kind is not LogLine:  # What a program prints is its own affair.
             fields = {key: one.translate(SHOWN) if isinstance(one, str) else one for key, one in fields.items()}
         if left_out:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from ..errors import MailboxFull
-from ..overflow import Overflow, check, decide
+from ..overflow import Overflow, check, decide, drop_reason
 from .envelope import LEAVE, Ask, Envelope, Item, message_in
 
 if TYPE_CHECKING:
@@ -266,7 +266,7 @@ class Bound:
         if isinstance(item, Ask):
             item.fail(MailboxFull(cell.path, self.capacity, displaced_by))
         sender = item.sender if isinstance(item, (Envelope, Ask)) else None
-        cell.node.dead_letter(cell, message, f"mailbox full ({self.capacity}, {self.overflow})", sender)
+        cell.node.dead_letter(cell, message, drop_reason(self.capacity, self.overflow), sender)
 
     def _lose_queued(self, cell: Cell, keep: int) -> None:
         """Drop queued messages, oldest first, until `keep` are left."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from ...actors.errors import HoldfastError, MailboxFull
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.mailbox import Bound, Senders
-from ...actors.overflow import DROPS, Overflow, decide
+from ...actors.overflow import DROPS, Overflow, decide, drop_reason
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer
 from .disposal import lose
@@ -75,15 +75,12 @@ class HomeBound:
         error = MailboxFull(self._home.path, self.capacity)
         self._home.node.count_no_room(self._home.path)
         if verdict == "lose":
-            lose(self._home, Parcel(name, body), self._why())
+            lose(self._home, Parcel(name, body), drop_reason(self.capacity, self.overflow))
         elif ask is None:
             raise error
         if ask is not None:
             ask.fail(error)
         return False
-
-    def _why(self) -> str:
-        return f"mailbox full ({self.capacity}, {self.overflow})"
 
     def _drop(self, keep: int) -> None:
         """End queued messages, oldest first, until `keep` are left."""
@@ -96,7 +93,7 @@ class HomeBound:
             if source.id not in (self._fed, home.ledger.begun):
                 self._behind.pop(source.id, None)
                 home.node.count_no_room(home.path)
-                lose(home, source, self._why())
+                lose(home, source, drop_reason(self.capacity, self.overflow))
                 home.end_without_turn(source, error, batch)
         batch.commit(home.journal)
 

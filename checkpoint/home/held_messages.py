@@ -17,7 +17,7 @@ from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, Item
 from ...actors.kernel.mailbox import Senders, admit_gone
-from ...actors.overflow import decide
+from ...actors.overflow import decide, held_drop_reason
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer
 from ..recovery_settings import Held
@@ -213,7 +213,7 @@ class Holding:
 
 
 def _why(rule: Held) -> str:
-    return f"there was no room while messages were held (for {rule.capacity}, {rule.overflow})"
+    return held_drop_reason(rule.capacity, rule.overflow)
 
 
 class Inlet(Cell):

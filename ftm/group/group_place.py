@@ -66,7 +66,8 @@ FINISHED_WITHIN = 3600.0
 """Seconds that `on_stop` may take; whoever has ordered the end keeps the time."""
 REPLICA_SHUTDOWN = 20.0
 """Seconds that a replica may take to end its bricks, before its process is killed."""
-REPLICA_BACKOFF = Backoff(initial=0.01, maximum=2.0, reset_after=5.0)
+REPLICA_BACKOFF = Backoff(initial=0.01, maximum=0.8, reset_after=1.0)
+"""Waits before a replica is started again: with jitter less than a second, for the last one may be alone meanwhile."""
 BUILT_WITHIN = 60.0
 """Seconds that the processes of a group may take to come up."""
 BRICKS_FLAGS = Flags(intensity=100, period=5.0)

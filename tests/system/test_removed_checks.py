@@ -1352,10 +1352,24 @@ CHECKS = {
     ),
     "a program waits for whoever gets its lines": Check(
         "supervision/services/program_lines.py",
-        "            self._hold()\n",
-        "            pass\n",
+        "        if self._waiting >= MOST:\n            self._hold()\n",
+        "",
         LINES,
         "test_a_program_that_prints_faster",
+    ),
+    "first lines wait for whoever gets them": Check(
+        "supervision/services/program_lines.py",
+        "        if first is None:\n",
+        "        if True:\n",
+        LINES,
+        "test_the_first_lines_are_kept",
+    ),
+    "lines that are not to be logged are not": Check(
+        "system/logs.py",
+        "                if event.is_logged:\n",
+        "                if True:\n",
+        LINES,
+        "test_lines_are_logged_unless",
     ),
     "a child elsewhere has its name before it starts": Check(
         "actors/kernel/address_host.py",
