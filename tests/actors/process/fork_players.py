@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import time
 from pathlib import Path
 
 import holdfast as hf
@@ -70,3 +71,60 @@ class SlowToReturn(hf.Actor):
     @hf.on(Life)
     def life(self, message: Life) -> int:
         return self.ctx.life
+
+
+class Tally(hf.Message[int]):
+    """The number of the message is the answer, if none was lost and none handled twice."""
+
+    number: int
+
+
+class Taken(hf.Message[list[int]]): ...
+
+
+class Tallying(hf.Actor):
+    """Keeps all numbers that it has been told or asked."""
+
+    def __init__(self) -> None:
+        self.numbers: list[int] = []
+
+    @hf.on(Tally)
+    def tally(self, message: Tally) -> int:
+        self.numbers.append(message.number)
+        return len(self.numbers)
+
+    @hf.on(Taken, readonly=True)
+    def taken(self, message: Taken) -> list[int]:
+        return self.numbers
+
+
+def double(number: int) -> int:
+    return 2 * number
+
+
+class Effecting(Tallying):
+    """Has a part of each turn done by a process for effects."""
+
+    @hf.on(Tally)
+    async def tally(self, message: Tally) -> int:
+        doubled = await self.ctx.effect(double, message.number, key=str(message.number), isolation="process")
+        self.numbers.append(doubled // 2)
+        return len(self.numbers)
+
+
+class Stray(hf.Message[int]):
+    """Leaves a process behind that has its socket open until the file is there."""
+
+    gate: str
+
+
+class Leaving(Counter):
+    @hf.on(Stray)
+    def stray(self, message: Stray) -> int:
+        pid = os.fork()
+        if pid == 0:
+            os.setsid()
+            while not os.path.exists(message.gate):
+                time.sleep(0.01)
+            os._exit(0)
+        return pid

@@ -13,8 +13,8 @@ import pytest
 import holdfast as hf
 from holdfast.actors.events import ActorStarted, ChildRestarted, ChildTerminated, MessageQuarantined, SupervisorGaveUp
 from holdfast.supervision.spec import Strategy
-from tests.actors.process.fork_players import Add, Counter, Eat, Life, Linger, SlowToReturn
-from tests.actors.process.waiting import next_event, until
+from tests.actors.process.fork_players import Add, Counter, Eat, Leaving, Life, Linger, SlowToReturn, Stray
+from tests.actors.process.waiting import end_of, next_event, until
 
 MANY = 6
 
@@ -86,12 +86,12 @@ async def test_supervisors_that_give_up_by_one_cause_count_once_above_them() -> 
     async with hf.ActorSystem("app", log=False) as system:
         teams = [hf.supervisor(f"t{n}", children=counters(2), intensity=0) for n in range(MANY)]
         await system.start(hf.supervisor("teams", children=teams, intensity=1, period=600.0))
-        with system.events() as events:
+        with system.events() as events, system.events() as everything:
             os.kill(fork_server(system, system.ref("/app/teams/t0/c0", hf.Actor)), signal.SIGKILL)
             for _ in range(2 * MANY):
                 await next_event(events, ActorStarted, lambda event: event.address[-2:] in ("c0", "c1"))
-        for n in range(MANY):
-            assert await lives(system, f"/app/teams/t{n}", 2) == [1, 1]
+            gave_up = [event.address for event in everything.take() if isinstance(event, SupervisorGaveUp)]
+        assert sorted(gave_up) == [f"/app/teams/t{n}" for n in range(MANY)]
 
 
 async def test_processes_that_end_by_themselves_count_each() -> None:
@@ -146,6 +146,22 @@ async def test_the_message_in_its_turn_is_not_blamed(tmp_path: Path, place: str)
             gate.touch()
             assert await waiting == 2
             assert not [event for event in events.take() if isinstance(event, MessageQuarantined)]
+
+
+async def test_a_stray_that_keeps_a_socket_open_holds_up_nobody_for_long(tmp_path: Path) -> None:
+    """What has left the process group of its actor lives on; the end of the socket never comes."""
+    gate = tmp_path / "gate"
+    async with hf.ActorSystem("app", log=False, intensity=1) as system:
+        refs = [await system.start(hf.child(f"c{n}", hf.start(Leaving), isolation="process")) for n in range(2)]
+        stray = os.pidfd_open(await refs[0].ask(Stray(str(gate))))
+        with system.events() as events:
+            os.kill(fork_server(system, refs[0]), signal.SIGKILL)
+            for _ in refs:
+                await next_event(events, ActorStarted)
+        assert await lives(system, "/app", 2) == [2, 2]
+        gate.touch()
+        await end_of(stray)
+        os.close(stray)
 
 
 async def test_why_names_the_fork_server() -> None:
