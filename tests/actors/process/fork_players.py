@@ -121,10 +121,13 @@ class Stray(hf.Message[int]):
 class Leaving(Counter):
     @hf.on(Stray)
     def stray(self, message: Stray) -> int:
+        reading, writing = os.pipe()
         pid = os.fork()
         if pid == 0:
             os.setsid()
+            os.write(writing, b".")
             while not os.path.exists(message.gate):
                 time.sleep(0.01)
             os._exit(0)
+        os.read(reading, 1)
         return pid
