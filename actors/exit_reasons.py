@@ -25,12 +25,12 @@ class ExitReason(msgspec.Struct, frozen=True):
 
     @property
     def common_cause(self) -> str:
-        """What outside of the actor has ended it and others: one fault, however many it strikes. "": nothing has."""
+        """Name what outside of the actor has ended it and others: one fault, however many it strikes. "": nothing."""
         return ""
 
     @property
     def blames_nobody(self) -> bool:
-        """Whether the turn that was in hand has no part in the end: it was ordered, or has a common cause."""
+        """Say whether the turn that was in hand has no part in the end, which was ordered or has a common cause."""
         return bool(self.common_cause)
 
 

@@ -156,10 +156,13 @@ async def test_a_stray_that_keeps_a_socket_open_holds_up_nobody_for_long(tmp_pat
         stray = os.pidfd_open(await refs[0].ask(Stray(str(gate))))
         with system.events() as events:
             os.kill(fork_server(system, refs[0]), signal.SIGKILL)
-            for _ in refs:
-                await next_event(events, ActorStarted)
+            try:
+                async with asyncio.timeout(20.0):
+                    for _ in refs:
+                        await next_event(events, ActorStarted)
+            finally:
+                gate.touch()
         assert await lives(system, "/app", 2) == [2, 2]
-        gate.touch()
         await end_of(stray)
         os.close(stray)
 
